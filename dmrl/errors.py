@@ -1,0 +1,84 @@
+"""Errors a user can act on. Every message is one line and ends with the way out.
+
+* DmrlError
+  - OutputError       the output exists, or cannot be written
+  - RecordingError    the file cannot be read, or lacks what was asked of it
+    + MissingTopic
+  - SourceError       a foreign file or folder is not what its format says
+  - DatasetError      a folder is not a dataset, or lacks what was asked of it
+  - ModelError        weights or a run folder cannot be used
+  - RecipeError       the TOML does not describe a run
+  - SettingError      a setting cannot be met by this input
+  - MissingExtra      a package that an optional room needs is not installed
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class DmrlError(Exception):
+    """Base of every error that ``dmrl`` prints without a traceback."""
+
+
+class OutputError(DmrlError):
+    """An output exists already, or cannot be written."""
+
+
+class RecordingError(DmrlError):
+    """A recording cannot be used as asked."""
+
+
+class MissingTopic(RecordingError):
+    """A recording lacks a topic that a stage reads.
+
+    Parameters
+    ----------
+    topic
+        The topic, or pattern of topics, that was wanted.
+    present
+        Topics the recording has; the nearest is offered.
+    where
+        The recording.
+    """
+
+    def __init__(self, topic: str, present: Iterable[str], where: object) -> None:
+        near = get_close_matches(topic, sorted(present), n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"Try: dmrl info {where}"
+        super().__init__(f"no topic {topic} in {where}. {hint}")
+
+
+class SourceError(DmrlError):
+    """A foreign file or folder is not what its format says."""
+
+
+class DatasetError(DmrlError):
+    """A folder is not a dataset, or lacks what was asked of it."""
+
+
+class ModelError(DmrlError):
+    """Weights or a run folder cannot be used."""
+
+
+class RecipeError(DmrlError):
+    """A recipe does not describe a run."""
+
+
+class SettingError(DmrlError):
+    """A setting cannot be met by this input."""
+
+
+class MissingExtra(DmrlError):
+    """A package from an optional extra is not installed.
+
+    Parameters
+    ----------
+    package
+        Name on PyPI.
+    extra
+        The extra of dmrl that brings it.
+    what
+        What needs it, as the user knows it.
+    """
+
+    def __init__(self, package: str, extra: str, what: str) -> None:
+        super().__init__(f"{what} needs {package}. Install it with: pip install 'dmrl[{extra}]'")

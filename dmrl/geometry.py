@@ -1,0 +1,169 @@
+"""Frames, cameras, projection and grid labels. Pure NumPy: no files, no topics, no state.
+
+Frames, all right-handed, metres and radians:
+
+* ``horizontal``  origin at the robot, x forward, y left, z up against gravity.
+* ``camera``      origin at the optical centre, x forward, y left, z up; horizontal
+  turned by roll and pitch.
+* ``image``       pixels from the top-left corner, u right, v down, pixel-edge
+  coordinates: an image covers [0, width] x [0, height].
+
+A matrix that turns ``b`` coordinates into ``a`` coordinates is named ``a_from_b``.
+A grid cell is (row, col) = (v, u) // stride; the paper writes (x_p / 8, y_p / 8).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+STRIDE_PX = 8
+"""Image pixels per grid cell, both ways."""
+
+# camera (x forward, y left, z up) -> optical (x right, y down, z forward); paper eq. 1.
+OPTICAL_FROM_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera with radial-tangential distortion.
+
+    Parameters
+    ----------
+    width_px, height_px
+        Size of the image, pixels.
+    fx_px, fy_px
+        Focal lengths, pixels.
+    cx_px, cy_px
+        Principal point, pixel-edge coordinates.
+    distortion
+        k1, k2, p1, p2, k3 of the plumb-bob model; empty for none.
+    """
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def image_from_optical(self) -> Array:
+        """(3, 3) intrinsic matrix, pixels."""
+        return np.array(
+            [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
+        )
+
+
+AIDECK = Camera(320, 224, 183.73, 184.12, 166.90, 77.51, (-0.0957, 0.0211, 0.0, 0.0, 0.0))
+"""The AI-deck camera of the paper (eq. 1): 324x244 cropped to 320x224."""
+
+PUBLISHED_RENDER = Camera(320, 224, 120.0, 120.0, 160.0, 112.0)
+"""The camera that the published synthetic images were rendered with."""
+
+
+def camera_from_horizontal(roll_rad: float, pitch_rad: float) -> Array:
+    """(3, 3) rotation that turns horizontal into camera coordinates.
+
+    The body's attitude is Rz(yaw) Ry(pitch) Rx(roll), z up: roll positive right side down,
+    pitch positive nose down. The paper's eq. 2, Rx(phi) Ry(theta), is this matrix with
+    phi = -roll and theta = -pitch; with standard signs it is a different rotation.
+
+    Parameters
+    ----------
+    roll_rad, pitch_rad
+        Attitude of the robot that carries the camera, radians.
+    """
+    cr, sr, cp, sp = np.cos(roll_rad), np.sin(roll_rad), np.cos(pitch_rad), np.sin(pitch_rad)
+    horizontal_from_camera = np.array(
+        [[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]]
+    )
+    return horizontal_from_camera.T
+
+
+def project(xyz_camera: Array, image_from_optical: Array) -> tuple[Array, Array]:
+    """Pixel and depth of points in front of the camera, without distortion (paper eq. 1).
+
+    Parameters
+    ----------
+    xyz_camera
+        (N, 3) points, camera frame, metres.
+    image_from_optical
+        (3, 3) intrinsic matrix, pixels.
+
+    Returns
+    -------
+    uv : Array
+        (N, 2) pixels, u right and v down. Not clipped to the image.
+    depth_m : Array
+        (N,) distance along camera x, metres.
+
+    Raises
+    ------
+    ValueError
+        If a point lies at or behind the optical centre (x <= 0).
+
+    Examples
+    --------
+    >>> k = np.array([[184.0, 0.0, 160.0], [0.0, 184.0, 112.0], [0.0, 0.0, 1.0]])
+    >>> project(np.array([[2.0, 0.0, 0.0]]), k)
+    (array([[160., 112.]]), array([2.]))
+    """
+    depth_m = xyz_camera[:, 0]
+    if (behind := np.flatnonzero(depth_m <= 0)).size:
+        raise ValueError(
+            f"{behind.size} of {depth_m.size} points lie behind the camera, "
+            f"first at row {behind[0]} with x = {depth_m[behind[0]]:.3f} m"
+        )
+    uvw = xyz_camera @ (image_from_optical @ OPTICAL_FROM_CAMERA).T
+    return uvw[:, :2] / uvw[:, 2:], depth_m
+
+
+def inside(uv: Array, width_px: int, height_px: int) -> NDArray[np.bool_]:
+    """(N,) whether pixels lie in the image, [0, width) x [0, height).
+
+    Parameters
+    ----------
+    uv
+        (N, 2) pixels.
+    width_px, height_px
+        Size of the image.
+    """
+    return np.asarray(((uv >= 0) & (uv < (width_px, height_px))).all(axis=1))
+
+
+def grid_label(
+    uv: Array, depth_m: Array, *, shape: tuple[int, int] = (28, 40), stride_px: int = STRIDE_PX
+) -> NDArray[np.float32]:
+    """Confidence and depth maps for one image (paper eq. 4).
+
+    Parameters
+    ----------
+    uv
+        (N, 2) pixels of the robot centres.
+    depth_m
+        (N,) depths, metres.
+    shape
+        Rows and columns of the grid.
+    stride_px
+        Pixels per cell, both ways.
+
+    Returns
+    -------
+    Array
+        (2, rows, cols). Channel 0 is confidence, 0 or 1; channel 1 is depth in metres,
+        0 where the confidence is 0. Robots outside the image are dropped. Of two robots
+        in one cell the nearer wins, since it hides the other.
+    """
+    rows, cols = shape
+    grid = np.zeros((2, rows, cols), np.float32)
+    seen = inside(uv, cols * stride_px, rows * stride_px)
+    uv, depth_m = uv[seen], depth_m[seen]
+    order = np.argsort(-depth_m, kind="stable")  # far first, so that near overwrites
+    col, row = (uv[order] // stride_px).astype(int).T
+    grid[0, row, col] = 1.0
+    grid[1, row, col] = depth_m[order]
+    return grid

@@ -1,0 +1,133 @@
+"""The one table of topics: pattern, message, frame, units, rate, who writes it.
+
+``<robot>`` carries the camera or sensor; ``<peer>`` is the robot it sees or ranges to.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One row of the table.
+
+    Parameters
+    ----------
+    pattern
+        Topic with ``{robot}`` and ``{peer}`` left open.
+    message
+        Full name of its message.
+    frame
+        Frame its values are in.
+    units
+        Units of its values.
+    rate
+        How often, as a rule.
+    written_by
+        Commands that write it.
+    """
+
+    pattern: str
+    message: str
+    frame: str
+    units: str
+    rate: str
+    written_by: str
+
+
+CAMERA_IMAGE = "/{robot}/camera/image"
+CALIBRATION = "/{robot}/camera/calibration"
+ATTITUDE = "/{robot}/attitude"
+VELOCITY = "/{robot}/velocity"
+HEIGHT = "/{robot}/height"
+RANGE = "/{robot}/range/{peer}"
+POSITION = "/{robot}/peer/{peer}/position"
+TRUTH = "/{robot}/peer/{peer}/truth"
+LABELS = "/{robot}/labels"
+DETECTIONS = "/{robot}/detections"
+GRID = "/{robot}/detections/grid"
+TRACKS = "/{robot}/tracks"
+TRANSFORMS = "/tf"
+
+TOPICS = (
+    Topic(CAMERA_IMAGE, "foxglove.CompressedImage", "image", "png or jpeg", "camera", "convert"),
+    Topic(CALIBRATION, "foxglove.CameraCalibration", "image", "px", "once", "convert"),
+    Topic(LABELS, "dmrl.v1.PeerLabels", "image", "px, m", "per image", "convert"),
+    Topic(DETECTIONS, "dmrl.v1.Detections", "image", "px, m", "per image", "predict"),
+    Topic(GRID, "dmrl.v1.GridMap", "image grid", "0..1, m", "per image", "predict"),
+    Topic(TRACKS, "dmrl.v1.Tracks", "<robot>/horizontal", "m, m/s", "per image", "track"),
+    Topic(ATTITUDE, "dmrl.v1.Attitude", "<robot>/horizontal", "rad, rad/s", "100 Hz", "convert"),
+    Topic(VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert"),
+    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert"),
+    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert"),
+    Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
+    Topic(TRUTH, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "per image", "convert"),
+    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "100 Hz", "fly"),
+)
+
+
+def camera_image(robot: str) -> str:
+    """Topic of a robot's images."""
+    return CAMERA_IMAGE.format(robot=robot)
+
+
+def calibration(robot: str) -> str:
+    """Topic of a robot's camera calibration."""
+    return CALIBRATION.format(robot=robot)
+
+
+def attitude(robot: str) -> str:
+    """Topic of a robot's attitude."""
+    return ATTITUDE.format(robot=robot)
+
+
+def labels(robot: str) -> str:
+    """Topic of the labels of a robot's images."""
+    return LABELS.format(robot=robot)
+
+
+def detections(robot: str) -> str:
+    """Topic of what the network found in a robot's images."""
+    return DETECTIONS.format(robot=robot)
+
+
+def grid(robot: str) -> str:
+    """Topic of the network's output maps for a robot's images."""
+    return GRID.format(robot=robot)
+
+
+def truth(robot: str, peer: str) -> str:
+    """Topic of where a peer truly is, seen from a robot."""
+    return TRUTH.format(robot=robot, peer=peer)
+
+
+@cache
+def _expression(pattern: str) -> re.Pattern[str]:
+    return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(pattern)))
+
+
+def names(pattern: str, topic: str) -> dict[str, str] | None:
+    """What ``{robot}`` and ``{peer}`` of a pattern are in a topic, or None.
+
+    Examples
+    --------
+    >>> names(RANGE, "/cf1/range/cf2")
+    {'robot': 'cf1', 'peer': 'cf2'}
+    >>> names(RANGE, "/cf1/labels") is None
+    True
+    """
+    match = _expression(pattern).fullmatch(topic)
+    return match.groupdict() if match else None
+
+
+@cache
+def row_of(topic: str) -> Topic | None:
+    """The table's row for a topic, or None for a topic that is not dmrl's."""
+    return next((row for row in TOPICS if names(row.pattern, topic) is not None), None)
+
+
+def robots(topics: list[str] | tuple[str, ...], pattern: str = CAMERA_IMAGE) -> list[str]:
+    """Robots that have a topic of this pattern, sorted."""
+    found = (names(pattern, topic) for topic in topics)
+    return sorted({n["robot"] for n in found if n is not None})

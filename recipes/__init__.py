@@ -1,0 +1,1 @@
+"""Recipes that ship with dmrl: TOML files, each runnable as it stands."""

@@ -1,0 +1,1 @@
+"""Message definitions (dmrl/v1/*.proto) and the descriptor set built from them."""

@@ -1,0 +1,64 @@
+"""Build ``dmrl.binpb`` from the .proto files and foxglove's own descriptors.
+
+Run as ``python schemas/build.py [OUT]``; ``make schemas`` does. A developer's tool: the
+package reads the committed result and needs neither protoc nor foxglove's classes.
+"""
+
+import sys
+import tempfile
+from importlib import import_module
+from pathlib import Path
+
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from grpc_tools import protoc
+
+HERE = Path(__file__).parent
+FOXGLOVE = ("CameraCalibration", "CompressedImage", "FrameTransforms", "Log", "PoseInFrame")
+
+
+def own_files() -> list[FileDescriptorProto]:
+    """Descriptors of dmrl/v1/*.proto, compiled by protoc."""
+    protos = sorted(str(p.relative_to(HERE)) for p in HERE.glob("dmrl/v1/*.proto"))
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "own.binpb"
+        if protoc.main(["protoc", f"-I{HERE}", f"--descriptor_set_out={out}", *protos]) != 0:
+            raise SystemExit("protoc refused the schemas; see above")
+        return list(FileDescriptorSet.FromString(out.read_bytes()).file)
+
+
+def with_dependencies(file: FileDescriptor, found: dict[str, FileDescriptorProto]) -> None:
+    """Add ``file`` and everything it imports to ``found``, imports first."""
+    for dependency in file.dependencies:
+        with_dependencies(dependency, found)
+    proto = FileDescriptorProto()
+    file.CopyToProto(proto)
+    found.setdefault(file.name, proto)
+
+
+def build() -> bytes:
+    """The serialized FileDescriptorSet, in one order always."""
+    found: dict[str, FileDescriptorProto] = {}
+    for name in FOXGLOVE:
+        with_dependencies(import_module(f"foxglove_schemas_protobuf.{name}_pb2").DESCRIPTOR, found)
+    files = [*found.values(), *own_files()]
+    done: set[str] = set()
+    ordered = FileDescriptorSet()
+
+    def add(file: FileDescriptorProto) -> None:
+        if file.name in done:
+            return
+        done.add(file.name)
+        for dependency in file.dependency:
+            add(by_name[dependency])
+        ordered.file.append(file)
+
+    by_name = {f.name: f for f in files}
+    for file in files:
+        add(file)
+    return ordered.SerializeToString(deterministic=True)
+
+
+if __name__ == "__main__":
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else HERE / "dmrl.binpb"
+    target.write_bytes(build())
