@@ -1,0 +1,107 @@
+"""Pictures as bytes and as arrays. The only home of Pillow.
+
+Arrays are (height, width, 3), uint8, RGB. EXIF orientation is not applied: a camera's
+calibration belongs to the pixels as they were stored.
+"""
+
+import struct
+from io import BytesIO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from dmrl.errors import SourceError
+
+Rgb = NDArray[np.uint8]
+
+FORMATS = ("PNG", "JPEG", "PPM", "BMP")
+# What Pillow raises on broken pictures, whichever decoder meets them.
+BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
+
+
+def _open(data: bytes, what: object) -> Image.Image:
+    try:
+        return Image.open(BytesIO(data), formats=FORMATS)
+    except BROKEN:
+        names = ", ".join(FORMATS)
+        raise SourceError(
+            f"{what} is not a picture ({names}). Remove it or save it again"
+        ) from None
+
+
+def decode(data: bytes, what: object = "the image") -> Rgb:
+    """Pixels of a PNG, JPEG, PPM or BMP.
+
+    Parameters
+    ----------
+    data
+        The encoded picture. Bytes after its end are ignored.
+    what
+        Name of the picture in the error.
+
+    Returns
+    -------
+    Rgb
+        (H, W, 3), uint8, RGB. Grey becomes RGB, transparency is dropped.
+
+    Raises
+    ------
+    SourceError
+        If the bytes are no such picture, or end too soon.
+    """
+    with _open(data, what) as image:
+        try:
+            return np.asarray(image.convert("RGB"))
+        except BROKEN as e:
+            why = " ".join(str(e).split())
+            raise SourceError(
+                f"{what} cannot be decoded: {why}. Remove it or save it again"
+            ) from None
+
+
+def size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
+    """Width and height in pixels and format (png, jpeg, ppm, bmp), without decoding.
+
+    Raises
+    ------
+    SourceError
+        If the bytes do not start like such a picture.
+    """
+    with _open(data, what) as image:
+        return image.width, image.height, str(image.format).lower()
+
+
+def encode_png(rgb: Rgb) -> bytes:
+    """Lossless PNG of an (H, W, 3) uint8 RGB array. Same pixels, same bytes."""
+    buffer = BytesIO()
+    # Level 3 is three times as fast as the default 6 and 2 % larger on camera images.
+    Image.fromarray(rgb).save(buffer, "PNG", compress_level=3)
+    return buffer.getvalue()
+
+
+def encode_jpeg(rgb: Rgb, quality: int = 95) -> bytes:
+    """JPEG of an (H, W, 3) uint8 RGB array, without chroma subsampling."""
+    buffer = BytesIO()
+    Image.fromarray(rgb).save(buffer, "JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue()
+
+
+def crop_and_scale(
+    rgb: Rgb, box_px: tuple[float, float, float, float], width_px: int, height_px: int
+) -> Rgb:
+    """Pixels inside ``box_px``, scaled to (height_px, width_px, 3).
+
+    Parameters
+    ----------
+    rgb
+        (H, W, 3), uint8.
+    box_px
+        Left, top, right, bottom, pixel-edge coordinates; fractions allowed.
+    width_px, height_px
+        Size of the result.
+    """
+    image = Image.fromarray(rgb)
+    # Bicubic with Pillow's support scaling averages when it shrinks: no aliasing.
+    scaled = image.resize((width_px, height_px), Image.Resampling.BICUBIC, box=box_px)
+    return np.asarray(scaled)

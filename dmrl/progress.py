@@ -1,0 +1,55 @@
+"""Progress on standard error, silent when that is not a terminal."""
+
+from collections.abc import Iterable, Iterator, Sized
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+Item = TypeVar("Item")
+
+
+def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+    """Items one by one, with a bar that says how many are done.
+
+    Parameters
+    ----------
+    items
+        Anything to iterate.
+    what
+        Words before the bar, such as "Rendering".
+    total
+        Number of items. None: the length of ``items``, or not known.
+
+    Yields
+    ------
+    Item
+        What ``items`` yields, unchanged.
+    """
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield from items
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        yield from bar.track(items, total=total, description=what)
+
+
+def say(line: str) -> None:
+    """Print one line of news on standard error, terminal or not."""
+    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(line)

@@ -1,0 +1,62 @@
+"""Results on standard output: a table for people, JSON for programs."""
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+NOT_A_TERMINAL_COLUMNS = 200  # a pipe has no width; wrapped rows cannot be searched
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a table. A column whose values are all numbers is set flush right.
+
+    Parameters
+    ----------
+    title
+        Line above the table; empty for none.
+    columns
+        Headers, with the unit where there is one.
+    rows
+        One sequence per row, as long as ``columns``. None prints as nothing.
+
+    Raises
+    ------
+    ValueError
+        If a row is not as long as ``columns``.
+    """
+    if wrong := [row for row in rows if len(row) != len(columns)]:
+        raise ValueError(f"a row of {len(wrong[0])} cells in a table of {len(columns)} columns")
+    table = Table(
+        title=title or None, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD
+    )
+    for index, column in enumerate(columns):
+        cells = [row[index] for row in rows if row[index] is not None]
+        number = bool(cells) and all(isinstance(cell, int | float) for cell in cells)
+        table.add_column(column, justify="right" if number else "left")
+    for row in rows:
+        table.add_row(*[_text(cell) for cell in row])
+    width = None if sys.stdout.isatty() else NOT_A_TERMINAL_COLUMNS
+    # Markup and highlighting off: file names hold square brackets.
+    Console(width=width, highlight=False, markup=False).print(table)
+
+
+def _text(cell: object) -> str:
+    if cell is None:
+        return ""
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+
+
+def print_json(document: Any) -> None:
+    """Print one JSON document, keys in the order given.
+
+    Raises
+    ------
+    ValueError
+        If a number is NaN or infinite, which JSON does not know.
+    """
+    sys.stdout.write(json.dumps(document, indent=2, allow_nan=False, default=str) + "\n")
