@@ -1,0 +1,103 @@
+"""Provenance of an output about to be written: its inputs hashed, their ancestry nested."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from dmrl.errors import RecordingError
+from dmrl.recording.index import summary
+from dmrl.recording.provenance import FILE_NAME, Input, Provenance
+
+
+def provenance(
+    stage: str,
+    settings: Any = None,
+    inputs: Sequence[Path] = (),
+    *,
+    seed: int | None = None,
+    libraries: Sequence[str] = (),
+) -> Provenance:
+    """Provenance of an output about to be written; hashes the inputs.
+
+    Parameters
+    ----------
+    stage
+        The command's name.
+    settings
+        A settings dataclass, a dictionary, or None.
+    inputs
+        Files and folders that are read.
+    seed
+        Random seed.
+    libraries
+        Names of installed packages whose version matters.
+
+    Raises
+    ------
+    RecordingError
+        If an input is not there.
+    """
+    values = asdict(settings) if is_dataclass(settings) else settings
+    return Provenance(
+        stage=stage,
+        settings=json.loads(json.dumps(values or {}, default=_name)),
+        seed=seed,
+        inputs=tuple(input_of(path) for path in inputs),
+        libraries={name: _version(name) for name in libraries},
+    )
+
+
+def _name(value: object) -> str:
+    # A path in a setting is named, not located, for the same reason as an input.
+    return value.name if isinstance(value, Path) else str(value)
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "absent"
+
+
+def input_of(path: Path) -> Input:
+    """Name, hash and own provenance of a file or folder.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such file or folder.
+    """
+    if not path.exists():
+        raise RecordingError(f"no file or folder {path}. Check the name")
+    digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
+    return Input(path.resolve().name, digest, _own_provenance(path))
+
+
+def sha256_of_file(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def sha256_of_folder(folder: Path) -> str:
+    """SHA-256 over the sorted relative names and contents of a folder's files."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of_file(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def _own_provenance(path: Path) -> Provenance | None:
+    if path.suffix == ".mcap" and path.is_file():
+        return summary(path).provenance
+    file = path / FILE_NAME
+    if not file.is_file():
+        return None
+    try:
+        return Provenance.from_json(json.loads(file.read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError) as e:
+        raise RecordingError(f"{file} is damaged: {e}. Make {path} again") from e

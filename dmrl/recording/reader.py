@@ -1,0 +1,218 @@
+"""Messages of a recording, one at a time or as Arrow columns, in log-time order."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from google.protobuf.descriptor import Descriptor
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessageClass
+
+from dmrl.errors import MissingTopic, RecordingError
+from dmrl.messages import descriptor, pool_of
+from dmrl.recording.blocks import Block, blocks
+from dmrl.recording.index import damaged, summary
+from dmrl.recording.wire import WireError, decode
+from dmrl.recording.writer import Channel, RawMessage
+from dmrl.topics import row_of
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped:
+    """A message with its log time (nanoseconds) and topic."""
+
+    time_ns: int
+    topic: str
+    message: Any
+
+
+def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
+    """Topics of a recording that the names and patterns ask for.
+
+    Parameters
+    ----------
+    path
+        A recording.
+    wanted
+        Topics, or patterns in which ``*`` stands for one part: ``/*/labels``.
+
+    Raises
+    ------
+    MissingTopic
+        If one of them matches nothing.
+    RecordingError
+        If a topic of dmrl's carries another message type.
+    """
+    topics = summary(path).topics
+    found: set[str] = set()
+    for want in wanted:
+        pattern = re.compile(re.escape(want).replace(r"\*", "[^/]+"))
+        hits = {t for t in topics if pattern.fullmatch(t)}
+        if not hits:
+            raise MissingTopic(want, topics, path)
+        found |= hits
+    for topic in sorted(found):
+        row = row_of(topic)
+        if row is not None and topics[topic].schema != row.message:
+            raise RecordingError(
+                f"{path}: {topic} carries {topics[topic].schema or 'no schema'}, not "
+                f"{row.message}. Convert the recording: dmrl convert --help"
+            )
+    return frozenset(found)
+
+
+def read_raw(
+    path: Path, *topics: str, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[RawMessage]:
+    """Messages as they stand in the file, in log-time order.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    topics
+        Only these topics or patterns. None given: all.
+    start_ns, end_ns
+        Only log times in [start_ns, end_ns), nanoseconds.
+
+    Raises
+    ------
+    MissingTopic
+        Before the first message, if a topic matches nothing.
+    RecordingError
+        If the file is not a complete recording.
+    """
+    names = matching(path, topics) if topics else None
+    for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):
+        view = memoryview(block.data)
+        rows = (block.channel, block.time_ns, block.publish_ns, block.start, block.end)
+        for number, time_ns, publish_ns, start, end in zip(*map(list_of, rows), strict=True):
+            yield RawMessage(time_ns, publish_ns, channels[number], bytes(view[start:end]))
+
+
+def list_of(values: Any) -> list[int]:
+    """A NumPy column as Python integers."""
+    return list(values.tolist())
+
+
+def read(
+    path: Path, *topics: str, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[Stamped]:
+    """Decoded messages, in log-time order, a few chunks in memory.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    topics
+        Only these topics or patterns (``/*/labels``). None given: all.
+    start_ns, end_ns
+        Only log times in [start_ns, end_ns), nanoseconds.
+
+    Raises
+    ------
+    MissingTopic
+        Before the first message, if a topic matches nothing.
+    RecordingError
+        If the file is not a complete recording, or a message is not of its type.
+    """
+    classes: dict[Channel, Any] = {}
+    for raw in read_raw(path, *topics, start_ns=start_ns, end_ns=end_ns):
+        kind = classes.get(raw.channel)
+        if kind is None:
+            kind = classes[raw.channel] = GetMessageClass(descriptor_of(path, raw.channel))
+        try:
+            yield Stamped(raw.time_ns, raw.channel.topic, kind.FromString(raw.data))
+        except DecodeError as e:
+            raise damaged(path, f"{raw.topic} at {raw.time_ns} ns: {e}") from e
+
+
+def descriptor_of(path: Path, channel: Channel) -> Descriptor:
+    """Type of a channel's messages: dmrl's own where it knows it, else the recording's.
+
+    Raises
+    ------
+    RecordingError
+        If the channel is not protobuf, or its schema cannot be read.
+    """
+    if channel.encoding != "protobuf" or channel.schema_encoding != "protobuf":
+        raise RecordingError(
+            f"{path}: {channel.topic} is {channel.encoding or 'without encoding'}, not protobuf. "
+            "Leave it out, or convert it: dmrl convert --help"
+        )
+    try:
+        return descriptor(channel.schema_name)
+    except KeyError:
+        pass
+    try:
+        return pool_of(channel.schema_data).FindMessageTypeByName(channel.schema_name)
+    except (DecodeError, TypeError, KeyError) as e:
+        raise damaged(path, f"schema {channel.schema_name}: {e}") from e
+
+
+def columns(
+    path: Path,
+    topic: str,
+    *,
+    fields: Sequence[str] | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Iterator[pa.RecordBatch]:
+    """One topic as Arrow columns, in log-time order, a batch per chunk or so.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    topic
+        One topic, no pattern.
+    fields
+        Only these fields of the message. None: all.
+    start_ns, end_ns
+        Only log times in [start_ns, end_ns), nanoseconds.
+
+    Yields
+    ------
+    pa.RecordBatch
+        ``log_time`` and ``publish_time`` (int64, nanoseconds), then a column per field:
+        sub-messages are structs, repeated fields lists, enums int32.
+
+    Raises
+    ------
+    MissingTopic
+        If the recording lacks the topic.
+    RecordingError
+        If the file is not a complete recording, or a message is not of its type.
+    """
+    for block, channels in blocks(path, matching(path, [topic]), start_ns=start_ns, end_ns=end_ns):
+        # One topic may have several channels, after a merge for instance.
+        kinds = {descriptor_of(path, channel) for channel in channels.values()}
+        if len(kinds) != 1:
+            raise RecordingError(f"{path}: {topic} mixes message types. Split it: dmrl trim --help")
+        try:
+            yield _batch(block, kinds.pop(), fields)
+        except WireError as e:
+            raise damaged(path, f"{topic}: {e}") from e
+
+
+def _batch(block: Block, kind: Descriptor, fields: Sequence[str] | None) -> pa.RecordBatch:
+    body = decode(block.data, block.start, block.end, kind, fields)
+    names = ["log_time", "publish_time", *(field.name for field in body.type)]
+    times = [pa.array(block.time_ns), pa.array(block.publish_ns)]
+    return pa.RecordBatch.from_arrays([*times, *body.flatten()], names)
+
+
+def read_table(
+    path: Path,
+    topic: str,
+    *,
+    fields: Sequence[str] | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> pa.Table:
+    """One topic as an Arrow table, all in memory; see ``columns``."""
+    batches = columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns)
+    return pa.Table.from_batches(list(batches))
