@@ -71,7 +71,7 @@ class Block:
 
     def compact(self) -> "Block":
         """A copy that holds no bytes but its own messages'."""
-        view = memoryview(self.data)
+        view = self.data.data
         size = self.end - self.start
         end = np.cumsum(size)
         data = b"".join(
@@ -142,7 +142,7 @@ def blocks(
             yield from _unindexed(path, stream, topics, low, high)
             return
         channels = {
-            number: channel_of(summary, number)
+            number: channel_of(number, summary.channels, summary.schemas)
             for number in summary.channels
             if topics is None or summary.channels[number].topic in topics
         }
@@ -216,7 +216,8 @@ def _indexed(
 def _chunk_record(raw: bytes) -> Chunk:
     stream = io.BytesIO(raw)
     stream.seek(RECORD_HEADER)
-    return Chunk.read(ReadDataStream(stream))
+    chunk: Chunk = Chunk.read(ReadDataStream(stream))
+    return chunk
 
 
 def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
@@ -265,7 +266,7 @@ def _at(data: Bytes, at_record: Ints) -> Block:
 
 def scanned(data: Bytes, numbers: set[int]) -> Block:
     """The messages of a chunk that has no message index, record by record."""
-    view, offsets, at = memoryview(data), [], 0
+    view, offsets, at = data.data, [], 0
     while at + RECORD_HEADER <= len(view):
         opcode, size = struct.unpack_from("<BQ", view, at)
         if opcode == Opcode.MESSAGE and int.from_bytes(view[at + 9 : at + 11], "little") in numbers:
@@ -286,9 +287,7 @@ def _unindexed(
         if isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, McapChannel) and (topics is None or record.topic in topics):
-            channels[record.id] = channel_of(
-                McapSummary(schemas=schemas, channels={record.id: record}), record.id
-            )
+            channels[record.id] = channel_of(record.id, {record.id: record}, schemas)
         elif isinstance(record, Message) and low <= record.log_time < high:
             rows.append(record)
     rows = [m for m in rows if m.channel_id in channels]

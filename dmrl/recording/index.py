@@ -131,16 +131,18 @@ def mcap_summary(path: Path, stream: BinaryIO) -> McapSummary | None:
     return found
 
 
-def channel_of(summary: McapSummary, number: int) -> Channel:
+def channel_of(
+    number: int, channels: dict[int, McapChannel], schemas: dict[int, McapSchema]
+) -> Channel:
     """Topic and schema of a channel number.
 
     Raises
     ------
     McapError
-        If the summary lacks the channel's schema.
+        If the channel's schema is not among them.
     """
-    channel = summary.channels[number]
-    schema = summary.schemas.get(channel.schema_id)
+    channel = channels[number]
+    schema = schemas.get(channel.schema_id)
     if schema is None and channel.schema_id != 0:
         raise McapError(f"no schema for {channel.topic}")
     metadata = tuple(sorted(channel.metadata.items()))
@@ -172,7 +174,7 @@ def summary(path: Path) -> Summary:
         counts = statistics.channel_message_counts if statistics else {}
         topics: dict[str, TopicInfo] = {}
         for number in sorted(found.channels):
-            channel = channel_of(found, number)
+            channel = channel_of(number, found.channels, found.schemas)
             before = topics[channel.topic].count if channel.topic in topics else 0
             topics[channel.topic] = TopicInfo(channel.schema_name, before + counts.get(number, 0))
         return Summary(

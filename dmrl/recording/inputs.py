@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -41,10 +41,10 @@ def provenance(
     RecordingError
         If an input is not there.
     """
-    values = asdict(settings) if is_dataclass(settings) else settings
+    values = settings if isinstance(settings, dict) else asdict(settings) if settings else {}
     return Provenance(
         stage=stage,
-        settings=json.loads(json.dumps(values or {}, default=_name)),
+        settings=json.loads(json.dumps(values, default=_name)),
         seed=seed,
         inputs=tuple(input_of(path) for path in inputs),
         libraries={name: _version(name) for name in libraries},

@@ -87,7 +87,7 @@ def read_raw(
     """
     names = matching(path, topics) if topics else None
     for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):
-        view = memoryview(block.data)
+        view = block.data.data
         rows = (block.channel, block.time_ns, block.publish_ns, block.start, block.end)
         for number, time_ns, publish_ns, start, end in zip(*map(list_of, rows), strict=True):
             yield RawMessage(time_ns, publish_ns, channels[number], bytes(view[start:end]))

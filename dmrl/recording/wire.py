@@ -276,13 +276,13 @@ def _values_of(field: FieldDescriptor, within: tuple[str, ...]) -> Values:
     if field.type in (F.TYPE_STRING, F.TYPE_BYTES):
         kind_of = pa.string() if field.type == F.TYPE_STRING else pa.binary()
         return lambda data, start, end, _: _text(data, start, end, kind_of)
-    if field.type == F.TYPE_MESSAGE:
+    if (kind_of_message := field.message_type) is not None:
 
         def message(
             data: Bytes, start: Ints, end: Ints, present: NDArray[np.bool_] | None
         ) -> pa.Array:
             mask = None if present is None or present.all() else ~present
-            return _struct(data, start, end, field.message_type, None, within, mask)
+            return _struct(data, start, end, kind_of_message, None, within, mask)
 
         return message
     raise WireError(f"{field.full_name} has a type that protobuf 3 does not write")
@@ -327,7 +327,7 @@ def _text(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa.Array:
     if offsets[-1] > np.iinfo(np.int32).max:
         raise WireError("more than 2 GiB of text in one block")
     if len(size) and offsets[-1] > GATHER_BYTES * len(size):
-        view = memoryview(data)
+        view = data.data
         body = b"".join(view[a:b] for a, b in zip(start.tolist(), end.tolist(), strict=True))
     else:
         index = np.arange(offsets[-1]) + np.repeat(start - offsets[:-1], size)

@@ -1,0 +1,63 @@
+"""The command line: a table of commands, each loaded when it is called.
+
+A command's flags and help come from the function that the table names; errors a user can
+act on become one line and exit status 1.
+"""
+
+import sys
+from typing import NoReturn
+
+from cyclopts import App
+
+from dmrl import __version__
+from dmrl.errors import DmrlError
+
+# In the order of the work. The help line is the first line of the function's docstring;
+# it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
+COMMANDS = {
+    "demo": ("demo", "Run the whole pipeline, small, on pictures that dmrl draws itself."),
+    "run": ("run", "Run every stage of a pipeline recipe, in order; go on where it stopped."),
+    "sketch": ("sketch", "Draw a folder of pictures of small drones, with exact labels."),
+    "convert": ("convert", "Convert SOURCE, a foreign file or folder, into a recording."),
+    "dataset": ("dataset", "Build an Arrow dataset and its card from recordings."),
+    "card": ("card", "Write a dataset's card and figures again."),
+    "train": ("train", "Train a network on a dataset."),
+    "predict": ("predict", "Run a network on every image of a recording."),
+    "evaluate": ("evaluate", "Judge a recording's detections against its labels."),
+    "view": ("view", "Show recordings in rerun, or save what it would show."),
+    "info": ("info", "Show what a recording holds and where it comes from."),
+    "check": ("check", "Check a recording: schemas, times, gaps, calibration, labels."),
+    "recover": ("recover", "Bring back the messages of a recording that was cut short."),
+    "merge": ("merge", "Merge recordings into one, by time."),
+    "trim": ("trim", "Keep a stretch of a recording, or some of its topics."),
+}
+
+app = App(
+    name="dmrl",
+    help="Teach tiny camera drones to see each other: recordings in, recordings out.",
+    version=__version__,
+    help_format="plaintext",
+)
+for _name, (_module, _help) in COMMANDS.items():
+    app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help)
+
+
+def main() -> NoReturn:
+    """Run the command; turn known errors into one line and exit status 1."""
+    try:
+        app()
+    except DmrlError as e:
+        print(f"dmrl: {e}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        print("dmrl: stopped. Nothing stands under its final name", file=sys.stderr)
+        raise SystemExit(130) from None
+    except BrokenPipeError:
+        # The reader of our output, such as `head`, has gone; there is nobody left to tell.
+        sys.stderr.close()
+        raise SystemExit(1) from None
+    raise SystemExit(0)
+
+
+if __name__ == "__main__":
+    main()

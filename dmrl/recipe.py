@@ -1,0 +1,229 @@
+"""Recipes: TOML files that describe a run, checked before anything is done.
+
+A recipe of one stage holds ``kind`` and that stage's settings. A pipeline holds ``[[step]]``
+tables, each a stage with its inputs, output and settings, run in order. A recipe with
+faults is refused whole, every fault named.
+"""
+
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from difflib import get_close_matches
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+
+from dmrl.errors import RecipeError
+
+Settings = TypeVar("Settings")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One stage of a pipeline.
+
+    Parameters
+    ----------
+    stage
+        Command name, such as "convert".
+    out
+        File or folder it writes, relative to the pipeline's folder.
+    inputs
+        What it reads: outputs of earlier steps, or ``{data}/...`` below ``--data``.
+    settings
+        The stage's settings.
+    """
+
+    stage: str
+    out: str
+    inputs: tuple[str, ...] = ()
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """Stages to run in order, and the text they were read from."""
+
+    steps: tuple[Step, ...]
+    text: str
+
+    @property
+    def needs_data(self) -> bool:
+        """Whether a step reads below ``--data``."""
+        return any("{data}" in name for step in self.steps for name in step.inputs)
+
+
+def names() -> list[str]:
+    """Names of the recipes that ship with dmrl."""
+    return sorted(f.name[:-5] for f in _shipped().iterdir() if f.name.endswith(".toml"))
+
+
+def read(name: str | Path) -> dict[str, Any]:
+    """Keys of a recipe, by path or by the name of a shipped one.
+
+    Raises
+    ------
+    RecipeError
+        If there is no such recipe, or it is not TOML.
+    """
+    return _parse(name, text(name))
+
+
+def text(name: str | Path) -> str:
+    """Text of a recipe, by path or by the name of a shipped one.
+
+    Raises
+    ------
+    RecipeError
+        If there is no such recipe.
+    """
+    path = Path(name)
+    source = path if path.suffix == ".toml" else _shipped() / f"{name}.toml"
+    try:
+        return source.read_text(encoding="utf-8")
+    except (FileNotFoundError, IsADirectoryError):
+        near = get_close_matches(path.stem, names(), n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"Shipped ones: {', '.join(names())}"
+        raise RecipeError(f"no recipe {name}. {hint}") from None
+    except (UnicodeDecodeError, OSError) as e:
+        raise RecipeError(f"{name} cannot be read: {e}. Give a TOML text file") from e
+
+
+def load(name: str | Path, kind: str, schema: type[Settings]) -> Settings:
+    """Settings of one stage, from a recipe.
+
+    Parameters
+    ----------
+    name
+        Path, or the name of a shipped recipe.
+    kind
+        What the recipe must describe, such as "train".
+    schema
+        The stage's settings dataclass.
+
+    Raises
+    ------
+    RecipeError
+        If there is no such recipe, it is not TOML, is of another kind, or any key is wrong;
+        names every wrong key.
+    """
+    keys = read(name)
+    _check_kind(name, keys, kind)
+    return check(name, {k: v for k, v in keys.items() if k != "kind"}, schema)
+
+
+def load_pipeline(name: str | Path, schemas: Mapping[str, type[Any]]) -> Pipeline:
+    """Steps of a pipeline recipe, every setting checked.
+
+    Parameters
+    ----------
+    name
+        Path, or the name of a shipped recipe.
+    schemas
+        Settings dataclass of every stage that a step may name.
+
+    Raises
+    ------
+    RecipeError
+        If anything in it is wrong; names every wrong key.
+    """
+    content = text(name)
+    keys = _parse(name, content)
+    _check_kind(name, keys, "pipeline")
+    faults = [f"  {k}: extra inputs are not permitted" for k in keys if k not in ("kind", "step")]
+    steps = keys.get("step")
+    if not isinstance(steps, list) or not steps:
+        raise _faulty(name, [*faults, "  step: at least one [[step]] is required"])
+    for k, step in enumerate(steps):
+        faults += [f"  step.{k + 1}.{fault}" for fault in _step_faults(step, schemas)]
+    if faults:
+        raise _faulty(name, faults)
+    return Pipeline(
+        tuple(
+            Step(s["stage"], s["out"], tuple(s.get("inputs", ())), s.get("settings", {}))
+            for s in steps
+        ),
+        content,
+    )
+
+
+def check(name: str | Path, keys: Mapping[str, Any], schema: type[Settings]) -> Settings:
+    """An instance of a settings dataclass from a recipe's keys.
+
+    Raises
+    ------
+    RecipeError
+        Naming the recipe and every wrong key.
+    """
+    if faults := _faults(keys, schema):
+        raise _faulty(name, [f"  {fault}" for fault in faults])
+    return _instance(keys, schema)
+
+
+def _shipped() -> Traversable:
+    return files("dmrl.recipes")
+
+
+def _parse(name: str | Path, content: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(content)
+    except tomllib.TOMLDecodeError as e:
+        raise RecipeError(f"{name} is not TOML: {e}. Mend that line") from e
+
+
+def _check_kind(name: str | Path, keys: Mapping[str, Any], kind: str) -> None:
+    if (found := keys.get("kind")) != kind:
+        has = f"is of kind {found!r}" if found is not None else "has no kind"
+        raise RecipeError(f'{name} {has}. This command wants a recipe with: kind = "{kind}"')
+
+
+def _faulty(name: str | Path, faults: Iterable[str]) -> RecipeError:
+    lines = list(faults)
+    keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
+    return RecipeError("\n".join([f"{name} has {keys}:", *lines]))
+
+
+def _step_faults(step: Any, schemas: Mapping[str, type[Any]]) -> list[str]:
+    if faults := _faults(step, Step):
+        return faults
+    if step["stage"] not in schemas:
+        return [f"stage: no stage {step['stage']!r}; there are {', '.join(sorted(schemas))}"]
+    return [f"settings.{f}" for f in _faults(step.get("settings", {}), schemas[step["stage"]])]
+
+
+def _model(schema: type[Any]) -> type[BaseModel]:
+    hints = get_type_hints(schema)
+    required = {f.name for f in fields(schema) if f.default is f.default_factory is MISSING}
+    return create_model(
+        schema.__name__,
+        __config__=ConfigDict(strict=True, extra="forbid", frozen=True),
+        **{n: (t, ... if n in required else None) for n, t in hints.items() if n in _names(schema)},
+    )  # type: ignore[call-overload]
+
+
+def _names(schema: type[Any]) -> set[str]:
+    return {f.name for f in fields(schema)}
+
+
+def _validated(keys: Mapping[str, Any], schema: type[Any]) -> dict[str, Any]:
+    # JSON, because pydantic's strict mode takes lists for tuples and text for paths only there.
+    model = _model(schema).model_validate_json(json.dumps(keys, default=str))
+    return {name: getattr(model, name) for name in keys}
+
+
+def _faults(keys: Any, schema: type[Any]) -> list[str]:
+    try:
+        schema(**_validated(keys, schema))
+    except ValidationError as e:
+        return [f"{'.'.join(map(str, d['loc']))}: {d['msg'].lower()}" for d in e.errors()]
+    except ValueError as e:
+        return [str(e)]
+    return []
+
+
+def _instance(keys: Mapping[str, Any], schema: type[Settings]) -> Settings:
+    return schema(**_validated(keys, schema))
