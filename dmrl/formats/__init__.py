@@ -1,0 +1,1 @@
+"""Foreign formats, one file each: bytes in, rows for a recording out."""

@@ -1,0 +1,54 @@
+"""A camera's calibration in a TOML file."""
+
+import tomllib
+from dataclasses import asdict, fields
+from pathlib import Path
+
+from dmrl.errors import SourceError
+from dmrl.geometry import Camera
+
+INTEGERS = ("width_px", "height_px")
+POSITIVE = (*INTEGERS, "fx_px", "fy_px")
+NEEDED = tuple(field.name for field in fields(Camera) if field.name != "distortion")
+KEYS = (*NEEDED, "distortion")
+
+
+def write_camera(camera: Camera) -> str:
+    """A TOML document that ``read_camera`` reads."""
+    values = asdict(camera) | {"distortion": list(camera.distortion)}
+    lines = [f"{key} = {value}" for key, value in values.items()]
+    return "\n".join(
+        ["# Pixel-edge coordinates: the image covers [0, width] x [0, height].", *lines, ""]
+    )
+
+
+def read_camera(path: Path) -> Camera:
+    """The camera that a TOML file describes.
+
+    Raises
+    ------
+    SourceError
+        If the file is not TOML, or a key is unknown, missing or of the wrong kind.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SourceError(f"no calibration {path}. Name a TOML file, aideck or published") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
+        raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
+    wrong = [key for key in values if key not in KEYS]
+    wrong += [f"{key} (missing)" for key in NEEDED if key not in values]
+    wrong += [key for key in NEEDED if key in values and not _is_number(key, values[key])]
+    distortion = values.get("distortion", [])
+    if not (isinstance(distortion, list) and all(_is_number("", d) for d in distortion)):
+        wrong.append("distortion")
+    if wrong:
+        raise SourceError(f"{path}: wrong keys {', '.join(wrong)}. Keys: {', '.join(KEYS)}")
+    return Camera(**(values | {"distortion": tuple(map(float, distortion))}))
+
+
+def _is_number(key: str, value: object) -> bool:
+    kinds = (int,) if key in INTEGERS else (int, float)
+    if not isinstance(value, kinds) or isinstance(value, bool):
+        return False
+    return abs(value) < float("inf") and (key not in POSITIVE or value > 0)

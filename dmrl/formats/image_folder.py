@@ -1,0 +1,164 @@
+"""A folder of pictures, with labels in a CSV file where there are any.
+
+Pictures: ``.png .jpg .jpeg .ppm .bmp``, in the order of their names. When every name is a
+number of 12 digits or more, the numbers are times in nanoseconds; otherwise the pictures
+get nominal times, evenly spaced from 0.
+
+Labels: ``labels.csv`` in the folder, or another file. One row per peer and picture; a row
+with an empty peer says that no peer is in view. A picture without a row is not labelled.
+
+* ``file, peer, u_px, v_px, depth_m`` must be there;
+* ``left_px, top_px, right_px, bottom_px, visible_share, source, split, sigma_u_px,
+  sigma_v_px, sigma_depth_m`` may be. ``source`` is "hand" where it is empty.
+
+Pixels are those of the stored picture, pixel-edge coordinates. ``calibration.toml`` in the
+folder is the camera that took the pictures as they are stored (keys: see ``Camera``).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from dmrl import images
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.crop import Crop
+from dmrl.formats.label_table import LabelRow, read_labels
+from dmrl.formats.sample import Content, Sample, calibration, image, intervals, labels
+from dmrl.geometry import Camera
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
+LABELS = "labels.csv"
+TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
+NS_PER_S = 1_000_000_000
+TIME_MAX_NS = 2**63 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a folder of pictures becomes samples.
+
+    Parameters
+    ----------
+    robot
+        Robot that carries the camera.
+    rate_hz
+        Pictures per second where their names are not times.
+    labels
+        CSV file; None: labels.csv in the folder, if there.
+    camera
+        Camera that took the pictures as they are stored; None: not known.
+    size_px
+        Width and height to crop and scale to; None: pictures stay as they are.
+    """
+
+    robot: str = "cf1"
+    rate_hz: float = 10.0
+    labels: Path | None = None
+    camera: Camera | None = None
+    size_px: tuple[int, int] | None = None
+
+
+def recognises(source: Path) -> bool:
+    """Whether a folder holds a picture."""
+    return source.is_dir() and any(_is_picture(path) for path in source.iterdir())
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def content(source: Path, options: Options) -> Content:
+    """Samples of a folder: pictures in time order, with the labels they have.
+
+    Parameters
+    ----------
+    source
+        The folder.
+    options
+        See ``Options``.
+
+    Raises
+    ------
+    SourceError
+        If there is no picture, one cannot be decoded, or the labels do not fit them: names
+        the file, and the line.
+    SettingError
+        If the camera is not of the pictures' size.
+    """
+    pictures = list_pictures(source, options.rate_hz)
+    path = options.labels or source / LABELS
+    known = {picture.name for _, picture in pictures}
+    rows = read_labels(path, known) if options.labels or path.is_file() else {}
+    splits = {name: found[0].split for name, found in rows.items()}
+    return Content(
+        samples=_samples(pictures, rows, options),
+        total=len(pictures) + len(rows) + (options.camera is not None),
+        split=intervals((time_ns, splits.get(p.name)) for time_ns, p in pictures),
+        inputs=(options.labels,) if options.labels else (),
+    )
+
+
+def list_pictures(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
+    """(time_ns, path) of every picture in a folder, in time order.
+
+    Raises
+    ------
+    SourceError
+        If there is none, only some are named by times, or two have the same time.
+    """
+    if not source.is_dir():
+        raise SourceError(f"no folder {source}. Name a folder of pictures")
+    paths = sorted(path for path in source.iterdir() if _is_picture(path))
+    if not paths:
+        raise SourceError(f"no picture ({', '.join(SUFFIXES)}) in {source}. Name another folder")
+    timed = [path for path in paths if _time_ns(path) is not None]
+    if not timed:
+        return [(round(k * NS_PER_S / rate_hz), path) for k, path in enumerate(paths)]
+    if odd := sorted(set(paths) - set(timed)):
+        raise SourceError(
+            f"{odd[0]} is not named by its time in nanoseconds as {timed[0].name} is. "
+            "Rename it, or move it out of the folder"
+        )
+    moments = sorted((_time_ns(path) or 0, path) for path in paths)
+    for (time_ns, path), (next_ns, following) in pairwise(moments):
+        if time_ns == next_ns:
+            raise SourceError(f"{path} and {following.name} have the same time. Remove one")
+    return moments
+
+
+def _time_ns(path: Path) -> int | None:
+    if not (path.stem.isdecimal() and len(path.stem) >= TIME_DIGITS):
+        return None
+    if int(path.stem) > TIME_MAX_NS:
+        raise SourceError(f"{path}: time after the year 2262. Name it by nanoseconds since 1970")
+    return int(path.stem)
+
+
+def _samples(
+    pictures: list[tuple[int, Path]], rows: dict[str, list[LabelRow]], options: Options
+) -> Iterator[Sample]:
+    for k, (time_ns, path) in enumerate(pictures):
+        data = path.read_bytes()
+        rgb = images.decode(data, path)
+        crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
+        if options.camera is not None and k == 0:
+            yield calibration(time_ns, options.robot, crop.camera(options.camera))
+        if crop.changes:
+            data, kind = images.encode_png(crop.pixels(rgb)), "png"
+        elif (kind := images.size(data)[2]) not in ("png", "jpeg"):
+            data, kind = images.encode_png(rgb), "png"
+        yield image(time_ns, options.robot, data, kind)
+        if path.name in rows:
+            peers = [crop.label(row) for row in rows[path.name] if row.peer]
+            yield labels(time_ns, options.robot, [row.fields() for row in peers])
+
+
+def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
+    camera = options.camera
+    if camera is not None and (width_px, height_px) != (camera.width_px, camera.height_px):
+        raise SettingError(
+            f"{path} is {width_px}x{height_px} px, its camera {camera.width_px}x"
+            f"{camera.height_px}. Give the calibration of the pictures as they are stored"
+        )
+    return Crop(width_px, height_px, *(options.size_px or (width_px, height_px)))

@@ -1,0 +1,208 @@
+"""Labels of pictures in a CSV file: rows in, rows out."""
+
+import csv
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TextIO
+
+from dmrl.errors import SourceError
+
+POINT = ("u_px", "v_px", "depth_m")
+BOX = ("left_px", "top_px", "right_px", "bottom_px")
+SIGMAS = ("sigma_u_px", "sigma_v_px", "sigma_depth_m")
+NEEDED = ("file", "peer", *POINT)
+COLUMNS = (*NEEDED, *BOX, "visible_share", "source", "split", *SIGMAS)
+
+
+@dataclass(frozen=True, slots=True)
+class LabelRow:
+    """One peer in one picture.
+
+    Parameters
+    ----------
+    file
+        Name of the picture.
+    peer
+        The robot that is seen; empty: no peer is in view.
+    u_px, v_px
+        Projection of its centre, pixel-edge coordinates.
+    depth_m
+        Distance along the optical axis, metres.
+    box_px
+        Left, top, right, bottom of the visible part; empty where not known.
+    visible_share
+        Share of the peer's pixels that nothing hides, 0 to 1; 0: not known.
+    source
+        truth, estimate, published or hand.
+    split
+        train, test or another; None: in none.
+    sigmas
+        One standard deviation of u, v (px) and depth (m); 0: exact or not known.
+    """
+
+    file: str
+    peer: str
+    u_px: float = 0.0
+    v_px: float = 0.0
+    depth_m: float = 0.0
+    box_px: tuple[float, ...] = ()
+    visible_share: float = 0.0
+    source: str = "hand"
+    split: str | None = None
+    sigmas: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def fields(self) -> dict[str, Any]:
+        """Fields of a PeerLabel."""
+        point = {name: getattr(self, name) for name in ("peer", *POINT, "visible_share", "source")}
+        return point | dict(zip(SIGMAS, self.sigmas, strict=True)) | {"box_px": list(self.box_px)}
+
+    def cells(self) -> list[str]:
+        """Cells of the row in the order of ``COLUMNS``; what is not known is empty."""
+        if not self.peer:
+            return [self.file, *[""] * 9, self.source, self.split or "", "", "", ""]
+        point = [f"{self.u_px:.4f}", f"{self.v_px:.4f}", f"{self.depth_m:.5f}"]
+        box = [f"{edge:g}" for edge in self.box_px] or [""] * 4
+        share = f"{self.visible_share:.4f}" if self.visible_share else ""
+        sigmas = [f"{sigma:g}" if sigma else "" for sigma in self.sigmas]
+        head = [self.file, self.peer, *point, *box, share]
+        return [*head, self.source, self.split or "", *sigmas]
+
+
+def write_labels(stream: TextIO, rows: Sequence[LabelRow]) -> None:
+    """Write rows as ``read_labels`` reads them. The stream needs ``newline=""``."""
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(row.cells() for row in rows)
+
+
+def read_labels(path: Path, files: Collection[str]) -> dict[str, list[LabelRow]]:
+    """Rows by picture, in the order of the file.
+
+    Parameters
+    ----------
+    path
+        CSV file with a header; see ``COLUMNS``.
+    files
+        Names of the pictures there are.
+
+    Raises
+    ------
+    SourceError
+        If a column is unknown or missing, a cell is not a number, a picture does not exist,
+        or rows contradict each other: names file and line.
+    """
+    found: dict[str, list[LabelRow]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream, strict=True)
+            _check_columns(path, reader.fieldnames or ())
+            for cells in reader:
+                row = _row(f"{path}:{reader.line_num}", cells, files)
+                others = found.setdefault(row.file, [])
+                _check_agrees(f"{path}:{reader.line_num}", row, others)
+                others.append(row)
+    except FileNotFoundError:
+        raise SourceError(f"no label file {path}. Name another with --labels") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as e:
+        raise SourceError(f"{path} is not a CSV file: {e}. Save it as CSV in UTF-8") from None
+    return found
+
+
+def _check_columns(path: Path, columns: Sequence[str]) -> None:
+    for column in columns:
+        if column not in COLUMNS:
+            near = get_close_matches(column, COLUMNS, n=1)
+            hint = f"Did you mean {near[0]}?" if near else f"Known are {', '.join(COLUMNS)}"
+            raise SourceError(f"{path}:1: unknown column {column!r}. {hint}")
+    if missing := [column for column in NEEDED if column not in columns]:
+        raise SourceError(
+            f"{path}:1: no column {', '.join(missing)}. The first line names the columns; "
+            f"needed are {', '.join(NEEDED)}"
+        )
+    if len(set(columns)) < len(columns):
+        raise SourceError(f"{path}:1: a column appears twice. Delete one")
+
+
+def _row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) -> LabelRow:
+    if None in cells or None in cells.values():
+        raise SourceError(f"{where}: not as many cells as the header. Mend the line")
+    row = {str(name): str(cell).strip() for name, cell in cells.items()}
+    if row["file"] not in files:
+        near = get_close_matches(row["file"], files, n=1)
+        hint = f"Did you mean {near[0]}?" if near else "Add the picture, or delete the line"
+        raise SourceError(f"{where}: no picture {row['file']!r} in the folder. {hint}")
+    split = row.get("split") or None
+    if not row["peer"]:
+        return _empty_row(where, row, split)
+    box = tuple(_number(where, row, name) for name in BOX if row.get(name))
+    u_px, v_px, depth_m = (_number(where, row, name) for name in POINT)
+    sigma_u, sigma_v, sigma_depth = (_number(where, row, name, 0.0) for name in SIGMAS)
+    share = _number(where, row, "visible_share", 0.0)
+    _check_values(where, depth_m, box, share, (sigma_u, sigma_v, sigma_depth))
+    return LabelRow(
+        file=row["file"],
+        peer=row["peer"],
+        u_px=u_px,
+        v_px=v_px,
+        depth_m=depth_m,
+        box_px=box,
+        visible_share=share,
+        source=row.get("source") or "hand",
+        split=split,
+        sigmas=(sigma_u, sigma_v, sigma_depth),
+    )
+
+
+def _empty_row(where: str, row: Mapping[str, str], split: str | None) -> LabelRow:
+    if filled := [name for name in (*POINT, *BOX, *SIGMAS) if row.get(name)]:
+        raise SourceError(
+            f"{where}: {filled[0]} without a peer. Name the peer, or leave the cells empty"
+        )
+    return LabelRow(row["file"], "", source=row.get("source") or "hand", split=split)
+
+
+def _number(where: str, row: Mapping[str, str], name: str, default: float | None = None) -> float:
+    cell = row.get(name, "")
+    if not cell and default is not None:
+        return default
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise SourceError(f"{where}: {name} is {cell!r}, not a number. Mend the cell")
+    return value
+
+
+def _check_values(
+    where: str, depth_m: float, box: tuple[float, ...], share: float, sigmas: tuple[float, ...]
+) -> None:
+    if depth_m <= 0:
+        raise SourceError(f"{where}: depth_m is {depth_m:g}; it must be over 0. Mend the cell")
+    if box and not (len(box) == 4 and box[0] < box[2] and box[1] < box[3]):
+        raise SourceError(
+            f"{where}: not a box. {', '.join(BOX)}: all or none, left < right, top < bottom"
+        )
+    if not 0 <= share <= 1:
+        raise SourceError(f"{where}: visible_share is {share:g}. It must be from 0 to 1")
+    if min(sigmas) < 0:
+        raise SourceError(f"{where}: a sigma is negative. Mend the cell")
+
+
+def _check_agrees(where: str, row: LabelRow, others: Sequence[LabelRow]) -> None:
+    if others and (not row.peer or not others[0].peer):
+        raise SourceError(
+            f"{where}: {row.file} has a row with an empty peer, so no other. Delete one"
+        )
+    if any((row.peer, row.source) == (other.peer, other.source) for other in others):
+        raise SourceError(
+            f"{where}: {row.file} has {row.peer} from {row.source} already. Delete one row"
+        )
+    if others and row.split != others[0].split:
+        raise SourceError(
+            f"{where}: {row.file} is in split {row.split or 'none'} and in "
+            f"{others[0].split or 'none'}. Choose one"
+        )
