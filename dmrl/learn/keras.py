@@ -1,0 +1,90 @@
+"""Published Keras weights (.h5) as torch weights of ``locanet``.
+
+Keras keeps a kernel as (height, width, in, out), torch as (out, in, height, width). 'same'
+padding at stride 1 is symmetric, so a 3x3 kernel moves over with padding 1.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dmrl.errors import MissingExtra, ModelError
+from dmrl.learn.network import LocaNet
+
+try:
+    import h5py
+except ImportError:
+    h5py = None
+
+NORM = {
+    "gamma": "weight",
+    "beta": "bias",
+    "moving_mean": "running_mean",
+    "moving_variance": "running_var",
+}
+
+
+def read_h5(path: Path) -> dict[str, Tensor]:
+    """Weights of ``locanet`` from a Keras file, by torch name.
+
+    Parameters
+    ----------
+    path
+        A whole saved model, or weights alone, with layers conv2d, conv2d_1 .. conv2d_4 and
+        batch_normalization .. batch_normalization_3.
+
+    Raises
+    ------
+    ModelError
+        If a layer is missing or of another shape; it is named with both shapes.
+    MissingExtra
+        If h5py is not installed.
+    """
+    if h5py is None:
+        raise MissingExtra("h5py", "keras", f"{path.name}")
+    try:
+        with h5py.File(path, "r") as file:
+            group = file.get("model_weights", file)
+            return {name: _read(path, group, *where) for name, where in _places().items()}
+    except OSError as e:
+        raise ModelError(f"{path} cannot be read: {e}. Download it again") from None
+
+
+def _places() -> dict[str, tuple[str, str]]:
+    """Layer and variable in the Keras file of every torch tensor."""
+    blocks = len(LocaNet.widths)
+    numbered = [f"_{i}" if i else "" for i in range(blocks + 1)]
+    places = {f"convs.{i}.weight": (f"conv2d{numbered[i]}", "kernel") for i in range(blocks)}
+    for i in range(blocks):
+        for keras, ours in NORM.items():
+            places[f"norms.{i}.{ours}"] = (f"batch_normalization{numbered[i]}", keras)
+    places["head.weight"] = (f"conv2d{numbered[blocks]}", "kernel")
+    places["head.bias"] = (f"conv2d{numbered[blocks]}", "bias")
+    return places
+
+
+def _read(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
+    key = f"{layer}/{layer}/{variable}:0"
+    if not isinstance(group.get(key), h5py.Dataset):
+        raise ModelError(f"{path} has no {layer}/{variable}. Give weights of locanet")
+    values = np.asarray(group[key], dtype=np.float32)
+    wanted = _keras_shape(layer, variable)
+    if values.shape != wanted:
+        raise ModelError(
+            f"{path}: {layer}/{variable} has shape {values.shape}, locanet needs {wanted}. "
+            "Give weights of locanet"
+        )
+    if values.ndim == 4:
+        values = values.transpose(3, 2, 0, 1)
+    return torch.from_numpy(np.ascontiguousarray(values))
+
+
+def _keras_shape(layer: str, variable: str) -> tuple[int, ...]:
+    ins, outs = (3, *LocaNet.widths), (*LocaNet.widths, 2)
+    index = int(layer.rpartition("_")[2]) if layer[-1].isdigit() else 0
+    if variable != "kernel":
+        return (outs[index],)
+    side = 1 if index == len(LocaNet.widths) else 3
+    return (side, side, ins[index], outs[index])

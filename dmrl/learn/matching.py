@@ -1,0 +1,186 @@
+"""Which detection belongs to which label. NumPy only.
+
+Two questions, two rules. *How far off is the network* (``errors``): an image with N labels
+has its N most confident detections matched one-to-one with the least total distance; for one
+label that is the most confident cell. *Which detections are right* (``hits``): in order of
+confidence each detection takes the nearest label that is still free, within a radius.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Labels or detections of many images, flat, one row each.
+
+    Parameters
+    ----------
+    image
+        (M,) index of the image, ascending. Detections of one image: best first.
+    u_px, v_px, depth_m
+        (M,) pixel and depth.
+    confidence
+        (M,) 0 to 1; ones for labels.
+    """
+
+    image: Index
+    u_px: Array
+    v_px: Array
+    depth_m: Array
+    confidence: Array
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def ranks(self) -> Index:
+        """(M,) place of each row within its image, from 0."""
+        return np.arange(len(self), dtype=np.int64) - np.searchsorted(self.image, self.image)
+
+    def select(self, keep: NDArray[np.bool_] | Index) -> "Points":
+        """The chosen rows."""
+        return Points(
+            self.image[keep],
+            self.u_px[keep],
+            self.v_px[keep],
+            self.depth_m[keep],
+            self.confidence[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Label minus detection, one row per label; NaN where an image has too few detections.
+
+    Parameters
+    ----------
+    u_px, v_px, depth_m
+        (M,) pixel and depth errors.
+    """
+
+    u_px: Array
+    v_px: Array
+    depth_m: Array
+
+    @property
+    def norm_px(self) -> Array:
+        """(M,) length of the pixel error; infinite where there was no detection."""
+        length = np.hypot(self.u_px, self.v_px)
+        return np.where(np.isnan(length), np.inf, length)
+
+
+def errors(labels: Points, detections: Points) -> Errors:
+    """Error of every label, by the first rule of this module."""
+    rows = partners(labels, detections)
+    missing = rows < 0
+
+    def difference(label: Array, detection: Array) -> Array:
+        if not len(detection):
+            return np.full(len(label), np.nan)
+        return np.where(missing, np.nan, label - detection[rows])
+
+    return Errors(
+        difference(labels.u_px, detections.u_px),
+        difference(labels.v_px, detections.v_px),
+        difference(labels.depth_m, detections.depth_m),
+    )
+
+
+def partners(labels: Points, detections: Points) -> Index:
+    """(M,) row of the detection matched to each label, -1 for none."""
+    first = np.searchsorted(detections.image, labels.image)
+    available = np.searchsorted(detections.image, labels.image, side="right") - first
+    wanted = np.searchsorted(labels.image, labels.image, side="right") - np.searchsorted(
+        labels.image, labels.image
+    )
+    out = np.where(available > 0, first, -1).astype(np.int64)
+    ranks = labels.ranks()
+    for start in np.flatnonzero((wanted > 1) & (available > 0) & (ranks == 0)):
+        rows = slice(start, start + wanted[start])
+        columns = slice(first[start], first[start] + min(wanted[start], available[start]))
+        distance_px = np.hypot(
+            labels.u_px[rows, None] - detections.u_px[columns],
+            labels.v_px[rows, None] - detections.v_px[columns],
+        )
+        chosen = assign(distance_px)
+        out[rows] = np.where(chosen < 0, -1, first[start] + chosen)
+    return out
+
+
+def assign(cost: Array) -> Index:
+    """(rows,) column of each row with the least total cost, -1 for rows without one.
+
+    Shortest augmenting paths (Jonker and Volgenant 1987) on a dense (rows, cols) matrix.
+    """
+    if cost.shape[0] > cost.shape[1]:
+        row_of = assign(cost.T)
+        out = np.full(cost.shape[0], -1, np.int64)
+        out[row_of] = np.arange(cost.shape[1])
+        return out
+    rows, cols = cost.shape
+    row_price, col_price = np.zeros(rows), np.zeros(cols + 1)
+    row_of = np.full(cols + 1, -1)  # the last column is where each new row starts
+    for row in range(rows):
+        row_of[cols] = row
+        col, came_from = _shortest_path(cost, row_of, row_price, col_price)
+        while col != cols:
+            row_of[col] = row_of[came_from[col]]
+            col = int(came_from[col])
+    out = np.empty(rows, np.int64)
+    taken = np.flatnonzero(row_of[:cols] >= 0)
+    out[row_of[taken]] = taken
+    return out
+
+
+def _shortest_path(
+    cost: Array, row_of: Index, row_price: Array, col_price: Array
+) -> tuple[int, Index]:
+    """The free column that the last column of ``row_of`` reaches, and the way back to it."""
+    cols = cost.shape[1]
+    distance = np.full(cols, np.inf)
+    came_from = np.full(cols, cols)
+    visited = np.zeros(cols + 1, bool)
+    col = cols
+    while row_of[col] >= 0:
+        visited[col] = True
+        row = row_of[col]
+        reduced = cost[row] - row_price[row] - col_price[:cols]
+        nearer = ~visited[:cols] & (reduced < distance)
+        distance[nearer], came_from[nearer] = reduced[nearer], col
+        col = int(np.argmin(np.where(visited[:cols], np.inf, distance)))
+        step = distance[col]
+        row_price[row_of[visited]] += step
+        col_price[visited] -= step
+        distance[~visited[:cols]] -= step
+    return col, came_from
+
+
+def hits(labels: Points, detections: Points, radius_px: float) -> Index:
+    """(D,) label that each detection is right about, -1 for none; the second rule."""
+    out = np.full(len(detections), -1, np.int64)
+    if not len(labels):
+        return out
+    places = labels.ranks()
+    images = int(max(labels.image[-1], detections.image[-1] if len(detections) else 0)) + 1
+    row_at = np.full((images, int(places.max()) + 1), -1, np.int64)
+    row_at[labels.image, places] = np.arange(len(labels))
+    ranks = detections.ranks()
+    for rank in range(int(ranks.max(initial=-1)) + 1):
+        chosen = np.flatnonzero(ranks == rank)
+        image = detections.image[chosen]
+        rows = row_at[image]
+        distance_px = np.hypot(
+            labels.u_px[rows] - detections.u_px[chosen, None],
+            labels.v_px[rows] - detections.v_px[chosen, None],
+        )
+        distance_px[rows < 0] = np.inf
+        nearest = np.argmin(distance_px, axis=1)
+        right = distance_px[np.arange(len(chosen)), nearest] <= radius_px
+        out[chosen[right]] = rows[right, nearest[right]]
+        row_at[image[right], nearest[right]] = -1
+    return out

@@ -1,0 +1,218 @@
+"""A trained network with what is needed to use it: run folders, safetensors, published .h5.
+
+A run folder holds ``model.safetensors`` and ``model.json``. Nothing is ever unpickled.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from dmrl.errors import ModelError, SettingError
+from dmrl.learn.keras import read_h5
+from dmrl.learn.network import ARCHITECTURES, Network, build, parameter_count, to_input
+
+WEIGHTS_NAME = "model.safetensors"
+DESCRIPTION_NAME = "model.json"
+PUBLISHED_THRESHOLD = 0.33
+"""Confidence threshold of the published evaluation."""
+
+Grid = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A network and its description.
+
+    Parameters
+    ----------
+    network
+        In evaluation mode.
+    architecture
+        Its name in ``ARCHITECTURES``.
+    name
+        Of the file or folder it came from.
+    width_px, height_px
+        Size of the images it was trained on.
+    threshold
+        Confidence above which a detection is to be believed, 0 to 1.
+    label_source
+        Source of the labels it was trained on ("truth", "published", ...); empty: not known.
+    training
+        Summary of the training: settings, losses, images.
+    """
+
+    network: Network
+    architecture: str
+    name: str = ""
+    width_px: int = 320
+    height_px: int = 224
+    threshold: float = PUBLISHED_THRESHOLD
+    label_source: str = ""
+    training: dict[str, Any] = field(default_factory=dict)
+
+    def require_size(self, width_px: int, height_px: int, what: object) -> None:
+        """Nothing, if the network can take images of this size.
+
+        Raises
+        ------
+        SettingError
+            If a side is not a whole number of grid cells.
+        """
+        cell = self.network.stride_px
+        if width_px % cell or height_px % cell:
+            raise SettingError(
+                f"{what}: images of {width_px} x {height_px} px do not divide into cells of "
+                f"{cell} px, as {self.architecture} needs. Crop or scale the images first"
+            )
+
+    def grids(self, images: NDArray[np.uint8]) -> tuple[Grid, Grid]:
+        """Confidence (0 to 1) and depth (m), each (N, rows, cols), of (N, H, W, 3) RGB images.
+
+        Raises
+        ------
+        SettingError
+            If the network cannot take images of this size.
+        """
+        self.require_size(images.shape[2], images.shape[1], self.name or self.architecture)
+        device = next(self.network.parameters()).device
+        with torch.inference_mode():
+            raw = torch.from_numpy(images).permute(0, 3, 1, 2).to(device)
+            out = self.network(to_input(raw))
+            confidence, depth_m = out[:, 1].sigmoid(), out[:, 0].exp()
+        return confidence.cpu().numpy(), depth_m.cpu().numpy()
+
+
+def weights_of(network: Network) -> dict[str, Tensor]:
+    """Every tensor of a network, contiguous, on the CPU.
+
+    Batch counters are left out: no fixed-momentum normalisation reads them.
+    """
+    return {
+        name: value.detach().cpu().contiguous()
+        for name, value in network.state_dict().items()
+        if not name.endswith("num_batches_tracked")
+    }
+
+
+def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> None:
+    """Copy weights into a network.
+
+    Raises
+    ------
+    ModelError
+        If a tensor is missing, unknown, not finite or of another shape.
+    """
+    wanted = weights_of(network)
+    if odd := sorted(wanted.keys() ^ weights.keys()):
+        verb = "lacks" if odd[0] in wanted else "has an unknown"
+        raise ModelError(f"{where} {verb} tensor {odd[0]}. Give weights of this architecture")
+    for name, value in weights.items():
+        if value.shape != wanted[name].shape:
+            raise ModelError(
+                f"{where}: {name} has shape {tuple(value.shape)}, the network needs "
+                f"{tuple(wanted[name].shape)}. Give weights of this architecture"
+            )
+        if not torch.isfinite(value).all():
+            raise ModelError(f"{where}: {name} holds values that are not finite. Train again")
+    network.load_state_dict(weights, strict=False)
+
+
+def describe(model: Model) -> dict[str, Any]:
+    """What ``model.json`` says about a model."""
+    return {
+        "architecture": model.architecture,
+        "parameters": parameter_count(model.network),
+        "width_px": model.width_px,
+        "height_px": model.height_px,
+        "stride_px": model.network.stride_px,
+        "channels": 3,
+        "threshold": model.threshold,
+        "label_source": model.label_source,
+        "training": model.training,
+    }
+
+
+def save_model(model: Model, folder: Path) -> None:
+    """Write ``model.safetensors`` and ``model.json`` into a folder."""
+    save_file(weights_of(model.network), folder / WEIGHTS_NAME)
+    text = json.dumps(describe(model), indent=1) + "\n"
+    (folder / DESCRIPTION_NAME).write_text(text, encoding="utf-8")
+
+
+def load_model(path: Path) -> Model:
+    """Model of a run folder, of a .safetensors with its .json beside it, or of a Keras .h5.
+
+    The kind is told by the content, not the name.
+
+    Raises
+    ------
+    ModelError
+        If the file is none of these (a pickle is refused unread), is damaged, or its tensors
+        do not fit the architecture.
+    """
+    if path.is_dir():
+        return _load_safetensors(path / WEIGHTS_NAME, path / DESCRIPTION_NAME, path.name)
+    if not path.is_file():
+        raise ModelError(f"no model {path}. Give a run folder, a .safetensors or a Keras .h5")
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    if head.startswith(b"\x89HDF\r\n\x1a\n"):
+        network = build("locanet")
+        set_weights(network, read_h5(path), path)
+        return Model(network.eval(), "locanet", path.name)
+    if head[4:9] != b"\0\0\0\0{":
+        if head.startswith((b"PK\x03\x04", b"\x80")):
+            raise ModelError(
+                f"{path} is a pickle, which can run any code when it is opened, so it is not. "
+                "Give a run folder, a .safetensors or a Keras .h5"
+            )
+        raise ModelError(f"{path} is not a model. Give a run folder, a .safetensors or a Keras .h5")
+    return _load_safetensors(path, path.with_suffix(".json"), path.name)
+
+
+def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
+    for file in (weights, description):
+        if not file.is_file():
+            raise ModelError(f"no {file.name} in {file.parent}. Give a run folder of dmrl train")
+    said = _read_description(description)
+    network = build(said["architecture"])
+    try:
+        tensors = load_file(weights)
+    except (SafetensorError, OSError) as e:
+        raise ModelError(f"{weights} is damaged: {e}. Copy it again or train again") from None
+    set_weights(network, tensors, weights)
+    known = ("width_px", "height_px", "threshold", "label_source", "training")
+    return Model(network.eval(), said["architecture"], name, **{k: said[k] for k in known})
+
+
+def _read_description(path: Path) -> dict[str, Any]:
+    kinds: dict[str, type | tuple[type, ...]] = {
+        "architecture": str,
+        "width_px": int,
+        "height_px": int,
+        "threshold": (int, float),
+        "label_source": str,
+        "training": dict,
+    }
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as e:
+        raise ModelError(f"{path} is not JSON: {e}. Copy it again") from None
+    for key, kind in kinds.items():
+        if not isinstance(said, dict) or not isinstance(said.get(key), kind):
+            raise ModelError(f"{path} has no valid {key}. Give the model.json of dmrl train")
+    if said["architecture"] not in ARCHITECTURES:
+        known = ", ".join(sorted(ARCHITECTURES))
+        raise ModelError(
+            f"{path} asks for architecture {said['architecture']}, this dmrl knows {known}. "
+            "Update dmrl"
+        )
+    return dict(said)
