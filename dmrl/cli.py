@@ -15,21 +15,21 @@ from dmrl.errors import DmrlError
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
 COMMANDS = {
-    "demo": ("demo", "Run the whole pipeline, small, on pictures that dmrl draws itself."),
-    "run": ("run", "Run every stage of a pipeline recipe, in order; go on where it stopped."),
-    "sketch": ("sketch", "Draw a folder of pictures of small drones, with exact labels."),
-    "convert": ("convert", "Convert SOURCE, a foreign file or folder, into a recording."),
-    "dataset": ("dataset", "Build an Arrow dataset and its card from recordings."),
-    "card": ("card", "Write a dataset's card and figures again."),
-    "train": ("train", "Train a network on a dataset."),
-    "predict": ("predict", "Run a network on every image of a recording."),
-    "evaluate": ("evaluate", "Judge a recording's detections against its labels."),
-    "view": ("view", "Show recordings in rerun, or save what it would show."),
-    "info": ("info", "Show what a recording holds and where it comes from."),
-    "check": ("check", "Check a recording: schemas, times, gaps, calibration, labels."),
-    "recover": ("recover", "Bring back the messages of a recording that was cut short."),
-    "merge": ("merge", "Merge recordings into one, by time."),
-    "trim": ("trim", "Keep a stretch of a recording, or some of its topics."),
+    "demo": "Run the whole pipeline, small, on pictures that dmrl draws itself.",
+    "run": "Run every stage of a pipeline recipe, in order; go on where it stopped.",
+    "sketch": "Draw a folder of pictures of small drones, with exact labels.",
+    "convert": "Convert SOURCE, a foreign file or folder, into a recording.",
+    "dataset": "Build an Arrow dataset and its card from recordings.",
+    "card": "Write a dataset's card and figures again.",
+    "train": "Train a network on a dataset.",
+    "predict": "Run a network on every image of a recording.",
+    "evaluate": "Judge a recording's detections against its labels.",
+    "view": "Show recordings in rerun, or save what it would show.",
+    "info": "Show what a recording holds and where it comes from.",
+    "check": "Check a recording: schemas, times, gaps, calibration, labels.",
+    "recover": "Bring back the messages of a recording that was cut short.",
+    "merge": "Merge recordings into one, by time.",
+    "trim": "Keep a stretch of a recording, or some of its topics.",
 }
 
 app = App(
@@ -38,8 +38,8 @@ app = App(
     version=__version__,
     help_format="plaintext",
 )
-for _name, (_module, _help) in COMMANDS.items():
-    app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help)
+for _order, (_name, _help) in enumerate(COMMANDS.items()):
+    app.command(f"dmrl.stages.{_name}:command", name=_name, help=_help, sort_key=_order)
 
 
 def main() -> NoReturn:

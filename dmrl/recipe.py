@@ -198,15 +198,10 @@ def _step_faults(step: Any, schemas: Mapping[str, type[Any]]) -> list[str]:
 def _model(schema: type[Any]) -> type[BaseModel]:
     hints = get_type_hints(schema)
     required = {f.name for f in fields(schema) if f.default is f.default_factory is MISSING}
-    return create_model(
-        schema.__name__,
-        __config__=ConfigDict(strict=True, extra="forbid", frozen=True),
-        **{n: (t, ... if n in required else None) for n, t in hints.items() if n in _names(schema)},
-    )  # type: ignore[call-overload]
-
-
-def _names(schema: type[Any]) -> set[str]:
-    return {f.name for f in fields(schema)}
+    keys = {n: (t, ... if n in required else None) for n, t in hints.items()}
+    config = ConfigDict(strict=True, extra="forbid", frozen=True)
+    model: type[BaseModel] = create_model(schema.__name__, __config__=config, **keys)  # type: ignore[call-overload]
+    return model
 
 
 def _validated(keys: Mapping[str, Any], schema: type[Any]) -> dict[str, Any]:

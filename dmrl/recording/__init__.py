@@ -3,28 +3,40 @@
 The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
 """
 
+from dmrl.recording.check import Finding, check
+from dmrl.recording.edit import merge, trim
+from dmrl.recording.extras import copy_extras, splits
 from dmrl.recording.index import SPLIT_METADATA, Summary, TopicInfo, summary
 from dmrl.recording.inputs import input_of, provenance
 from dmrl.recording.provenance import Input, Provenance
 from dmrl.recording.reader import Stamped, columns, matching, read, read_raw, read_table
+from dmrl.recording.recover import Recovery, recover
 from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
 
 __all__ = [
     "SPLIT_METADATA",
     "Channel",
+    "Finding",
     "Input",
     "Provenance",
     "RawMessage",
     "RecordingWriter",
+    "Recovery",
     "Stamped",
     "Summary",
     "TopicInfo",
+    "check",
     "columns",
+    "copy_extras",
     "input_of",
     "matching",
+    "merge",
     "provenance",
     "read",
     "read_raw",
     "read_table",
+    "recover",
+    "splits",
     "summary",
+    "trim",
 ]

@@ -150,6 +150,23 @@ def blocks(
             yield block, channels
 
 
+def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
+    """Every message as the file has them, chunk by chunk, unsorted.
+
+    Raises
+    ------
+    RecordingError
+        As ``blocks``.
+    """
+    with opened(path) as stream:
+        summary = mcap_summary(path, stream)
+        if summary is None or not summary.chunk_indexes:
+            return
+        channels = {n: channel_of(n, summary.channels, summary.schemas) for n in summary.channels}
+        for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
+            yield _indexed(path, stream, chunk, channels), channels
+
+
 def _message_count(summary: McapSummary) -> int:
     return summary.statistics.message_count if summary.statistics else 1
 

@@ -200,9 +200,8 @@ def columns(
 
 def _batch(block: Block, kind: Descriptor, fields: Sequence[str] | None) -> pa.RecordBatch:
     body = decode(block.data, block.start, block.end, kind, fields)
-    names = ["log_time", "publish_time", *(field.name for field in body.type)]
-    times = [pa.array(block.time_ns), pa.array(block.publish_ns)]
-    return pa.RecordBatch.from_arrays([*times, *body.flatten()], names)
+    times = {"log_time": pa.array(block.time_ns), "publish_time": pa.array(block.publish_ns)}
+    return pa.RecordBatch.from_pydict(times | body)
 
 
 def read_table(

@@ -61,8 +61,8 @@ class Found:
 
 def decode(
     data: Bytes, start: Ints, end: Ints, descriptor: Descriptor, fields: Sequence[str] | None = None
-) -> pa.StructArray:
-    """Messages as an Arrow struct, one column per field.
+) -> dict[str, pa.Array]:
+    """Messages as Arrow columns, one per field, by name.
 
     Parameters
     ----------
@@ -77,38 +77,45 @@ def decode(
 
     Returns
     -------
-    pa.StructArray
-        (N,) structs. A field that a message lacks has its default, as protobuf has it;
-        an absent sub-message is null. Repeated fields are lists, enums int32.
+    dict[str, pa.Array]
+        (N,) each, in the order of the schema. A field that a message lacks has its default,
+        as protobuf has it; an absent sub-message is null. Repeated fields are lists, enums int32.
 
     Raises
     ------
     WireError
         If the bytes do not follow the wire format or the type.
     """
-    return _struct(data, start, end, descriptor, fields, ())
+    wanted = [f for f in descriptor.fields if fields is None or f.name in fields]
+    return _columns(data, start, end, wanted, (descriptor.full_name,)) if wanted else {}
+
+
+def _columns(
+    data: Bytes,
+    start: Ints,
+    end: Ints,
+    fields: Sequence[FieldDescriptor],
+    within: tuple[str, ...],
+) -> dict[str, pa.Array]:
+    found = _scan(data, start, end, {f.number for f in fields})
+    return {f.name: _column(data, len(start), found.get(f.number, []), f, within) for f in fields}
 
 
 def _struct(
     data: Bytes,
     start: Ints,
     end: Ints,
-    descriptor: Descriptor,
-    fields: Sequence[str] | None,
+    kind: Descriptor,
     within: tuple[str, ...],
-    mask: NDArray[np.bool_] | None = None,
+    absent: NDArray[np.bool_] | None,
 ) -> pa.StructArray:
-    if descriptor.full_name in within:
-        raise WireError(f"{descriptor.full_name} contains itself")
-    wanted = [f for f in descriptor.fields if fields is None or f.name in fields]
-    found = _scan(data, start, end, {f.number for f in wanted})
-    inner = (*within, descriptor.full_name)
-    columns = [_column(data, len(start), found.get(f.number, []), f, inner) for f in wanted]
-    names = [f.name for f in wanted]
-    nulls = None if mask is None else pa.array(mask)
-    if not columns:
-        return pa.array([{}] * len(start), pa.struct([]))
-    return pa.StructArray.from_arrays(columns, names, mask=nulls)
+    if kind.full_name in within:
+        raise WireError(f"{kind.full_name} contains itself")
+    if not kind.fields:
+        return pa.nulls(len(start), pa.struct([]))
+    columns = _columns(data, start, end, kind.fields, (*within, kind.full_name))
+    mask = None if absent is None else pa.array(absent)
+    return pa.StructArray.from_arrays(list(columns.values()), list(columns), mask=mask)
 
 
 def _scan(data: Bytes, start: Ints, end: Ints, wanted: set[int]) -> dict[int, list[Found]]:
@@ -281,8 +288,8 @@ def _values_of(field: FieldDescriptor, within: tuple[str, ...]) -> Values:
         def message(
             data: Bytes, start: Ints, end: Ints, present: NDArray[np.bool_] | None
         ) -> pa.Array:
-            mask = None if present is None or present.all() else ~present
-            return _struct(data, start, end, kind_of_message, None, within, mask)
+            absent = None if present is None or present.all() else ~present
+            return _struct(data, start, end, kind_of_message, within, absent)
 
         return message
     raise WireError(f"{field.full_name} has a type that protobuf 3 does not write")

@@ -1,0 +1,90 @@
+"""Recordings out of recordings: merged by time, or trimmed."""
+
+import heapq
+from collections.abc import Sequence
+from pathlib import Path
+
+from dmrl.errors import RecordingError
+from dmrl.recording.extras import copy_extras
+from dmrl.recording.index import summary
+from dmrl.recording.inputs import provenance
+from dmrl.recording.reader import matching, read_raw
+from dmrl.recording.writer import RecordingWriter
+from dmrl.topics import CALIBRATION, names
+
+
+def merge(paths: Sequence[Path], out: Path) -> int:
+    """Write one recording with the messages of several, by log time; how many.
+
+    Messages are copied bit for bit; of equal times, those of the first recording come
+    first. Metadata and attachments of all are kept.
+
+    Raises
+    ------
+    RecordingError
+        If an input is not a complete recording, or is given twice.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    if len({path.resolve() for path in paths}) != len(paths):
+        raise RecordingError(f"{paths[0]}: a recording is given twice. Name each once")
+    count = 0
+    with RecordingWriter(out, provenance("merge", inputs=paths)) as sink:
+        for path in paths:
+            copy_extras(summary(path), sink)
+        streams = [read_raw(path) for path in paths]
+        for raw in heapq.merge(*streams, key=lambda raw: raw.time_ns):
+            sink.write_raw(raw)
+            count += 1
+    return count
+
+
+def trim(
+    path: Path,
+    out: Path,
+    *,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    topics: Sequence[str] = (),
+) -> int:
+    """Write the messages of a stretch of time, or of some topics; how many.
+
+    Camera calibration is kept wherever it stands, so that what is left can be used.
+
+    Parameters
+    ----------
+    path, out
+        Recording to read and recording to write.
+    start_ns, end_ns
+        Log times in [start_ns, end_ns) are kept, nanoseconds.
+    topics
+        Topics or patterns to keep. Empty: all.
+
+    Raises
+    ------
+    RecordingError
+        If the recording is not complete, or nothing would be left.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    found = summary(path)
+    wanted = matching(path, topics) if topics else frozenset(found.topics)
+    latched = {t for t in wanted if names(CALIBRATION, t) is not None}
+    settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
+    count = 0
+    with RecordingWriter(out, provenance("trim", settings, [path])) as sink:
+        copy_extras(found, sink)
+        low = found.start_ns if start_ns is None else start_ns
+        high = found.end_ns + 1 if end_ns is None else end_ns
+        for raw in read_raw(path, *sorted(wanted)):
+            if low <= raw.time_ns < high:
+                count += 1
+            elif raw.topic not in latched:
+                continue
+            sink.write_raw(raw)
+        if not count:
+            raise RecordingError(
+                f"{path} has no message in that stretch; it lasts "
+                f"{(found.end_ns - found.start_ns) / 1e9:.3f} s. Choose times within"
+            )
+    return count

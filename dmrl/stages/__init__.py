@@ -1,0 +1,1 @@
+"""One file per command. No stage imports another; ``dmrl.cli`` loads them by name."""

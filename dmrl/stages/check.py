@@ -1,0 +1,36 @@
+"""check: is a recording what it should be?"""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from dmrl.recording import check as findings_of
+from dmrl.recording import summary
+from dmrl.tables import print_json
+
+
+def command(recording: Path, /, *, json: bool = False) -> int:
+    """Check a recording: schemas, times, gaps, calibration, labels.
+
+    Exit status 1 if there are errors; warnings alone leave it 0.
+
+    Parameters
+    ----------
+    recording
+        A recording.
+    json
+        Print one JSON document instead of lines.
+    """
+    findings = findings_of(recording)
+    errors = sum(f.level == "error" for f in findings)
+    if json:
+        print_json({"recording": recording.name, "findings": [asdict(f) for f in findings]})
+    else:
+        for finding in findings:
+            where = f" {finding.topic}:" if finding.topic else ""
+            print(f"{finding.level}:{where} {finding.text}")
+        found = summary(recording)
+        print(
+            f"{recording}: {found.count} messages on {len(found.topics)} topics, "
+            f"{errors} errors, {len(findings) - errors} warnings"
+        )
+    return 1 if errors else 0

@@ -1,0 +1,78 @@
+"""info: what a recording holds and where it comes from."""
+
+from pathlib import Path
+from typing import Any
+
+from dmrl.recording import Provenance, Summary, summary
+from dmrl.tables import print_json, print_table
+
+
+def command(recording: Path, /, *, json: bool = False) -> None:
+    """Show what a recording holds and where it comes from.
+
+    Parameters
+    ----------
+    recording
+        A recording.
+    json
+        Print one JSON document instead of tables.
+    """
+    found = summary(recording)
+    if json:
+        print_json(document(recording, found))
+        return
+    print(headline(recording, found))
+    print_table("", ("topic", "message", "messages", "rate, Hz"), topic_rows(found))
+    for line in ancestry_lines(found.provenance):
+        print(line)
+
+
+def document(path: Path, found: Summary) -> dict[str, Any]:
+    """Everything ``info`` shows, as plain values."""
+    return {
+        "recording": path.name,
+        "bytes": path.stat().st_size,
+        "messages": found.count,
+        "start_ns": found.start_ns,
+        "end_ns": found.end_ns,
+        "topics": {t: {"message": i.schema, "count": i.count} for t, i in found.topics.items()},
+        "metadata": found.metadata,
+        "attachments": sorted(found.attachments),
+        "provenance": found.provenance.to_json() if found.provenance else None,
+    }
+
+
+def headline(path: Path, found: Summary) -> str:
+    """Name, size, number of messages and duration, in one line."""
+    duration_s = (found.end_ns - found.start_ns) / 1e9
+    megabytes = path.stat().st_size / 1e6
+    return f"{path}: {megabytes:.1f} MB, {found.count} messages over {duration_s:.3f} s"
+
+
+def topic_rows(found: Summary) -> list[tuple[str, str, int, float | None]]:
+    """Topic, message, count and mean rate of each topic."""
+    duration_s = (found.end_ns - found.start_ns) / 1e9
+    return [
+        (topic, info.schema, info.count, (info.count - 1) / duration_s if info.count > 1 else None)
+        for topic, info in found.topics.items()
+    ]
+
+
+def ancestry_lines(made: Provenance | None) -> list[str]:
+    """How the recording was made, then its inputs, and theirs, indented."""
+    if made is None:
+        return ["made by: not known (no dmrl.provenance metadata)"]
+    lines = [f"made by: {_made_by(made)}"]
+    for depth, name, own in made.ancestry():
+        source = f", made by: {_made_by(own)}" if own else ""
+        lines.append(f"{'  ' * (depth + 1)}from {name}{source}")
+    return lines
+
+
+def _made_by(made: Provenance) -> str:
+    settings = "".join(
+        f" {key}={value}" for key, value in made.settings.items() if value is not None
+    )
+    seed = f" seed={made.seed}" if made.seed is not None and "seed" not in made.settings else ""
+    libraries = "".join(f" {name} {version}" for name, version in made.libraries.items())
+    return f"dmrl {made.dmrl_version} {made.stage}{settings}{seed}{libraries}"

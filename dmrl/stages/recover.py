@@ -1,0 +1,35 @@
+"""recover: bring back the messages of a recording that was cut short."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from dmrl.recording import recover
+from dmrl.tables import print_json
+
+
+def command(recording: Path, out: Path, /, *, json: bool = False) -> None:
+    """Bring back the messages of a recording that was cut short.
+
+    Every message before the damage is kept, bit for bit; a chunk that fails its CRC is left
+    out, and what follows it is kept.
+
+    Parameters
+    ----------
+    recording
+        A damaged recording, or the .partial file of a killed run.
+    out
+        Recording to write. Must not exist.
+    json
+        Print one JSON document instead of a line.
+    """
+    result = recover(recording, out)
+    if json:
+        print_json(asdict(result))
+        return
+    lost = "nothing was lost"
+    if not result.whole:
+        lost = (
+            f"{result.damaged_chunks} damaged chunks left out, "
+            f"{result.lost_bytes} bytes after the last whole record lost"
+        )
+    print(f"{out}: {result.messages} messages brought back; {lost}")

@@ -1,0 +1,45 @@
+"""trim: a stretch of a recording, or some of its topics."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from dmrl.recording import summary, trim
+
+
+def command(
+    recording: Path,
+    out: Path,
+    /,
+    *,
+    from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None,
+    to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None,
+    topic: list[str] | None = None,
+) -> None:
+    """Keep a stretch of a recording, or some of its topics.
+
+    Camera calibration is kept wherever it stands.
+
+    Parameters
+    ----------
+    recording
+        A recording.
+    out
+        Recording to write. Must not exist.
+    from_s
+        First time kept, seconds from the recording's start.
+    to_s
+        First time left out, seconds from the recording's start.
+    topic
+        Topic to keep, or a pattern such as /*/labels. Repeat for more. None: all.
+    """
+    start_ns = summary(recording).start_ns
+    count = trim(
+        recording,
+        out,
+        start_ns=None if from_s is None else start_ns + round(from_s * 1e9),
+        end_ns=None if to_s is None else start_ns + round(to_s * 1e9),
+        topics=topic or (),
+    )
+    print(f"{out}: {count} messages")
