@@ -1,0 +1,91 @@
+"""The card of a dataset: README.md and figures/ in its folder.
+
+Everything on it is counted from the data or read from provenance.json, so it can be written
+again at any time. Title and license are kept from the card before.
+"""
+
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from dmrl.card import sections
+from dmrl.card.counts import Counts, count
+from dmrl.card.front import front_matter, read_front
+from dmrl.dataset import Split, open_dataset
+from dmrl.errors import DatasetError, MissingExtra
+from dmrl.geometry import STRIDE_PX
+from dmrl.output import partial_of
+from dmrl.progress import say
+from dmrl.recording import Provenance
+from dmrl.recording.provenance import FILE_NAME
+
+plots: ModuleType | None
+try:
+    from dmrl import plots
+except MissingExtra:
+    plots = None
+
+
+def write_card(folder: Path, *, title: str | None = None, license_id: str | None = None) -> Path:
+    """Path of the README.md that was written into a dataset's folder.
+
+    Parameters
+    ----------
+    folder
+        A dataset.
+    title, license_id
+        None: as the card before has them, or as the dataset was made.
+
+    Raises
+    ------
+    DatasetError
+        If the folder is not a dataset, lacks a shard, or its provenance.
+    """
+    dataset = open_dataset(folder)
+    splits = {name: dataset.split(name) for name in dataset.splits}
+    made = _provenance(folder)
+    readme = folder / "README.md"
+    before = read_front(readme)
+    title = title or before.get("pretty_name") or made.settings.get("title") or _title(made)
+    license_id = license_id or before.get("license") or made.settings.get("license", "unknown")
+    counts = {name: count(split) for name, split in splits.items()}
+    figures = _draw(folder / "figures", counts, splits)
+    text = [*front_matter(splits, str(title), str(license_id), parquet=dataset.parquet)]
+    text += sections.about(splits, str(title), made)
+    text += sections.loading(splits, parquet=dataset.parquet)
+    text += [*sections.numbers(counts), *figures, *sections.features(splits)]
+    text += ["## Provenance", "", *sections.ancestry(made)]
+    partial_of(readme).write_text("\n".join(text) + "\n", encoding="utf-8")
+    partial_of(readme).replace(readme)
+    return readme
+
+
+def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> list[str]:
+    if plots is None:
+        say("card without figures: pip install 'dmrl[plot]', then dmrl card")
+        return []
+    folder.mkdir(exist_ok=True)
+    height_px, width_px = next(iter(splits.values())).image_shape
+    every = np.concatenate([c.uv_px for c in counts.values()])
+    plots.depth_histogram({n: c.depth_m for n, c in counts.items()}, folder / "depth")
+    plots.position_heat(every, width_px, height_px, 2 * STRIDE_PX, folder / "position")
+    plots.peers_per_image({n: c.peers for n, c in counts.items()}, folder / "peers")
+    names = {"depth": "Depth", "position": "Position in the image", "peers": "Peers per image"}
+    lines = [f"![{text}](figures/{name}.png)" for name, text in names.items()]
+    return ["## Distributions", "", "Peers inside the images. Also as SVG.", "", *lines, ""]
+
+
+def _provenance(folder: Path) -> Provenance:
+    path = folder / FILE_NAME
+    try:
+        return Provenance.from_json(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise DatasetError(f"{path} cannot be read ({e}). Make the dataset again") from None
+
+
+def _title(made: Provenance) -> str:
+    names = [source.name for source in made.inputs]
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"Peer robots in camera images: {names[0]}{more}" if names else "Peer robots"

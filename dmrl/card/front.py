@@ -1,0 +1,90 @@
+"""The YAML front matter of a card, as the Hugging Face Hub reads it."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from dmrl.dataset import Split, layout
+
+SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
+
+
+def read_front(readme: Path) -> dict[str, str]:
+    """Plain values of the front matter of a card, by key; empty where there is no card."""
+    if not readme.is_file():
+        return {}
+    lines = readme.read_text(encoding="utf-8").split("\n---\n")[0].splitlines()
+    pairs = (line.partition(": ") for line in lines)
+    return {key: value.strip().strip('"') for key, _, value in pairs if value}
+
+
+def front_matter(
+    splits: dict[str, Split], title: str, license_id: str, *, parquet: bool
+) -> Iterator[str]:
+    """Lines of the front matter, with the dashes around it.
+
+    Parameters
+    ----------
+    splits
+        By name.
+    title, license_id
+        For ``pretty_name`` and ``license``.
+    parquet
+        Name the Parquet files, so that ``datasets.load_dataset`` finds them.
+    """
+    total = sum(map(len, splits.values()))
+    size = next((name for limit, name in SIZES.items() if total < limit), "n>1M")
+    schema = next(iter(splits.values())).table.schema
+    sizes = [
+        {"name": n, "num_bytes": s.table.nbytes, "num_examples": len(s)} for n, s in splits.items()
+    ]
+    front: dict[str, Any] = {
+        "pretty_name": title,
+        "license": license_id,
+        "task_categories": ["object-detection", "depth-estimation", "robotics"],
+        "size_categories": [size],
+        "tags": ["dmrl", "multi-robot", "relative-localization"],
+        "dataset_info": {"features": [_yaml_feature(f) for f in schema], "splits": sizes},
+    }
+    if parquet:
+        files = [{"split": name, "path": f"data/{name}-*"} for name in splits]
+        front["configs"] = [{"config_name": "default", "data_files": files}]
+    yield from ("---", *_yaml(front), "---", "")
+
+
+def _yaml_feature(column: pa.Field) -> dict[str, Any]:
+    if column.name == layout.IMAGE:
+        return {"name": column.name, "dtype": "image"}
+    inner = _yaml_type(column.type)
+    return {"name": column.name, **(inner if isinstance(inner, dict) else {"dtype": inner})}
+
+
+def _yaml_type(kind: pa.DataType) -> Any:
+    if pa.types.is_struct(kind):
+        return [_yaml_feature(f) for f in kind]
+    if pa.types.is_fixed_size_list(kind):
+        return {"list": _yaml_type(kind.value_type), "length": kind.list_size}
+    if pa.types.is_list(kind):
+        return {"list": _yaml_type(kind.value_type)}
+    return layout.dtype_name(kind)
+
+
+def _yaml(value: Any, indent: int = 0) -> Iterator[str]:
+    # JSON scalars are YAML; only blocks are laid out here.
+    pad = " " * indent
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            block = isinstance(inner, dict | list)
+            yield (
+                f"{pad}{key}:" if block else f"{pad}{key}: {json.dumps(inner, ensure_ascii=False)}"
+            )
+            yield from _yaml(inner, indent + 2) if block else ()
+    else:
+        for item in value:
+            block = isinstance(item, dict | list)
+            first, *rest = _yaml(item, indent + 2) if block else (json.dumps(item),)
+            yield f"{pad}- {first.lstrip()}"
+            yield from rest

@@ -1,0 +1,164 @@
+"""The text of a card, section by section, as lines of Markdown."""
+
+from collections.abc import Iterator
+
+import pyarrow as pa
+
+from dmrl.card.counts import Counts
+from dmrl.dataset import Split, layout
+from dmrl.geometry import STRIDE_PX
+from dmrl.recording import Provenance
+
+MEANING = {
+    layout.PIXELS: "image, {height} x {width} x 3 bytes, RGB, row by row from the top left",
+    layout.IMAGE: "image, {height} x {width} px, PNG, RGB",
+    "peers": "every labelled peer; it may lie outside the image",
+    "peers.peer": "name of the robot that is seen",
+    "peers.u_px": "px, right from the left edge; pixel-edge coordinates: [0, {width}]",
+    "peers.v_px": "px, down from the top edge: [0, {height}]",
+    "peers.depth_m": "m, along the optical axis (camera x), not the range",
+    "peers.sigma_u_px": "px, one standard deviation; 0: exact or not known",
+    "peers.sigma_v_px": "px, likewise",
+    "peers.sigma_depth_m": "m, likewise",
+    "peers.box_px": "px: left, top, right, bottom of the visible part; empty: none",
+    "peers.visible_share": "share of the peer that nothing hides, 0 to 1; 0: not known",
+    "peers.status": "OK, UNCONVERGED or AMBIGUOUS",
+    "peers.source": "truth, estimate, hand or published",
+    layout.CONFIDENCE: "1 in the cell (v, u) // {stride} of a peer's centre, else 0",
+    layout.DEPTH: "m, depth of the peer in that cell, the nearest of several; else 0",
+    "robot": "whose camera took the image",
+    "source": "file name of the recording that the row comes from",
+    "log_time": "ns, time of exposure in that recording",
+    "split": "train or test",
+}
+
+
+def about(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
+    """What the dataset is."""
+    height_px, width_px = next(iter(splits.values())).image_shape
+    rows, cols = next(iter(splits.values())).grid_shape
+    return [
+        f"# {title}",
+        "",
+        f"{sum(map(len, splits.values()))} camera images of {width_px} x {height_px} px, each with "
+        "the pixel position and depth of the peer robots in it, and the same as grid labels of "
+        f"{rows} x {cols} cells for training a network. Every row names its recording and time.",
+        f"Made with dmrl {made.dmrl_version}.",
+        "",
+        "Pixels: u right, v down from the top-left corner, pixel-edge coordinates. Lengths in "
+        "metres, times in nanoseconds. Depth is measured along the optical axis.",
+        "",
+    ]
+
+
+def loading(splits: dict[str, Split], *, parquet: bool) -> list[str]:
+    """How to open the dataset, three ways; DATASET stands for its folder."""
+    name, split = next(iter(splits.items()))
+    height_px, width_px = split.image_shape
+    png = layout.IMAGE in split.table.schema.names
+    shape = f"{height_px}, {width_px}, 3"
+    rgb = (
+        'rgb = np.asarray(row["image"])'
+        if png
+        else f'rgb = np.frombuffer(row["pixels"], np.uint8).reshape({shape})'
+    )
+    opened = (
+        f'row = load_dataset("DATASET", split="{name}")[0]'
+        if parquet
+        else f'row = load_from_disk("DATASET")["{name}"][0]'
+    )
+    shard = f"data/{name}-*.parquet" if parquet else f"{name}/data-*.arrow"
+    table = (
+        "table = pq.read_table(shard)"
+        if parquet
+        else "table = pa.ipc.open_stream(pa.memory_map(shard)).read_all()  # no copy"
+    )
+    parts = {
+        "datasets": [
+            "import numpy as np",
+            f"from datasets import {'load_dataset' if parquet else 'load_from_disk'}",
+            "",
+            opened,
+            rgb,
+        ],
+        "pyarrow": [
+            "from glob import glob",
+            "",
+            "import pyarrow.parquet as pq" if parquet else "import pyarrow as pa",
+            "",
+            f'shard = sorted(glob("DATASET/{shard}"))[0]',
+            table,
+        ],
+        "dmrl": [
+            "from pathlib import Path",
+            "",
+            "from dmrl.dataset import open_dataset",
+            "",
+            f'split = open_dataset(Path("DATASET")).split("{name}")',
+            "rgb, confidence, depth = split.pixels[0][0], split.confidence[0], split.depth[0]",
+        ],
+    }
+    lines = ["## Load it", ""]
+    for package, code in parts.items():
+        lines += [f"With {package}:", "", "```python", *code, "```", ""]
+    if not png:
+        lines += [
+            "Leave `pixels` in the default or the `arrow` format of datasets: its NumPy and torch "
+            "formats drop zero bytes at the end of binary values.",
+            "",
+        ]
+    return lines
+
+
+def numbers(counts: dict[str, Counts]) -> list[str]:
+    """Tables of images, peers and label sources, by split and by recording."""
+    lines = ["## Numbers", "", "| split | images | with a peer | peers | depth, m | labels from |"]
+    lines.append("|---|--:|--:|--:|--:|---|")
+    for name, c in counts.items():
+        low, high = (c.depth_m.min(), c.depth_m.max()) if c.depth_m.size else (0.0, 0.0)
+        sources = ", ".join(f"{source} ({n})" for source, n in sorted(c.label_sources.items()))
+        lines.append(
+            f"| {name} | {c.images} | {int((c.peers > 0).sum())} | {int(c.peers.sum())} "
+            f"| {low:.2f} to {high:.2f} | {sources} |"
+        )
+    lines += ["", "Peers and depths: inside the image. Labels: all of them.", ""]
+    lines += ["| recording | split | images |", "|---|---|--:|"]
+    rows = sorted((r, name, n) for name, c in counts.items() for r, n in c.recordings.items())
+    return [*lines, *(f"| {r} | {name} | {n} |" for r, name, n in rows), ""]
+
+
+def features(splits: dict[str, Split]) -> list[str]:
+    """Table of the columns with type, unit and meaning."""
+    split = next(iter(splits.values()))
+    height_px, width_px = split.image_shape
+    rows, cols = split.grid_shape
+    values = {"height": height_px, "width": width_px, "stride": STRIDE_PX}
+    lines = ["## Columns", "", "| column | type | meaning |", "|---|---|---|"]
+    for name, kind in _columns(split.table.schema):
+        text = "grid" if name in (layout.CONFIDENCE, layout.DEPTH) else str(kind)
+        kind_text = f"{rows} x {cols} float32" if text == "grid" else layout.dtype_name(kind)
+        meaning = MEANING.get(name, "").format(**values)
+        lines.append(f"| `{name}` | {kind_text.partition('<')[0]} | {meaning} |")
+    return [*lines, ""]
+
+
+def _columns(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
+    for column in schema:
+        yield column.name, column.type
+        if column.name == "peers":
+            yield from ((f"peers.{f.name}", f.type) for f in column.type.value_type)
+
+
+def ancestry(made: Provenance, depth: int = 0) -> Iterator[str]:
+    """Nested list of stages: settings, versions, and the hash of every input."""
+    pad = "  " * depth
+    seed = "" if made.seed is None else f", seed {made.seed}"
+    libraries = "".join(f", {name} {version}" for name, version in made.libraries.items())
+    yield f"{pad}- **{made.stage}**, dmrl {made.dmrl_version}{seed}{libraries}"
+    if made.settings:
+        settings = ", ".join(f"{key} = {value!r}" for key, value in made.settings.items())
+        yield f"{pad}  - settings: `{settings}`"
+    for source in made.inputs:
+        yield f"{pad}  - input `{source.name}`, SHA-256 `{source.sha256}`"
+        if source.provenance is not None:
+            yield from ancestry(source.provenance, depth + 2)

@@ -1,0 +1,9 @@
+"""Arrow datasets: what trainers see of recordings.
+
+`layout` says what a dataset looks like, `rows` and `splits` make rows from recordings,
+`write` and `read` store and open them.
+"""
+
+from dmrl.dataset.read import Dataset, Split, open_dataset
+
+__all__ = ["Dataset", "Split", "open_dataset"]

@@ -1,0 +1,117 @@
+"""The layout of a dataset: columns, Arrow types, files, and what ``datasets`` reads them as.
+
+An Arrow dataset is a folder that ``datasets.load_from_disk`` opens, written without it::
+
+    OUT/dataset_dict.json                 names of the splits
+    OUT/train/state.json                  names of the shards
+    OUT/train/dataset_info.json           features, rows per shard
+    OUT/train/data-00000-of-00002.arrow   uncompressed Arrow IPC stream
+    OUT/README.md, figures/               the card
+    OUT/provenance.json                   how it was made
+
+A Parquet dataset has ``OUT/data/train-00000-of-00002.parquet`` in place of the first four.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from dmrl.geometry import STRIDE_PX
+
+PIXELS, IMAGE = "pixels", "image"
+CONFIDENCE, DEPTH = "confidence", "depth"
+
+PEER = pa.struct(
+    [
+        ("peer", pa.string()),
+        ("u_px", pa.float64()),
+        ("v_px", pa.float64()),
+        ("depth_m", pa.float64()),
+        ("sigma_u_px", pa.float64()),
+        ("sigma_v_px", pa.float64()),
+        ("sigma_depth_m", pa.float64()),
+        ("box_px", pa.list_(pa.float64())),
+        ("visible_share", pa.float64()),
+        ("status", pa.string()),
+        ("source", pa.string()),
+    ]
+)
+"""One peer of one image: the fields of ``dmrl.v1.PeerLabel``, status by name."""
+
+PNG = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+"""Storage of the Image feature of ``datasets``."""
+
+
+def schema(height_px: int, width_px: int, *, png: bool = False) -> pa.Schema:
+    """Arrow schema of a dataset of images of one size.
+
+    Parameters
+    ----------
+    height_px, width_px
+        Size of the images, multiples of 8.
+    png
+        Column ``image`` with PNG bytes in place of ``pixels`` with raw RGB.
+
+    Returns
+    -------
+    pa.Schema
+        With the features under the key ``huggingface``, so that ``datasets`` reads
+        shards and Parquet files as they are meant.
+    """
+    picture = (IMAGE, PNG) if png else (PIXELS, pa.binary(height_px * width_px * 3))
+    row = pa.list_(pa.float32(), width_px // STRIDE_PX)
+    grid = pa.list_(row, height_px // STRIDE_PX)
+    plain = pa.schema(
+        [
+            picture,
+            ("peers", pa.list_(PEER)),
+            (CONFIDENCE, grid),
+            (DEPTH, grid),
+            ("robot", pa.string()),
+            ("source", pa.string()),
+            ("log_time", pa.int64()),
+            ("split", pa.string()),
+        ]
+    )
+    info = {"info": {"features": features(plain)}}
+    return plain.with_metadata({"huggingface": json.dumps(info)})
+
+
+def features(columns: pa.Schema) -> dict[str, Any]:
+    """The columns as ``datasets`` writes them in dataset_info.json.
+
+    Fixed-size lists are spelled "Sequence" and lists as ``[item]``: every version of
+    ``datasets`` reads these, while "List" needs 4 or later.
+    """
+    return {f.name: {"_type": "Image"} if f.name == IMAGE else _feature(f.type) for f in columns}
+
+
+def _feature(kind: pa.DataType) -> Any:
+    if pa.types.is_struct(kind):
+        return {f.name: _feature(f.type) for f in kind}
+    if pa.types.is_fixed_size_list(kind):
+        item = _feature(kind.value_type)
+        return {"feature": item, "length": kind.list_size, "_type": "Sequence"}
+    if pa.types.is_list(kind):
+        return [_feature(kind.value_type)]
+    return {"dtype": dtype_name(kind), "_type": "Value"}
+
+
+def dtype_name(kind: pa.DataType) -> str:
+    """Name that ``datasets`` gives a plain Arrow type: ``float32``, not ``float``."""
+    return {"float": "float32", "double": "float64"}.get(str(kind), str(kind))
+
+
+def shard_path(folder: Path, split: str, index: int, count: int, *, parquet: bool) -> Path:
+    """File of one shard, named as ``datasets`` and the Hub name it."""
+    number = f"{index:05d}-of-{count:05d}"
+    if parquet:
+        return folder / "data" / f"{split}-{number}.parquet"
+    return folder / split / f"data-{number}.arrow"
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a small JSON file, keys sorted so that equal content is equal bytes."""
+    path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")

@@ -1,0 +1,196 @@
+"""Open datasets: shards are mapped into memory, never read as a whole."""
+
+import json
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from dmrl.dataset import layout
+from dmrl.errors import DatasetError
+from dmrl.geometry import STRIDE_PX
+from dmrl.images import decode
+
+PARQUET_NAME = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")
+
+
+@dataclass(frozen=True)
+class Split:
+    """The rows of one split.
+
+    Parameters
+    ----------
+    name
+        ``train`` or ``test``.
+    table
+        All columns; ``layout.schema`` has their types. Memory-mapped for Arrow shards.
+    """
+
+    name: str
+    table: pa.Table
+
+    def __len__(self) -> int:
+        return int(self.table.num_rows)
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid labels."""
+        kind = self.table.schema.field(layout.CONFIDENCE).type
+        return kind.list_size, kind.value_type.list_size
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Height and width of the images, pixels."""
+        rows, cols = self.grid_shape
+        return rows * STRIDE_PX, cols * STRIDE_PX
+
+    @cached_property
+    def pixels(self) -> list[NDArray[np.uint8]]:
+        """Images, one (n_i, H, W, 3) RGB array per record batch, in the order of ``table``.
+
+        Read-only views of the mapped files for raw pixels: nothing is read before it is
+        used. A dataset of PNGs is decoded here, once, as a whole, into memory.
+        """
+        if layout.PIXELS in self.table.schema.names:
+            return [self._view(chunk) for chunk in self.table[layout.PIXELS].chunks]
+        return [self._decoded(chunk) for chunk in self.table[layout.IMAGE].chunks]
+
+    @cached_property
+    def confidence(self) -> NDArray[np.float32]:
+        """(N, rows, cols): 1 in the cell of a peer's centre, else 0."""
+        return self._grid(layout.CONFIDENCE)
+
+    @cached_property
+    def depth(self) -> NDArray[np.float32]:
+        """(N, rows, cols): depth in metres where the confidence is 1, else 0."""
+        return self._grid(layout.DEPTH)
+
+    def _view(self, chunk: pa.Array) -> NDArray[np.uint8]:
+        every = np.frombuffer(chunk.buffers()[1], np.uint8)
+        width = chunk.type.byte_width
+        mine = every[chunk.offset * width : (chunk.offset + len(chunk)) * width]
+        return mine.reshape(len(chunk), *self.image_shape, 3)
+
+    def _decoded(self, chunk: pa.Array) -> NDArray[np.uint8]:
+        out = np.empty((len(chunk), *self.image_shape, 3), np.uint8)
+        for image, data in zip(out, chunk.field("bytes"), strict=True):
+            image[:] = decode(data.as_py(), f"an image of split {self.name}")
+        return out
+
+    def _grid(self, name: str) -> NDArray[np.float32]:
+        chunks = self.table[name].chunks
+        flat = [chunk.flatten().flatten().to_numpy(zero_copy_only=True) for chunk in chunks]
+        joined = flat[0] if len(flat) == 1 else np.concatenate(flat)
+        return joined.reshape(len(self), *self.grid_shape)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset folder.
+
+    Parameters
+    ----------
+    path
+        The folder.
+    splits
+        Names of its splits.
+    parquet
+        Parquet files in place of Arrow shards.
+    """
+
+    path: Path
+    splits: tuple[str, ...]
+    parquet: bool = False
+
+    def split(self, name: str) -> Split:
+        """One split, mapped into memory.
+
+        Raises
+        ------
+        DatasetError
+            If there is no such split, or a shard is missing or cut short.
+        """
+        if name not in self.splits:
+            present = ", ".join(self.splits)
+            raise DatasetError(f"no split {name} in {self.path}. It has: {present}")
+        shards = self._parquet_shards(name) if self.parquet else self._arrow_shards(name)
+        tables = [_open_shard(path, rows) for path, rows in shards]
+        return Split(name, pa.concat_tables(tables))
+
+    def _arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
+        folder = self.path / name
+        files = [item["filename"] for item in _read_json(folder / "state.json")["_data_files"]]
+        info = (_read_json(folder / "dataset_info.json").get("splits") or {}).get(name, {})
+        rows = info.get("shard_lengths") or [None] * len(files)
+        return list(zip([folder / file for file in files], rows, strict=True))
+
+    def _parquet_shards(self, name: str) -> list[tuple[Path, int | None]]:
+        found = {index: count for split, index, count in _parquet_names(self.path) if split == name}
+        count = max(found.values())
+        paths = [layout.shard_path(self.path, name, k, count, parquet=True) for k in range(count)]
+        return [(path, None) for path in paths]
+
+
+def open_dataset(path: Path) -> Dataset:
+    """A dataset that ``dmrl dataset`` wrote, or ``datasets`` saved with the same columns.
+
+    Parameters
+    ----------
+    path
+        The folder.
+
+    Raises
+    ------
+    DatasetError
+        If it is not a dataset.
+    """
+    parquet = not (path / "dataset_dict.json").is_file()
+    if not parquet:
+        splits = tuple(_read_json(path / "dataset_dict.json")["splits"])
+    else:
+        splits = tuple(sorted({split for split, _, _ in _parquet_names(path)}, reverse=True))
+    if not splits:
+        what = "is not a dataset" if path.exists() else "does not exist"
+        raise DatasetError(f"{path} {what}. Make one with: dmrl dataset RECORDING.mcap {path}")
+    return Dataset(path, splits, parquet)
+
+
+def _parquet_names(folder: Path) -> list[tuple[str, int, int]]:
+    matches = (PARQUET_NAME.fullmatch(path.name) for path in (folder / "data").glob("*.parquet"))
+    return [(m["split"], int(m["index"]), int(m["count"])) for m in matches if m]
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing. Make the dataset again, or copy it whole") from None
+    except ValueError as e:
+        raise DatasetError(f"{path} is not JSON: {e}. Make the dataset again") from None
+
+
+def _open_shard(path: Path, rows: int | None) -> pa.Table:
+    again = "Make the dataset again, or copy it whole"
+    try:
+        if path.suffix == ".parquet":
+            table = pq.read_table(path)
+        else:
+            table = pa.ipc.open_stream(pa.memory_map(str(path))).read_all()
+    except FileNotFoundError:
+        raise DatasetError(f"shard {path} is missing. {again}") from None
+    except (pa.ArrowInvalid, OSError) as e:
+        why = " ".join(str(e).split())
+        raise DatasetError(f"shard {path} is cut short or damaged: {why}. {again}") from None
+    # A stream cut between two batches reads without an error.
+    if rows is not None and table.num_rows != rows:
+        found = f"{table.num_rows} of {rows} rows"
+        raise DatasetError(f"shard {path} is cut short: {found}. {again}")
+    if absent := sorted({layout.CONFIDENCE, layout.DEPTH} - set(table.schema.names)):
+        raise DatasetError(f"shard {path} has no column {absent[0]}. Make it with: dmrl dataset")
+    return table

@@ -1,0 +1,195 @@
+"""Recordings to rows: images joined with their labels by robot and log time.
+
+Of each image one source of labels is used. An image without any PeerLabels is left out:
+nobody looked. One whose PeerLabels names no peer stays: somebody looked, and saw none. One
+that has peers, but none from the chosen source, is left out, and so is one with a peer whose
+label is not OK: as a picture of "nobody there" it would teach the opposite of the truth.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+
+from dmrl import topics
+from dmrl.dataset.layout import PEER
+from dmrl.dataset.splits import SplitOf
+from dmrl.dataset.write import Row
+from dmrl.errors import RecordingError, SettingError
+from dmrl.geometry import STRIDE_PX, grid_label
+from dmrl.images import decode
+from dmrl.messages import STATUS_OK, descriptor
+from dmrl.recording import Stamped, columns, matching, read, summary
+
+SOURCES = ("truth", "estimate", "hand", "published")
+"""Sources of labels, best first."""
+
+PATTERNS = (topics.camera_image("*"), topics.labels("*"))
+
+
+@dataclass(slots=True)
+class Tally:
+    """What became of the images: how many were kept, and how many left out, and why."""
+
+    kept: int = 0
+    without_labels: int = 0
+    of_other_sources: int = 0
+    not_ok: int = 0
+    in_no_split: int = 0
+
+    def left_out(self) -> dict[str, int]:
+        """Why images were left out, and how many."""
+        return {
+            "had no labels": self.without_labels,
+            "had peers, but none from the chosen source (--labels)": self.of_other_sources,
+            "had a label that is not OK (--keep-all keeps them)": self.not_ok,
+            "belong to no split of their source (--split)": self.in_no_split,
+        }
+
+
+def count_images(path: Path) -> int:
+    """Number of images in a recording, labelled or not.
+
+    Raises
+    ------
+    MissingTopic
+        If it has no topic of images, or none of labels.
+    RecordingError
+        If one of these topics holds another message.
+    """
+    found = matching(path, PATTERNS)
+    present = summary(path).topics
+    return sum(present[t].count for t in found if topics.names(topics.CAMERA_IMAGE, t))
+
+
+def label_source(path: Path, wanted: str) -> str:
+    """The source whose labels are used for a recording.
+
+    Parameters
+    ----------
+    path
+        A recording that `count_images` accepts.
+    wanted
+        One of `SOURCES`, or "best" for the first of them that the recording has.
+
+    Raises
+    ------
+    SettingError
+        If the recording has labels, but none from that source.
+    """
+    present: set[str] = set()
+    for topic in summary(path).topics:
+        if topics.names(topics.LABELS, topic):
+            for batch in columns(path, topic, fields=("peers",)):
+                peers = batch.column("peers").flatten()
+                present.update(pc.unique(pc.struct_field(peers, "source")).to_pylist())
+    if not present:
+        return SOURCES[0] if wanted == "best" else wanted
+    usable = [source for source in SOURCES if source in present and wanted in (source, "best")]
+    if not usable:
+        has = ", ".join(sorted(present))
+        raise SettingError(f"{path} has no labels from {wanted}. Try one of --labels {has}")
+    return usable[0]
+
+
+def rows_of(
+    path: Path, source: str, split_of: SplitOf, tally: Tally, *, keep_all: bool
+) -> Iterator[tuple[str, Row] | None]:
+    """Split and row of each image of a recording, in time order; None for one left out.
+
+    Parameters
+    ----------
+    path
+        A recording that `count_images` accepts.
+    source
+        Whose labels; see `label_source`.
+    split_of
+        Split of a log time.
+    tally
+        Is counted up.
+    keep_all
+        Labels that are not OK count as well.
+    """
+    for image, labels in labelled_images(path):
+        if labels is None:
+            tally.without_labels += 1
+            yield None
+            continue
+        mine = [label for label in labels.peers if label.source == source]
+        split = split_of(image.time_ns)
+        if split is None:
+            tally.in_no_split += 1
+        elif labels.peers and not mine:
+            tally.of_other_sources += 1
+        elif not keep_all and any(label.status != STATUS_OK for label in mine):
+            tally.not_ok += 1
+        else:
+            tally.kept += 1
+            yield split, _row(path, image, [_peer(label) for label in mine])
+            continue
+        yield None
+
+
+def labelled_images(path: Path) -> Iterator[tuple[Stamped, Any]]:
+    """Each image with the PeerLabels of the same robot and log time, or None."""
+    for _, same_time in groupby(read(path, *PATTERNS), key=lambda stamped: stamped.time_ns):
+        images, labels = [], {}
+        for stamped in same_time:
+            if found := topics.names(topics.LABELS, stamped.topic):
+                labels[found["robot"]] = stamped.message
+            else:
+                images.append(stamped)
+        for image in images:
+            yield image, labels.get(_robot(image))
+
+
+def _robot(image: Stamped) -> str:
+    return (topics.names(topics.CAMERA_IMAGE, image.topic) or {})["robot"]
+
+
+def _peer(label: Any) -> dict[str, Any]:
+    peer = {field.name: getattr(label, field.name) for field in PEER}
+    return {**peer, "box_px": list(label.box_px), "status": _status(label.status)}
+
+
+def _status(number: int) -> str:
+    kind = descriptor("PeerLabel").fields_by_name["status"].enum_type
+    known = kind.values_by_number if kind is not None else {}
+    return known[number].name if number in known else str(number)
+
+
+def _row(path: Path, image: Stamped, peers: list[dict[str, Any]]) -> Row:
+    what = f"{path}: the image of {image.topic} at {image.time_ns} ns"
+    rgb = decode(image.message.data, what)
+    height_px, width_px = rgb.shape[:2]
+    if height_px % STRIDE_PX or width_px % STRIDE_PX:
+        raise RecordingError(
+            f"{what} is {width_px} x {height_px} px, not a multiple of {STRIDE_PX} both ways. "
+            "Scale it: dmrl convert --from images --width-px 320 --height-px 224"
+        )
+    uv_depth = np.array([[p["u_px"], p["v_px"], p["depth_m"]] for p in peers]).reshape(-1, 3)
+    ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & (uv_depth[:, 2] > 0)]
+    shape = (height_px // STRIDE_PX, width_px // STRIDE_PX)
+    grid = grid_label(ahead[:, :2], ahead[:, 2], shape=shape)
+    return Row(rgb, peers, grid, _robot(image), path.name, image.time_ns)
+
+
+def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
+    """Nothing, if a row's image has the size of the rows before it.
+
+    Raises
+    ------
+    RecordingError
+        If it has not.
+    """
+    if row.size_px != size_px:
+        width_px, height_px = row.size_px
+        raise RecordingError(
+            f"{path}: the image of {row.robot} at {row.time_ns} ns is {width_px} x {height_px} px, "
+            f"those before it {size_px[0]} x {size_px[1]} px. Make one dataset for each size, "
+            "or scale: dmrl convert --from images --width-px 320 --height-px 224"
+        )

@@ -1,0 +1,231 @@
+"""Write datasets: rows in, one Arrow stream or Parquet file per shard out, in bounded memory."""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from dmrl.dataset import layout
+from dmrl.images import encode_png
+
+BATCH_IMAGES = 64
+"""Rows per record batch: 14 MB of 320 x 224 pixels, all that a split keeps in memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One labelled image.
+
+    Parameters
+    ----------
+    rgb
+        (H, W, 3) pixels, RGB.
+    peers
+        Dictionaries with the fields of ``layout.PEER``.
+    grid
+        (2, H/8, W/8): confidence, and depth in metres, as ``geometry.grid_label`` gives it.
+    robot
+        Whose camera took it.
+    source
+        File name of the recording.
+    time_ns
+        Log time of the image.
+    """
+
+    rgb: NDArray[np.uint8]
+    peers: list[dict[str, Any]]
+    grid: NDArray[np.float32]
+    robot: str
+    source: str
+    time_ns: int
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the image, pixels."""
+        return self.rgb.shape[1], self.rgb.shape[0]
+
+
+@dataclass(slots=True)
+class SplitWriter:
+    """Writes the shards of one split and what ``datasets`` wants to know of them.
+
+    Parameters
+    ----------
+    folder
+        Folder of the dataset, there already.
+    name
+        Name of the split.
+    schema
+        From ``layout.schema``.
+    parquet
+        Parquet files in place of Arrow streams.
+    shard_images
+        Images per shard, at most.
+    """
+
+    folder: Path
+    name: str
+    schema: pa.Schema
+    parquet: bool
+    shard_images: int
+    _rows: list[Row] = field(default_factory=list)
+    _lengths: list[int] = field(default_factory=list)
+    _files: list[Path] = field(default_factory=list)
+    _sink: Any = None
+
+    def add(self, row: Row) -> None:
+        """Add one row; every ``BATCH_IMAGES`` rows go to disk."""
+        self._rows.append(row)
+        room = self.shard_images - (self._lengths[-1] if self._sink else 0)
+        if len(self._rows) >= min(BATCH_IMAGES, room):
+            self._flush()
+            if self._lengths[-1] >= self.shard_images:
+                self._close_shard()
+
+    def close(self, *, fingerprint: str, about: dict[str, str]) -> int:
+        """Finish the last shard, name all of them, write the JSON files.
+
+        Parameters
+        ----------
+        fingerprint
+            Names the content; ``datasets`` keys its cache with it.
+        about
+            ``description`` and ``license`` for dataset_info.json.
+
+        Returns
+        -------
+        int
+            Rows written.
+        """
+        if self._rows:
+            self._flush()
+        self._close_shard()
+        names = [self._path(k, len(self._files)) for k in range(len(self._files))]
+        for file, name in zip(self._files, names, strict=True):
+            file.rename(name)
+        if not self.parquet:
+            self._write_info(names, fingerprint, about)
+        return sum(self._lengths)
+
+    def _path(self, index: int, count: int) -> Path:
+        return layout.shard_path(self.folder, self.name, index, count, parquet=self.parquet)
+
+    def _flush(self) -> None:
+        if self._sink is None:
+            self._open_shard()
+        self._sink.write_batch(_record_batch(self._rows, self.schema, self.name))
+        self._lengths[-1] += len(self._rows)
+        self._rows.clear()
+
+    def _open_shard(self) -> None:
+        # How many shards there will be is not known yet: the name says 0 until close().
+        path = self._path(len(self._files), 0)
+        path.parent.mkdir(exist_ok=True)
+        if self.parquet:
+            plain = {"compression": "zstd", "use_dictionary": False, "write_statistics": False}
+            self._sink = pq.ParquetWriter(path, self.schema, **plain)
+        else:
+            self._sink = pa.ipc.new_stream(str(path), self.schema)
+        self._files.append(path)
+        self._lengths.append(0)
+
+    def _close_shard(self) -> None:
+        if self._sink is not None:
+            self._sink.close()
+            self._sink = None
+
+    def _write_info(self, shards: list[Path], fingerprint: str, about: dict[str, str]) -> None:
+        digest = hashlib.sha256(f"{fingerprint} {self.name}".encode()).hexdigest()
+        state: dict[str, Any] = {
+            "_data_files": [{"filename": path.name} for path in shards],
+            "_fingerprint": digest[:16],
+            "_format_columns": None,
+            "_format_kwargs": {},
+            "_format_type": None,
+            "_output_all_columns": False,
+            "_split": self.name,
+        }
+        split = {
+            "name": self.name,
+            "num_bytes": sum(path.stat().st_size for path in shards),
+            "num_examples": sum(self._lengths),
+            "shard_lengths": self._lengths,
+            "dataset_name": None,
+        }
+        info = {**about, "features": layout.features(self.schema), "splits": {self.name: split}}
+        layout.write_json(self.folder / self.name / "state.json", state)
+        layout.write_json(self.folder / self.name / "dataset_info.json", info)
+
+
+def write_dataset(
+    folder: Path,
+    rows: Iterable[tuple[str, Row]],
+    *,
+    png: bool,
+    parquet: bool,
+    shard_images: int,
+    fingerprint: str,
+    about: dict[str, str],
+) -> dict[str, int]:
+    """Rows written per split, train first.
+
+    Parameters
+    ----------
+    folder
+        There already, and empty.
+    rows
+        Name of the split and row; all images of one size.
+    png
+        PNG bytes in place of raw pixels.
+    parquet, shard_images
+        See `SplitWriter`.
+    fingerprint, about
+        See `SplitWriter.close`.
+    """
+    writers: dict[str, SplitWriter] = {}
+    for split, row in rows:
+        if split not in writers:
+            schema = layout.schema(*row.rgb.shape[:2], png=png)
+            writers[split] = SplitWriter(folder, split, schema, parquet, shard_images)
+        writers[split].add(row)
+    names = sorted(writers, key=lambda name: (name != "train", name))
+    counts = {name: writers[name].close(fingerprint=fingerprint, about=about) for name in names}
+    if not parquet:
+        layout.write_json(folder / "dataset_dict.json", {"splits": names})
+    return counts
+
+
+def _record_batch(rows: list[Row], schema: pa.Schema, split: str) -> pa.RecordBatch:
+    grid = np.stack([row.grid for row in rows]).astype(np.float32, copy=False)
+    columns = {
+        "peers": pa.array([row.peers for row in rows], schema.field("peers").type),
+        layout.CONFIDENCE: _grid_column(grid[:, 0]),
+        layout.DEPTH: _grid_column(grid[:, 1]),
+        "robot": pa.array([row.robot for row in rows]),
+        "source": pa.array([row.source for row in rows]),
+        "log_time": pa.array([row.time_ns for row in rows], pa.int64()),
+        "split": pa.array([split] * len(rows)),
+    }
+    if layout.PIXELS in schema.names:
+        pixels = pa.py_buffer(np.stack([row.rgb for row in rows]))
+        kind = schema.field(layout.PIXELS).type
+        columns[layout.PIXELS] = pa.Array.from_buffers(kind, len(rows), [None, pixels])
+    else:
+        pictures = [
+            {"bytes": encode_png(row.rgb), "path": f"{row.robot}_{row.time_ns}.png"} for row in rows
+        ]
+        columns[layout.IMAGE] = pa.array(pictures, layout.PNG)
+    return pa.record_batch([columns[name] for name in schema.names], schema=schema)
+
+
+def _grid_column(grid: NDArray[np.float32]) -> pa.Array:
+    _, rows, cols = grid.shape
+    flat = pa.array(np.ascontiguousarray(grid).ravel())
+    row = pa.FixedSizeListArray.from_arrays(flat, cols)
+    return pa.FixedSizeListArray.from_arrays(row, rows)

@@ -1,0 +1,224 @@
+"""``dmrl dataset``: recordings to an Arrow dataset, with its card."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter, validators
+
+from dmrl.card import write_card
+from dmrl.dataset.rows import Tally, count_images, label_source, one_size, rows_of
+from dmrl.dataset.splits import SplitOf, held_out, of_source
+from dmrl.dataset.write import Row, write_dataset
+from dmrl.errors import RecordingError, SettingError
+from dmrl.output import partial_folder
+from dmrl.progress import say, track
+from dmrl.recording import SPLIT_METADATA, Provenance, provenance, summary
+from dmrl.tables import print_json, print_table
+
+Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
+Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How recordings become a dataset.
+
+    Parameters
+    ----------
+    labels
+        Whose labels. "best" takes, for each recording, the first of truth, estimate, hand and
+        published that it has.
+    keep_all
+        Use labels that are not OK as well. Without it, images with such a label are left out.
+    split
+        "auto": as the source says, where it does, else whole recordings. "recordings": whole
+        recordings. "none": everything is train.
+    test_share
+        Share of the recordings that become the test split, 0 to 1.
+    seed
+        Another seed holds out other recordings.
+    png
+        Store PNG images in place of raw pixels: a third of the disk, slower to open.
+    parquet
+        Write Parquet files in place of Arrow shards: for publishing.
+    shard_images
+        Images per shard, at most.
+    title
+        Name of the dataset on its card. Empty: made from the recordings' names.
+    license
+        License on the card, as the Hugging Face Hub spells it.
+    """
+
+    labels: Literal["best", "truth", "estimate", "hand", "published"] = "best"
+    keep_all: bool = False
+    split: Literal["auto", "recordings", "none"] = "auto"
+    test_share: Share = 0.2
+    seed: int = 0
+    png: bool = False
+    parquet: bool = False
+    shard_images: Positive = 2048
+    title: str = ""
+    license: str = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What was written: images per split, label source per recording, images left out."""
+
+    images: dict[str, int]
+    sources: dict[str, str]
+    tally: Tally
+
+
+def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
+    """Images per split of the dataset written to ``out``.
+
+    Parameters
+    ----------
+    recordings
+        With images and labels.
+    out
+        Folder to write. Must not exist.
+    settings
+        See `Settings`.
+
+    Raises
+    ------
+    RecordingError
+        If a recording cannot be read, lacks images or labels, or its images cannot be used.
+    SettingError
+        If a recording has no labels from the source asked for, or two share name or content.
+    OutputError
+        If ``out`` exists.
+    """
+    with partial_folder(out) as partial:
+        total = sum(count_images(path) for path in recordings)
+        made = provenance(
+            "dataset", settings, recordings, seed=settings.seed, libraries=("pyarrow", "pillow")
+        )
+        sources = {path: label_source(path, settings.labels) for path in recordings}
+        splits = _splits(recordings, made, settings)
+        tally = Tally()
+        images = write_dataset(
+            partial,
+            _rows(sources, splits, tally, total, keep_all=settings.keep_all),
+            png=settings.png,
+            parquet=settings.parquet,
+            shard_images=settings.shard_images,
+            fingerprint=hashlib.sha256(json.dumps(made.to_json()).encode()).hexdigest(),
+            about={"description": settings.title, "license": settings.license},
+        )
+        _explain(recordings, images, tally, settings)
+        made.write(partial)
+        write_card(partial)
+    return Result(images, {path.name: source for path, source in sources.items()}, tally)
+
+
+def _splits(
+    recordings: Sequence[Path], made: Provenance, settings: Settings
+) -> dict[Path, SplitOf]:
+    hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=True)}
+    _refuse_twins(recordings, hashes)
+    own = {path: summary(path).metadata.get(SPLIT_METADATA) for path in recordings}
+    by_source = {p: o[0] for p, o in own.items() if o and settings.split == "auto"}
+    whole = {path: hashes[path] for path in recordings if path not in by_source}
+    share = 0.0 if settings.split == "none" else settings.test_share
+    test = held_out(whole, share, settings.seed)
+    return {
+        path: of_source(path, by_source[path])
+        if path in by_source
+        else _constant("test" if path in test else "train")
+        for path in recordings
+    }
+
+
+def _constant(name: str) -> SplitOf:
+    return lambda time_ns: name
+
+
+def _refuse_twins(recordings: Sequence[Path], hashes: dict[Path, str]) -> None:
+    names: dict[str, Path] = {}
+    contents: dict[str, Path] = {}
+    for path in recordings:
+        if (twin := names.setdefault(path.name, path)) is not path:
+            raise SettingError(
+                f"{twin} and {path} have one name, so rows could not be traced. Rename one"
+            )
+        if (twin := contents.setdefault(hashes[path], path)) is not path:
+            raise SettingError(f"{twin} and {path} hold the same bytes. Name only one of them")
+
+
+def _rows(
+    sources: dict[Path, str],
+    splits: dict[Path, SplitOf],
+    tally: Tally,
+    total: int,
+    *,
+    keep_all: bool,
+) -> Iterator[tuple[str, Row]]:
+    rows = (
+        (path, row)
+        for path, source in sources.items()
+        for row in rows_of(path, source, splits[path], tally, keep_all=keep_all)
+    )
+    size_px: tuple[int, int] | None = None
+    for path, kept in track(rows, "Writing images", total):
+        if kept is not None:
+            size_px = size_px or kept[1].size_px
+            one_size(path, kept[1], size_px)
+            yield kept
+
+
+def _explain(
+    recordings: Sequence[Path], images: dict[str, int], tally: Tally, settings: Settings
+) -> None:
+    reasons = [f"{count} images {why}" for why, count in tally.left_out().items() if count]
+    if not images:
+        names = ", ".join(str(path) for path in recordings)
+        raise RecordingError(
+            f"no image of {names} can be used: {'; '.join(reasons) or 'there is none'}. "
+            "Try: dmrl info, dmrl label"
+        )
+    for reason in reasons:
+        say(f"left out: {reason}")
+    if list(images) == ["train"] and settings.split != "none" and settings.test_share > 0:
+        say(
+            "nothing is held out for testing. Name two or more recordings or one with a split "
+            "of its own, or test on another dataset"
+        )
+
+
+DEFAULTS = Settings()
+
+
+def command(
+    recordings: Annotated[list[Path], Parameter(name="IN")],
+    out: Path,
+    /,
+    *,
+    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Build an Arrow dataset and its card from recordings.
+
+    Parameters
+    ----------
+    recordings
+        Recordings with images and labels.
+    out
+        Folder to write. Must not exist.
+    as_json
+        Print one JSON document in place of the tables.
+    """
+    result = run(recordings, out, settings)
+    left_out = {why: count for why, count in result.tally.left_out().items() if count}
+    if as_json:
+        document = {"dataset": str(out), "images": result.images}
+        print_json({**document, "labels": result.sources, "left_out": left_out})
+        return
+    print_table(str(out), ("split", "images"), list(result.images.items()))
+    print_table("", ("recording", "labels from"), list(result.sources.items()))
