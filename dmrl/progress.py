@@ -1,6 +1,6 @@
 """Progress on standard error, silent when that is not a terminal."""
 
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
 from typing import TypeVar
 
 from rich.console import Console
@@ -16,7 +16,13 @@ from rich.progress import (
 Item = TypeVar("Item")
 
 
-def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+def track(
+    items: Iterable[Item],
+    what: str,
+    total: int | None = None,
+    *,
+    describe: Callable[[Item], str] | None = None,
+) -> Iterator[Item]:
     """Items one by one, with a bar that says how many are done.
 
     Parameters
@@ -27,6 +33,8 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
         Words before the bar, such as "Rendering".
     total
         Number of items. None: the length of ``items``, or not known.
+    describe
+        Words before the bar once an item is there, in place of ``what``.
 
     Yields
     ------
@@ -47,7 +55,12 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True) as bar:
-        yield from bar.track(items, total=total, description=what)
+        task = bar.add_task(what, total=total)
+        for item in items:
+            if describe is not None:
+                bar.update(task, description=describe(item))
+            yield item
+            bar.advance(task)
 
 
 def say(line: str) -> None:

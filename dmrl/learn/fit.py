@@ -62,6 +62,18 @@ class FitSettings:
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: must be at least 1")
+        if self.learning_rate <= 0 or not 0 <= self.final_learning_rate <= self.learning_rate:
+            raise ValueError("learning_rate: must be over 0 and not below final_learning_rate")
+        for name in ("warmup_epochs", "confidence_weight", "depth_weight", "seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: must not be negative")
+        if not 0 <= self.threshold <= 1:
+            raise ValueError("threshold: must be between 0 and 1")
+
 
 class Step(NamedTuple):
     """One step of a training: epoch from 1, and the mean loss of the last few steps."""
@@ -109,15 +121,16 @@ def losses(network: Network, batch: Batch, settings: FitSettings) -> Tensor:
     )
 
 
-def new_optimizer(network: Network, settings: FitSettings) -> torch.optim.Adam:
-    """Adam on all weights of a network."""
-    return torch.optim.Adam(network.parameters(), lr=settings.learning_rate, eps=ADAM_EPSILON)
-
-
 def train_step(
-    network: Network, optimizer: torch.optim.Optimizer, batch: Batch, settings: FitSettings
+    network: Network,
+    optimizer: torch.optim.Optimizer,
+    batch: Batch,
+    settings: FitSettings,
+    learning_rate: float,
 ) -> Tensor:
     """(2,) losses of a batch, after one step of the optimizer on their sum."""
+    for group in optimizer.param_groups:
+        group["lr"] = learning_rate
     parts = losses(network, batch, settings)
     optimizer.zero_grad(set_to_none=True)
     parts.sum().backward()  # type: ignore[no-untyped-call]
@@ -148,22 +161,13 @@ def new_network(settings: FitSettings, examples: Examples) -> Network:
     return network
 
 
-def fit(
-    network: Network,
-    examples: Examples,
-    settings: FitSettings,
-    folder: Path,
-    *,
-    validation: Examples | None = None,
-    identity: str = "",
-    resume: bool = False,
-) -> Iterator[Step]:
-    """Train ``network`` in place, one step at a time.
+class Training:
+    """One training: iterate ``steps()`` to the end, then look at ``history``.
 
     Parameters
     ----------
     network
-        On any device; moved to the one of the settings.
+        Trained in place, on the device of the settings.
     examples
         Training images and labels.
     settings
@@ -177,65 +181,103 @@ def fit(
     resume
         Go on from the checkpoint in ``folder``.
 
-    Yields
-    ------
-    Step
-        After every step.
-
     Raises
     ------
     SettingError
-        If the loss is no longer a number, or the checkpoint is of another training.
+        If the checkpoint is of another training, or the device is not there.
     ModelError
         If there is no checkpoint to resume from.
     """
-    network.to(device_of(settings.device))
-    optimizer = new_optimizer(network, settings)
-    run = {**asdict(settings), "data": identity}
-    state = load_checkpoint(folder, network, optimizer, run) if resume else State(run)
-    steps = batch_count(len(examples), settings.batch_size)
-    with SummaryWriter(folder / "tensorboard", purge_step=state.epochs_done * steps + 1) as board:
-        for epoch in range(state.epochs_done, settings.epochs):
-            network.train()
-            mean = yield from _epoch(network, optimizer, examples, settings, epoch, board)
-            if validation is not None:
-                mean["validation_loss"] = mean_loss(network, validation, settings)
-                board.add_scalar("loss/validation", mean["validation_loss"], (epoch + 1) * steps)
-            state = State(run, epoch + 1, [*state.history, mean])
-            save_checkpoint(folder, network, optimizer, state)
-    network.eval()
 
+    def __init__(
+        self,
+        network: Network,
+        examples: Examples,
+        settings: FitSettings,
+        folder: Path,
+        *,
+        validation: Examples | None = None,
+        identity: str = "",
+        resume: bool = False,
+    ) -> None:
+        self._network = network.to(device_of(settings.device))
+        self._examples, self._validation = examples, validation
+        self._settings, self._folder = settings, folder
+        self._optimizer = torch.optim.Adam(network.parameters(), eps=ADAM_EPSILON)
+        self._steps_per_epoch = batch_count(len(examples), settings.batch_size)
+        run = {**asdict(settings), "data": identity}
+        self._state = State(run)
+        if resume:
+            self._state = load_checkpoint(folder, network, self._optimizer, run)
 
-def _epoch(
-    network: Network,
-    optimizer: torch.optim.Optimizer,
-    examples: Examples,
-    settings: FitSettings,
-    epoch: int,
-    board: SummaryWriter,
-) -> Generator[Step, None, dict[str, float]]:
-    """Train one epoch; returns its mean losses."""
-    steps = batch_count(len(examples), settings.batch_size)
-    batches = shuffled(examples, settings.batch_size, seed=settings.seed, epoch=epoch)
-    seen: list[Tensor] = []
-    total, loss = torch.zeros(2), math.nan
-    for index, batch in enumerate(batches, start=1):
-        rate = learning_rate_at(epoch * steps + index, steps, settings)
-        for group in optimizer.param_groups:
-            group["lr"] = rate
-        seen.append(train_step(network, optimizer, batch, settings) * len(batch.images))
-        if index % WATCH_STEPS == 0 or index == steps:
-            recent = torch.stack(seen).cpu()
-            images = (len(seen) - 1) * settings.batch_size + len(batch.images)
-            loss = float(recent.sum()) / images
-            _require_finite(loss, epoch + 1, index)
-            board.add_scalar("loss/train", loss, epoch * steps + index)
-            board.add_scalar("learning_rate", rate, epoch * steps + index)
-            total += recent.sum(dim=0)
-            seen.clear()
-        yield Step(epoch + 1, loss)
-    confidence, depth = (total / len(examples)).tolist()
-    return {"loss": confidence + depth, "confidence_loss": confidence, "depth_loss": depth}
+    @property
+    def history(self) -> list[dict[str, float]]:
+        """Mean losses of every epoch so far."""
+        return self._state.history
+
+    @property
+    def steps_left(self) -> int:
+        """Steps that ``steps()`` will take."""
+        return (self._settings.epochs - self._state.epochs_done) * self._steps_per_epoch
+
+    def steps(self) -> Iterator[Step]:
+        """Train, one step at a time.
+
+        Yields
+        ------
+        Step
+            After every step.
+
+        Raises
+        ------
+        SettingError
+            If the loss is no longer a number.
+        """
+        first = self._state.epochs_done
+        log = self._folder / "tensorboard"
+        with SummaryWriter(log, purge_step=first * self._steps_per_epoch + 1) as board:
+            for epoch in range(first, self._settings.epochs):
+                self._network.train()
+                mean = yield from self._epoch(epoch, board)
+                if self._validation is not None:
+                    mean["validation_loss"] = self._validation_loss(self._validation)
+                    step = (epoch + 1) * self._steps_per_epoch
+                    board.add_scalar("loss/validation", mean["validation_loss"], step)
+                self._state = State(self._state.run, epoch + 1, [*self.history, mean])
+                save_checkpoint(self._folder, self._network, self._optimizer, self._state)
+        self._network.eval()
+
+    def _epoch(self, epoch: int, board: SummaryWriter) -> Generator[Step, None, dict[str, float]]:
+        """Train one epoch; returns its mean losses."""
+        size, seed = self._settings.batch_size, self._settings.seed
+        seen: list[Tensor] = []
+        total, loss = torch.zeros(2), math.nan
+        batches = shuffled(self._examples, size, seed=seed, epoch=epoch)
+        for index, batch in enumerate(batches, start=1):
+            step = epoch * self._steps_per_epoch + index
+            rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
+            parts = train_step(self._network, self._optimizer, batch, self._settings, rate)
+            seen.append(parts * len(batch.images))
+            if index % WATCH_STEPS == 0 or index == self._steps_per_epoch:
+                recent = torch.stack(seen).cpu()
+                loss = float(recent.sum()) / ((len(seen) - 1) * size + len(batch.images))
+                _require_finite(loss, epoch + 1, index)
+                board.add_scalar("loss/train", loss, step)
+                board.add_scalar("learning_rate", rate, step)
+                total += recent.sum(dim=0)
+                seen.clear()
+            yield Step(epoch + 1, loss)
+        confidence, depth = (total / len(self._examples)).tolist()
+        return {"loss": confidence + depth, "confidence_loss": confidence, "depth_loss": depth}
+
+    def _validation_loss(self, examples: Examples) -> float:
+        self._network.eval()
+        total = 0.0
+        with torch.inference_mode():
+            for batch in shuffled(examples, self._settings.batch_size, seed=0, epoch=0):
+                parts = losses(self._network, batch, self._settings)
+                total += float(parts.sum()) * len(batch.images)
+        return total / len(examples)
 
 
 def _require_finite(loss: float, epoch: int, step: int) -> None:
@@ -244,13 +286,3 @@ def _require_finite(loss: float, epoch: int, step: int) -> None:
             f"the loss is {loss} in epoch {epoch}, step {step}. "
             "Lower --learning-rate, or look for labels that are not finite"
         )
-
-
-def mean_loss(network: Network, examples: Examples, settings: FitSettings) -> float:
-    """Mean loss over images that are not trained on."""
-    network.eval()
-    total = 0.0
-    with torch.inference_mode():
-        for batch in shuffled(examples, settings.batch_size, seed=0, epoch=0):
-            total += float(losses(network, batch, settings).sum()) * len(batch.images)
-    return total / len(examples)

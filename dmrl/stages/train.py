@@ -1,0 +1,233 @@
+"""``dmrl train``: an Arrow dataset to a run folder with a trained network."""
+
+import shutil
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from dmrl import recipe as recipes
+from dmrl.dataset import Split, open_dataset
+from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
+from dmrl.output import partial_folder, partial_of, refuse_existing
+from dmrl.progress import track
+from dmrl.recording import provenance
+from dmrl.tables import print_json, print_table
+
+try:
+    from dmrl.learn.batches import Examples
+    from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
+    from dmrl.learn.fit import FitSettings, Step, Training, new_network
+    from dmrl.learn.model import Model, load_model, save_model, set_weights, weights_of
+    from dmrl.learn.network import Network
+except ModuleNotFoundError as e:
+    raise MissingExtra(str(e.name), "train", "dmrl train") from e
+
+Settings = FitSettings
+LIBRARIES = ("torch", "numpy")
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a training came to: images, mean loss of the last epoch, seconds it took."""
+
+    images: int
+    loss: float
+    seconds: float
+    images_per_s: float
+
+
+def run(
+    dataset: Path,
+    out: Path,
+    settings: Settings,
+    *,
+    init: Path | None = None,
+    resume: bool = False,
+) -> Result:
+    """Train on the train split of ``dataset`` and write the run folder ``out``.
+
+    A split named val is watched, where there is one, and used for nothing else.
+
+    Parameters
+    ----------
+    dataset
+        Folder that ``dmrl dataset`` wrote.
+    out
+        Run folder to write. Until the training is done it is ``<out>.partial``.
+    settings
+        See `FitSettings`.
+    init
+        Model whose weights to start from. None: new weights, by the seed.
+    resume
+        Go on with the interrupted training in ``<out>.partial``.
+
+    Raises
+    ------
+    OutputError
+        If ``out`` exists, or an interrupted training is in the way.
+    DatasetError
+        If ``dataset`` is not one, or has no train split.
+    ModelError
+        If ``init`` cannot be used, or there is nothing to resume.
+    SettingError
+        If the network cannot take the images, or the loss is no longer a number.
+    """
+    refuse_existing(out)
+    _clear_the_way(partial_of(out), resume=resume)
+    data = open_dataset(dataset)
+    train = data.split("train")
+    examples = _examples(train)
+    watched = _examples(data.split("val")) if "val" in data.splits else None
+    network = _first_network(settings, examples, init)
+    inputs = (dataset,) if init is None else (dataset, init)
+    made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
+    identity = " ".join(source.sha256 for source in made.inputs)
+    with partial_folder(out, keep_on_error=True) as folder:
+        training = Training(
+            network,
+            examples,
+            settings,
+            folder,
+            validation=watched,
+            identity=identity,
+            resume=resume,
+        )
+        made.write(folder)
+        result = _train(training, settings, len(examples))
+        save_model(_model(network, settings, train, training.history), folder)
+        remove_checkpoint(folder)
+    return result
+
+
+def _clear_the_way(partial: Path, *, resume: bool) -> None:
+    if resume and not partial.is_dir():
+        raise ModelError(f"no {partial} to resume. Train without --resume")
+    if resume or not partial.exists():
+        return
+    if partial.is_dir() and has_checkpoint(partial):
+        raise OutputError(
+            f"{partial} holds an interrupted training. Go on with --resume, or remove it"
+        )
+    shutil.rmtree(partial)
+
+
+def _examples(split: Split) -> Examples:
+    return Examples(split.pixels, split.confidence, split.depth)
+
+
+def _first_network(settings: Settings, examples: Examples, init: Path | None) -> Network:
+    network = new_network(settings, examples)
+    if init is not None:
+        set_weights(network, weights_of(load_model(init).network), init)
+    return network
+
+
+def _train(training: Training, settings: Settings, images: int) -> Result:
+    def words(step: Step) -> str:
+        return f"Epoch {step.epoch}/{settings.epochs}, loss {step.loss:.3f}"
+
+    left, begun = training.steps_left, time.perf_counter()
+    for _ in track(training.steps(), "Training", left, describe=words):
+        pass
+    seconds = time.perf_counter() - begun
+    seen = left * settings.batch_size
+    return Result(images, training.history[-1]["loss"], seconds, seen / seconds)
+
+
+def _model(
+    network: Network, settings: Settings, train: Split, history: list[dict[str, float]]
+) -> Model:
+    height_px, width_px = train.image_shape
+    sources = train.table.column("source").unique().to_pylist()
+    return Model(
+        network,
+        settings.architecture,
+        width_px=width_px,
+        height_px=height_px,
+        threshold=settings.threshold,
+        label_source=", ".join(sorted(sources)),
+        training={"images": len(train), "settings": asdict(settings), "history": history},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Flags:
+    """Settings of the recipe that a flag may overrule.
+
+    Parameters
+    ----------
+    epochs
+        Times that every image is seen. Without it, the recipe's.
+    batch_size
+        Images per step. Without it, the recipe's.
+    learning_rate
+        Of Adam, at the end of the warm-up. Without it, the recipe's.
+    seed
+        Of the first weights and the order of the images. Without it, the recipe's.
+    device
+        Where to compute. Without it, the recipe's.
+    """
+
+    epochs: int | None = None
+    batch_size: int | None = None
+    learning_rate: float | None = None
+    seed: int | None = None
+    device: Literal["auto", "cpu", "cuda"] | None = None
+
+    def over(self, settings: Settings) -> Settings:
+        """The settings, with the flags that were given in their place.
+
+        Raises
+        ------
+        SettingError
+            If a value is out of range.
+        """
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        try:
+            return replace(settings, **given)
+        except ValueError as e:
+            raise SettingError(f"{e}. Give another value") from None
+
+
+NO_FLAGS = Flags()
+
+
+def command(
+    dataset: Path,
+    out: Annotated[Path, Parameter(name="OUT_DIR")],
+    /,
+    *,
+    recipe: str = "locanet",
+    init: Path | None = None,
+    resume: bool = False,
+    flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Train a network on a dataset.
+
+    Parameters
+    ----------
+    dataset
+        Folder that dmrl dataset wrote; its train split is used.
+    out
+        Run folder to write: model.safetensors, model.json, TensorBoard's log.
+    recipe
+        Every setting: a TOML file, or the name of a shipped recipe. Flags win over it.
+    init
+        Model to start from: a run folder, a .safetensors or a Keras .h5.
+    resume
+        Go on with the interrupted training in OUT_DIR.partial.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    settings = flags.over(recipes.load(recipe, "train", Settings))
+    result = run(dataset, out, settings, init=init, resume=resume)
+    if as_json:
+        print_json({"model": str(out), **asdict(result)})
+        return
+    columns = ("images", "epochs", "last loss", "seconds", "images/s")
+    row = (result.images, settings.epochs, result.loss, result.seconds, result.images_per_s)
+    print_table(str(out), columns, [row])
