@@ -32,6 +32,7 @@ Ints = NDArray[np.int64]
 
 RECORD_HEADER = 1 + 8  # opcode, length
 MESSAGE_HEADER = 2 + 4 + 8 + 8  # channel id, sequence, log time, publish time
+SMALLEST_MESSAGE = RECORD_HEADER + MESSAGE_HEADER
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,17 +218,33 @@ def _indexed(
     data = unpacked(path, _chunk_record(raw), chunk.chunk_start_offset)
     if not chunk.message_index_offsets:
         return scanned(data, set(channels))
-    offsets = []
+    parts = [np.empty((0, 2), np.int64)]
     for number, at in chunk.message_index_offsets.items():
         if number in channels:
-            head = at - chunk.chunk_start_offset + RECORD_HEADER
-            _, size = struct.unpack_from("<HI", raw, head)
-            entries = np.frombuffer(raw, "<u8", size // 8, head + 6)
-            offsets.append(entries[1::2].astype(np.int64))
-    at_record = np.sort(np.concatenate(offsets)) if offsets else np.empty(0, np.int64)
-    if at_record.size and at_record[-1] + RECORD_HEADER + MESSAGE_HEADER > len(data):
+            parts.append(_index_entries(path, raw, at - chunk.chunk_start_offset, number))
+    entries = np.concatenate(parts)
+    entries = entries[np.argsort(entries[:, 1])]
+    # Indexes carry no CRC of their own, so they are held against the records they point at.
+    if entries.size and not 0 <= entries[0, 1] <= entries[-1, 1] <= len(data) - SMALLEST_MESSAGE:
         raise damaged(path, f"index beyond the chunk at byte {chunk.chunk_start_offset}")
-    return _at(data, at_record)
+    block = _at(data, entries[:, 1])
+    if not (
+        (data[entries[:, 1]] == Opcode.MESSAGE).all()
+        and np.array_equal(block.time_ns, entries[:, 0])
+        and (block.end <= len(data)).all()
+        and set(np.unique(block.channel).tolist()) <= channels.keys()
+    ):
+        raise damaged(path, f"index of the chunk at byte {chunk.chunk_start_offset} is wrong")
+    return block
+
+
+def _index_entries(path: Path, raw: bytes, at: int, number: int) -> Ints:
+    """(N, 2) log time and offset of one channel's messages in a chunk."""
+    opcode, length, channel, size = struct.unpack_from("<BQHI", raw, at)
+    if (opcode, length, channel) != (Opcode.MESSAGE_INDEX, size + 6, number) or size % 16:
+        raise damaged(path, f"message index of channel {number} is wrong")
+    entries = np.frombuffer(raw, "<i8", size // 8, at + RECORD_HEADER + 6)
+    return entries.reshape(-1, 2).astype(np.int64)
 
 
 def _chunk_record(raw: bytes) -> Chunk:

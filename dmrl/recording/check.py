@@ -25,7 +25,6 @@ from dmrl.topics import (
     LABELS,
     calibration,
     camera_image,
-    labels,
     names,
     row_of,
 )
@@ -128,7 +127,7 @@ def _gaps(topic: str, step_ns: NDArray[np.int64]) -> Iterator[Finding]:
         yield Finding(
             "warning",
             topic,
-            f"{gaps.size} gaps, the longest {gaps.max():.3f} s, at a usual period of {period_s:.3f} s",
+            f"{gaps.size} gaps, the longest {gaps.max():.3f} s; the usual period: {period_s:.3f} s",
         )
 
 

@@ -1,4 +1,4 @@
-"""check: is a recording what it should be?"""
+"""check: whether a recording is what it should be."""
 
 from dataclasses import asdict
 from pathlib import Path

@@ -1,0 +1,124 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.images import encode_png
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, check
+
+PNG = encode_png(np.zeros((224, 320, 3), np.uint8))
+Write = Callable[[int, str, Any], None]
+
+
+def record(path: Path, fill: Callable[[Write], None]) -> list[str]:
+    """Findings of a recording, each as "level topic text"."""
+    with RecordingWriter(path, Provenance("test")) as sink:
+        fill(sink.write)
+    return [f"{f.level} {f.topic} {f.text}" for f in check(path)]
+
+
+def image(data: bytes = PNG) -> Any:
+    return message("CompressedImage")(data=data, format="png")
+
+
+def label(u_px: float, v_px: float, *, source: str = "truth", box: bool = True) -> Any:
+    return message("PeerLabel")(
+        peer="cf2",
+        u_px=u_px,
+        v_px=v_px,
+        depth_m=1.0,
+        source=source,
+        box_px=[u_px - 10, v_px - 6, u_px + 10, v_px + 6] if box else [],
+    )
+
+
+def labelled(write: Write, shift_v_px: float = 0.0) -> None:
+    """Forty images with a true label each, and one whose source shifts it."""
+    write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        u_px, v_px = rng.uniform(50, 170, 2)
+        true, other = label(u_px, v_px), label(u_px, v_px, source="published")
+        other.u_px += rng.normal(0, 1)
+        other.v_px += shift_v_px + rng.normal(0, 1)
+        write(k * 10**9, "/cf1/camera/image", image())
+        write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[true, other]))
+
+
+def test_a_sound_recording_has_no_findings(tmp_path: Path) -> None:
+    assert record(tmp_path / "a.mcap", labelled) == []
+
+
+def test_a_label_bias_is_found_and_said_in_one_line(tmp_path: Path) -> None:
+    (finding,) = record(tmp_path / "a.mcap", lambda write: labelled(write, shift_v_px=10.0))
+    assert finding.startswith("warning /cf1/labels labels of source 'published' are biased:")
+    assert "+10." in finding or "+9." in finding
+    assert "\n" not in finding
+
+
+def test_times_that_go_back_repeat_or_leave_gaps_are_found(tmp_path: Path) -> None:
+    times_s = [*range(20), 15, 15, *range(60, 70)]
+
+    def fill(write: Write) -> None:
+        for time_s in times_s:
+            write(time_s * 10**9, "/cf1/height", message("Height")())
+
+    findings = record(tmp_path / "a.mcap", fill)
+    assert "warning /cf1/height 1 messages go back in time, by up to 4.000 s" in findings
+    assert "warning /cf1/height 1 messages repeat the time before them" in findings
+    assert any("1 gaps, the longest 45.000 s" in f for f in findings)
+
+
+def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path) -> None:
+    assert record(tmp_path / "a.mcap", lambda write: write(0, "/cf1/camera/image", image())) == [
+        "warning /cf1/camera/image no calibration on /cf1/camera/calibration"
+    ]
+
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=324, height=244))
+        write(0, "/cf1/camera/image", image())
+        write(1, "/cf1/camera/image", image(b"no image"))
+
+    findings = record(tmp_path / "b.mcap", fill)
+    assert (
+        "error /cf1/camera/image images of 320x224, but the calibration is for 324x244" in findings
+    )
+    assert "error /cf1/camera/image 1 messages hold no image that can be read" in findings
+
+
+@pytest.mark.parametrize(
+    ("bad", "complaint"),
+    [
+        (label(400.0, 50.0), "warning /cf1/labels 1 of 1 labels of source 'truth' lie outside"),
+        (
+            message("PeerLabel")(u_px=5, v_px=5, source="hand"),
+            "error /cf1/labels 1 labels of source",
+        ),
+        (label(float("nan"), 5.0), "error /cf1/labels 1 labels of source 'truth' have no pixel"),
+    ],
+    ids=["outside", "no depth", "not a number"],
+)
+def test_impossible_labels_are_found(tmp_path: Path, bad: Any, complaint: str) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        write(0, "/cf1/camera/image", image())
+        write(0, "/cf1/labels", message("PeerLabels")(peers=[bad]))
+
+    assert any(f.startswith(complaint) for f in record(tmp_path / "a.mcap", fill))
+
+
+def test_labels_without_their_image_are_found(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        write(0, "/cf1/camera/image", image())
+        write(5, "/cf1/labels", message("PeerLabels")())
+
+    (finding,) = record(tmp_path / "a.mcap", fill)
+    assert finding == "error /cf1/labels 1 of 1 messages have no image at their time"
+
+
+def test_an_empty_recording_is_an_error(tmp_path: Path) -> None:
+    assert record(tmp_path / "a.mcap", lambda _: None) == ["error  has no messages"]

@@ -1,0 +1,123 @@
+from math import sin
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import MissingTopic, OutputError, RecordingError
+from dmrl.messages import message
+from dmrl.recording import (
+    Provenance,
+    RecordingWriter,
+    merge,
+    read_raw,
+    recover,
+    splits,
+    summary,
+    trim,
+)
+
+
+def heights(path: Path, times_ns: list[int], split: str) -> Path:
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for time_ns in times_ns:
+            # A sine, so that chunks do not compress to nothing.
+            sink.write(time_ns, "/cf1/height", message("Height")(height_m=sin(time_ns)))
+        sink.add_metadata("dmrl.split", {split: f"[[{times_ns[0]}, {times_ns[-1]}]]"})
+    return path
+
+
+def test_merging_interleaves_by_time_and_keeps_every_bit(tmp_path: Path, flight: Path) -> None:
+    other = heights(tmp_path / "b.mcap", [15_000_000, 25_000_000], "test")
+    assert merge([flight, other], tmp_path / "out.mcap") == 4403
+    merged = list(read_raw(tmp_path / "out.mcap"))
+    assert [r.time_ns for r in merged] == sorted(r.time_ns for r in merged)
+    assert [r for r in merged if r.topic == "/cf1/height"] == list(read_raw(other))
+    assert splits(summary(tmp_path / "out.mcap")) == {
+        "train": [(0, 10)],
+        "test": [(15_000_000, 25_000_000)],
+    }
+
+
+def test_a_merge_tells_its_whole_ancestry(tmp_path: Path, flight: Path) -> None:
+    trim(flight, tmp_path / "b.mcap", topics=["/cf1/attitude"])
+    merge([flight, tmp_path / "b.mcap"], tmp_path / "out.mcap")
+    made = summary(tmp_path / "out.mcap").provenance
+    assert made is not None
+    assert [(depth, p.stage if p else "") for depth, _, p in made.ancestry()] == [
+        (0, "test"),
+        (0, "trim"),
+        (1, "test"),
+    ]
+
+
+def test_a_recording_merged_with_itself_is_refused(tmp_path: Path, flight: Path) -> None:
+    with pytest.raises(RecordingError, match="given twice"):
+        merge([flight, flight], tmp_path / "out.mcap")
+
+
+def test_trimming_keeps_the_stretch_and_the_calibration(tmp_path: Path, flight: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert trim(flight, out, start_ns=10**9, end_ns=2 * 10**9) == 110
+    kept = list(read_raw(out))
+    assert kept[0].topic == "/cf1/camera/calibration"
+    assert {r.time_ns // 10**9 for r in kept[1:]} == {1}
+
+
+def test_trimming_to_nothing_is_an_error_and_leaves_no_file(tmp_path: Path, flight: Path) -> None:
+    with pytest.raises(RecordingError, match=r"no message in that stretch; it lasts 39.990 s"):
+        trim(flight, tmp_path / "out.mcap", start_ns=10**12)
+    with pytest.raises(MissingTopic, match=r"Did you mean /cf1/attitude\?"):
+        trim(flight, tmp_path / "out.mcap", topics=["/cf1/atitude"])
+    with pytest.raises(OutputError, match="never overwritten"):
+        trim(flight, flight)
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]
+
+
+def test_recover_returns_every_message_before_the_cut(tmp_path: Path, flight: Path) -> None:
+    whole = list(read_raw(flight))
+    data = flight.read_bytes()
+    counts = []
+    for k, share in enumerate((0.99, 0.6, 0.3)):
+        (tmp_path / "cut.mcap").write_bytes(data[: int(len(data) * share)])
+        try:
+            result = recover(tmp_path / "cut.mcap", tmp_path / f"{k}.mcap")
+        except RecordingError as e:
+            assert "no whole chunk" in str(e)
+            continue
+        got = list(read_raw(tmp_path / f"{k}.mcap"))
+        assert got == whole[: len(got)]
+        assert result.messages == len(got)
+        counts.append(len(got))
+        made = summary(tmp_path / f"{k}.mcap").provenance
+        assert made is not None
+        assert made.inputs[0].provenance == Provenance("test", {"level": 1}, seed=3)
+    assert counts == sorted(counts, reverse=True)
+    assert counts
+
+
+def test_recover_steps_over_a_damaged_chunk(tmp_path: Path) -> None:
+    path = heights(tmp_path / "a.mcap", list(range(30_000)), "train")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    result = recover(path, tmp_path / "b.mcap")
+    assert result.damaged_chunks == 1
+    assert not result.whole
+    times_ns = [r.time_ns for r in read_raw(tmp_path / "b.mcap")]
+    assert 15_000 < len(times_ns) < 30_000
+    assert times_ns[-1] == 29_999
+    assert splits(summary(tmp_path / "b.mcap")) == {"train": [(0, 29_999)]}
+
+
+def test_recovering_a_whole_recording_loses_nothing(tmp_path: Path, flight: Path) -> None:
+    result = recover(flight, tmp_path / "b.mcap")
+    assert result.whole
+    assert list(read_raw(tmp_path / "b.mcap")) == list(read_raw(flight))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r", b"\x89PNG\r\n\x1a\n", b"\x89MCAP0\r\n"])
+def test_nothing_to_recover_is_an_error_and_leaves_no_file(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.mcap").write_bytes(content)
+    with pytest.raises(RecordingError, match="nothing to recover"):
+        recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]

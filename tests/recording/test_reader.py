@@ -1,0 +1,235 @@
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, IndexType, Writer
+
+from dmrl.errors import MissingTopic, RecordingError
+from dmrl.messages import message, schema_bytes
+from dmrl.recording import (
+    Provenance,
+    RecordingWriter,
+    columns,
+    read,
+    read_raw,
+    read_table,
+    summary,
+)
+
+HEIGHT = message("Height")
+
+
+def foreign(path: Path, times_ns: list[int], **options: object) -> Path:
+    """A recording by mcap's own writer."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=200, **options)  # type: ignore[arg-type]
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        for t in times_ns:
+            writer.add_message(channel, t, HEIGHT(height_m=t).SerializeToString(), t)
+        writer.finish()
+    return path
+
+
+SHUFFLED = np.random.default_rng(0).permutation(500).tolist()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.CHUNK},
+        {"use_chunking": False},
+        {"use_statistics": False, "use_summary_offsets": False, "repeat_channels": False,
+         "repeat_schemas": False, "index_types": IndexType.NONE},
+    ],
+    ids=["indexed", "lz4", "uncompressed", "no index", "chunk index", "unchunked", "no summary"],
+)  # fmt: skip
+def test_any_complete_file_is_read_in_time_order(
+    tmp_path: Path, options: dict[str, object]
+) -> None:
+    path = foreign(tmp_path / "a.mcap", SHUFFLED, **options)
+    assert [s.message.height_m for s in read(path)] == list(range(500))
+    assert read_table(path, "/cf1/height")["height_m"].to_pylist() == list(range(500))
+    assert summary(path).topics["/cf1/height"].count == 500
+
+
+def test_a_stretch_of_time_is_half_open(flight: Path) -> None:
+    got = list(read(flight, "/cf1/range/cf2", start_ns=100_000_000, end_ns=300_000_000))
+    assert [s.time_ns for s in got] == [100_000_000, 200_000_000]
+    (batch,) = columns(flight, "/cf1/range/cf2", start_ns=100_000_000, end_ns=300_000_000)
+    assert batch["log_time"].to_pylist() == [100_000_000, 200_000_000]
+
+
+def test_equal_times_keep_their_order_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(30_000):
+            sink.write(k // 10_000, "/cf1/height", HEIGHT(height_m=k))
+    assert [s.message.height_m for s in read(path)] == list(range(30_000))
+
+
+def test_columns_hold_what_the_messages_hold(flight: Path) -> None:
+    table = read_table(flight, "/cf1/attitude")
+    got = [
+        (s.time_ns, s.message.roll_rad, s.message.pitch_rad) for s in read(flight, "/cf1/attitude")
+    ]
+    assert (
+        list(
+            zip(*(table[c].to_pylist() for c in ("log_time", "roll_rad", "pitch_rad")), strict=True)
+        )
+        == got
+    )
+    assert table.schema.names[:2] == ["log_time", "publish_time"]
+
+
+def test_only_the_fields_asked_for_are_decoded(flight: Path) -> None:
+    assert read_table(flight, "/cf1/attitude", fields=["roll_rad"]).schema.names == [
+        "log_time",
+        "publish_time",
+        "roll_rad",
+    ]
+    assert read_table(flight, "/cf1/attitude", fields=[]).num_rows == 4000
+
+
+def test_patterns_name_topics(flight: Path) -> None:
+    assert {raw.topic for raw in read_raw(flight, "/*/range/*")} == {"/cf1/range/cf2"}
+
+
+def test_a_missing_topic_is_named_with_the_nearest_before_the_first_message(flight: Path) -> None:
+    with pytest.raises(
+        MissingTopic, match=r"no topic /cf1/range/cf3 .* Did you mean /cf1/range/cf2\?"
+    ):
+        next(read(flight, "/cf1/range/cf3"))
+
+
+def test_a_topic_with_another_schema_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        writer.add_message(writer.register_channel("/cf1/labels", "protobuf", schema), 0, b"", 0)
+        writer.finish()
+    with pytest.raises(
+        RecordingError, match=r"/cf1/labels carries dmrl.v1.Height, not dmrl.v1.PeerLabels"
+    ):
+        list(read(path, "/cf1/labels"))
+
+
+def test_a_type_unknown_to_dmrl_is_read_by_its_own_schema(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "a.mcap", [1, 2])
+    data = path.read_bytes()
+    assert data.count(b"Height") >= 2
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start()
+        renamed = (
+            schema_bytes("Height").replace(b"Height", b"Weight").replace(b"dmrl.v1", b"else.v1")
+        )
+        schema = writer.register_schema("else.v1.Weight", "protobuf", renamed)
+        channel = writer.register_channel("/scale", "protobuf", schema)
+        writer.add_message(channel, 3, HEIGHT(height_m=2.5).SerializeToString(), 3)
+        writer.finish()
+    assert read_table(path, "/scale")["height_m"].to_pylist() == [2.5]
+    assert [s.message.height_m for s in read(path)] == [2.5]
+
+
+def test_a_json_channel_is_copied_but_not_decoded(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel(
+            "/note", "json", writer.register_schema("Note", "jsonschema", b"{}")
+        )
+        writer.add_message(channel, 0, b"{}", 0)
+        writer.finish()
+    assert [raw.data for raw in read_raw(path)] == [b"{}"]
+    with pytest.raises(RecordingError, match=r"/note is json, not protobuf"):
+        list(read(path))
+
+
+def test_memory_stays_bounded_when_chunks_touch_in_time(tmp_path: Path) -> None:
+    """Chunks that share their border time must not chain into one block."""
+    path = foreign(tmp_path / "a.mcap", [t for k in range(300) for t in (k, k)])
+    assert max(len(batch) for batch in columns(path, "/cf1/height")) < 50
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.1])
+def test_a_truncated_file_names_the_way_out(flight: Path, tmp_path: Path, share: float) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(flight.read_bytes()[: int(flight.stat().st_size * share)])
+    for use in (summary, lambda p: list(read(p)), lambda p: list(columns(p, "/cf1/attitude"))):
+        with pytest.raises(RecordingError, match=r"cut short.*dmrl recover"):
+            use(cut)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"", "is empty"),
+        (b"\x89MCAP0\r", "is not an MCAP file"),
+        (b"\x89MCAP0\r\n", "cut short"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(50), r"is not an MCAP file: it begins with b'\\x89PNG"),
+    ],
+    ids=["zero bytes", "7 bytes", "8 bytes", "a PNG"],
+)
+def test_what_is_no_recording_is_said_so(tmp_path: Path, content: bytes, complaint: str) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=complaint):
+        list(read(path))
+
+
+def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no recording"):
+        summary(tmp_path / "none.mcap")
+    with pytest.raises(RecordingError, match="is a folder"):
+        summary(tmp_path)
+
+
+def test_every_flipped_byte_is_an_error_or_harmless(flight: Path, tmp_path: Path) -> None:
+    """No single damaged byte gives another exception than ours, or silently other values."""
+    data = flight.read_bytes()
+    good = list(read_raw(flight))
+    path = tmp_path / "bad.mcap"
+    rng = np.random.default_rng(1)
+    for at in rng.integers(8, len(data), 400):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :])
+        try:
+            got = list(read_raw(path))
+        except RecordingError:
+            continue
+        # A flip in metadata, or in a part of the summary that is not needed, does nothing.
+        assert [(r.time_ns, r.data) for r in got] == [(r.time_ns, r.data) for r in good], at
+
+
+def test_a_bad_message_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        writer.add_message(channel, 0, struct.pack("<Bf", 9, 1.0), 0)  # a double cut in half
+        writer.finish()
+    with pytest.raises(RecordingError, match="/cf1/height"):
+        list(columns(path, "/cf1/height"))
+    with pytest.raises(RecordingError, match="/cf1/height"):
+        list(read(path))
+
+
+def test_an_empty_recording_has_no_messages(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")):
+        pass
+    assert list(read(path)) == []
+    assert summary(path).count == 0
+    assert io.BytesIO(path.read_bytes()).read(8) == b"\x89MCAP0\r\n"
