@@ -75,8 +75,8 @@ def size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
 def encode_png(rgb: Rgb) -> bytes:
     """Lossless PNG of an (H, W, 3) uint8 RGB array. Same pixels, same bytes."""
     buffer = BytesIO()
-    # Level 3 is three times as fast as the default 6 and 2 % larger on camera images.
-    Image.fromarray(rgb).save(buffer, "PNG", compress_level=3)
+    # Level 1 takes half the time of the default 6; camera images grow by a tenth.
+    Image.fromarray(rgb).save(buffer, "PNG", compress_level=1)
     return buffer.getvalue()
 
 

@@ -29,6 +29,7 @@ from dmrl.geometry import Camera
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
 LABELS = "labels.csv"
+CALIBRATION = "calibration.toml"
 TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
 NS_PER_S = 1_000_000_000
 TIME_MAX_NS = 2**63 - 1
@@ -95,7 +96,6 @@ def content(source: Path, options: Options) -> Content:
         samples=_samples(pictures, rows, options),
         total=len(pictures) + len(rows) + (options.camera is not None),
         split=intervals((time_ns, splits.get(p.name)) for time_ns, p in pictures),
-        inputs=(options.labels,) if options.labels else (),
     )
 
 

@@ -4,9 +4,10 @@ A new format is one file in ``dmrl/formats`` and one row in ``KINDS``.
 """
 
 import json
+import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +26,7 @@ from dmrl.recording import SPLIT_METADATA, RecordingWriter, provenance
 from dmrl.tables import print_json, print_table
 
 CAMERAS = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
-CALIBRATION = "calibration.toml"
+ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
@@ -57,7 +58,7 @@ class Settings:
     robot: str = "cf1"
     rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 10.0
     labels: Path | None = None
-    camera: str | None = None
+    camera: Path | None = None
     width_px: Positive | None = None
     height_px: Positive | None = None
 
@@ -85,14 +86,16 @@ def _images(source: Path, settings: Settings) -> Content:
         camera=_camera(source, settings.camera),
         size_px=None if size_px[0] is None or size_px[1] is None else (size_px[0], size_px[1]),
     )
-    return image_folder.content(source, options)
+    content = image_folder.content(source, options)
+    read = (path for path in (settings.labels, settings.camera) if path and path.is_file())
+    return replace(content, inputs=tuple(read))
 
 
-def _camera(source: Path, name: str | None) -> Camera | None:
+def _camera(source: Path, name: Path | None) -> Camera | None:
     if name is None:
-        own = source / CALIBRATION
+        own = source / image_folder.CALIBRATION
         return read_camera(own) if own.is_file() else None
-    return CAMERAS.get(name) or read_camera(Path(name))
+    return CAMERAS.get(str(name)) or read_camera(name)
 
 
 # Looked at in this order: the published set is a folder of pictures too.
@@ -154,6 +157,7 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
         If ``out`` exists or cannot be written.
     """
     refuse_existing(out)
+    _check(settings)
     content = kind_of(source, settings.source_kind).content(source, settings)
     made = provenance("convert", settings, (source, *content.inputs), libraries=("pillow", "numpy"))
     counts: Counter[str] = Counter()
@@ -165,6 +169,14 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
             sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
             counts[sample.topic] += 1
     return dict(sorted(counts.items()))
+
+
+def _check(settings: Settings) -> None:
+    if not ROBOT.fullmatch(settings.robot):
+        raise SettingError(f"--robot {settings.robot!r} cannot stand in a topic. Try: cf1")
+    sizes = [size for size in (settings.width_px, settings.height_px) if size is not None]
+    if settings.rate_hz <= 0 or min(sizes, default=1) < 1:
+        raise SettingError("--rate-hz, --width-px and --height-px must be over 0. Raise them")
 
 
 DEFAULTS = Settings()

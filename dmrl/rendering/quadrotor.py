@@ -1,0 +1,115 @@
+"""A small quadrotor of boxes and discs, the size of a Crazyflie. Metres, body frame.
+
+Body frame: origin between the motors, x forward, y left, z up.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.geometry import Array
+
+ARM_M = 0.046
+ROTOR_RADIUS_M = 0.0235
+ROTOR_Z_M = 0.013
+BLADE_HALF_WIDTH_M = 0.003
+DISC_CORNERS = 20
+ARM_ANGLES_RAD = np.pi / 4 + np.arange(4) * np.pi / 2
+
+# The six faces of a box by its corners; corner k has the signs of the bits of k (x, y, z).
+FACES = np.array(
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+)
+SIGNS = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)]) * 2.0 - 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Flat faces.
+
+    Parameters
+    ----------
+    corners
+        (F, 4, 3) metres, body frame, anticlockwise seen from outside.
+    normals
+        (F, 3) outward, unit length.
+    colours
+        (F, 3) red, green, blue, 0 to 1.
+    glows
+        (F,) whether a face shines by itself.
+    """
+
+    corners: Array
+    normals: Array
+    colours: Array
+    glows: NDArray[np.bool_]
+
+
+def _boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Array, bool]]:
+    """Centre, half sizes, yaw, colour and glow of every box."""
+    black, dark = np.array([0.05, 0.05, 0.06]), np.array([0.12, 0.12, 0.13])
+    metal, grey = np.array([0.45, 0.45, 0.47]), np.array([0.3, 0.31, 0.33])
+    for angle in ARM_ANGLES_RAD:
+        x, y = np.cos(angle), np.sin(angle)
+        middle = ARM_M * 0.6
+        yield (x * middle, y * middle, 0.0), np.array([0.019, 0.003, 0.001]), angle, dark, False
+        motor = (x * ARM_M, y * ARM_M, 0.001)
+        yield motor, np.array([0.0038, 0.0038, 0.009]), angle, metal, False
+        foot = (x * ARM_M, y * ARM_M, -0.0105)
+        yield foot, np.array([0.003, 0.003, 0.004]), angle, dark, False
+        # As on the Crazyflie: blue behind, red and green in front.
+        led = np.array([0.2, 0.35, 1.0]) if x < 0 else np.array([1.0, 0.2, 0.1])
+        at = (x * ARM_M * 0.72, y * ARM_M * 0.72, 0.0018)
+        yield at, np.array([0.0017, 0.0017, 0.001]), angle, led, True
+    yield (0.0, 0.0, 0.0), np.array([0.0155, 0.0155, 0.001]), 0.0, black, False
+    yield (0.0, 0.0, 0.0055), np.array([0.0175, 0.010, 0.0035]), 0.0, grey, False
+    yield (0.0, 0.0, 0.0115), np.array([0.0145, 0.0145, 0.0008]), 0.0, black, False
+    yield (-0.006, 0.0, 0.0145), np.array([0.004, 0.012, 0.0022]), 0.0, metal, False
+    yield (0.0, 0.0, -0.006), np.array([0.0145, 0.0145, 0.0008]), 0.0, black, False
+    yield (0.013, 0.0, -0.0085), np.array([0.003, 0.003, 0.003]), 0.0, dark, False
+
+
+def _mesh() -> Mesh:
+    corners, normals, colours, glows = [], [], [], []
+    for centre, half, yaw, colour, glow in _boxes():
+        c, s = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        box = (SIGNS * half) @ turn.T
+        outward = box[FACES].mean(axis=1)
+        corners.append(box[FACES] + centre)
+        normals.append(outward / np.linalg.norm(outward, axis=1, keepdims=True))
+        colours.append(np.tile(colour, (len(FACES), 1)))
+        glows.append(np.full(len(FACES), glow))
+    return Mesh(*(np.concatenate(part) for part in (corners, normals, colours, glows)))
+
+
+MESH = _mesh()
+
+
+def blades(turn_rad: float) -> Array:
+    """(4, 4, 3) outlines of the blades, each rotor a quarter of a turn further."""
+    angle = turn_rad + ARM_ANGLES_RAD * 1.5
+    along = np.stack([np.cos(angle), np.sin(angle), np.zeros(4)], axis=1) * ROTOR_RADIUS_M
+    across = np.stack([-np.sin(angle), np.cos(angle), np.zeros(4)], axis=1) * BLADE_HALF_WIDTH_M
+    outline = np.stack([along + across, along - across, -along - across, -along + across], axis=1)
+    return outline + _hubs()[:, None]
+
+
+def _hubs() -> Array:
+    x, y = np.cos(ARM_ANGLES_RAD) * ARM_M, np.sin(ARM_ANGLES_RAD) * ARM_M
+    return np.stack([x, y, np.full(4, ROTOR_Z_M)], axis=1)
+
+
+def _discs() -> Array:
+    turn = np.arange(DISC_CORNERS) * 2 * np.pi / DISC_CORNERS
+    rim = np.stack([np.cos(turn), np.sin(turn), np.zeros(DISC_CORNERS)], axis=1) * ROTOR_RADIUS_M
+    return rim + _hubs()[:, None]
+
+
+DISCS = _discs()
+"""(4, DISC_CORNERS, 3) outlines of what the rotors sweep."""
+
+RADIUS_M = float(np.hypot(ARM_M + ROTOR_RADIUS_M, ROTOR_Z_M))
+"""Radius of a ball about the origin that holds the whole quadrotor."""

@@ -1,0 +1,90 @@
+"""Random poses and looks for sketches."""
+
+import numpy as np
+from numpy.random import Generator
+
+from dmrl.geometry import Array, Camera, camera_from_horizontal
+from dmrl.rendering.background import background
+from dmrl.rendering.quadrotor import RADIUS_M
+from dmrl.rendering.sketch import Look, Pose
+
+DEPTH_M = (0.2, 2.0)
+TILT_MAX_RAD = float(np.radians(20))
+TRIES = 30
+
+
+def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
+    """At most ``count`` robots, uniform over the image, log-uniform in depth 0.2 to 2 m.
+
+    Robots keep apart in the image, so that none hides the centre of another; where there
+    is no room for one more, there are fewer.
+
+    Parameters
+    ----------
+    rng
+        Where the randomness comes from.
+    camera
+        Its image is filled.
+    count
+        Robots wanted.
+    """
+    tilt = camera_from_horizontal(*rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist())
+    poses: list[Pose] = []
+    for _ in range(count * TRIES):
+        if len(poses) == count:
+            break
+        pose = Pose(_place(rng, camera), tilt @ _attitude(rng))
+        if all(_apart(pose.xyz_camera, other.xyz_camera) for other in poses):
+            poses.append(pose)
+    return poses
+
+
+def _place(rng: Generator, camera: Camera) -> Array:
+    u_px, v_px = rng.uniform((0, 0), (camera.width_px, camera.height_px))
+    depth_m = np.exp(rng.uniform(*np.log(DEPTH_M)))
+    left = (camera.cx_px - u_px) / camera.fx_px
+    up = (camera.cy_px - v_px) / camera.fy_px
+    return np.array([depth_m, depth_m * left, depth_m * up])
+
+
+def _attitude(rng: Generator) -> Array:
+    """Rotation horizontal_from_body: Rz(yaw) Ry(pitch) Rx(roll)."""
+    roll, pitch = rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist()
+    yaw = rng.uniform(-np.pi, np.pi)
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(turn @ camera_from_horizontal(roll, pitch).T)
+
+
+def _apart(one: Array, other: Array) -> bool:
+    """Whether neither hides the other's centre, and they do not touch."""
+    slope = np.hypot(*(one[1:] / one[0] - other[1:] / other[0]))
+    return bool(slope > RADIUS_M / min(one[0], other[0]))
+
+
+def random_look(rng: Generator, camera: Camera) -> Look:
+    """Background, light and sensor at random.
+
+    Parameters
+    ----------
+    rng
+        Where the randomness comes from.
+    camera
+        Gives the size of the picture.
+    """
+    towards = rng.normal((0.0, 0.0, 1.5), 1.0)
+    shape = (camera.height_px, camera.width_px, 1)
+    noise = rng.standard_normal(shape, np.float32) * np.float32(rng.uniform(0.003, 0.04))
+    return Look(
+        background=background(rng, camera.width_px, camera.height_px),
+        light_camera=towards / np.linalg.norm(towards),
+        ambient=rng.uniform(0.3, 0.7),
+        shine=rng.uniform(0.6, 1.6) * rng.normal(1, 0.06, 3),
+        rotor_opacity=rng.uniform(0.12, 0.5),
+        blade_rad=rng.uniform(0, np.pi),
+        blur=rng.uniform(0, 0.9),
+        vignette=rng.uniform(0, 0.5),
+        gain=np.exp(rng.normal(0.1, 0.2)) * rng.normal(1, 0.05, 3),
+        gamma=float(np.exp(rng.normal(0, 0.2))),
+        noise=noise,
+    )

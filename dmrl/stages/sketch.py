@@ -1,0 +1,170 @@
+"""``dmrl sketch``: a folder of pictures drawn by code, as ``dmrl convert --from images`` reads.
+
+So a demonstration takes the same road as anyone's own pictures.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from cyclopts import Parameter, validators
+from numpy.random import Generator
+
+from dmrl.errors import SettingError
+from dmrl.formats.camera_toml import write_camera
+from dmrl.formats.image_folder import CALIBRATION, LABELS
+from dmrl.formats.label_table import LabelRow, write_labels
+from dmrl.geometry import AIDECK, Camera
+from dmrl.images import encode_png
+from dmrl.output import partial_folder
+from dmrl.progress import track
+from dmrl.recording import provenance
+from dmrl.rendering.scene import random_look, random_poses
+from dmrl.rendering.sketch import Sketch, draw
+from dmrl.tables import print_json, print_table
+
+CAMERA = replace(AIDECK, distortion=())
+"""The AI-deck's camera without its distortion."""
+
+Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is drawn.
+
+    Parameters
+    ----------
+    images
+        Pictures to draw.
+    seed
+        Another seed draws other pictures.
+    robots_max
+        Robots in a picture, at most.
+    empty_share
+        Share of pictures without a robot, 0 to 1.
+    test_share
+        Share of pictures, the last ones, that form the test split, 0 to 1.
+    """
+
+    images: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=999_999))] = 600
+    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0
+    robots_max: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=20))] = 3
+    empty_share: Share = 0.1
+    test_share: Share = 0.2
+
+
+def run(out: Path, settings: Settings) -> dict[str, int]:
+    """Counts of pictures and robots drawn into the folder ``out``.
+
+    Parameters
+    ----------
+    out
+        Folder to write. Must not exist.
+    settings
+        See `Settings`.
+
+    Raises
+    ------
+    SettingError
+        If a setting is out of range.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    _check(settings)
+    rows: list[LabelRow] = []
+    with partial_folder(out) as partial:
+        for index in track(range(settings.images), "Drawing"):
+            name = f"{index:06d}.png"
+            picture = sketch(settings, index)
+            (partial / name).write_bytes(encode_png(picture.rgb))
+            rows += _rows(name, picture, _split(settings, index))
+        with (partial / LABELS).open("w", newline="", encoding="utf-8") as stream:
+            write_labels(stream, rows)
+        (partial / CALIBRATION).write_text(write_camera(CAMERA), encoding="utf-8")
+        made = provenance("sketch", settings, seed=settings.seed, libraries=("numpy", "pillow"))
+        made.write(partial)
+    empty = sum(not row.peer for row in rows)
+    return {"images": settings.images, "robots": len(rows) - empty, "empty images": empty}
+
+
+def sketch(settings: Settings, index: int, camera: Camera = CAMERA) -> Sketch:
+    """Picture number ``index``, the same whatever else is drawn.
+
+    Parameters
+    ----------
+    settings
+        Seed, and how many robots.
+    index
+        Number of the picture, from 0.
+    camera
+        Without distortion.
+    """
+    rng = np.random.default_rng((settings.seed, index))
+    poses = random_poses(rng, camera, _count(rng, settings))
+    return draw(camera, poses, random_look(rng, camera))
+
+
+def _count(rng: Generator, settings: Settings) -> int:
+    empty = rng.random() < settings.empty_share
+    return 0 if empty else int(rng.integers(1, settings.robots_max + 1))
+
+
+def _split(settings: Settings, index: int) -> str:
+    first_test = settings.images - round(settings.images * settings.test_share)
+    return "test" if index >= first_test else "train"
+
+
+def _rows(name: str, picture: Sketch, split: str) -> Iterator[LabelRow]:
+    if not len(picture.depth_m):
+        yield LabelRow(name, "", source="truth", split=split)
+    for k, ((u_px, v_px), depth_m) in enumerate(zip(picture.uv_px, picture.depth_m, strict=True)):
+        box = tuple(picture.box_px[k].tolist())
+        yield LabelRow(
+            file=name,
+            peer=f"cf{k + 2}",
+            u_px=u_px,
+            v_px=v_px,
+            depth_m=depth_m,
+            box_px=() if np.isnan(box).any() else box,
+            visible_share=float(picture.visible_share[k]),
+            source="truth",
+            split=split,
+        )
+
+
+def _check(settings: Settings) -> None:
+    if not (1 <= settings.images <= 999_999 and 1 <= settings.robots_max <= 20):
+        raise SettingError("--images must be 1 to 999999 and --robots-max 1 to 20. Change them")
+    if settings.seed < 0:
+        raise SettingError(f"--seed {settings.seed} is negative. Choose 0 or more")
+    if not (0 <= settings.empty_share <= 1 and 0 <= settings.test_share <= 1):
+        raise SettingError("--empty-share and --test-share must be 0 to 1. Change them")
+
+
+DEFAULTS = Settings()
+
+
+def command(
+    out: Path,
+    /,
+    *,
+    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Draw a folder of pictures of small drones, with exact labels.
+
+    Parameters
+    ----------
+    out
+        Folder to write. Must not exist.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    counts = run(out, settings)
+    if as_json:
+        print_json({"folder": str(out), **counts})
+        return
+    print_table(str(out), ("what", "count"), list(counts.items()))
