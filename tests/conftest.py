@@ -1,0 +1,17 @@
+"""What every test may use."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Real data: the published set, weights, frames, logs. Skips where they are absent."""
+    folder = Path(os.environ.get("DMRL_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip("no real data; set DMRL_DATA to the folder that holds it")
+    return folder
