@@ -1,0 +1,72 @@
+# From a fresh checkout: `make demo`, or `make test`. Each makes .venv first.
+# Needed before that: Python 3.11 or newer, make, a C compiler.
+
+VENV ?= .venv
+PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,$(shell command -v $(p) 2>/dev/null)))
+BIN := $(abspath $(VENV))/bin
+LAYOUT := build/layout
+INSTALL := $(BIN)/pip install --constraint constraints.txt --editable
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-all check format lint types imports spell schemas docs layout clean
+
+help: ## Show this list.
+	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+
+demo: $(VENV)/.demo ## Run the whole pipeline, small; pictures and a table end up in demo/.
+	$(BIN)/dmrl demo --out demo
+
+test: $(VENV)/.dev ## Run the tests that take seconds. ARGS="-k name" picks some.
+	$(BIN)/pytest $(ARGS)
+
+test-all: $(VENV)/.dev ## Run every test, the slow ones too.
+	$(BIN)/pytest -m "slow or not slow" $(ARGS)
+
+check: format lint types imports spell ## Check format, lint, types, imports and spelling.
+
+format: $(VENV)/.dev ## Check that the code is formatted.
+	$(BIN)/ruff format --check .
+
+lint: $(VENV)/.dev ## Look for mistakes that a linter finds.
+	$(BIN)/ruff check .
+
+types: $(VENV)/.dev layout ## Check types, strictly.
+	cd $(LAYOUT) && $(BIN)/mypy --config-file $(CURDIR)/pyproject.toml
+
+imports: $(VENV)/.dev layout ## Check that imports go down only.
+	cd $(LAYOUT) && $(BIN)/lint-imports --config $(CURDIR)/pyproject.toml
+
+spell: $(VENV)/.dev ## Check spelling.
+	$(BIN)/codespell
+
+schemas: $(VENV)/.dev ## Build the message classes again from schemas/dmrl/v1/*.proto.
+	$(BIN)/python schemas/build.py
+
+docs: $(VENV)/.dev ## Write the generated parts of README.md and docs/ again.
+	$(BIN)/python docs/build.py
+
+clean: ## Remove what was built, .venv and demo/ as well.
+	rm -rf $(VENV) build demo *.egg-info
+
+# viewer/, schemas/ and recipes/ are imported as dmrl.viewer and so on. Tools that read the
+# source without importing it see them there only in a tree laid out as it is installed.
+layout:
+	@rm -rf $(LAYOUT)
+	@mkdir -p $(LAYOUT)/dmrl
+	@ln -s $(CURDIR)/dmrl/* $(CURDIR)/viewer $(CURDIR)/schemas $(CURDIR)/recipes $(LAYOUT)/dmrl/
+
+$(VENV)/.pip:
+	@test -n "$(PYTHON)" || { echo "dmrl needs Python 3.11 or newer; none was found" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("dmrl needs Python 3.11 or newer. Try: make PYTHON=/path/to/python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --upgrade 'pip>=25.1'
+	@touch $@
+
+$(VENV)/.demo: $(VENV)/.pip pyproject.toml constraints.txt
+	$(INSTALL) '.[train,view,plot]'
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.pip pyproject.toml constraints.txt
+	$(INSTALL) '.[all]' --group dev
+	@touch $(VENV)/.demo $@
