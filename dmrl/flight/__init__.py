@@ -1,0 +1,25 @@
+"""Simulated flights: how robots move, and what their sensors make of it. Arrays only.
+
+``simulate(scenario, noise, seed)`` gives every robot's log, the ranges between them and the
+truth. A robot's own randomness depends on the seed and its number alone, so adding robots
+changes nothing for those already there.
+"""
+
+from dmrl.flight.arrays import Clock, Flight, Ranges, RobotLog, Truth
+from dmrl.flight.motion import TRAJECTORIES, Trajectory
+from dmrl.flight.noise import NOISE, Noise
+from dmrl.flight.simulate import Scenario, simulate
+
+__all__ = [
+    "NOISE",
+    "TRAJECTORIES",
+    "Clock",
+    "Flight",
+    "Noise",
+    "Ranges",
+    "RobotLog",
+    "Scenario",
+    "Trajectory",
+    "Truth",
+    "simulate",
+]

@@ -1,0 +1,268 @@
+"""How robots move: commands, a lag in velocity and yaw rate, tilt from acceleration.
+
+The plane is complex inside this file: x is the real part, y the imaginary one, and a turn by
+``yaw`` is a product with exp(1j yaw).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from dmrl.flight.arrays import RATE_HZ, Truth
+from dmrl.geometry import Array
+
+Plane = NDArray[np.complex128]
+Signal = TypeVar("Signal", Plane, Array)
+Trajectory = Literal[
+    "in_view",
+    "random",
+    "lawn_mower",
+    "hover",
+    "parallel",
+    "observer_static",
+    "peer_static",
+    "no_yaw",
+    "both_static",
+]
+
+VELOCITY_LAG_S = 0.25
+YAW_RATE_LAG_S = 0.15
+GRAVITY_MPS2 = 9.81
+SPEED_MAX_MPS = 1.2
+VIEW_DISTANCE_M = (0.5, 2.0)
+VIEW_BEARING_RAD = 0.6
+VIEW_REDRAW_S = 2.5
+FOLLOW_GAIN_PER_S = 2.0
+HOVER_SPEED_MPS = 0.03
+ROW_M, ROW_GAP_M, ROWS = 2.0, 0.4, 5
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """One robot's way over the floor, (N,) each, 100 Hz.
+
+    Parameters
+    ----------
+    position, velocity
+        World frame, metres and metres per second, complex.
+    yaw
+        Radians, not wrapped.
+    yaw_rate
+        Radians per second.
+    """
+
+    position: Plane
+    velocity: Plane
+    yaw: Array
+    yaw_rate: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a robot is when the flight begins.
+
+    Parameters
+    ----------
+    samples
+        Length of the flight at 100 Hz.
+    position
+        World frame, metres, complex.
+    yaw_rad
+        Against world x.
+    """
+
+    samples: int
+    position: complex
+    yaw_rad: float
+
+
+Mover = Callable[[Generator, Start, "Motion | None"], Motion]
+
+
+def lagged(commands: Signal, lag_s: float) -> Signal:
+    """(N,) what becomes of piecewise constant commands behind a first-order lag, from rest."""
+    share = 1.0 - np.exp(-1.0 / (RATE_HZ * lag_s))
+    values = accumulate(commands.tolist(), lambda v, u: v + share * (u - v), initial=0.0)
+    return np.array(list(values)[1:], commands.dtype)
+
+
+def _integrated(rate: Signal, start: complex) -> Signal:
+    """(N,) integral by the trapezoid rule: its central differences are the mean rates."""
+    steps = (rate[1:] + rate[:-1]) / (2 * RATE_HZ)
+    return np.concatenate([[start], start + np.cumsum(steps)]).astype(rate.dtype)
+
+
+def _motion(start: Start, velocity_own: Plane, yaw_rate: Array) -> Motion:
+    """The motion of a robot that flies these velocities in its own horizontal frame."""
+    yaw = np.real(_integrated(yaw_rate, start.yaw_rad))
+    velocity = velocity_own * np.exp(1j * yaw)
+    return Motion(_integrated(velocity, start.position), velocity, yaw, yaw_rate)
+
+
+def _held(draws: Signal, hold_s: float, samples: int) -> Signal:
+    """(samples,) each draw held for a while."""
+    held: Signal = draws[(np.arange(samples) / (RATE_HZ * hold_s)).astype(int)]
+    return held
+
+
+def _draws(hold_s: float, samples: int) -> int:
+    return int(samples / (RATE_HZ * hold_s)) + 2
+
+
+def back_and_forth(speed_mps: float, yaw_rate_radps: float, hold_s: float) -> Mover:
+    """A robot that flies a random velocity for a while, and then back the same way.
+
+    Parameters
+    ----------
+    speed_mps
+        Each axis is uniform within plus and minus this, in the robot's own frame.
+    yaw_rate_radps
+        Uniform within plus and minus this.
+    hold_s
+        Seconds one way.
+    """
+
+    def move(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+        count = _draws(2 * hold_s, start.samples)
+        vx, vy, turn = rng.uniform(-1.0, 1.0, (3, count))
+        ways = np.array([1.0, -1.0])
+        velocity = np.asarray(speed_mps * np.outer(vx + 1j * vy, ways).ravel(), complex)
+        yaw_rate = np.asarray(yaw_rate_radps * np.outer(turn, ways).ravel(), float)
+        return _motion(
+            start,
+            lagged(_held(velocity, hold_s, start.samples), VELOCITY_LAG_S),
+            lagged(_held(yaw_rate, hold_s, start.samples), YAW_RATE_LAG_S),
+        )
+
+    return move
+
+
+def in_view(yaw_rate_radps: float) -> Mover:
+    """A robot that keeps to changing points in front of the leader.
+
+    Parameters
+    ----------
+    yaw_rate_radps
+        Its own yaw rate is uniform within plus and minus this, redrawn with each point.
+    """
+
+    def move(rng: Generator, start: Start, leader: Motion | None) -> Motion:
+        assert leader is not None
+        count = _draws(VIEW_REDRAW_S, start.samples)
+        points, turns = view_points(rng, count), rng.uniform(-1.0, 1.0, count)
+        ahead = _held(points, VIEW_REDRAW_S, start.samples) * np.exp(1j * leader.yaw)
+        turning = _held(turns, VIEW_REDRAW_S, start.samples) * yaw_rate_radps
+        yaw_rate = lagged(turning, YAW_RATE_LAG_S)
+        carried = leader.velocity + 1j * leader.yaw_rate * ahead
+        velocity = _following(leader.position + ahead, carried)
+        yaw = np.real(_integrated(yaw_rate, start.yaw_rad))
+        first = complex(leader.position[0] + ahead[0])
+        return Motion(_integrated(velocity, first), velocity, yaw, yaw_rate)
+
+    return move
+
+
+def view_points(rng: Generator, count: int) -> Plane:
+    """(count,) points in front of a robot, in its horizontal frame, metres."""
+    distance = rng.uniform(*VIEW_DISTANCE_M, count)
+    bearing = rng.uniform(-VIEW_BEARING_RAD, VIEW_BEARING_RAD, count)
+    return np.asarray(distance * np.exp(1j * bearing))
+
+
+def _following(target: Plane, carried: Plane) -> Plane:
+    """(N,) world velocity of a robot that starts on a moving target and stays near it."""
+    share = 1.0 - np.exp(-1.0 / (RATE_HZ * VELOCITY_LAG_S))
+    position, velocity = complex(target[0]), 0j
+    flown = []
+    for goal, speed in zip(target.tolist(), carried.tolist(), strict=True):
+        wanted = speed + FOLLOW_GAIN_PER_S * (goal - position)
+        wanted *= min(1.0, SPEED_MAX_MPS / max(abs(wanted), 1e-9))
+        before = velocity
+        velocity += share * (wanted - velocity)
+        position += (velocity + before) / (2 * RATE_HZ)
+        flown.append(velocity)
+    return np.array(flown)
+
+
+def still(_rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+    """A robot that does not move at all."""
+    return _motion(start, np.zeros(start.samples, complex), np.zeros(start.samples))
+
+
+def hover(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+    """A robot that holds its place as well as a small drone does: a few centimetres."""
+    pushes = rng.normal(0.0, HOVER_SPEED_MPS, (2, _draws(1.0, start.samples)))
+    # Differences, so that the pushes cancel and the robot stays.
+    velocity = np.diff(pushes[0] + 1j * pushes[1], prepend=0.0)
+    return _motion(
+        start,
+        lagged(_held(velocity, 1.0, start.samples), VELOCITY_LAG_S),
+        np.zeros(start.samples),
+    )
+
+
+def parallel(_rng: Generator, start: Start, leader: Motion | None) -> Motion:
+    """A robot that flies exactly as the leader does, beside it."""
+    assert leader is not None
+    position = leader.position + (start.position - leader.position[0])
+    return Motion(position, leader.velocity, leader.yaw, leader.yaw_rate)
+
+
+def lawn_mower(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+    """A robot that flies rows to and fro in its own frame, and then the same field back."""
+    speed = rng.uniform(0.3, 0.6)
+    row, gap = ROW_M / speed, ROW_GAP_M / speed
+    legs = [(row, (-1) ** k * 1.0) for k in range(ROWS)]
+    field = [leg for k in range(ROWS - 1) for leg in (legs[k], (gap, 1j))] + [legs[-1]]
+    round_trip = field + [(lasts, -way) for lasts, way in reversed(field)]
+    ends = np.cumsum([lasts for lasts, _ in round_trip])
+    phase = (np.arange(start.samples) / RATE_HZ) % ends[-1]
+    ways = np.array([way for _, way in round_trip])[np.searchsorted(ends, phase, side="right")]
+    return _motion(start, lagged(speed * ways, VELOCITY_LAG_S), np.zeros(start.samples))
+
+
+TRAJECTORIES: dict[Trajectory, tuple[Mover, Mover]] = {
+    "in_view": (back_and_forth(0.5, 0.4, 1.5), in_view(0.8)),
+    "random": (back_and_forth(1.0, 0.5, 1.0), back_and_forth(1.0, 0.5, 1.0)),
+    "lawn_mower": (lawn_mower, lawn_mower),
+    "hover": (hover, hover),
+    "parallel": (back_and_forth(0.5, 0.4, 1.5), parallel),
+    "observer_static": (still, in_view(0.8)),
+    "peer_static": (back_and_forth(0.5, 0.4, 1.5), still),
+    "no_yaw": (back_and_forth(0.5, 0.0, 1.5), in_view(0.0)),
+    "both_static": (still, still),
+}
+"""How the first robot moves, and how every other one does."""
+
+
+def truth_of(motion: Motion, height_m: Array) -> Truth:
+    """The truth of a robot: its motion, its height, and the tilt that its motion takes.
+
+    Thrust points along the body's z, so a robot that accelerates forward pitches nose down
+    and one that accelerates to the left rolls left side down.
+
+    Parameters
+    ----------
+    motion
+        Over the floor.
+    height_m
+        (N,) above the floor.
+    """
+    pull_xy = np.gradient(motion.velocity) * RATE_HZ * np.exp(-1j * motion.yaw)
+    climb = np.gradient(height_m) * RATE_HZ
+    pull_z = GRAVITY_MPS2 + np.gradient(climb) * RATE_HZ
+    pitch = np.arctan2(pull_xy.real, pull_z)
+    roll = -np.arctan2(pull_xy.imag, np.hypot(pull_xy.real, pull_z))
+    return Truth(
+        time_s=np.arange(len(height_m)) / RATE_HZ,
+        position=np.stack([motion.position.real, motion.position.imag, height_m], axis=1),
+        velocity=np.stack([motion.velocity.real, motion.velocity.imag, climb], axis=1),
+        yaw=motion.yaw,
+        roll=roll,
+        pitch=pitch,
+    )

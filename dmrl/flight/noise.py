@@ -1,0 +1,136 @@
+"""How wrong sensors are: one number per kind of error, and named presets."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Errors of every sensor, standard deviations where nothing else is said.
+
+    What is "per flight" is drawn once for a robot, or for a pair of robots.
+
+    Parameters
+    ----------
+    uwb_white_m
+        Of each range.
+    uwb_bias_m, uwb_scale
+        Per flight and pair: added, and share of the range.
+    nlos_share, nlos_mean_m
+        Share of ranges whose signal took a detour, 0 to 1; mean of its exponential length.
+    ranging_rate_hz, ranging_loss
+        Ranges per second and direction, before a share of them, 0 to 1, is lost.
+    velocity_white_mps, velocity_coloured_mps, velocity_tau_s
+        Of each sample at 100 Hz, per axis; the coloured part fades with this time constant.
+    velocity_scale, velocity_bias_mps
+        Per flight: share of the velocity, one for both axes; added, per axis.
+    yaw_rate_white_radps, yaw_rate_bias_radps
+        Of each sample; per flight.
+    height_white_m, height_bias_m
+        Of each sample; per flight.
+    attitude_white_rad, attitude_bias_rad
+        Of roll and pitch, each sample; per flight.
+    clock_offset_s
+        Largest offset of a robot's clock against the first robot's, either way, uniform.
+    clock_drift_ppm
+        Of a robot's clock against the first robot's.
+    """
+
+    uwb_white_m: float = 0.0
+    uwb_bias_m: float = 0.0
+    uwb_scale: float = 0.0
+    nlos_share: float = 0.0
+    nlos_mean_m: float = 0.0
+    ranging_rate_hz: float = 50.0
+    ranging_loss: float = 0.0
+    velocity_white_mps: float = 0.0
+    velocity_coloured_mps: float = 0.0
+    velocity_tau_s: float = 0.3
+    velocity_scale: float = 0.0
+    velocity_bias_mps: float = 0.0
+    yaw_rate_white_radps: float = 0.0
+    yaw_rate_bias_radps: float = 0.0
+    height_white_m: float = 0.0
+    height_bias_m: float = 0.0
+    attitude_white_rad: float = 0.0
+    attitude_bias_rad: float = 0.0
+    clock_offset_s: float = 0.0
+    clock_drift_ppm: float = 0.0
+
+
+CALIBRATED = Noise(
+    uwb_white_m=0.10,
+    uwb_bias_m=0.03,
+    uwb_scale=0.01,
+    nlos_share=0.05,
+    nlos_mean_m=0.4,
+    ranging_loss=0.15,
+    velocity_white_mps=0.10,
+    velocity_coloured_mps=0.05,
+    velocity_scale=0.02,
+    velocity_bias_mps=0.01,
+    yaw_rate_white_radps=0.02,
+    yaw_rate_bias_radps=0.003,
+    height_white_m=0.02,
+    height_bias_m=0.01,
+    attitude_white_rad=0.005,
+    attitude_bias_rad=0.005,
+)
+
+REALISTIC = Noise(
+    uwb_white_m=0.10,
+    uwb_bias_m=0.10,
+    uwb_scale=0.02,
+    nlos_share=0.07,
+    nlos_mean_m=0.5,
+    ranging_loss=0.15,
+    velocity_white_mps=0.10,
+    velocity_coloured_mps=0.08,
+    velocity_scale=0.05,
+    velocity_bias_mps=0.015,
+    yaw_rate_white_radps=0.02,
+    yaw_rate_bias_radps=0.005,
+    height_white_m=0.02,
+    height_bias_m=0.02,
+    attitude_white_rad=0.005,
+    attitude_bias_rad=0.01,
+    clock_drift_ppm=10.0,
+)
+
+HARSH = Noise(
+    uwb_white_m=0.10,
+    uwb_bias_m=0.20,
+    uwb_scale=0.03,
+    nlos_share=0.12,
+    nlos_mean_m=0.8,
+    ranging_loss=0.20,
+    velocity_white_mps=0.25,
+    velocity_coloured_mps=0.12,
+    velocity_scale=0.10,
+    velocity_bias_mps=0.03,
+    yaw_rate_white_radps=0.03,
+    yaw_rate_bias_radps=0.01,
+    height_white_m=0.03,
+    height_bias_m=0.03,
+    attitude_white_rad=0.01,
+    attitude_bias_rad=0.02,
+    clock_offset_s=0.04,
+    clock_drift_ppm=20.0,
+)
+
+# Li et al. 2020, the simulation that the paper's filter was tuned on: white noise only, a
+# range at every step.
+PUBLISHED = Noise(
+    uwb_white_m=0.1,
+    ranging_rate_hz=100.0,
+    velocity_white_mps=0.25,
+    yaw_rate_white_radps=0.4,
+)
+
+NOISE: dict[str, Noise] = {
+    "ideal": Noise(),
+    "calibrated": CALIBRATED,
+    "realistic": REALISTIC,
+    "harsh": HARSH,
+    "published": PUBLISHED,
+}
+"""Presets by name. Attitude and clock drift are ours; the rest is measured or published."""

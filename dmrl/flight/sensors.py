@@ -1,0 +1,106 @@
+"""What sensors make of the truth."""
+
+from itertools import accumulate
+
+import numpy as np
+from numpy.random import Generator
+
+from dmrl.flight.arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
+from dmrl.flight.noise import Noise
+from dmrl.geometry import Array
+
+
+def coloured(rng: Generator, samples: int, std: float, tau_s: float) -> Array:
+    """(samples,) noise of one standard deviation throughout that fades with ``tau_s``."""
+    keep = float(np.exp(-1.0 / (RATE_HZ * tau_s)))
+    steps = rng.normal(0.0, std, samples)
+    steps[1:] *= np.sqrt(1.0 - keep**2)
+    return np.array(list(accumulate(steps.tolist(), lambda x, w: keep * x + w)))
+
+
+def robot_log(
+    rng: Generator, truth: Truth, yaw_rate: Array, clock: Clock, noise: Noise
+) -> RobotLog:
+    """What a robot measures of itself.
+
+    Parameters
+    ----------
+    rng
+        Where the randomness comes from.
+    truth
+        Of this robot.
+    yaw_rate
+        (N,) its true yaw rate, radians per second.
+    clock
+        Its clock.
+    noise
+        How wrong its sensors are.
+    """
+    samples = len(truth.time_s)
+
+    def sensed(true: Array, white: float, bias: float) -> Array:
+        return np.asarray(true + rng.normal(0.0, bias) + rng.normal(0.0, white, samples))
+
+    velocity = _velocity(rng, truth, noise)
+    return RobotLog(
+        time_s=clock.shows(truth.time_s),
+        roll_rad=sensed(truth.roll, noise.attitude_white_rad, noise.attitude_bias_rad),
+        pitch_rad=sensed(truth.pitch, noise.attitude_white_rad, noise.attitude_bias_rad),
+        yaw_rate_radps=sensed(yaw_rate, noise.yaw_rate_white_radps, noise.yaw_rate_bias_radps),
+        vx_mps=velocity[0],
+        vy_mps=velocity[1],
+        height_m=sensed(truth.position[:, 2], noise.height_white_m, noise.height_bias_m),
+    )
+
+
+def _velocity(rng: Generator, truth: Truth, noise: Noise) -> Array:
+    """(2, N) velocity from flow, in the robot's horizontal frame."""
+    samples = len(truth.time_s)
+    x, y, _ = truth.velocity.T
+    c, s = np.cos(truth.yaw), np.sin(truth.yaw)
+    scale = 1.0 + rng.normal(0.0, noise.velocity_scale)
+    bias = rng.normal(0.0, noise.velocity_bias_mps, (2, 1))
+    white = rng.normal(0.0, noise.velocity_white_mps, (2, samples))
+    slow = [
+        coloured(rng, samples, noise.velocity_coloured_mps, noise.velocity_tau_s) for _ in range(2)
+    ]
+    return np.asarray(scale * np.stack([c * x + s * y, c * y - s * x]) + bias + white + slow)
+
+
+def pair_errors(rng: Generator, noise: Noise) -> tuple[float, float]:
+    """Bias (metres) and scale (a factor) of the ranges of one pair of robots, for a flight."""
+    return float(rng.normal(0.0, noise.uwb_bias_m)), float(1 + rng.normal(0.0, noise.uwb_scale))
+
+
+def ranges(
+    rng: Generator,
+    here: Truth,
+    peer: Truth,
+    clock: Clock,
+    noise: Noise,
+    errors: tuple[float, float],
+) -> Ranges:
+    """Distances that one robot measures to another.
+
+    Parameters
+    ----------
+    rng
+        Where the randomness comes from.
+    here, peer
+        Truth of the robot that ranges, and of the one that answers.
+    clock
+        Of the robot that ranges.
+    noise
+        How wrong its ranges are, and how many there are.
+    errors
+        Bias and scale of this pair.
+    """
+    period_s = 1.0 / noise.ranging_rate_hz
+    time_s = np.arange(rng.uniform(0.0, period_s), here.time_s[-1], period_s)
+    distance = np.linalg.norm(peer.position_at(time_s) - here.position_at(time_s), axis=1)
+    bias_m, scale = errors
+    detour = rng.exponential(noise.nlos_mean_m, len(time_s))
+    detour *= rng.random(len(time_s)) < noise.nlos_share
+    measured = scale * distance + bias_m + detour + rng.normal(0.0, noise.uwb_white_m, len(time_s))
+    kept = rng.random(len(time_s)) >= noise.ranging_loss
+    return Ranges(clock.shows(time_s[kept]), np.maximum(measured[kept], 0.01))

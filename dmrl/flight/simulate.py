@@ -1,0 +1,146 @@
+"""A whole flight from a scenario, a noise preset and a seed."""
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.random import Generator
+
+from dmrl.errors import SettingError
+from dmrl.flight import motion, sensors
+from dmrl.flight.arrays import RATE_HZ, Clock, Flight
+from dmrl.flight.motion import TRAJECTORIES, Motion, Start, Trajectory
+from dmrl.flight.noise import Noise
+from dmrl.geometry import Array
+
+ROBOTS_MAX = 20
+HEIGHT_M = 1.0
+HEIGHT_SPREAD_M = 0.25
+SPACING_M = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Who flies, for how long, and how.
+
+    Parameters
+    ----------
+    robots
+        2 to 20, named cf1, cf2, ...; cf1 leads where a trajectory has a leader.
+    duration_s
+        Length of the flight.
+    trajectory
+        One of ``TRAJECTORIES``.
+    yaw_spread_rad
+        Robots start with a yaw within plus and minus this, uniform; the first one with 0.
+    """
+
+    robots: int = 2
+    duration_s: float = 100.0
+    trajectory: Trajectory = "in_view"
+    yaw_spread_rad: float = float(np.pi)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the robots."""
+        return tuple(f"cf{k + 1}" for k in range(self.robots))
+
+
+def simulate(scenario: Scenario, noise: Noise, seed: int) -> Flight:
+    """A flight: logs, ranges and truth. The same arguments give the same flight.
+
+    Parameters
+    ----------
+    scenario
+        Who flies, for how long, and how.
+    noise
+        How wrong the sensors are.
+    seed
+        Another seed gives another flight.
+
+    Raises
+    ------
+    SettingError
+        If the scenario cannot be flown.
+    """
+    _check(scenario)
+    motions = _motions(scenario, seed)
+    names = scenario.names
+    truth = {
+        name: motion.truth_of(motions[k], _height(_rng(seed, "height", k), scenario))
+        for k, name in enumerate(names)
+    }
+    clocks = {name: _clock(_rng(seed, "clock", k), k, noise) for k, name in enumerate(names)}
+    robots = {
+        name: sensors.robot_log(
+            _rng(seed, "log", k), truth[name], motions[k].yaw_rate, clocks[name], noise
+        )
+        for k, name in enumerate(names)
+    }
+    ranges = {
+        (names[i], names[j]): sensors.ranges(
+            _rng(seed, "range", i, j),
+            truth[names[i]],
+            truth[names[j]],
+            clocks[names[i]],
+            noise,
+            sensors.pair_errors(_rng(seed, "pair", min(i, j), max(i, j)), noise),
+        )
+        for i, j in permutations(range(len(names)), 2)
+    }
+    return Flight(robots, truth, ranges, clocks)
+
+
+PURPOSES = ("motion", "height", "clock", "log", "range", "pair", "start")
+
+
+def _rng(seed: int, purpose: str, *numbers: int) -> Generator:
+    return np.random.default_rng((seed, PURPOSES.index(purpose), *numbers))
+
+
+def _motions(scenario: Scenario, seed: int) -> list[Motion]:
+    first, others = TRAJECTORIES[scenario.trajectory]
+    made: list[Motion] = []
+    for k in range(scenario.robots):
+        move = others if k else first
+        start = _start(_rng(seed, "start", k), k, scenario)
+        made.append(move(_rng(seed, "motion", k), start, made[0] if k else None))
+    return made
+
+
+def _start(rng: Generator, k: int, scenario: Scenario) -> Start:
+    """The first robot starts at the origin; others in front of it, or spread on a spiral."""
+    samples = round(scenario.duration_s * RATE_HZ) + 1
+    if k == 0:
+        return Start(samples, 0j, 0.0)
+    yaw = float(rng.uniform(-1.0, 1.0) * scenario.yaw_spread_rad)
+    if scenario.trajectory in ("random", "lawn_mower"):
+        # Sunflower: neighbours stay about a spacing apart however many there are.
+        place = SPACING_M * np.sqrt(k) * np.exp(1j * (rng.uniform(-0.2, 0.2) + 2.4 * k))
+        return Start(samples, complex(place), yaw)
+    return Start(samples, complex(motion.view_points(rng, 1)[0]), yaw)
+
+
+def _height(rng: Generator, scenario: Scenario) -> Array:
+    """(N,) height of one robot, slowly varying, metres."""
+    time_s = np.arange(round(scenario.duration_s * RATE_HZ) + 1) / RATE_HZ
+    base = HEIGHT_M + rng.uniform(-HEIGHT_SPREAD_M, HEIGHT_SPREAD_M)
+    swing = 2 * np.pi * time_s / rng.uniform(15.0, 30.0) + rng.uniform(0, 2 * np.pi)
+    return np.asarray(base + 0.05 * np.sin(swing))
+
+
+def _clock(rng: Generator, k: int, noise: Noise) -> Clock:
+    if k == 0:
+        return Clock()
+    offset = rng.uniform(-noise.clock_offset_s, noise.clock_offset_s)
+    return Clock(float(offset), float(rng.normal(0.0, noise.clock_drift_ppm * 1e-6)))
+
+
+def _check(scenario: Scenario) -> None:
+    if not 2 <= scenario.robots <= ROBOTS_MAX:
+        raise SettingError(f"{scenario.robots} robots cannot be flown. Choose 2 to {ROBOTS_MAX}")
+    if not 1.0 <= scenario.duration_s <= 3600.0:
+        raise SettingError(f"a flight of {scenario.duration_s} s. Choose 1 to 3600 seconds")
+    if scenario.trajectory not in TRAJECTORIES:
+        kinds = ", ".join(TRAJECTORIES)
+        raise SettingError(f"no trajectory {scenario.trajectory!r}. There are: {kinds}")
