@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import pyarrow.compute as pc
 from cyclopts import Parameter
 
 from dmrl import recipe as recipes
@@ -141,7 +142,8 @@ def _model(
     network: Network, settings: Settings, train: Split, history: list[dict[str, float]]
 ) -> Model:
     height_px, width_px = train.image_shape
-    sources = train.table.column("source").unique().to_pylist()
+    peers = pc.list_flatten(train.table.column("peers"))
+    sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
     return Model(
         network,
         settings.architecture,
