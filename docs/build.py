@@ -39,10 +39,10 @@ def topics() -> str:
         (
             f"`{t.pattern.replace('{', '<').replace('}', '>')}`",
             f"`{t.message}`",
-            "" if t.frame == "-" else t.frame.replace("<", "&lt;"),
+            f"`{t.frame}`" if "<" in t.frame else t.frame,
             t.units,
             t.rate,
-            t.written_by,
+            t.written_by if t.written_by in COMMANDS else f"({t.written_by}, not there yet)",
         )
         for t in TOPICS
     ]
