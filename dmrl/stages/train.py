@@ -63,7 +63,8 @@ def run(
     init
         Model whose weights to start from. None: new weights, by the seed.
     resume
-        Go on with the interrupted training in ``<out>.partial``.
+        Go on with the interrupted training in ``<out>.partial``; from the start, if that had
+        not come to the end of its first epoch.
 
     Raises
     ------
@@ -94,7 +95,7 @@ def run(
             folder,
             validation=watched,
             identity=identity,
-            resume=resume,
+            resume=resume and has_checkpoint(folder),
         )
         made.write(folder)
         result = _train(training, settings, len(examples))
