@@ -16,10 +16,10 @@ RECIPES = sorted(ROOT.glob("recipes/*.toml"))
 
 
 def command_lines(page: Path) -> list[str]:
-    """``dmrl ...`` in the shell blocks of a page, or in the head of a recipe."""
+    """``dmrl ...`` in the shell blocks of a page, or in a recipe up to two spaces."""
     text = page.read_text(encoding="utf-8")
     if page.suffix == ".toml":
-        return re.findall(r"^# (dmrl .*)", text, re.MULTILINE)
+        return re.findall(r"^# (dmrl .*?)(?:  .*)?$", text, re.MULTILINE)
     blocks = re.findall(r"```(?:sh|console)\n(.*?)```", text, re.DOTALL)
     joined = "\n".join(blocks).replace("\\\n", " ")
     return re.findall(r"^(?:\$ )?(dmrl .*)", joined, re.MULTILINE)
