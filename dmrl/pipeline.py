@@ -64,7 +64,7 @@ def run(name: str | Path, out: Path, data: Path | None = None) -> list[Done]:
     DmrlError
         What a stage raises.
     """
-    pipeline = recipes.load_pipeline(name, settings_types())
+    pipeline = recipes.load_pipeline(name, STAGES, settings_of)
     if pipeline.needs_data and data is None:
         raise SettingError(f"{name} reads data that does not ship with dmrl. Say where: --data DIR")
     _check_order(name, pipeline)
@@ -75,9 +75,10 @@ def run(name: str | Path, out: Path, data: Path | None = None) -> list[Done]:
     ]
 
 
-def settings_types() -> dict[str, type[Any]]:
-    """The settings dataclass of every stage that a step may name."""
-    return {stage: _module(stage).Settings for stage in STAGES}
+def settings_of(stage: str) -> type[Any]:
+    """The settings dataclass of a stage."""
+    settings: type[Any] = _module(stage).Settings
+    return settings
 
 
 def _module(stage: str) -> Any:
@@ -140,7 +141,7 @@ def _located(name: str, folder: Path, data: Path | None) -> Path:
 
 def _call(step: Step, inputs: list[Path], out: Path) -> None:
     module = _module(step.stage)
-    settings = recipes.check(f"step {step.stage}", step.settings, module.Settings)
+    settings = recipes.check(f"step {step.stage}", step.settings, settings_of(step.stage))
     extra: dict[str, Any] = {}
     if step.stage == "train" and partial_of(out).exists():
         extra["resume"] = True

@@ -154,7 +154,7 @@ settings = { robot = "cf1" }
 
 
 def test_a_pipeline_is_its_steps_in_order_and_its_text(write: Write) -> None:
-    found = recipe.load_pipeline(write(PIPELINE), SCHEMAS)
+    found = recipe.load_pipeline(write(PIPELINE), SCHEMAS, SCHEMAS.__getitem__)
     assert found == Pipeline(
         (
             Step("draw", "a.mcap", ("{data}/pictures",), {"images": 3}),
@@ -168,7 +168,7 @@ def test_a_pipeline_is_its_steps_in_order_and_its_text(write: Write) -> None:
 def test_every_fault_of_a_pipeline_is_named_with_its_step(write: Write) -> None:
     text = PIPELINE.replace("images = 3", "imagse = 3").replace('robot = "cf1"', "robot = 1")
     with pytest.raises(RecipeError) as caught:
-        recipe.load_pipeline(write(f"seed = 3\n{text}"), SCHEMAS)
+        recipe.load_pipeline(write(f"seed = 3\n{text}"), SCHEMAS, SCHEMAS.__getitem__)
     faults = [line.split(":")[0].strip() for line in str(caught.value).splitlines()[1:]]
     assert faults == ["seed", "step.1.settings.imagse", "step.2.settings.robot"]
 
@@ -185,7 +185,7 @@ def test_every_fault_of_a_pipeline_is_named_with_its_step(write: Write) -> None:
 )
 def test_broken_pipelines_are_recipe_errors(write: Write, text: str, words: str) -> None:
     with pytest.raises(RecipeError, match=words):
-        recipe.load_pipeline(write(text), SCHEMAS)
+        recipe.load_pipeline(write(text), SCHEMAS, SCHEMAS.__getitem__)
 
 
 @pytest.mark.parametrize("name", recipe.names())
