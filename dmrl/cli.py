@@ -5,9 +5,11 @@ act on become one line and exit status 1.
 """
 
 import sys
+from difflib import get_close_matches
 from typing import NoReturn
 
-from cyclopts import App
+from cyclopts import App, CycloptsError, UnknownCommandError
+from rich.text import Text
 
 from dmrl import __version__
 from dmrl.errors import DmrlError
@@ -32,11 +34,24 @@ COMMANDS = {
     "trim": "Keep a stretch of a recording, or some of its topics.",
 }
 
+
+def bad_command_line(error: CycloptsError) -> Text:
+    """What is printed for a command line that cannot be understood."""
+    if not isinstance(error, UnknownCommandError) or not error.unused_tokens:
+        return Text(f"dmrl: {error}")
+    # The error's own text would load every command, and fail where an extra is missing.
+    word = error.unused_tokens[0]
+    near = get_close_matches(word, COMMANDS, n=1)
+    hint = f"Did you mean {near[0]}?" if near else "Try: dmrl --help"
+    return Text(f"dmrl: no command {word}. {hint}")
+
+
 app = App(
     name="dmrl",
     help="Teach tiny camera drones to see each other: recordings in, recordings out.",
     version=__version__,
     help_format="plaintext",
+    error_formatter=bad_command_line,
 )
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
     app.command(f"dmrl.stages.{_name}:command", name=_name, help=_help, sort_key=_order)

@@ -7,7 +7,7 @@ faults is refused whole, every fault named.
 
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from difflib import get_close_matches
 from importlib.resources import files
@@ -116,15 +116,19 @@ def load(name: str | Path, kind: str, schema: type[Settings]) -> Settings:
     return check(name, {k: v for k, v in keys.items() if k != "kind"}, schema)
 
 
-def load_pipeline(name: str | Path, schemas: Mapping[str, type[Any]]) -> Pipeline:
+def load_pipeline(
+    name: str | Path, stages: Collection[str], schema_of: Callable[[str], type[Any]]
+) -> Pipeline:
     """Steps of a pipeline recipe, every setting checked.
 
     Parameters
     ----------
     name
         Path, or the name of a shipped recipe.
-    schemas
-        Settings dataclass of every stage that a step may name.
+    stages
+        Stages that a step may name.
+    schema_of
+        The settings dataclass of a stage; asked only for stages that the recipe names.
 
     Raises
     ------
@@ -139,7 +143,7 @@ def load_pipeline(name: str | Path, schemas: Mapping[str, type[Any]]) -> Pipelin
     if not isinstance(steps, list) or not steps:
         raise _faulty(name, [*faults, "  step: at least one [[step]] is required"])
     for k, step in enumerate(steps):
-        faults += [f"  step.{k + 1}.{fault}" for fault in _step_faults(step, schemas)]
+        faults += [f"  step.{k + 1}.{fault}" for fault in _step_faults(step, stages, schema_of)]
     if faults:
         raise _faulty(name, faults)
     return Pipeline(
@@ -187,12 +191,14 @@ def _faulty(name: str | Path, faults: Iterable[str]) -> RecipeError:
     return RecipeError("\n".join([f"{name} has {keys}:", *lines]))
 
 
-def _step_faults(step: Any, schemas: Mapping[str, type[Any]]) -> list[str]:
+def _step_faults(
+    step: Any, stages: Collection[str], schema_of: Callable[[str], type[Any]]
+) -> list[str]:
     if faults := _faults(step, Step):
         return faults
-    if step["stage"] not in schemas:
-        return [f"stage: no stage {step['stage']!r}; there are {', '.join(sorted(schemas))}"]
-    return [f"settings.{f}" for f in _faults(step.get("settings", {}), schemas[step["stage"]])]
+    if step["stage"] not in stages:
+        return [f"stage: no stage {step['stage']!r}; there are {', '.join(sorted(stages))}"]
+    return [f"settings.{f}" for f in _faults(step.get("settings", {}), schema_of(step["stage"]))]
 
 
 def _model(schema: type[Any]) -> type[BaseModel]:

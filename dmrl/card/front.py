@@ -18,7 +18,15 @@ def read_front(readme: Path) -> dict[str, str]:
         return {}
     lines = readme.read_text(encoding="utf-8").split("\n---\n")[0].splitlines()
     pairs = (line.partition(": ") for line in lines)
-    return {key: value.strip().strip('"') for key, _, value in pairs if value}
+    return {key: _scalar(value.strip()) for key, _, value in pairs if value}
+
+
+def _scalar(text: str) -> str:
+    # We write JSON strings; a hand may have written a bare word.
+    try:
+        return str(json.loads(text))
+    except ValueError:
+        return text
 
 
 def front_matter(

@@ -54,60 +54,53 @@ def about(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
 def loading(splits: dict[str, Split], *, parquet: bool) -> list[str]:
     """How to open the dataset, three ways; DATASET stands for its folder."""
     name, split = next(iter(splits.items()))
-    height_px, width_px = split.image_shape
     png = layout.IMAGE in split.table.schema.names
-    shape = f"{height_px}, {width_px}, 3"
-    rgb = (
-        'rgb = np.asarray(row["image"])'
-        if png
-        else f'rgb = np.frombuffer(row["pixels"], np.uint8).reshape({shape})'
-    )
-    opened = (
-        f'row = load_dataset("DATASET", split="{name}")[0]'
-        if parquet
-        else f'row = load_from_disk("DATASET")["{name}"][0]'
-    )
-    shard = f"data/{name}-*.parquet" if parquet else f"{name}/data-*.arrow"
-    table = (
-        "table = pq.read_table(shard)"
-        if parquet
-        else "table = pa.ipc.open_stream(pa.memory_map(shard)).read_all()  # no copy"
-    )
-    parts = {
-        "datasets": [
-            "import numpy as np",
-            f"from datasets import {'load_dataset' if parquet else 'load_from_disk'}",
-            "",
-            opened,
-            rgb,
-        ],
-        "pyarrow": [
-            "from glob import glob",
-            "",
-            "import pyarrow.parquet as pq" if parquet else "import pyarrow as pa",
-            "",
-            f'shard = sorted(glob("DATASET/{shard}"))[0]',
-            table,
-        ],
-        "dmrl": [
-            "from pathlib import Path",
-            "",
-            "from dmrl.dataset import open_dataset",
-            "",
-            f'split = open_dataset(Path("DATASET")).split("{name}")',
-            "rgb, confidence, depth = split.pixels[0][0], split.confidence[0], split.depth[0]",
-        ],
+    ways = {
+        "datasets": _with_datasets(name, split, png=png, parquet=parquet),
+        "pyarrow": _with_pyarrow(name, parquet=parquet),
+        "dmrl": f"""from pathlib import Path
+
+from dmrl.dataset import open_dataset
+
+split = open_dataset(Path("DATASET")).split("{name}")
+rgb, confidence, depth = split.pixels[0][0], split.confidence[0], split.depth[0]""",
     }
     lines = ["## Load it", ""]
-    for package, code in parts.items():
-        lines += [f"With {package}:", "", "```python", *code, "```", ""]
+    for package, code in ways.items():
+        lines += [f"With {package}:", "", "```python", code, "```", ""]
     if not png:
         lines += [
-            "Leave `pixels` in the default or the `arrow` format of datasets: its NumPy and torch "
-            "formats drop zero bytes at the end of binary values.",
+            "`pixels` need datasets 5.1 or newer. Leave them in its default or `arrow` format: its "
+            "NumPy and torch formats drop zero bytes at the end of binary values.",
             "",
         ]
     return lines
+
+
+def _with_datasets(name: str, split: Split, *, png: bool, parquet: bool) -> str:
+    height_px, width_px = split.image_shape
+    load = "load_dataset" if parquet else "load_from_disk"
+    raw = f'np.frombuffer(row["pixels"], np.uint8).reshape({height_px}, {width_px}, 3)'
+    return f"""import numpy as np
+from datasets import {load}
+
+row = {load}("DATASET")["{name}"][0]
+rgb = {'np.asarray(row["image"])' if png else raw}"""
+
+
+def _with_pyarrow(name: str, *, parquet: bool) -> str:
+    if parquet:
+        return f"""from glob import glob
+
+import pyarrow.parquet as pq
+
+table = pq.read_table(sorted(glob("DATASET/data/{name}-*.parquet"))[0])"""
+    return f"""from glob import glob
+
+import pyarrow as pa
+
+shard = sorted(glob("DATASET/{name}/data-*.arrow"))[0]
+table = pa.ipc.open_stream(pa.memory_map(shard)).read_all()  # no copy"""
 
 
 def numbers(counts: dict[str, Counts]) -> list[str]:

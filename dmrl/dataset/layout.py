@@ -82,8 +82,9 @@ def schema(height_px: int, width_px: int, *, png: bool = False) -> pa.Schema:
 def features(columns: pa.Schema) -> dict[str, Any]:
     """The columns as ``datasets`` writes them in dataset_info.json.
 
-    Fixed-size lists are spelled "Sequence" and lists as ``[item]``: every version of
-    ``datasets`` reads these, while "List" needs 4 or later.
+    Fixed-size lists are spelled "Sequence" and lists as ``[item]``, which ``datasets`` 3.6 reads
+    as well as 5; "List" came with 4. Raw pixels need ``datasets`` 5.1 all the same: earlier ones
+    do not know fixed_size_binary.
     """
     return {f.name: {"_type": "Image"} if f.name == IMAGE else _feature(f.type) for f in columns}
 

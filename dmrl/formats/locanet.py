@@ -10,9 +10,10 @@ A folder holds ``synImgs/`` (one robot per picture) or ``synImgsMulti/``, with
 
 Only the file name of ``path`` counts. Attitudes: the camera stands in the horizontal frame
 as Rx(roll) Ry(pitch), and a robot as Rx(roll) Rz(yaw) Ry(pitch), x forward, y left, z up,
-not negated. That follows from the boxes: of all signs only these fit the outlines (0.6 px
-median, the next best 1.1 px), and a test holds it. The robots' attitudes are against the
-horizontal frame, unlike their positions.
+not negated. The signs follow from the boxes: of all combinations only these fit the
+outlines (0.6 px median, the next best 1.1 px), and a test holds it. The order of the
+camera's two turns is that of the authors' rendering script; the boxes agree, weakly. The
+robots' attitudes are against the horizontal frame, unlike their positions.
 """
 
 from collections.abc import Iterator, Mapping

@@ -6,6 +6,7 @@ label that is the most confident cell. *Which detections are right* (``hits``): 
 confidence each detection takes the nearest label that is still free, within a radius.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,17 @@ class Points:
     def ranks(self) -> Index:
         """(M,) place of each row within its image, from 0."""
         return np.arange(len(self), dtype=np.int64) - np.searchsorted(self.image, self.image)
+
+    @staticmethod
+    def concatenate(parts: Sequence["Points"], first: Index) -> "Points":
+        """All parts, the images of part k counted from ``first[k]``."""
+        return Points(
+            np.concatenate([part.image + first[k] for k, part in enumerate(parts)]),
+            np.concatenate([part.u_px for part in parts]),
+            np.concatenate([part.v_px for part in parts]),
+            np.concatenate([part.depth_m for part in parts]),
+            np.concatenate([part.confidence for part in parts]),
+        )
 
     def select(self, keep: NDArray[np.bool_] | Index) -> "Points":
         """The chosen rows."""

@@ -84,7 +84,9 @@ class Model:
         self.require_size(images.shape[2], images.shape[1], self.name or self.architecture)
         device = next(self.network.parameters()).device
         with torch.inference_mode():
-            raw = torch.from_numpy(images).permute(0, 3, 1, 2).to(device)
+            # torch takes writable arrays only; a view of a mapped file is copied here.
+            writable = np.require(images, requirements="W")
+            raw = torch.from_numpy(writable).permute(0, 3, 1, 2).to(device)
             out = self.network(to_input(raw))
             confidence, depth_m = out[:, 1].sigmoid(), out[:, 0].exp()
         return confidence.cpu().numpy(), depth_m.cpu().numpy()

@@ -42,7 +42,7 @@ class Settings:
     seed
         Another seed holds out other recordings.
     png
-        Store PNG images in place of raw pixels: a third of the disk, slower to open.
+        Store PNG images in place of raw pixels: less disk, but decoded at each opening.
     parquet
         Write Parquet files in place of Arrow shards: for publishing.
     shard_images

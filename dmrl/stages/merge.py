@@ -1,5 +1,7 @@
 """merge: several recordings into one."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -7,6 +9,16 @@ from cyclopts import Parameter
 
 from dmrl.errors import SettingError
 from dmrl.recording import merge
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Merging has no settings."""
+
+
+def run(recordings: Sequence[Path], out: Path, _settings: Settings) -> int:
+    """Messages of the recordings merged into ``out``; see `dmrl.recording.merge`."""
+    return merge(recordings, out)
 
 
 def command(
@@ -22,5 +34,5 @@ def command(
             "merge wants two recordings or more and OUT: dmrl merge A.mcap B.mcap OUT.mcap"
         )
     *inputs, out = recordings
-    count = merge(inputs, out)
+    count = run(inputs, out, Settings())
     print(f"{out}: {count} messages of {len(inputs)} recordings")

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import pyarrow.compute as pc
 from cyclopts import Parameter
 
 from dmrl import recipe as recipes
@@ -62,7 +63,8 @@ def run(
     init
         Model whose weights to start from. None: new weights, by the seed.
     resume
-        Go on with the interrupted training in ``<out>.partial``.
+        Go on with the interrupted training in ``<out>.partial``; from the start, if that had
+        not come to the end of its first epoch.
 
     Raises
     ------
@@ -93,7 +95,7 @@ def run(
             folder,
             validation=watched,
             identity=identity,
-            resume=resume,
+            resume=resume and has_checkpoint(folder),
         )
         made.write(folder)
         result = _train(training, settings, len(examples))
@@ -141,7 +143,8 @@ def _model(
     network: Network, settings: Settings, train: Split, history: list[dict[str, float]]
 ) -> Model:
     height_px, width_px = train.image_shape
-    sources = train.table.column("source").unique().to_pylist()
+    peers = pc.list_flatten(train.table.column("peers"))
+    sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
     return Model(
         network,
         settings.architecture,

@@ -1,0 +1,174 @@
+"""Images per cpu-second: building a dataset, and gathering shuffled batches from it into torch.
+
+    python benchmarks/bench_dataset.py [IMAGES]
+
+Peers, in the same run on the same images: `datasets` with its torch format on its own Array3D
+and Image columns, as `save_to_disk` writes them, and `datasets` on our files. The page cache
+is dropped before the first pass of each. One thread.
+"""
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import datasets
+import numpy as np
+import torch
+
+from dmrl.dataset import Split, open_dataset
+from dmrl.images import encode_jpeg
+from dmrl.learn.batches import Examples, shuffled
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter
+from dmrl.stages.dataset import Settings, run
+from dmrl.tables import print_table
+from dmrl.topics import camera_image, labels
+
+HEIGHT_PX, WIDTH_PX, BATCH, PASSES = 224, 320, 32, 3
+Batches = Callable[[], Iterator[torch.Tensor]]
+
+
+def write_recording(path: Path, count: int) -> None:
+    """Write smooth pictures with noise, as JPEG, one peer each."""
+    rng = np.random.default_rng(0)
+    ramp = np.linspace(0, 200, WIDTH_PX)[None, :, None]
+    with RecordingWriter(path, Provenance("bench")) as sink:
+        for k in range(count):
+            noise = rng.integers(0, 50, (HEIGHT_PX, WIDTH_PX, 3))
+            data = encode_jpeg((ramp + noise).astype(np.uint8))
+            picture = message("CompressedImage")(data=data, format="jpeg")
+            peer = {"peer": "cf2", "u_px": 160, "v_px": 112, "depth_m": 1, "source": "truth"}
+            sink.write(k * 10**8, camera_image("cf1"), picture)
+            sink.write(k * 10**8, labels("cf1"), message("PeerLabels")(peers=[peer]))
+
+
+def order_of(count: int) -> Iterator[np.ndarray]:
+    """Yield shuffled indices, batch by batch."""
+    order = np.random.default_rng(1).permutation(count)
+    yield from (order[k : k + BATCH] for k in range(0, count, BATCH))
+
+
+def from_dmrl(split: Split) -> Iterator[torch.Tensor]:
+    """The loader that `dmrl train` uses; it gathers the grid labels as well."""
+    examples = Examples(split.pixels, split.confidence, split.depth)
+    for batch in shuffled(examples, BATCH, seed=1, epoch=0):
+        yield batch.images
+
+
+def from_datasets_bytes(split: datasets.Dataset) -> Iterator[torch.Tensor]:
+    """Our files, opened by `datasets`: bytes to arrays by hand, as the card shows."""
+    for batch in order_of(len(split)):
+        data = split[batch]["pixels"]
+        flat = np.stack([np.frombuffer(item, np.uint8) for item in data])
+        yield torch.from_numpy(flat.reshape(-1, HEIGHT_PX, WIDTH_PX, 3))
+
+
+def from_datasets_torch(split: datasets.Dataset, column: str) -> Iterator[torch.Tensor]:
+    """Let `datasets` make the tensors."""
+    ready = split.select_columns([column]).with_format("torch", dtype=torch.uint8)
+    for batch in order_of(len(split)):
+        yield ready[batch][column]
+
+
+def save(split: Split, folder: Path, feature: object) -> None:
+    """Save the same images in a column of `datasets`' own, by its own means."""
+    features = datasets.Features({"image": feature})
+    images = [image for block in split.pixels for image in block]
+    datasets.Dataset.from_dict({"image": images}, features=features).save_to_disk(str(folder))
+
+
+def evict(folder: Path) -> None:
+    """Drop every file of a folder from the page cache."""
+    for path in folder.rglob("*.arrow"):
+        with path.open("rb") as stream:
+            os.fsync(stream.fileno())
+            os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def content_sum(batches: Iterator[torch.Tensor]) -> int:
+    """Sum of every byte of every batch, whatever the order of the axes."""
+    return sum(int(batch.sum(dtype=torch.int64)) for batch in batches)
+
+
+def rates(folder: Path, open_way: Callable[[], Batches]) -> tuple[int, int]:
+    """Images per cpu-second of a pass from disk and of the pass after it, over `PASSES` openings.
+
+    The files leave the page cache before each opening. Without that the first pass looks two to
+    five times as fast, depending on how the files came into the cache: freshly written ones
+    are mapped in larger pieces than those that were copied or read back.
+    """
+    spent, images = np.zeros(2), np.zeros(2, int)
+    for _ in range(PASSES):
+        evict(folder)
+        batches = open_way()
+        for later in (0, 1):
+            start = time.process_time()
+            images[later] += sum(len(batch) for batch in batches())
+            spent[later] += time.process_time() - start
+    first, later = images / spent
+    return round(first), round(later)
+
+
+def build(folder: Path, count: int) -> None:
+    """Time `dmrl dataset`, card and hashing of the inputs included."""
+    built = []
+    for way in ("raw", "png"):
+        start = time.process_time()
+        settings = Settings(split="none", png=way == "png")
+        run([folder / "flight.mcap"], folder / way, settings)
+        built.append((f"dmrl dataset, {way}", round(count / (time.process_time() - start))))
+    print_table("build", ("way", "images per cpu-second"), built)
+
+
+def ways_of(folder: Path) -> dict[str, Callable[[], Batches]]:
+    """What opens the images anew, for each way to load them."""
+    raw = str(folder / "raw")
+    pixels = open_dataset(folder / "raw").split("train")
+    shape = (HEIGHT_PX, WIDTH_PX, 3)
+    for name, feature in (("a", datasets.Array3D(shape, "uint8")), ("i", datasets.Image())):
+        save(pixels, folder / name, feature)
+
+    def ours() -> Batches:
+        split = open_dataset(folder / "raw").split("train")
+        return lambda: from_dmrl(split)
+
+    def our_bytes() -> Batches:
+        split = datasets.load_from_disk(raw, keep_in_memory=False)["train"]
+        return lambda: from_datasets_bytes(split)
+
+    def tensors(name: str) -> Batches:
+        split = datasets.load_from_disk(str(folder / name), keep_in_memory=False)
+        return lambda: from_datasets_torch(split, "image")
+
+    return {
+        "dmrl, raw, with grid labels": ours,
+        "datasets on our files, bytes": our_bytes,
+        "datasets, Array3D, torch format": lambda: tensors("a"),
+        "datasets, Image (PNG), torch format": lambda: tensors("i"),
+    }
+
+
+def main() -> None:
+    """Print the tables."""
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1024
+    torch.set_num_threads(1)
+    datasets.disable_progress_bars()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_recording(folder / "flight.mcap", count)
+        build(folder, count)
+        ways = ways_of(folder)
+        # Also brings lazy imports and the page cache to where they are in a long run.
+        sums = {way: content_sum(open_way()()) for way, open_way in ways.items()}
+        if len(set(sums.values())) != 1:
+            raise SystemExit(f"the ways gave different images: {sums}")
+        rows = [(way, *rates(folder, open_way)) for way, open_way in ways.items()]
+        title = "load, images per cpu-second; every way gave the same bytes"
+        print_table(title, ("way", "from disk", "pass after it"), rows)
+
+
+if __name__ == "__main__":
+    main()

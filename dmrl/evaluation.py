@@ -1,0 +1,212 @@
+"""Labels and detections of a recording, joined by robot and log time.
+
+The images are those that a dataset would take: with labels from the source that is asked
+for, all of them OK, or with labels that name no peer at all. See ``dmrl.dataset.rows``.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.errors import RecordingError, SettingError
+from dmrl.images import size
+from dmrl.learn.matching import Points
+from dmrl.messages import STATUS_OK
+from dmrl.recording import read, read_table, splits, summary
+
+Mask = NDArray[np.bool_]
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Labels and detections of the same images.
+
+    Parameters
+    ----------
+    images
+        Number of images.
+    labels
+        Those inside the image, from one source.
+    detections
+        All of them, best first within an image.
+    threshold
+        Confidence from which they are to be believed, as the detector says; 0: not known.
+    left_out
+        Why images and labels were left out, and how many.
+    """
+
+    images: int
+    labels: Points
+    detections: Points
+    threshold: float = 0.0
+    left_out: dict[str, int] = field(default_factory=dict)
+
+
+def join(recording: Path, against: str, split: str | None = None) -> Pairs:
+    """Labels and detections of every image that can be judged.
+
+    Parameters
+    ----------
+    recording
+        With labels and detections.
+    against
+        Source of the labels.
+    split
+        Only this split of the recording's source. None: all images.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read, or has no detections, labels or images.
+    SettingError
+        If it has no labels of that source, no such split, or no image to judge.
+    """
+    held = summary(recording)
+    robots = topics.robots(list(held.topics), topics.DETECTIONS)
+    if not robots:
+        raise RecordingError(
+            f"{recording} has no detections. Try: dmrl predict MODEL {recording} OUT.mcap"
+        )
+    spans = _spans(recording, splits(held), split)
+    _require_source(recording, robots, against)
+    pairs = _together([_join_robot(recording, robot, against, spans) for robot in robots])
+    if not pairs.images:
+        where = f"in split {split}" if split else "in it"
+        raise SettingError(
+            f"{recording} has no image with labels from {against} and detections {where}. "
+            f"Try: dmrl info {recording}"
+        )
+    return pairs
+
+
+def _spans(
+    recording: Path, own: dict[str, list[tuple[int, int]]], split: str | None
+) -> list[tuple[int, int]] | None:
+    if split is None:
+        return None
+    if split not in own:
+        has = f"It has: {', '.join(sorted(own))}" if own else "It has none; leave --split out"
+        raise SettingError(f"{recording} has no split {split}. {has}")
+    return own[split]
+
+
+def _require_source(recording: Path, robots: Iterable[str], against: str) -> None:
+    present: set[str] = set()
+    for robot in robots:
+        peers = _column(read_table(recording, topics.labels(robot), fields=("peers",)), "peers")
+        present.update(pc.unique(pc.struct_field(peers.flatten(), "source")).to_pylist())
+    if against not in present:
+        has = (
+            f"Give --against one of: {', '.join(sorted(present))}" if present else "Label it first"
+        )
+        raise SettingError(f"{recording} has no labels from {against}. {has}")
+
+
+def _join_robot(
+    recording: Path, robot: str, against: str, spans: list[tuple[int, int]] | None
+) -> Pairs:
+    left_out: Counter[str] = Counter()
+    labelled = read_table(recording, topics.labels(robot), fields=("peers",))
+    detected = read_table(recording, topics.detections(robot))
+    times = _column(labelled, "log_time").to_numpy()
+    seen_at = _column(detected, "log_time").to_numpy()
+    peers = _column(labelled, "peers")
+    mine, usable = _usable(peers, against, _within(times, spans), left_out)
+    left_out["images without detections"] += int((usable & ~np.isin(times, seen_at)).sum())
+    judged, in_usable, in_detections = np.intersect1d(times[usable], seen_at, return_indices=True)
+    labels = _points(peers, mine, np.flatnonzero(usable)[in_usable], len(labelled))
+    width_px, height_px = _image_size(recording, robot)
+    inside = (labels.u_px >= 0) & (labels.u_px < width_px)
+    inside &= (labels.v_px >= 0) & (labels.v_px < height_px) & (labels.depth_m > 0)
+    left_out["labels outside their image"] += int((~inside).sum())
+    every = _column(detected, "detections")
+    detections = _points(every, None, in_detections, len(detected))
+    threshold = float(np.max(_column(detected, "threshold").to_numpy(), initial=0.0))
+    return Pairs(len(judged), labels.select(inside), detections, threshold, left_out)
+
+
+def _usable(
+    peers: pa.Array, against: str, within: Mask, left_out: Counter[str]
+) -> tuple[Mask, Mask]:
+    """Which peers are from the source, and which of the images can be judged by them."""
+    image = _image_of(peers)
+    flat = peers.flatten()
+    mine = pc.equal(flat.field("source"), against).to_numpy(zero_copy_only=False)
+    bad = mine & (flat.field("status").to_numpy(zero_copy_only=False) != STATUS_OK)
+    count = np.bincount(image, minlength=len(peers))
+    own = np.bincount(image[mine], minlength=len(peers))
+    not_ok = np.bincount(image[bad], minlength=len(peers)) > 0
+    foreign = (count > 0) & (own == 0)
+    left_out["images with labels from other sources only"] += int((within & foreign).sum())
+    left_out["images with a label that is not OK"] += int((within & not_ok).sum())
+    return mine, within & ~foreign & ~not_ok
+
+
+def _points(entries: pa.Array, mine: Mask | None, rows: Times, count: int) -> Points:
+    """Entries of the chosen rows of a list column, numbered by their place in ``rows``."""
+    place = np.full(count, -1, np.int64)
+    place[rows] = np.arange(len(rows))
+    image = place[_image_of(entries)]
+    keep = np.flatnonzero((image >= 0) if mine is None else (image >= 0) & mine)
+    flat = entries.flatten()
+    names = {flat.type.field(i).name for i in range(flat.type.num_fields)}
+    values = {
+        name: flat.field(name).to_numpy(zero_copy_only=False)[keep]
+        for name in ("u_px", "v_px", "depth_m", "confidence")
+        if name in names
+    }
+    image = image[keep]
+    values.setdefault("confidence", np.ones(len(keep)))
+    # By image, and best first: a foreign detector may not have sorted them.
+    order = np.lexsort((-values["confidence"], image))
+    return Points(image[order], **{name: value[order] for name, value in values.items()})
+
+
+def _together(parts: list[Pairs]) -> Pairs:
+    """The images of several robots, one after another."""
+    first = np.cumsum([0, *(part.images for part in parts)])
+    left_out: Counter[str] = Counter()
+    for part in parts:
+        left_out.update(part.left_out)
+    return Pairs(
+        int(first[-1]),
+        Points.concatenate([p.labels for p in parts], first),
+        Points.concatenate([p.detections for p in parts], first),
+        max(part.threshold for part in parts),
+        {why: count for why, count in left_out.items() if count},
+    )
+
+
+def _within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
+    if spans is None:
+        return np.ones(len(times), bool)
+    inside = np.zeros(len(times), bool)
+    for start, end in spans:
+        inside |= (start <= times) & (times <= end)
+    return inside
+
+
+def _image_of(entries: pa.Array) -> Times:
+    """(M,) row of a list column that each of its M entries belongs to."""
+    return np.repeat(np.arange(len(entries)), np.diff(entries.offsets.to_numpy()))
+
+
+def _column(table: pa.Table, name: str) -> pa.Array:
+    joined = table.column(name).combine_chunks()
+    return pa.concat_arrays(joined.chunks) if isinstance(joined, pa.ChunkedArray) else joined
+
+
+def _image_size(recording: Path, robot: str) -> tuple[int, int]:
+    first = next(read(recording, topics.camera_image(robot)), None)
+    if first is None:
+        raise RecordingError(f"{recording} has no image of {robot}. Give the whole recording")
+    width_px, height_px, _ = size(first.message.data, f"{recording}: the first image of {robot}")
+    return width_px, height_px

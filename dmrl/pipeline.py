@@ -1,0 +1,203 @@
+"""Pipelines: every stage of a recipe, in order, each output whole before the next begins.
+
+A stage is done when its output stands under its final name, which no stage gives to half
+an output; so a pipeline that was stopped goes on where it was.
+"""
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from dmrl import recipe as recipes
+from dmrl.errors import RecipeError, SettingError
+from dmrl.output import partial_of
+from dmrl.progress import say
+from dmrl.recipe import Pipeline, Step
+from dmrl.tables import print_json, print_table
+
+# Stages that a step may name, and how many inputs each takes; None: a list of any length.
+# They are loaded by name, because stages stand above this module and not below it.
+STAGES: dict[str, int | None] = {
+    "sketch": 0,
+    "convert": 1,
+    "merge": None,
+    "dataset": None,
+    "train": 1,
+    "predict": 2,
+    "evaluate": 1,
+    "view": None,
+}
+RECIPE_FILE = "recipe.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """One step that is done: its stage, its output, and whether it was there already."""
+
+    stage: str
+    out: Path
+    seconds: float
+    skipped: bool
+
+
+def run(name: str | Path, out: Path, data: Path | None = None) -> list[Done]:
+    """Run what is not done yet of a pipeline recipe.
+
+    Parameters
+    ----------
+    name
+        Path of a recipe, or the name of a shipped one.
+    out
+        Folder for all outputs; made if it is not there.
+    data
+        Folder that ``{data}`` in the recipe stands for.
+
+    Raises
+    ------
+    RecipeError
+        If the recipe is wrong; before anything is done.
+    SettingError
+        If the recipe needs ``data`` and has none, or ``out`` belongs to another recipe.
+    DmrlError
+        What a stage raises.
+    """
+    pipeline = recipes.load_pipeline(name, STAGES, settings_of)
+    if pipeline.needs_data and data is None:
+        raise SettingError(f"{name} reads data that does not ship with dmrl. Say where: --data DIR")
+    _check_order(name, pipeline)
+    _claim(out, pipeline)
+    return [
+        _do(step, out, data, f"[{k}/{len(pipeline.steps)}]")
+        for k, step in enumerate(pipeline.steps, start=1)
+    ]
+
+
+def settings_of(stage: str) -> type[Any]:
+    """The settings dataclass of a stage."""
+    settings: type[Any] = _module(stage).Settings
+    return settings
+
+
+def _module(stage: str) -> Any:
+    return import_module(f"dmrl.stages.{stage}")
+
+
+def _check_order(name: str | Path, pipeline: Pipeline) -> None:
+    """Refuse a step that reads what no earlier step writes, and outputs given twice."""
+    made: set[str] = set()
+    for number, step in enumerate(pipeline.steps, start=1):
+        wants = STAGES[step.stage]
+        if (wants is None and not step.inputs) or (wants is not None and wants != len(step.inputs)):
+            raise RecipeError(
+                f"{name}: step {number} ({step.stage}) has {len(step.inputs)} inputs, not "
+                f"{'one or more' if wants is None else wants}. See: dmrl {step.stage} --help"
+            )
+        for source in step.inputs:
+            if not source.startswith("{data}") and source.split("/")[0] not in made:
+                raise RecipeError(
+                    f"{name}: step {number} ({step.stage}) reads {source}, which no step before "
+                    "it writes. Name an earlier step's out, or {data}/..."
+                )
+        if step.out in made:
+            raise RecipeError(f"{name}: step {number} writes {step.out} again. Name another out")
+        made.add(step.out)
+
+
+def _claim(out: Path, pipeline: Pipeline) -> None:
+    """Make ``out`` this recipe's folder, or see that it is."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise SettingError(f"{out} is a file. Name a folder: --out DIR") from None
+    known = out / RECIPE_FILE
+    if known.exists() and known.read_text(encoding="utf-8") != pipeline.text:
+        raise SettingError(
+            f"{out} was made by another recipe. Remove it or name another: --out DIR"
+        )
+    if not known.exists() and any(out.iterdir()):
+        raise SettingError(f"{out} is not empty. Remove it or name another: --out DIR")
+    known.write_text(pipeline.text, encoding="utf-8")
+
+
+def _do(step: Step, folder: Path, data: Path | None, count: str) -> Done:
+    out = folder / step.out
+    if out.exists():
+        say(f"{count} {step.stage}: {out} is there already")
+        return Done(step.stage, out, 0.0, skipped=True)
+    say(f"{count} {step.stage}: {out}")
+    begun = time.perf_counter()
+    _call(step, [_located(name, folder, data) for name in step.inputs], out)
+    return Done(step.stage, out, time.perf_counter() - begun, skipped=False)
+
+
+def _located(name: str, folder: Path, data: Path | None) -> Path:
+    if data is not None and name.startswith("{data}"):
+        return data / name.removeprefix("{data}").lstrip("/")
+    return folder / name
+
+
+def _call(step: Step, inputs: list[Path], out: Path) -> None:
+    module = _module(step.stage)
+    settings = recipes.check(f"step {step.stage}", step.settings, settings_of(step.stage))
+    extra: dict[str, Any] = {}
+    if step.stage == "train" and partial_of(out).exists():
+        extra["resume"] = True
+    sources = [inputs] if STAGES[step.stage] is None else inputs
+    module.run(*sources, out, settings, **extra)
+
+
+EVALUATION_NAME = "evaluation.json"
+COLUMNS = {
+    "median_px": ("median, px", ".1f"),
+    "within_8_px": ("within 8 px", ".1%"),
+    "within_20_px": ("within 20 px", ".1%"),
+    "depth_mae_m": ("depth MAE, m", ".3f"),
+    "f1": ("F1", ".3f"),
+    "ap_16_px": ("AP at 16 px", ".3f"),
+}
+
+
+def report(done: list[Done], *, as_json: bool = False) -> None:
+    """Print what a pipeline came to: a row per evaluation, and where the pictures are.
+
+    Parameters
+    ----------
+    done
+        What ``run`` gave.
+    as_json
+        Print one JSON document instead: seconds per step, evaluations, pictures.
+    """
+    evaluations = {
+        d.out.name: json.loads((d.out / EVALUATION_NAME).read_text(encoding="utf-8"))
+        for d in done
+        if (d.out / EVALUATION_NAME).is_file()
+    }
+    pictures = [picture for d in done for picture in _pictures(d.out)]
+    if as_json:
+        print_json(
+            {
+                "steps": [asdict(d) for d in done],
+                "evaluations": evaluations,
+                "pictures": pictures,
+            }
+        )
+        return
+    rows = [(name, *_row(document)) for name, document in evaluations.items()]
+    headers = [words for words, _ in COLUMNS.values()]
+    print_table("", ["evaluation", "against", "images", *headers], rows)
+    for picture in pictures:
+        print(picture)
+
+
+def _row(document: dict[str, Any]) -> list[str]:
+    figures = document["overall"]
+    values = [(figures[name]["value"], form) for name, (_, form) in COLUMNS.items()]
+    cells = ["-" if value is None else format(value, form) for value, form in values]
+    return [document["against"], str(document["images"]), *cells]
+
+
+def _pictures(out: Path) -> list[Path]:
+    return sorted(out.rglob("*.png")) if out.is_dir() else [out] * (out.suffix == ".png")

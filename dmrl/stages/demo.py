@@ -1,0 +1,29 @@
+"""demo: the whole pipeline, small, on what ships with dmrl."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from dmrl import pipeline
+
+
+def command(
+    *,
+    out: Path = Path("demo"),
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Run the whole pipeline, small, on pictures that dmrl draws itself.
+
+    Draws pictures of small drones, converts them to a recording, builds a dataset, trains
+    the published network on it, lets it look at pictures it has not seen, judges it against
+    the truth and shows it. The steps are those of the recipe demo: dmrl run demo.
+
+    Parameters
+    ----------
+    out
+        Folder for every output.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    pipeline.report(pipeline.run("demo", out), as_json=as_json)

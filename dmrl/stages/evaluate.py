@@ -1,0 +1,245 @@
+"""``dmrl evaluate``: a recording's detections against its labels."""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter, validators
+
+from dmrl.errors import MissingExtra
+from dmrl.evaluation import Pairs, join
+from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
+from dmrl.output import partial_folder, refuse_existing
+from dmrl.recording import input_of
+from dmrl.tables import print_json, print_table
+
+plots: ModuleType | None
+try:
+    from dmrl import plots
+except MissingExtra:
+    plots = None
+
+DOCUMENT_NAME = "evaluation.json"
+FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What detections are judged against, and how.
+
+    Parameters
+    ----------
+    against
+        Whose labels.
+    split
+        Only images of this split of the recording's source, such as test. Without it, all.
+    threshold
+        Confidence from which a detection counts in precision, recall and F1, 0 to 1. Without
+        it, the one in the recording.
+    draws
+        Bootstrap samples behind the 95 % intervals.
+    seed
+        Of the bootstrap.
+    """
+
+    against: Literal["truth", "estimate", "hand", "published"] = "truth"
+    split: str | None = None
+    threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
+    draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """A judged recording.
+
+    Parameters
+    ----------
+    pairs
+        Labels and detections.
+    scored
+        The same, matched.
+    bands
+        Figures over all distances, then by band.
+    threshold
+        The one that was used.
+    """
+
+    pairs: Pairs
+    scored: Scored
+    bands: list[BandFigures]
+    threshold: float
+
+
+def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
+    """Judge the detections of ``recording``, robot by robot and image by image.
+
+    Parameters
+    ----------
+    recording
+        With images, labels and detections.
+    out
+        Folder to write plots and ``evaluation.json`` to. None: nothing is written.
+    settings
+        See `Settings`.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read, or has no labels, detections or images.
+    SettingError
+        If it has no labels of that source, no such split, or no image to judge.
+    MissingExtra
+        If plots are wanted and matplotlib is not installed.
+    OutputError
+        If ``out`` exists.
+    """
+    if out is not None:
+        refuse_existing(out)
+        if plots is None:
+            raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
+    pairs = join(recording, settings.against, settings.split)
+    threshold = settings.threshold
+    if threshold is None:
+        threshold = pairs.threshold or FALLBACK_THRESHOLD
+    scored = score(pairs.images, pairs.labels, pairs.detections)
+    bands = by_band(scored, threshold=threshold, draws=settings.draws, seed=settings.seed)
+    evaluation = Evaluation(pairs, scored, bands, threshold)
+    if out is not None:
+        with partial_folder(out) as folder:
+            text = json.dumps(document(recording, settings, evaluation), indent=1, allow_nan=False)
+            (folder / DOCUMENT_NAME).write_text(text + "\n", encoding="utf-8")
+            _draw(folder, scored)
+    return evaluation
+
+
+def _draw(folder: Path, scored: Scored) -> None:
+    assert plots is not None
+    error, depth_m = scored.label_error, scored.labels.depth_m
+    plots.error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
+    plots.error_by_distance(depth_m, error.norm_px, error.depth_m, folder / "error-by-distance")
+
+
+def document(recording: Path, settings: Settings, evaluation: Evaluation) -> dict[str, Any]:
+    """Everything that was measured, as JSON values; null where there was nothing to measure."""
+    source = input_of(recording)
+    overall, *bands = [_band(band) for band in evaluation.bands]
+    return {
+        "recording": {"name": source.name, "sha256": source.sha256},
+        "against": settings.against,
+        "split": settings.split,
+        "threshold": evaluation.threshold,
+        "images": evaluation.pairs.images,
+        "labels": len(evaluation.pairs.labels),
+        "detections": len(evaluation.pairs.detections),
+        "left_out": evaluation.pairs.left_out,
+        "bootstrap": {"draws": settings.draws, "seed": settings.seed},
+        "overall": overall,
+        "bands": bands,
+        "definitions": DEFINITIONS,
+    }
+
+
+def _band(band: BandFigures) -> dict[str, Any]:
+    return {
+        "from_m": band.from_m,
+        "to_m": _finite(band.to_m),
+        "labels": band.labels,
+        "images": band.images,
+        "unmatched_labels": band.unmatched,
+        **{
+            name: {key: _finite(value) for key, value in asdict(figure).items()}
+            for name, figure in band.figures.items()
+        },
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+# Name of a figure, its words in the table, and its format.
+ROWS = (
+    ("median_px", "median error, px", ".2f"),
+    ("mean_px", "mean error, px", ".1f"),
+    ("rmse_px", "RMS error, px", ".1f"),
+    ("p95_px", "95th percentile, px", ".1f"),
+    ("within_8_px", "within 8 px", ".1%"),
+    ("within_20_px", "within 20 px", ".1%"),
+    ("bias_u_px", "median error in u, px", ".2f"),
+    ("bias_v_px", "median error in v, px", ".2f"),
+    ("depth_mae_m", "depth MAE, m", ".3f"),
+    ("depth_rmse_m", "depth RMSE, m", ".3f"),
+    ("precision", "precision", ".1%"),
+    ("recall", "recall", ".1%"),
+    ("f1", "F1", ".3f"),
+    ("ap_8_px", "AP at 8 px", ".3f"),
+    ("ap_16_px", "AP at 16 px", ".3f"),
+)
+
+
+def print_evaluation(recording: Path, settings: Settings, evaluation: Evaluation) -> None:
+    """Print the figures, one column per band that holds labels."""
+    overall, *others = evaluation.bands
+    shown = [overall, *(band for band in others if band.labels)]
+    headers = ["all", *(_range(band) for band in shown[1:])]
+    rows: list[list[object]] = [["labels", *(str(band.labels) for band in shown)]]
+    for name, words, form in ROWS:
+        cells = [_cell(band.figures[name], form) for band in shown]
+        rows.append([words, *cells])
+    split = f", split {settings.split}" if settings.split else ""
+    title = f"{recording}: {evaluation.pairs.images} images against {settings.against}{split}"
+    print_table(title, ["label minus detection", *headers], rows)
+    notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
+    if overall.unmatched:
+        notes.append(f"{overall.unmatched} labels without any detection")
+    for note in notes:
+        print(f"left out: {note}")
+    print(
+        f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
+        f"confidence {evaluation.threshold:g}, within 16 px"
+    )
+
+
+def _range(band: BandFigures) -> str:
+    to = f" to {band.to_m:g} m" if math.isfinite(band.to_m) else " m and more"
+    return f"{band.from_m:g}{to}"
+
+
+def _cell(figure: Figure, form: str) -> str:
+    if math.isnan(figure.value):
+        return "-"
+    low, high = format(figure.low, form), format(figure.high, form)
+    return f"{figure.value:{form}} [{low.removesuffix('%')}, {high.removesuffix('%')}]"
+
+
+DEFAULTS = Settings()
+
+
+def command(
+    recording: Annotated[Path, Parameter(name="IN")],
+    /,
+    *,
+    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    plots_to: Annotated[Path | None, Parameter(name="--plots")] = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Judge a recording's detections against its labels.
+
+    Parameters
+    ----------
+    recording
+        Recording with images, labels and detections.
+    plots_to
+        Folder to write plots and evaluation.json to. Must not exist.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    evaluation = run(recording, plots_to, settings)
+    if as_json:
+        print_json(document(recording, settings, evaluation))
+    else:
+        print_evaluation(recording, settings, evaluation)

@@ -1,0 +1,252 @@
+"""``dmrl predict``: a model and a recording to a recording with detections."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from cyclopts import Parameter, validators
+
+from dmrl import topics
+from dmrl.errors import MissingExtra, MissingTopic
+from dmrl.images import Rgb, decode
+from dmrl.messages import message
+from dmrl.progress import track
+from dmrl.recording import (
+    Provenance,
+    RawMessage,
+    RecordingWriter,
+    copy_extras,
+    provenance,
+    read_raw,
+    summary,
+)
+from dmrl.recording.inputs import sha256_of_file
+from dmrl.tables import print_json, print_table
+
+try:
+    from dmrl.learn.decode import Found
+    from dmrl.learn.decode import decode as find
+    from dmrl.learn.model import WEIGHTS_NAME, Grid, Model, load_model
+except ModuleNotFoundError as e:
+    raise MissingExtra(str(e.name), "train", "dmrl predict") from e
+
+OWN = (topics.DETECTIONS, topics.GRID)
+HELD_MESSAGES = 10_000
+"""Messages held back until their batch of images is full: bounds the memory."""
+
+Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
+Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How a network is run.
+
+    Parameters
+    ----------
+    backend
+        What computes.
+    threshold
+        Confidence from which detections are to be believed, written beside them, 0 to 1.
+        Without it, the model's.
+    min_confidence
+        Leave out detections below this, 0 to 1; the best of each image stays.
+    most
+        Keep at most this many detections per image.
+    batch_size
+        Images that go through the network together.
+    """
+
+    backend: Literal["torch"] = "torch"
+    threshold: Share | None = None
+    min_confidence: Share = 0.01
+    most: Positive = 20
+    batch_size: Positive = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """How many images went through, and how many detections reached the threshold."""
+
+    images: int
+    believed: int
+
+
+def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
+    """Copy ``recording`` to ``out`` with the detections of ``model`` in every image.
+
+    Messages of other topics are copied bit for bit; detections that were there are replaced.
+
+    Parameters
+    ----------
+    model
+        Run folder, .safetensors or Keras .h5.
+    recording
+        With images of one robot or more.
+    out
+        Recording to write. Must not exist.
+    settings
+        See `Settings`.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be used.
+    RecordingError
+        If the recording cannot be read, or has no images.
+    SettingError
+        If the network cannot take images of this size.
+    OutputError
+        If ``out`` exists.
+    """
+    network = load_model(model)
+    if settings.threshold is not None:
+        network = replace(network, threshold=settings.threshold)
+    held = summary(recording)
+    if not topics.robots(list(held.topics)):
+        raise MissingTopic(topics.camera_image("*"), held.topics, recording)
+    kept = [t for t in held.topics if not any(topics.names(own, t) for own in OWN)]
+    total = sum(held.topics[t].count for t in kept)
+    messages = track(read_raw(recording, *kept), "Predicting", total)
+    images = believed = 0
+    with RecordingWriter(out, _provenance(model, recording, settings)) as sink:
+        copy_extras(held, sink)
+        for batch in _batches(messages, settings.batch_size):
+            pictures = [_decode(raw, network, recording) for raw in batch if _robot(raw)]
+            seen = _seen(pictures, network, settings)
+            images += len(seen)
+            believed += sum(d.confidence >= network.threshold for s in seen for d in s.detections)
+            _write(batch, seen, sink)
+    return Result(images, believed)
+
+
+def _provenance(model: Path, recording: Path, settings: Settings) -> Provenance:
+    made = provenance("predict", settings, (model, recording), libraries=("torch", "numpy"))
+    if model.is_dir():
+        # The log of a training tells when it ran; the weights alone decide what is predicted.
+        weights = replace(made.inputs[0], sha256=sha256_of_file(model / WEIGHTS_NAME))
+        made = replace(made, inputs=(weights, *made.inputs[1:]))
+    return made
+
+
+def _batches(messages: Iterable[RawMessage], images: int) -> Iterator[list[RawMessage]]:
+    """Stretches of messages with at most that many images each."""
+    held: list[RawMessage] = []
+    count = 0
+    for raw in messages:
+        held.append(raw)
+        count += _robot(raw) is not None
+        if count == images or len(held) == HELD_MESSAGES:
+            yield held
+            held, count = [], 0
+    yield held
+
+
+def _robot(raw: RawMessage) -> str | None:
+    found = topics.names(topics.CAMERA_IMAGE, raw.topic)
+    return found["robot"] if found else None
+
+
+def _decode(raw: RawMessage, model: Model, recording: Path) -> Rgb:
+    what = f"{recording}: the image of {raw.topic} at {raw.time_ns} ns"
+    rgb = decode(message("CompressedImage").FromString(raw.data).data, what)
+    model.require_size(rgb.shape[1], rgb.shape[0], what)
+    return rgb
+
+
+class _Seen(NamedTuple):
+    """The messages of one image: Detections, and the GridMap they were found in."""
+
+    message: Any
+    grid: Any
+
+    @property
+    def detections(self) -> Any:
+        return self.message.detections
+
+
+def _seen(pictures: list[Rgb], model: Model, settings: Settings) -> list[_Seen]:
+    """What the network finds in each picture."""
+    out = []
+    for _, same_size in groupby(pictures, key=np.shape):
+        confidence, depth_m = model.grids(np.stack(list(same_size)))
+        found = find(
+            confidence,
+            depth_m,
+            stride_px=model.network.stride_px,
+            most=settings.most,
+            min_confidence=settings.min_confidence,
+        )
+        for k in range(len(confidence)):
+            grid = _grid(confidence[k], depth_m[k], model.network.stride_px)
+            out.append(_Seen(_detections(found, k, model.threshold), grid))
+    return out
+
+
+def _detections(found: Found, image: int, threshold: float) -> Any:
+    columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
+    rows = np.stack([column[image, : found.count[image]] for column in columns], axis=1)
+    names = ("u_px", "v_px", "depth_m", "confidence")
+    detections = [dict(zip(names, row, strict=True)) for row in rows.tolist()]
+    return message("Detections")(detections=detections, threshold=threshold)
+
+
+def _grid(confidence: Grid, depth_m: Grid, stride_px: int) -> Any:
+    rows, cols = confidence.shape
+    return message("GridMap")(
+        rows=rows,
+        cols=cols,
+        channels=("confidence", "depth_m"),
+        data=np.stack((confidence, depth_m)).astype("<f4").tobytes(),
+        stride_px=stride_px,
+    )
+
+
+def _write(batch: list[RawMessage], seen: list[_Seen], sink: RecordingWriter) -> None:
+    """Write the messages as they are, each image followed by what was seen in it."""
+    following = iter(seen)
+    for raw in batch:
+        sink.write_raw(raw)
+        if robot := _robot(raw):
+            found = next(following)
+            for topic, own in (
+                (topics.detections(robot), found.message),
+                (topics.grid(robot), found.grid),
+            ):
+                sink.write(raw.time_ns, topic, own, publish_ns=raw.publish_ns)
+
+
+DEFAULTS = Settings()
+
+
+def command(
+    model: Path,
+    recording: Annotated[Path, Parameter(name="IN")],
+    out: Path,
+    /,
+    *,
+    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Run a network on every image of a recording.
+
+    Parameters
+    ----------
+    model
+        A run folder of dmrl train, a .safetensors or a Keras .h5.
+    recording
+        Recording with images.
+    out
+        Recording to write: all of IN, and what was detected. Must not exist.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    result = run(model, recording, out, settings)
+    if as_json:
+        print_json({"recording": str(out), **asdict(result)})
+        return
+    columns = ("images", "detections over the threshold")
+    print_table(str(out), columns, [(result.images, result.believed)])

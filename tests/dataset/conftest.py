@@ -1,0 +1,67 @@
+"""Small recordings with images and labels, made in code."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl import card
+from dmrl.images import encode_png
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter
+from dmrl.topics import camera_image, labels
+
+HEIGHT_PX, WIDTH_PX = 48, 64
+STEP_NS = 100_000_000
+
+Record = Callable[..., Path]
+
+
+def pixels_of(seed: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX) -> Any:
+    """Noise, dark at the end: trailing zero bytes must survive."""
+    rgb = np.random.default_rng(seed).integers(0, 256, (height_px, width_px, 3), np.uint8)
+    rgb[-1] = 0
+    return rgb
+
+
+def peer(**fields: Any) -> Any:
+    """One peer of PeerLabels, inside the image unless told otherwise."""
+    values = {"peer": "cf2", "u_px": 20.5, "v_px": 12.5, "depth_m": 1.5, "source": "truth"}
+    return message("PeerLabel")(**{**values, **fields})
+
+
+@pytest.fixture(autouse=True)
+def figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cards without figures, which take longer than the rest; test_card.py draws them."""
+    monkeypatch.setattr(card, "plots", None)
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Record:
+    """Writes a recording: one list of peers per image, None for an image without labels."""
+
+    def write(
+        name: str = "flight.mcap",
+        peers: Sequence[Sequence[Any] | None] = ([peer()],) * 6,
+        *,
+        seed: int = 0,
+        split: Mapping[str, str] | None = None,
+        sizes_px: Mapping[int, tuple[int, int]] | None = None,
+    ) -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        with RecordingWriter(path, Provenance("test", {"seed": seed})) as sink:
+            if split is not None:
+                sink.add_metadata("dmrl.split", dict(split))
+            for k, listed in enumerate(peers):
+                size_px = (sizes_px or {}).get(k, (HEIGHT_PX, WIDTH_PX))
+                data = encode_png(pixels_of(1000 * seed + k, *size_px))
+                picture = message("CompressedImage")(data=data, format="png")
+                sink.write(k * STEP_NS, camera_image("cf1"), picture)
+                if listed is not None:
+                    sink.write(k * STEP_NS, labels("cf1"), message("PeerLabels")(peers=listed))
+        return path
+
+    return write

@@ -1,0 +1,214 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.dataset import open_dataset
+from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
+from dmrl.images import encode_png
+from dmrl.messages import STATUS_AMBIGUOUS, message, schema_bytes
+from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter
+from dmrl.stages import convert
+from dmrl.stages import dataset as stage
+from dmrl.stages.dataset import Settings, run
+from dmrl.topics import camera_image, labels
+
+from .conftest import STEP_NS, Record, peer, pixels_of
+
+PLAIN = Settings()
+
+
+def test_every_labelled_image_becomes_a_row_that_names_recording_and_time(
+    record: Record, tmp_path: Path
+) -> None:
+    run([record()], tmp_path / "out", PLAIN)
+    rows = open_dataset(tmp_path / "out").split("train").table
+    assert rows["log_time"].to_pylist() == [k * STEP_NS for k in range(6)]
+    assert set(rows["source"].to_pylist()) == {"flight.mcap"}
+    assert set(rows["robot"].to_pylist()) == {"cf1"}
+    assert set(rows["split"].to_pylist()) == {"train"}
+
+
+def test_pixels_are_those_of_the_image(record: Record, tmp_path: Path) -> None:
+    run([record()], tmp_path / "out", PLAIN)
+    (got,) = open_dataset(tmp_path / "out").split("train").pixels
+    assert np.array_equal(got, np.stack([pixels_of(k) for k in range(6)]))
+
+
+def test_a_label_makes_its_cell_and_keeps_its_numbers(record: Record, tmp_path: Path) -> None:
+    run([record(peers=[[peer(sigma_u_px=2.0, box_px=[1, 2, 30, 40])]])], tmp_path / "out", PLAIN)
+    split = open_dataset(tmp_path / "out").split("train")
+    assert split.confidence.shape == split.depth.shape == (1, 6, 8)
+    assert np.argwhere(split.confidence).tolist() == [[0, 1, 2]]
+    assert split.depth[0, 1, 2] == np.float32(1.5)
+    (got,) = split.table["peers"][0].as_py()
+    assert (got["peer"], got["u_px"], got["v_px"]) == ("cf2", 20.5, 12.5)
+    assert (got["sigma_u_px"], got["box_px"], got["status"]) == (2.0, [1, 2, 30, 40], "OK")
+
+
+@pytest.mark.parametrize("fields", [{"u_px": 64.0}, {"v_px": -0.1}, {"depth_m": -1.0}])
+def test_a_peer_out_of_sight_is_listed_but_makes_no_cell(
+    record: Record, tmp_path: Path, fields: dict[str, float]
+) -> None:
+    run([record(peers=[[peer(**fields)]])], tmp_path / "out", PLAIN)
+    split = open_dataset(tmp_path / "out").split("train")
+    assert not split.confidence.any()
+    assert len(split.table["peers"][0].as_py()) == 1
+
+
+def test_an_image_where_nobody_is_seen_stays_and_one_nobody_labelled_goes(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = run([record(peers=[[peer()], [], None, None])], tmp_path / "out", PLAIN)
+    assert result.images == {"train": 2}
+    assert "left out: 2 images had no labels" in capsys.readouterr().err
+
+
+def test_the_best_source_wins_and_the_others_are_dropped(record: Record, tmp_path: Path) -> None:
+    both = [peer(source="published", u_px=30.0), peer(source="truth", u_px=20.0)]
+    flight = record(peers=[both])
+    for wanted, u_px in (("best", 20.0), ("truth", 20.0), ("published", 30.0)):
+        settings = Settings(labels=wanted)  # type: ignore[arg-type]  # parametrised literal
+        run([flight], tmp_path / wanted, settings)
+        (got,) = open_dataset(tmp_path / wanted).split("train").table["peers"][0].as_py()
+        assert got["u_px"] == u_px
+
+
+def test_an_image_whose_peers_another_source_labelled_is_no_negative(
+    record: Record, tmp_path: Path
+) -> None:
+    flight = record(peers=[[peer(source="hand")], [peer(source="estimate")], []])
+    result = run([flight], tmp_path / "out", Settings(labels="hand"))
+    assert (result.images, result.tally.of_other_sources) == ({"train": 2}, 1)
+
+
+def test_a_source_nobody_used_is_refused_with_those_that_are_there(
+    record: Record, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingError, match=r"no labels from hand\. Try one of --labels truth"):
+        run([record()], tmp_path / "out", Settings(labels="hand"))
+
+
+def test_an_image_with_a_doubtful_label_is_left_out_unless_all_are_kept(
+    record: Record, tmp_path: Path
+) -> None:
+    doubtful = [peer(), peer(peer="cf3", status=STATUS_AMBIGUOUS)]
+    flight = record(peers=[[peer()], doubtful])
+    assert run([flight], tmp_path / "a", PLAIN).images == {"train": 1}
+    assert run([flight], tmp_path / "b", Settings(keep_all=True)).images == {"train": 2}
+    statuses = open_dataset(tmp_path / "b").split("train").table["peers"][1].as_py()
+    assert [p["status"] for p in statuses] == ["OK", "AMBIGUOUS"]
+
+
+def test_same_input_same_bytes(record: Record, tmp_path: Path) -> None:
+    flights = [record(), record("other.mcap", seed=1)]
+    for name in ("a", "b"):
+        run(flights, tmp_path / name, Settings(shard_images=4))
+    files = [p.relative_to(tmp_path / "a") for p in sorted((tmp_path / "a").rglob("*"))]
+    assert len(files) > 10
+    for file in files:
+        if (tmp_path / "a" / file).is_file():
+            assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_shards_hold_no_more_images_than_asked(record: Record, tmp_path: Path) -> None:
+    run([record(peers=[[peer()]] * 150)], tmp_path / "out", Settings(shard_images=70))
+    info = json.loads((tmp_path / "out/train/dataset_info.json").read_text())
+    assert info["splits"]["train"]["shard_lengths"] == [70, 70, 10]
+    split = open_dataset(tmp_path / "out").split("train")
+    assert [len(p) for p in split.pixels] == [64, 6, 64, 6, 10]
+    got = np.concatenate(split.pixels)
+    assert np.array_equal(got, np.stack([pixels_of(k) for k in range(150)]))
+
+
+def test_images_of_two_sizes_are_refused_with_both_sizes(record: Record, tmp_path: Path) -> None:
+    flight = record(sizes_px={4: (40, 64)})
+    with pytest.raises(RecordingError, match=r"flight.mcap.* 64 x 40 px, .* 64 x 48 px.*convert"):
+        run([flight], tmp_path / "out", PLAIN)
+
+
+def test_a_size_that_is_no_multiple_of_eight_is_refused(record: Record, tmp_path: Path) -> None:
+    flight = record(sizes_px={0: (244, 324)})
+    with pytest.raises(RecordingError, match=r"324 x 244 px, not a multiple of 8 .*--width-px"):
+        run([flight], tmp_path / "out", PLAIN)
+
+
+def test_a_recording_without_labels_is_refused_by_topic(record: Record, tmp_path: Path) -> None:
+    with pytest.raises(MissingTopic, match=r"no topic /\*/labels in .*flight.mcap"):
+        run([record(peers=[None])], tmp_path / "out", PLAIN)
+
+
+def test_a_topic_with_another_message_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "odd.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        picture = message("CompressedImage")(data=encode_png(pixels_of(0)), format="png")
+        sink.write(0, camera_image("cf1"), picture)
+        odd = Channel(labels("cf1"), "dmrl.v1.Height", schema_bytes("Height"))
+        sink.write_raw(RawMessage(0, 0, odd, b""))
+    with pytest.raises(RecordingError, match=r"/cf1/labels .*Height"):
+        run([path], tmp_path / "out", PLAIN)
+
+
+def test_recordings_with_nothing_to_keep_say_why(record: Record, tmp_path: Path) -> None:
+    flight = record(peers=[[peer(status=STATUS_AMBIGUOUS)]] * 3)
+    with pytest.raises(RecordingError, match=r"3 images had a label that is not OK"):
+        run([flight], tmp_path / "out", PLAIN)
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]
+
+
+def test_datasets_are_never_overwritten(record: Record, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with pytest.raises(OutputError, match="never overwritten"):
+        run([record()], tmp_path / "out", PLAIN)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_run_that_dies_in_the_middle_leaves_no_dataset(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    flight = record(peers=[[peer()]] * 100)
+    monkeypatch.setattr(stage, "one_size", die)
+    with pytest.raises(KeyboardInterrupt):
+        run([flight], tmp_path / "out", PLAIN)
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]
+
+
+def test_the_command_prints_images_and_label_sources(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = record()
+    stage.command([flight], tmp_path / "out", as_json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["images"] == {"train": 6}
+    assert printed["labels"] == {"flight.mcap": "truth"}
+    stage.command([flight], tmp_path / "again")
+    assert "flight.mcap" in capsys.readouterr().out
+
+
+def test_the_published_set_keeps_its_split_and_its_labels_by_source(
+    data: Path, tmp_path: Path
+) -> None:
+    recording = tmp_path / "single.mcap"
+    convert.run(data / "locanet-synthetic", recording, convert.Settings())
+    for source in ("truth", "published"):
+        result = run([recording], tmp_path / source, Settings(labels=source))  # type: ignore[arg-type]  # one of the choices
+        assert result.images == {"train": 784, "test": 98}
+    true, published = (
+        open_dataset(tmp_path / source).split("test") for source in ("truth", "published")
+    )
+    shift = np.array(
+        [
+            [b[0]["u_px"] - a[0]["u_px"], b[0]["v_px"] - a[0]["v_px"]]
+            for a, b in zip(
+                true.table["peers"].to_pylist(), published.table["peers"].to_pylist(), strict=True
+            )
+        ]
+    )
+    # The published labels were projected with another camera than the images.
+    assert np.abs(np.median(shift, axis=0) - (2.0, 10.0)).max() < 1.0
+    assert true.confidence.sum() == 98

@@ -1,0 +1,149 @@
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from dmrl import card
+from dmrl.card import write_card
+from dmrl.errors import DatasetError
+from dmrl.stages.card import Settings as CardSettings
+from dmrl.stages.card import run as run_card
+from dmrl.stages.dataset import Settings, run
+
+from .conftest import Record, peer
+
+yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
+datasets = pytest.importorskip("datasets", reason="datasets is not installed")
+
+
+@pytest.fixture(autouse=True)
+def figures() -> None:
+    """Figures are drawn here."""
+
+
+@pytest.fixture
+def built(record: Record, tmp_path: Path) -> Path:
+    flights = [
+        record(peers=[[peer()], [], [peer(), peer(peer="cf3", u_px=40.0)]]),
+        record("other.mcap", peers=[[peer(u_px=99.0)], [peer()]], seed=1),
+    ]
+    settings = Settings(title="Two flights: a test", license="cc-by-4.0")
+    run(flights, tmp_path / "out", settings)
+    return tmp_path / "out"
+
+
+def front_of(folder: Path) -> Any:
+    return yaml.safe_load((folder / "README.md").read_text().split("---\n")[1])
+
+
+def test_the_front_matter_says_what_the_hub_asks(built: Path) -> None:
+    front = front_of(built)
+    assert front["pretty_name"] == "Two flights: a test"
+    assert front["license"] == "cc-by-4.0"
+    assert front["size_categories"] == ["n<1K"]
+    info = front["dataset_info"]
+    assert {s["name"]: s["num_examples"] for s in info["splits"]}.keys() == {"train", "test"}
+    opened = datasets.load_from_disk(str(built))
+    features = datasets.Features._from_yaml_list(info["features"])
+    assert features == opened["train"].features
+
+
+def test_it_counts_images_and_peers(built: Path) -> None:
+    text = (built / "README.md").read_text()
+    counts = re.findall(r"^\| (?:train|test) \| (\d+) \| (\d+) \| (\d+) \|", text, re.M)
+    assert sorted(counts) == [("2", "1", "1"), ("3", "2", "3")]
+    assert re.search(r"^\| flight.mcap \| (train|test) \| 3 \|$", text, re.M)
+
+
+def test_every_column_has_a_meaning_with_its_unit(built: Path) -> None:
+    text = (built / "README.md").read_text()
+    rows = re.findall(r"^\| `([\w.]+)` \| [^|]+ \| ([^|]*) \|$", text, re.M)
+    front = front_of(built)["dataset_info"]["features"]
+    names = [f["name"] for f in front] + [f"peers.{f['name']}" for f in front[1]["list"]]
+    assert sorted(name for name, _ in rows) == sorted(names)
+    assert all(meaning.strip() for _, meaning in rows)
+
+
+def test_it_tells_the_whole_ancestry_with_hashes(built: Path) -> None:
+    text = (built / "README.md").read_text()
+    made = json.loads((built / "provenance.json").read_text())
+    for source in made["inputs"]:
+        assert f"input `{source['name']}`, SHA-256 `{source['sha256']}`" in text
+    assert "    - **test**, dmrl" in text
+    assert "seed = 1" in text
+
+
+def test_figures_stand_beside_it_as_png_and_svg(built: Path) -> None:
+    text = (built / "README.md").read_text()
+    for name in ("depth", "position", "peers"):
+        assert f"](figures/{name}.png)" in text
+        with Image.open(built / "figures" / f"{name}.png") as image:
+            assert image.width >= 800
+        assert (built / "figures" / f"{name}.svg").read_text().startswith("<?xml")
+
+
+def test_figures_have_units_on_their_axes(built: Path) -> None:
+    # Text in SVG is drawn as paths; matplotlib keeps the words as comments.
+    assert "<!-- depth along the optical axis, m -->" in (built / "figures/depth.svg").read_text()
+    assert "<!-- u, px -->" in (built / "figures/position.svg").read_text()
+
+
+def test_writing_it_again_gives_the_same_bytes(built: Path) -> None:
+    before = {p: p.read_bytes() for p in built.rglob("*") if p.is_file()}
+    assert run_card(built, CardSettings()) == built / "README.md"
+    assert {p: p.read_bytes() for p in built.rglob("*") if p.is_file()} == before
+
+
+def test_title_and_license_can_be_given_and_stay(built: Path) -> None:
+    run_card(built, CardSettings(title='A "new" name', license="mit"))
+    readme = built / "README.md"
+    readme.write_text(readme.read_text().replace('license: "mit"', "license: mit"))
+    run_card(built, CardSettings())
+    front = front_of(built)
+    assert (front["pretty_name"], front["license"]) == ('A "new" name', "mit")
+
+
+@pytest.mark.parametrize("options", [{}, {"png": True}, {"parquet": True}])
+def test_its_code_runs(record: Record, tmp_path: Path, options: dict[str, bool]) -> None:
+    flight = record()
+    run([flight], tmp_path / "out", Settings(split="none", **options))  # type: ignore[arg-type]  # bools
+    text = (tmp_path / "out" / "README.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    assert len(blocks) == 3
+    for code in blocks:
+        names: dict[str, Any] = {}
+        exec(code.replace("DATASET", str(tmp_path / "out")), names)
+        shown = names["rgb"] if "rgb" in names else names["table"]
+        assert shown.shape[0] in (48, 6)
+
+
+def test_without_matplotlib_the_card_has_no_figures_and_says_how_to_get_them(
+    record: Record,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(card, "plots", None)
+    run([record()], tmp_path / "out", Settings(split="none"))
+    assert "pip install 'dmrl[plot]', then dmrl card" in capsys.readouterr().err
+    assert "figures/" not in (tmp_path / "out" / "README.md").read_text()
+
+
+def test_a_dataset_without_any_peer_has_a_card(record: Record, tmp_path: Path) -> None:
+    run([record(peers=[[], []])], tmp_path / "out", Settings(split="none"))
+    assert "| train | 2 | 0 | 0 |" in (tmp_path / "out" / "README.md").read_text()
+
+
+def test_a_folder_that_is_no_dataset_gets_no_card(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="is not a dataset"):
+        write_card(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_broken_provenance_is_one_line(built: Path) -> None:
+    (built / "provenance.json").write_text("[]")
+    with pytest.raises(DatasetError, match=r"provenance.json cannot be read .* again$"):
+        write_card(built)

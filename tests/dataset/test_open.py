@@ -1,0 +1,170 @@
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from dmrl.dataset import open_dataset
+from dmrl.dataset.layout import schema
+from dmrl.errors import DatasetError
+from dmrl.stages.dataset import Settings, run
+
+from .conftest import HEIGHT_PX, WIDTH_PX, Record, pixels_of
+
+datasets = pytest.importorskip("datasets", reason="datasets is not installed")
+
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel for its maps")
+SHARD = re.compile(r"/train/data-\d{5}-of-00002\.arrow$")
+
+
+@pytest.fixture
+def built(record: Record, tmp_path: Path) -> Path:
+    flights = [record(), record("other.mcap", seed=1)]
+    run(flights, tmp_path / "out", Settings(shard_images=4))
+    return tmp_path / "out"
+
+
+def mapped_file(address: int) -> str:
+    """File that the kernel has mapped at an address, or an empty string."""
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        start, end = (int(x, 16) for x in line.split()[0].split("-"))
+        if start <= address < end:
+            return line.split(maxsplit=5)[5] if len(line.split()) > 5 else ""
+    return ""
+
+
+def test_datasets_opens_it_with_the_features_of_the_contract(built: Path) -> None:
+    opened = datasets.load_from_disk(str(built))
+    assert {name: len(split) for name, split in opened.items()} == {"train": 6, "test": 6}
+    arrow = schema(HEIGHT_PX, WIDTH_PX)
+    features = opened["train"].features
+    assert features == datasets.Features.from_arrow_schema(arrow)
+    assert features.arrow_schema.types == arrow.types
+    assert str(features["pixels"].dtype) == f"fixed_size_binary[{HEIGHT_PX * WIDTH_PX * 3}]"
+    assert features["confidence"].length == 6
+    assert features["confidence"].feature.length == 8
+    assert opened["train"].info.splits["train"].num_examples == 6
+
+
+def test_datasets_reads_the_same_rows(built: Path) -> None:
+    row = datasets.load_from_disk(str(built))["train"][5]
+    split = open_dataset(built).split("train")
+    rgb = np.frombuffer(row["pixels"], np.uint8).reshape(HEIGHT_PX, WIDTH_PX, 3)
+    assert np.array_equal(rgb, np.concatenate(split.pixels)[5])
+    assert np.array_equal(row["confidence"], split.confidence[5])
+    assert row["peers"] == split.table["peers"][5].as_py()
+
+
+@LINUX
+def test_datasets_does_not_copy(built: Path) -> None:
+    table = datasets.load_from_disk(str(built), keep_in_memory=False)["train"].data
+    for chunk in table["pixels"].chunks:
+        assert SHARD.search(mapped_file(chunk.buffers()[1].address))
+
+
+def test_a_plain_memory_map_holds_every_buffer(built: Path) -> None:
+    for shard in sorted(built.rglob("*.arrow")):
+        whole = pa.memory_map(str(shard)).read_buffer()
+        table = pa.ipc.open_stream(whole).read_all()
+        for column in ("pixels", "log_time"):
+            for chunk in table[column].chunks:
+                buffer = chunk.buffers()[1]
+                assert whole.address <= buffer.address
+                assert buffer.address + buffer.size <= whole.address + whole.size
+                assert buffer.address % 8 == 0
+
+
+@LINUX
+def test_our_pixels_are_views_of_the_mapped_file(built: Path) -> None:
+    for block in open_dataset(built).split("train").pixels:
+        assert SHARD.search(mapped_file(block.ctypes.data))
+        assert not block.flags.writeable
+
+
+def test_a_sliced_table_gives_the_right_pixels(built: Path) -> None:
+    split = open_dataset(built).split("train")
+    part = type(split)("part", split.table.slice(1, 4))
+    assert np.array_equal(np.concatenate(part.pixels), np.concatenate(split.pixels)[1:5])
+    assert np.array_equal(part.depth, split.depth[1:5])
+
+
+@pytest.mark.parametrize("parquet", [False, True])
+@pytest.mark.parametrize("png", [False, True])
+def test_every_format_opens_with_the_same_rows(
+    record: Record, tmp_path: Path, png: bool, parquet: bool
+) -> None:
+    settings = Settings(split="none", png=png, parquet=parquet, shard_images=4)
+    run([record()], tmp_path / "out", settings)
+    split = open_dataset(tmp_path / "out").split("train")
+    wanted = np.stack([pixels_of(k) for k in range(6)])
+    assert np.array_equal(np.concatenate(split.pixels), wanted)
+    assert split.confidence.sum() == 6
+    assert split.image_shape == (HEIGHT_PX, WIDTH_PX)
+
+
+def test_datasets_shows_png_as_images(record: Record, tmp_path: Path) -> None:
+    run([record()], tmp_path / "out", Settings(split="none", png=True))
+    opened = datasets.load_from_disk(str(tmp_path / "out"))["train"]
+    assert isinstance(opened.features["image"], datasets.Image)
+    assert np.array_equal(np.asarray(opened[3]["image"]), pixels_of(3))
+
+
+@pytest.mark.parametrize("png", [False, True])
+def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path, png: bool) -> None:
+    flights = [record(), record("other.mcap", seed=1)]
+    run(flights, tmp_path / "out", Settings(png=png, parquet=True))
+    opened = datasets.load_dataset(str(tmp_path / "out"), cache_dir=str(tmp_path / "cache"))
+    assert set(opened) == {"train", "test"}
+    wanted = datasets.Features.from_arrow_schema(schema(HEIGHT_PX, WIDTH_PX, png=png))
+    assert opened["train"].features == wanted
+
+
+def test_an_absent_split_names_those_that_are_there(built: Path) -> None:
+    with pytest.raises(DatasetError, match=r"no split val in .*out. It has: train, test"):
+        open_dataset(built).split("val")
+
+
+@pytest.mark.parametrize("name", ["nothing", "empty"])
+def test_a_folder_that_is_no_dataset_is_refused_with_the_way_out(tmp_path: Path, name: str) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DatasetError, match=r"Make one with: dmrl dataset RECORDING.mcap"):
+        open_dataset(tmp_path / name)
+
+
+def test_a_missing_shard_is_named(built: Path) -> None:
+    shard = built / "train" / "data-00001-of-00002.arrow"
+    shard.unlink()
+    with pytest.raises(DatasetError, match=f"{shard.name} is missing"):
+        open_dataset(built).split("train")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
+def test_a_cut_shard_is_named(built: Path, share: float) -> None:
+    shard = built / "train" / "data-00000-of-00002.arrow"
+    data = shard.read_bytes()
+    shard.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(DatasetError, match=f"{shard.name} is cut short or damaged"):
+        open_dataset(built).split("train")
+
+
+def test_a_shard_cut_between_two_batches_is_named(built: Path) -> None:
+    shard = built / "train" / "data-00000-of-00002.arrow"
+    with pa.OSFile(str(shard), "wb") as sink:
+        pa.ipc.new_stream(sink, schema(HEIGHT_PX, WIDTH_PX)).close()
+    with pytest.raises(DatasetError, match=f"{shard.name} is cut short: 0 of 4 rows"):
+        open_dataset(built).split("train")
+
+
+def test_a_missing_parquet_shard_is_named(record: Record, tmp_path: Path) -> None:
+    run([record()], tmp_path / "out", Settings(split="none", parquet=True, shard_images=4))
+    (tmp_path / "out/data/train-00000-of-00002.parquet").unlink()
+    with pytest.raises(DatasetError, match=r"train-00000-of-00002.parquet is missing"):
+        open_dataset(tmp_path / "out").split("train")
+
+
+def test_broken_json_is_one_line(built: Path) -> None:
+    (built / "train" / "state.json").write_text("{")
+    with pytest.raises(DatasetError, match=r"state.json is not JSON"):
+        open_dataset(built).split("train")

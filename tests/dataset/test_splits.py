@@ -1,0 +1,94 @@
+from pathlib import Path
+
+import pytest
+
+from dmrl.dataset import open_dataset
+from dmrl.dataset.splits import held_out, of_source
+from dmrl.errors import RecordingError, SettingError
+from dmrl.stages.dataset import Settings, run
+
+from .conftest import STEP_NS, Record
+
+
+def test_the_split_of_the_source_wins(record: Record, tmp_path: Path) -> None:
+    own = {"train": f"[[0, {2 * STEP_NS}], [{5 * STEP_NS}, {5 * STEP_NS}]]"}
+    own["test"] = f"[[{3 * STEP_NS}, {4 * STEP_NS}]]"
+    result = run([record(split=own)], tmp_path / "out", Settings())
+    assert result.images == {"train": 4, "test": 2}
+    times = open_dataset(tmp_path / "out").split("test").table["log_time"].to_pylist()
+    assert times == [3 * STEP_NS, 4 * STEP_NS]
+
+
+def test_images_outside_every_span_are_left_out(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = {"train": "[[0, 0]]", "test": f"[[{STEP_NS}, {STEP_NS}]]"}
+    run([record(split=own)], tmp_path / "out", Settings())
+    assert "left out: 4 images belong to no split" in capsys.readouterr().err
+
+
+def test_the_split_of_the_source_can_be_ignored(record: Record, tmp_path: Path) -> None:
+    flight = record(split={"train": "[[0, 0]]"})
+    assert run([flight], tmp_path / "a", Settings(split="recordings")).images == {"train": 6}
+    assert run([flight], tmp_path / "b", Settings(split="none")).images == {"train": 6}
+
+
+def test_recordings_are_held_out_whole(record: Record, tmp_path: Path) -> None:
+    flights = [record(f"{k}.mcap", seed=k) for k in range(5)]
+    run(flights, tmp_path / "out", Settings(test_share=0.4))
+    dataset = open_dataset(tmp_path / "out")
+    held = set(dataset.split("test").table["source"].to_pylist())
+    kept = set(dataset.split("train").table["source"].to_pylist())
+    assert (len(held), len(kept), held & kept) == (2, 3, set())
+
+
+def test_one_recording_is_all_train_and_says_that_nothing_is_held_out(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([record()], tmp_path / "out", Settings()).images == {"train": 6}
+    assert "nothing is held out for testing. Name two or more" in capsys.readouterr().err
+
+
+def test_no_warning_where_nothing_was_to_be_held_out(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run([record()], tmp_path / "out", Settings(split="none"))
+    assert "held out" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("count", "share", "held"), [(2, 0.01, 1), (10, 0.2, 2), (3, 0.99, 2)])
+def test_at_least_one_recording_is_held_out_and_one_stays(
+    count: int, share: float, held: int
+) -> None:
+    hashes = {Path(f"{k}.mcap"): f"{k:064x}" for k in range(count)}
+    assert len(held_out(hashes, share, 0)) == held
+
+
+def test_the_choice_depends_on_content_and_seed_only() -> None:
+    hashes = {Path(f"{k}.mcap"): f"{k:064x}" for k in range(20)}
+    renamed = {Path(f"{99 - k}.mcap"): hashes[Path(f"{k}.mcap")] for k in reversed(range(20))}
+    chosen = {hashes[path] for path in held_out(hashes, 0.3, 0)}
+    assert chosen == {renamed[path] for path in held_out(renamed, 0.3, 0)}
+    assert chosen != {hashes[path] for path in held_out(hashes, 0.3, 1)}
+
+
+@pytest.mark.parametrize("text", ["[[0]]", "[1, 2]", "train", "null", '[["a", 2]]'])
+def test_a_split_that_is_no_list_of_spans_is_refused(text: str) -> None:
+    with pytest.raises(RecordingError, match=r"x.mcap: its split is not a list of \[start_ns"):
+        of_source(Path("x.mcap"), {"train": text})
+
+
+def test_splits_that_share_a_time_are_refused() -> None:
+    with pytest.raises(RecordingError, match=r"splits train and test share the time 5 ns"):
+        of_source(Path("x.mcap"), {"train": "[[0, 5]]", "test": "[[5, 9]]"})
+
+
+def test_two_recordings_of_one_name_are_refused(record: Record, tmp_path: Path) -> None:
+    flights = [record("a/x.mcap"), record("b/x.mcap", seed=1)]
+    with pytest.raises(SettingError, match="have one name"):
+        run(flights, tmp_path / "out", Settings())
+
+
+def test_a_copy_of_a_recording_is_refused(record: Record, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="hold the same bytes"):
+        run([record("x.mcap"), record("y.mcap")], tmp_path / "out", Settings())

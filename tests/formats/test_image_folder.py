@@ -1,0 +1,195 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats import image_folder
+from dmrl.formats.image_folder import Options
+from dmrl.formats.sample import Sample
+from dmrl.geometry import AIDECK, project
+from dmrl.images import decode, encode_jpeg, encode_png
+
+HEADER = "file,peer,u_px,v_px,depth_m\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three pictures of 64 x 48: PNG, JPEG and PPM."""
+    path = tmp_path / "pictures"
+    path.mkdir()
+    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    (path / "a.png").write_bytes(encode_png(rgb))
+    (path / "b.JPG").write_bytes(encode_jpeg(rgb))
+    (path / "c.ppm").write_bytes(b"P6\n# hi\n64 48\n255\n" + rgb.tobytes() + b"junk")
+    (path / "notes.txt").write_text("no picture")
+    return path
+
+
+def samples(folder: Path, kind: str, options: Options | None = None) -> list[Sample]:
+    """Samples of one message type."""
+    found = image_folder.content(folder, options or Options()).samples
+    return [sample for sample in found if sample.message == kind]
+
+
+def test_png_and_jpeg_keep_their_bytes_and_others_their_pixels(folder: Path) -> None:
+    png, jpeg, ppm = samples(folder, "CompressedImage")
+    assert png.fields["data"] == (folder / "a.png").read_bytes()
+    assert (jpeg.fields["format"], jpeg.fields["data"]) == (
+        "jpeg",
+        (folder / "b.JPG").read_bytes(),
+    )
+    assert ppm.fields["format"] == "png"
+    np.testing.assert_array_equal(decode(ppm.fields["data"]), decode(png.fields["data"]))
+
+
+def test_names_that_are_no_times_get_a_nominal_rate(folder: Path) -> None:
+    times = [s.time_ns for s in samples(folder, "CompressedImage", Options(rate_hz=30))]
+    assert times == [0, 33_333_333, 66_666_667]
+
+
+def test_names_of_twelve_digits_are_times(folder: Path) -> None:
+    times = (1_700_000_000_000_000_000, 1_600_000_000_000_000_000, 999_999_999_999)
+    for path, time_ns in zip(sorted(folder.glob("[abc].*")), times, strict=True):
+        path.rename(folder / f"{time_ns}{path.suffix}")
+    assert [s.time_ns for s in samples(folder, "CompressedImage")] == sorted(times)
+
+
+def test_unlabelled_empty_and_seen_are_three_things(folder: Path) -> None:
+    (folder / "labels.csv").write_text(
+        "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px,visible_share,source,split\n"
+        "a.png,cf2,10.5,20,0.8,5,15,16,25,0.5,truth,train\n"
+        "a.png,cf3,70,20,1.5,,,,,,,train\n"
+        "c.ppm,,,,,,,,,,,test\n"
+    )
+    content = image_folder.content(folder, Options())
+    found = [s for s in content.samples if s.message == "PeerLabels"]
+    assert [s.time_ns for s in found] == [0, 200_000_000]
+    first, second = found[0].fields["peers"]
+    assert first == {
+        "peer": "cf2",
+        "u_px": 10.5,
+        "v_px": 20.0,
+        "depth_m": 0.8,
+        "visible_share": 0.5,
+        "source": "truth",
+        "sigma_u_px": 0.0,
+        "sigma_v_px": 0.0,
+        "sigma_depth_m": 0.0,
+        "box_px": [5, 15, 16, 25],
+    }
+    assert (second["source"], second["box_px"]) == ("hand", [])
+    assert found[1].fields["peers"] == []
+    assert content.split == {"train": [(0, 0)], "test": [(200_000_000, 200_000_000)]}
+    assert content.total == 5
+
+
+def test_labels_boxes_and_camera_follow_the_crop(folder: Path) -> None:
+    # From 64 x 48 to 40 x 40: the middle 48 x 48, from column 8, scaled by 40/48.
+    (folder / "labels.csv").write_text(
+        "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px,sigma_u_px,sigma_depth_m\n"
+        "a.png,cf2,32,12,0.8,4,6,20,18,6,0.3\n"
+        "b.JPG,cf2,2,12,0.8,0,6,7,18,,\n"
+    )
+    camera = replace(AIDECK, width_px=64, height_px=48, cx_px=30.0, cy_px=20.0)
+    options = Options(camera=camera, size_px=(40, 40))
+    one, other = (s.fields["peers"][0] for s in samples(folder, "PeerLabels", options))
+    assert (one["u_px"], one["v_px"], one["sigma_u_px"]) == pytest.approx((20, 10, 5))
+    assert (one["depth_m"], one["sigma_depth_m"]) == (0.8, 0.3)
+    assert one["box_px"] == pytest.approx([0, 5, 10, 15])
+    assert other["u_px"] < 0 and other["box_px"] == []
+    assert {
+        decode(s.fields["data"]).shape for s in samples(folder, "CompressedImage", options)
+    } == {(40, 40, 3)}
+    (calibration,) = samples(folder, "CameraCalibration", options)
+    point = np.array([[2.0, 0.1, 0.2]])
+    before, _ = project(point, camera.image_from_optical)
+    after, _ = project(point, np.reshape(calibration.fields["K"], (3, 3)))
+    np.testing.assert_allclose(after, (before - (8, 0)) * 40 / 48)
+    assert (calibration.fields["width"], calibration.fields["height"]) == (40, 40)
+    assert calibration.fields["D"] == list(AIDECK.distortion)
+
+
+def test_the_crop_shows_what_its_labels_say(tmp_path: Path) -> None:
+    rgb = np.zeros((300, 500, 3), np.uint8)
+    rgb[100:120, 350:380] = 255
+    (tmp_path / "a.png").write_bytes(encode_png(rgb))
+    (tmp_path / "labels.csv").write_text(HEADER + "a.png,cf2,365,110,1\n")
+    options = Options(size_px=(320, 224))
+    (label,) = samples(tmp_path, "PeerLabels", options)
+    (picture,) = samples(tmp_path, "CompressedImage", options)
+    bright = np.argwhere(decode(picture.fields["data"])[..., 0] > 127)
+    v_px, u_px = (bright.min(0) + bright.max(0) + 1) / 2
+    peer = label.fields["peers"][0]
+    assert (peer["u_px"], peer["v_px"]) == pytest.approx((u_px, v_px), abs=0.6)
+
+
+def _write(text: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / "labels.csv").write_text(text) and None
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_write(HEADER + "a.pgn,cf2,1,2,3\n"), r"labels\.csv:2: .*'a\.pgn' .*mean a\.png\?"),
+        (_write(HEADER + "zzzz,cf2,1,2,3\n"), r"labels\.csv:2: .*Add the picture, or delete"),
+        (_write(HEADER + "\na.png,cf2,1,x,3\n"), r"labels\.csv:3: v_px is 'x', not a number"),
+        (_write(HEADER + "a.png,cf2,1,nan,3\n"), r"v_px is 'nan', not a number"),
+        (_write(HEADER + "a.png,cf2,1,2,0\n"), r"labels\.csv:2: depth_m is 0"),
+        (_write(HEADER + "a.png,cf2,1,2\n"), r"labels\.csv:2: not as many cells"),
+        (_write(HEADER + "a.png,cf2,1,2,3,4\n"), r"labels\.csv:2: not as many cells"),
+        (_write(HEADER + "a.png,,1,2,3\n"), r"labels\.csv:2: u_px without a peer"),
+        (_write(HEADER + "a.png,cf2,1,2,3\na.png,,,,\n"), r"labels\.csv:3: .*empty peer"),
+        (_write(HEADER + "a.png,cf2,1,2,3\n" * 2), r"labels\.csv:3: .*cf2 from hand already"),
+        (_write("file,peer,u,v_px,depth_m\n"), r"labels\.csv:1: unknown column 'u'"),
+        (_write("file,peer,u_px,v_px\n"), r"labels\.csv:1: no column depth_m"),
+        (_write(HEADER.strip() + ",peer\n"), r"labels\.csv:1: a column appears twice"),
+        (_write(HEADER.strip() + ",left_px\na.png,cf2,1,2,3,4\n"), r"labels\.csv:2: not a box"),
+        (
+            _write(HEADER.strip() + ",visible_share\na.png,cf2,1,2,3,40\n"),
+            r":2: visible_share is 40",
+        ),
+        (_write(HEADER.strip() + ",sigma_u_px\na.png,cf2,1,2,3,-1\n"), r":2: a sigma is negative"),
+        (
+            _write(HEADER.strip() + ",split\na.png,cf2,1,2,3,test\na.png,cf3,1,2,3,\n"),
+            r"labels\.csv:3: a\.png is in split none and in test",
+        ),
+        (_write(""), r"labels\.csv:1: no column file, peer"),
+        (lambda folder: (folder / "labels.csv").write_bytes(b"\xff\xfe\0") and None, "not a CSV"),
+        (lambda folder: (folder / "a.png").write_bytes(b"") and None, r"a\.png is not a picture"),
+        (lambda folder: (folder / "123456789012.png").write_bytes(b"") and None, "by its time"),
+    ],
+)
+def test_faults_name_the_file_and_the_way_out(
+    folder: Path, spoil: Callable[[Path], None], message: str
+) -> None:
+    spoil(folder)
+    with pytest.raises(SourceError, match=message) as e:
+        list(image_folder.content(folder, Options()).samples)
+    assert "\n" not in str(e.value)
+
+
+def test_a_label_file_that_was_named_must_be_there(folder: Path) -> None:
+    with pytest.raises(SourceError, match=r"no label file .*mine\.csv\. Name another"):
+        image_folder.content(folder, Options(labels=folder / "mine.csv"))
+
+
+def test_a_camera_of_another_size_is_refused(folder: Path) -> None:
+    with pytest.raises(SettingError, match=r"a\.png is 64x48 px, its camera 320x224\."):
+        samples(folder, "CompressedImage", Options(camera=AIDECK))
+
+
+def test_two_pictures_of_one_time_are_refused(tmp_path: Path) -> None:
+    for name in ("0123456789012.png", "123456789012.png"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(SourceError, match="have the same time"):
+        image_folder.list_pictures(tmp_path, 10.0)
+
+
+def test_real_frames_convert(data: Path) -> None:
+    found = samples(data / "aideck-frames", "CompressedImage", Options(camera=AIDECK))
+    paths = sorted((data / "aideck-frames").glob("*.ppm"))
+    for path, sample in zip(paths, found, strict=True):
+        np.testing.assert_array_equal(decode(sample.fields["data"]), decode(path.read_bytes()))

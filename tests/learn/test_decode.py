@@ -1,0 +1,46 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dmrl.learn.decode import decode, peaks
+
+
+def test_peaks_come_best_first_at_the_cell_centre() -> None:
+    confidence = np.zeros((1, 4, 6), np.float32)
+    confidence[0, 1, 2], confidence[0, 1, 3], confidence[0, 3, 5] = 0.6, 0.5, 0.9
+    depth_m = np.arange(24, dtype=np.float32).reshape(1, 4, 6)
+    found = decode(confidence, depth_m)
+    assert found.count.tolist() == [2]
+    assert found.u_px[0, :2].tolist() == [44.0, 20.0]
+    assert found.v_px[0, :2].tolist() == [28.0, 12.0]
+    assert found.depth_m[0, :2].tolist() == [23.0, 8.0]
+    np.testing.assert_allclose(found.confidence[0, :2], [0.9, 0.6])
+
+
+def test_the_best_cell_is_kept_however_low() -> None:
+    confidence = np.full((2, 3, 3), 1e-6)
+    confidence[0, 2, 2] = 2e-6
+    found = decode(confidence, np.ones((2, 3, 3)), min_confidence=0.5)
+    assert found.count.tolist() == [1, 1]
+    assert (found.u_px[:, 0].tolist(), found.v_px[:, 0].tolist()) == ([20.0, 4.0], [20.0, 4.0])
+
+
+def test_no_more_than_asked_for() -> None:
+    confidence = np.zeros((1, 9, 9))
+    confidence[0, ::2, ::2] = np.arange(1, 26).reshape(5, 5) / 30
+    found = decode(confidence, np.ones((1, 9, 9)), most=3)
+    assert found.count.tolist() == [3]
+    np.testing.assert_allclose(found.confidence[0], [25 / 30, 24 / 30, 23 / 30])
+
+
+@given(arrays(np.float32, (1, 5, 6), elements=st.sampled_from([0.0, 0.25, 0.5])))
+def test_equal_neighbours_give_one_peak_and_the_first_maximum_is_always_one(
+    confidence: np.ndarray,
+) -> None:
+    found = peaks(confidence)[0]
+    assert found.flat[confidence.argmax()]
+    rows, cols = np.nonzero(found)
+    for a in range(len(rows)):
+        for b in range(a):
+            assert max(abs(rows[a] - rows[b]), abs(cols[a] - cols[b])) > 1

@@ -1,0 +1,195 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from dmrl.errors import ModelError, SettingError
+from dmrl.learn.batches import Examples
+from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
+from dmrl.learn.decode import decode
+from dmrl.learn.fit import FitSettings, Training, device_of, learning_rate_at, new_network
+from dmrl.learn.model import Model, save_model
+from dmrl.learn.network import Network
+
+SETTINGS = FitSettings(epochs=4, batch_size=3, warmup_epochs=1, device="cpu")
+
+
+def dots(count: int) -> Examples:
+    """Dark images with one bright square, labelled at its centre, depth 1.5 m."""
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 40, (count, 32, 48, 3), np.uint8)
+    confidence = np.zeros((count, 4, 6), np.float32)
+    for k, cell in enumerate(rng.integers(0, 24, count)):
+        row, col = divmod(int(cell), 6)
+        pixels[k, 8 * row + 2 : 8 * row + 6, 8 * col + 2 : 8 * col + 6] = 250
+        confidence[k, row, col] = 1
+    return Examples([pixels[:7], pixels[7:]], confidence, 1.5 * confidence)
+
+
+@pytest.fixture
+def examples() -> Examples:
+    return dots(20)
+
+
+def trained(
+    examples: Examples, folder: Path, settings: FitSettings = SETTINGS, *, resume: bool = False
+) -> tuple[Training, Network]:
+    folder.mkdir(exist_ok=True)
+    network = new_network(settings, examples)
+    training = Training(network, examples, settings, folder, identity="dots", resume=resume)
+    for _ in training.steps():
+        pass
+    save_model(Model(network, "locanet", training={"history": training.history}), folder)
+    remove_checkpoint(folder)
+    return training, network
+
+
+def stopped(examples: Examples, folder: Path, epochs: int, steps: int = 0) -> None:
+    """A training that dies some steps into an epoch."""
+    folder.mkdir()
+    network = new_network(SETTINGS, examples)
+    training = Training(network, examples, SETTINGS, folder, identity="dots")
+    walk = training.steps()
+    for _ in range(epochs * 7 + steps):
+        next(walk)
+    walk.close()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+def test_a_resumed_training_ends_with_the_same_bytes(
+    examples: Examples, tmp_path: Path, steps: int
+) -> None:
+    trained(examples, tmp_path / "whole")
+    stopped(examples, tmp_path / "resumed", 2, steps)
+    trained(examples, tmp_path / "resumed", resume=True)
+    for name in ("model.safetensors", "model.json"):
+        whole, resumed = (tmp_path / f / name for f in ("whole", "resumed"))
+        assert whole.read_bytes() == resumed.read_bytes()
+
+
+def test_same_seed_same_bytes_and_another_seed_others(examples: Examples, tmp_path: Path) -> None:
+    weights = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        trained(examples, tmp_path / name, replace(SETTINGS, epochs=1, seed=seed))
+        weights.append((tmp_path / name / "model.safetensors").read_bytes())
+    assert weights[0] == weights[1] != weights[2]
+
+
+def test_training_finds_the_dot(tmp_path: Path) -> None:
+    examples = dots(150)
+    settings = replace(SETTINGS, epochs=12, learning_rate=3e-3)
+    training, network = trained(examples, tmp_path / "run", settings)
+    losses = [epoch["loss"] for epoch in training.history]
+    assert losses[-1] < losses[0] / 5
+    images: NDArray[np.uint8] = np.concatenate(list(examples.pixels))
+    found = decode(*Model(network, "locanet").grids(images))
+    best = (found.v_px[:, 0] // 8 * 6 + found.u_px[:, 0] // 8).astype(int)
+    right = best == examples.confidence.reshape(-1, 24).argmax(axis=1)
+    assert right.mean() > 0.95
+    np.testing.assert_allclose(found.depth_m[right, 0], 1.5, atol=0.3)
+
+
+def test_another_training_is_not_resumed(examples: Examples, tmp_path: Path) -> None:
+    stopped(examples, tmp_path / "run", 1, 1)
+    text = r"was trained with learning_rate 0\.001, not 0\.01\. Resume with the settings"
+    with pytest.raises(SettingError, match=text):
+        trained(examples, tmp_path / "run", replace(SETTINGS, learning_rate=0.01), resume=True)
+
+
+def test_without_a_checkpoint_there_is_nothing_to_resume(
+    examples: Examples, tmp_path: Path
+) -> None:
+    with pytest.raises(ModelError, match=r"no checkpoint in .* Train without --resume"):
+        trained(examples, tmp_path / "run", resume=True)
+
+
+def test_a_damaged_checkpoint_is_one_line(examples: Examples, tmp_path: Path) -> None:
+    stopped(examples, tmp_path / "run", 1, 1)
+    (tensors,) = (tmp_path / "run").glob("checkpoint-*.safetensors")
+    tensors.write_bytes(tensors.read_bytes()[:-9])
+    with pytest.raises(ModelError, match=r"checkpoint\.json is damaged"):
+        trained(examples, tmp_path / "run", resume=True)
+
+
+def test_one_checkpoint_is_kept_and_none_after_the_end(examples: Examples, tmp_path: Path) -> None:
+    stopped(examples, tmp_path / "run", 3, 1)
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"checkpoint.json", "checkpoint-0003.safetensors", "tensorboard"}
+    assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["epochs_done"] == 3
+    trained(examples, tmp_path / "run", resume=True)
+    assert not has_checkpoint(tmp_path / "run")
+
+
+def test_a_label_that_is_not_a_number_stops_the_training(
+    examples: Examples, tmp_path: Path
+) -> None:
+    examples.depth_m[examples.confidence > 0] = np.nan
+    with pytest.raises(SettingError, match="the loss is nan in epoch 1, step 7"):
+        trained(examples, tmp_path / "run")
+
+
+def test_tensorboard_gets_loss_and_learning_rate(examples: Examples, tmp_path: Path) -> None:
+    trained(examples, tmp_path / "run")
+    log = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    log.Reload()
+    assert set(log.Tags()["scalars"]) == {"loss/train", "learning_rate"}
+    assert [event.step for event in log.Scalars("loss/train")] == [7, 14, 21, 28]
+
+
+def test_validation_is_watched_and_changes_nothing(examples: Examples, tmp_path: Path) -> None:
+    weights = []
+    for name, watched in (("without", None), ("with", examples)):
+        (tmp_path / name).mkdir()
+        network = new_network(SETTINGS, examples)
+        training = Training(network, examples, SETTINGS, tmp_path / name, validation=watched)
+        assert sum(1 for _ in training.steps()) == 28
+        assert all(("validation_loss" in epoch) == bool(watched) for epoch in training.history)
+        save_model(Model(network, "locanet"), tmp_path / name)
+        weights.append((tmp_path / name / "model.safetensors").read_bytes())
+    assert weights[0] == weights[1]
+
+
+def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
+    rates = [learning_rate_at(step, 100, FitSettings()) for step in range(1, 1501)]
+    assert rates[0] == pytest.approx(1e-3 / 200)
+    assert rates[99] == pytest.approx(0.5e-3)
+    assert max(rates) == rates[199] == pytest.approx(1e-3)
+    assert rates[849] == pytest.approx((1e-3 + 1e-6) / 2)
+    assert rates[-1] == pytest.approx(1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("epochs", 0),
+        ("batch_size", 0),
+        ("learning_rate", 0.0),
+        ("final_learning_rate", 1.0),
+        ("warmup_epochs", -1),
+        ("depth_weight", -1.0),
+        ("threshold", 1.5),
+    ],
+)
+def test_settings_out_of_range_are_named(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=r"learning_rate: must|" + name):
+        replace(FitSettings(), **{name: value})  # type: ignore[arg-type]
+
+
+def test_images_that_do_not_fit_the_network_are_refused(examples: Examples) -> None:
+    odd = Examples([p[:, :30] for p in examples.pixels], examples.confidence, examples.depth_m)
+    with pytest.raises(SettingError, match=r"images of 48 x 30 px .* do not fit locanet"):
+        new_network(SETTINGS, odd)
+    none = Examples([p[:0] for p in examples.pixels], examples.confidence[:0], examples.depth_m[:0])
+    with pytest.raises(SettingError, match="no images to train on"):
+        new_network(SETTINGS, none)
+
+
+def test_a_missing_cuda_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert device_of("auto").type == "cpu"
+    with pytest.raises(SettingError, match="no CUDA device here"):
+        device_of("cuda")

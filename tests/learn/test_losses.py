@@ -1,0 +1,34 @@
+import math
+
+import pytest
+import torch
+
+from dmrl.learn.losses import confidence_loss, depth_loss
+
+
+def test_confidence_loss_is_the_published_sum_over_cells() -> None:
+    logit = torch.tensor([[[0.0, 2.0]], [[-1.0, -1.0]]])
+    label = torch.tensor([[[1.0, 0.0]], [[0.0, 0.0]]])
+
+    def cell(x: float, c: float) -> float:
+        p = 1 / (1 + math.exp(-x))
+        return (c - p) ** 2 * -(c * math.log(p) + (1 - c) * math.log(1 - p))
+
+    wanted = (cell(0.0, 1) + cell(2.0, 0) + 2 * cell(-1.0, 0)) / 2
+    assert float(confidence_loss(logit, label)) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_depth_loss_counts_cells_with_a_robot_only() -> None:
+    log_depth = torch.tensor([[[math.log(1.5), 0.3]], [[0.0, 0.0]]])
+    depth_m = torch.tensor([[[1.0, 0.0]], [[0.0, 0.0]]])
+    confidence = torch.tensor([[[1.0, 0.0]], [[0.0, 0.0]]])
+    assert float(depth_loss(log_depth, depth_m, confidence)) == pytest.approx(0.25 / 2)
+
+
+def test_a_far_off_log_depth_in_an_empty_cell_harms_nothing() -> None:
+    log_depth = torch.full((1, 1, 1), 1000.0, requires_grad=True)
+    loss = depth_loss(log_depth, torch.zeros(1, 1, 1), torch.zeros(1, 1, 1))
+    loss.backward()  # type: ignore[no-untyped-call]
+    assert float(loss.detach()) == 0
+    assert log_depth.grad is not None
+    assert float(log_depth.grad.abs().max()) == 0

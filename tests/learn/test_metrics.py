@@ -1,0 +1,158 @@
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dmrl.learn.matching import Points
+from dmrl.learn.metrics import (
+    BANDS_M,
+    DEFINITIONS,
+    BandFigures,
+    average_precision,
+    by_band,
+    score,
+    weighted_quantile,
+)
+
+
+def scene(images: int, offset_px: float = 0.0, depth_m: float = 1.0) -> tuple[Points, Points]:
+    """One label per image, found with an offset in u and 0.1 m too near."""
+    image = np.arange(images)
+    u, v, d = np.full(images, 100.0), np.full(images, 50.0), np.full(images, depth_m)
+    ones = np.ones(images)
+    return Points(image, u, v, d, ones), Points(image, u - offset_px, v, d - 0.1, 0.9 * ones)
+
+
+def overall(labels: Points, found: Points, images: int, draws: int = 20) -> BandFigures:
+    return by_band(score(images, labels, found), threshold=0.33, draws=draws)[0]
+
+
+def values(band: BandFigures) -> dict[str, float]:
+    return {name: figure.value for name, figure in band.figures.items()}
+
+
+def test_a_perfect_detector_has_perfect_figures() -> None:
+    labels, found = scene(10)
+    got = values(overall(labels, found, 10))
+    assert got["median_px"] == got["p95_px"] == got["rmse_px"] == got["bias_u_px"] == 0
+    assert got["within_8_px"] == got["f1"] == got["ap_8_px"] == got["ap_16_px"] == 1
+    assert got["depth_mae_m"] == pytest.approx(0.1)
+
+
+def test_figures_of_a_known_offset() -> None:
+    labels, found = scene(10, offset_px=12)
+    got = values(overall(labels, found, 10))
+    assert got["median_px"] == got["mean_px"] == got["rmse_px"] == got["bias_u_px"] == 12
+    assert (got["within_8_px"], got["within_20_px"]) == (0, 1)
+    assert (got["ap_8_px"], got["ap_16_px"], got["recall"]) == (0, 1, 1)
+
+
+def test_half_the_labels_missed() -> None:
+    labels, found = scene(10)
+    half = found.select(found.image < 5)
+    band = overall(labels, half, 10)
+    got = values(band)
+    assert band.unmatched == 5
+    assert got["within_20_px"] == got["recall"] == got["ap_16_px"] == 0.5
+    assert got["precision"] == 1
+    assert got["f1"] == pytest.approx(2 / 3)
+    assert got["rmse_px"] == 0
+    assert got["median_px"] == math.inf
+
+
+def test_detections_in_images_without_labels_are_wrong() -> None:
+    labels, found = scene(10)
+    got = values(overall(labels.select(labels.image < 5), found, 10))
+    assert (got["precision"], got["recall"], got["within_8_px"]) == (0.5, 1, 1)
+
+
+def test_below_the_threshold_is_not_claimed() -> None:
+    labels, found = scene(4)
+    sure = Points(found.image, found.u_px, found.v_px, found.depth_m, np.array([0.9, 0.33, 0.3, 0]))
+    got = values(overall(labels, sure, 4))
+    assert (got["precision"], got["recall"]) == (1, 0.5)
+    assert got["ap_16_px"] == 1
+
+
+def test_bands_hold_their_own_labels_and_empty_ones_say_nothing() -> None:
+    labels, found = scene(10, depth_m=0.7)
+    bands = by_band(score(10, labels, found), threshold=0.33, draws=5)
+    assert [(b.from_m, b.to_m) for b in bands] == list(BANDS_M)
+    assert [b.labels for b in bands] == [10, 0, 10, 0, 0, 0]
+    assert all(math.isnan(figure.value) for figure in bands[-1].figures.values())
+    assert set(bands[0].figures) == set(DEFINITIONS) - {"error", "band", "interval"}
+
+
+def test_a_wrong_detection_counts_in_the_band_of_its_own_depth() -> None:
+    labels, found = scene(10, depth_m=0.7)
+    extra = Points(np.arange(10), np.zeros(10), np.zeros(10), np.full(10, 1.7), np.full(10, 0.8))
+    order = np.argsort(np.concatenate([found.image, extra.image]), kind="stable")
+    both = Points.concatenate([found, extra], np.zeros(2, np.int64)).select(order)
+    bands = by_band(score(10, labels, both), threshold=0.33, draws=5)
+    assert [b.figures["precision"].value for b in bands[:3:2]] == [0.5, 1]
+    assert bands[4].figures["precision"].value == 0
+
+
+def test_average_precision_of_a_ranked_list_by_hand() -> None:
+    right = np.array([True, False, True, False])
+    area = average_precision(
+        np.array([0.9, 0.8, 0.7, 0.6]), right, ~right, np.ones((1, 4)), np.array([4.0])
+    )
+    # Recall 1/4 at precision 1, then 2/4 at 2/3; two of four labels are never found.
+    assert area[0] == pytest.approx(1 / 4 + 1 / 4 * 2 / 3)
+
+
+def test_intervals_cover_the_value_and_shrink_with_more_images() -> None:
+    rng = np.random.default_rng(0)
+    widths = []
+    for images in (30, 3000):
+        labels, found = scene(images)
+        near = rng.random(images) < 0.7
+        off = Points(
+            found.image, np.where(near, found.u_px, 0), found.v_px, found.depth_m, found.confidence
+        )
+        share = overall(labels, off, images, draws=300).figures["within_8_px"]
+        assert share.low < share.value < share.high
+        widths.append(share.high - share.low)
+    assert widths[1] == pytest.approx(2 * 1.96 * math.sqrt(0.7 * 0.3 / 3000), rel=0.2)
+    assert widths[0] > 5 * widths[1]
+
+
+def test_the_seed_decides_the_intervals() -> None:
+    rng = np.random.default_rng(1)
+    labels, found = scene(40)
+    off = Points(found.image, rng.random(40) * 200, found.v_px, found.depth_m, found.confidence)
+    scored = score(40, labels, off)
+
+    def figures(seed: int) -> list[BandFigures]:
+        return by_band(scored, threshold=0.33, draws=50, seed=seed)[:1]
+
+    assert figures(1) == figures(1) != figures(2)
+
+
+@given(st.lists(st.floats(-100, 100), min_size=1, max_size=30), st.randoms())
+def test_the_median_is_numpys_also_with_repeats(numbers: list[float], random: object) -> None:
+    array = np.array(numbers)
+    times = np.array([random.randint(1, 3) for _ in numbers])  # type: ignore[attr-defined]
+    repeated = np.repeat(array, times)
+    got = weighted_quantile(array, times[None].astype(float), 0.5)
+    assert got[0] == pytest.approx(np.median(repeated))
+
+
+def test_ten_thousand_images_take_seconds() -> None:
+    rng = np.random.default_rng(0)
+    images = 10_000
+    labels, found = scene(images)
+    off = Points(
+        found.image,
+        rng.random(images) * 200,
+        found.v_px,
+        rng.random(images) * 2.5,
+        found.confidence,
+    )
+    begun = time.process_time()
+    by_band(score(images, labels, off), threshold=0.33)
+    assert time.process_time() - begun < 20

@@ -1,0 +1,134 @@
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from dmrl.errors import ModelError, SettingError
+from dmrl.learn.model import Model, load_model, save_model
+from dmrl.learn.network import build
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run folder with an untrained network."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    network = build("locanet", seed=3).eval()
+    save_model(Model(network, "locanet", threshold=0.4, label_source="truth"), folder)
+    return folder
+
+
+class Bomb:
+    """A pickle that leaves a file behind when it is opened."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return Path.touch, (self.mark,)  # type: ignore[return-value]
+
+
+def test_a_saved_model_sees_the_same_when_it_is_loaded(run: Path) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
+    wanted = Model(build("locanet", seed=3).eval(), "locanet").grids(images)
+    for path in (run, run / "model.safetensors"):
+        model = load_model(path)
+        assert (model.threshold, model.label_source) == (0.4, "truth")
+        for got, want in zip(model.grids(images), wanted, strict=True):
+            np.testing.assert_array_equal(got, want)
+            assert got.shape == (2, 8, 8)
+
+
+def test_saving_twice_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    again.mkdir()
+    save_model(load_model(run), again)
+    for name in ("model.safetensors", "model.json"):
+        assert (again / name).read_bytes() == (run / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["weights.h5", "weights.safetensors", "weights.pt"])
+def test_a_pickle_is_refused_and_never_opened(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(pickle.dumps(Bomb(tmp_path / "exploded")))
+    with pytest.raises(ModelError, match="is a pickle, which can run any code"):
+        load_model(path)
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_a_torch_file_is_refused(tmp_path: Path) -> None:
+    torch.save({"weight": torch.zeros(2)}, tmp_path / "weights.pt")
+    with pytest.raises(ModelError, match=r"is a pickle.*Give a run folder"):
+        load_model(tmp_path / "weights.pt")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + bytes(20)])
+def test_anything_else_is_not_a_model(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "weights"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=r"is not a model\. Give a run folder"):
+        load_model(path)
+
+
+def test_a_missing_model_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no model"):
+        load_model(tmp_path / "nothing")
+    with pytest.raises(ModelError, match=r"no model\.safetensors in"):
+        load_model(tmp_path)
+
+
+def test_a_tensor_of_another_shape_is_named_with_both_shapes(run: Path) -> None:
+    tensors = load_file(run / "model.safetensors")
+    tensors["head.bias"] = torch.zeros(3)
+    save_file(tensors, run / "model.safetensors")
+    with pytest.raises(ModelError, match=r"head\.bias has shape \(3,\), the network needs \(2,\)"):
+        load_model(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda t: t.pop("head.bias"), r"lacks tensor head\.bias"),
+        (lambda t: t.update(extra=torch.zeros(1)), "has an unknown tensor extra"),
+        (lambda t: t["head.bias"].fill_(float("nan")), r"head\.bias holds values .* not finite"),
+    ],
+)
+def test_wrong_tensors_are_named(run: Path, change: object, text: str) -> None:
+    tensors = load_file(run / "model.safetensors")
+    change(tensors)  # type: ignore[operator]
+    save_file(tensors, run / "model.safetensors")
+    with pytest.raises(ModelError, match=text):
+        load_model(run)
+
+
+def test_damaged_weights_are_one_line(run: Path) -> None:
+    whole = (run / "model.safetensors").read_bytes()
+    (run / "model.safetensors").write_bytes(whole[:-100])
+    with pytest.raises(ModelError, match="is damaged"):
+        load_model(run)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ("threshold", "high", "has no valid threshold"),
+        ("architecture", "resnet", "asks for architecture resnet, this dmrl knows locanet"),
+    ],
+)
+def test_a_wrong_description_is_named(run: Path, key: str, value: str, text: str) -> None:
+    said = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps({**said, key: value}))
+    with pytest.raises(ModelError, match=text):
+        load_model(run)
+    (run / "model.json").write_text("{")
+    with pytest.raises(ModelError, match="is not JSON"):
+        load_model(run)
+
+
+def test_images_that_do_not_divide_into_cells_are_refused(run: Path) -> None:
+    with pytest.raises(SettingError, match="324 x 244 px do not divide into cells of 8 px"):
+        load_model(run).grids(np.zeros((1, 244, 324, 3), np.uint8))

@@ -1,0 +1,165 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from dmrl.geometry import AIDECK, Array, camera_from_horizontal, project
+from dmrl.rendering.canvas import Canvas
+from dmrl.rendering.quadrotor import DISCS, MESH, RADIUS_M
+from dmrl.rendering.scene import random_look, random_poses
+from dmrl.rendering.sketch import Look, Pose, Sketch, draw
+
+CAMERA = replace(AIDECK, distortion=())
+LEVEL = np.eye(3)
+
+
+@pytest.fixture
+def plain() -> Look:
+    """White background, even light, a sharp and noiseless sensor."""
+    shape = (CAMERA.height_px, CAMERA.width_px, 3)
+    return Look(
+        background=np.ones(shape, np.float32),
+        light_camera=np.array([0.0, 0.0, 1.0]),
+        ambient=1.0,
+        shine=np.ones(3),
+        rotor_opacity=0.5,
+        blade_rad=0.3,
+        blur=0.0,
+        vignette=0.0,
+        gain=np.ones(3),
+        gamma=1.0,
+        noise=np.zeros(shape, np.float32),
+    )
+
+
+def at(x: float, y: float, z: float, turn: Array = LEVEL) -> Pose:
+    """A robot at a place in the camera frame."""
+    return Pose(np.array([x, y, z]), turn)
+
+
+def dark(sketch: Sketch) -> Array:
+    """(N, 2) pixels (u, v) that are not background."""
+    return np.argwhere((sketch.rgb < 254).any(axis=2))[:, ::-1] + 0.5
+
+
+def test_a_robot_on_the_left_and_above_is_drawn_there(plain: Look) -> None:
+    sketch = draw(CAMERA, [at(1.0, 0.3, 0.1)], plain)
+    np.testing.assert_allclose(
+        sketch.uv_px, [[166.90 - 0.3 * 183.73, 77.51 - 0.1 * 184.12]], atol=1e-9
+    )
+    assert sketch.depth_m.tolist() == [1.0]
+    middle = dark(sketch).mean(axis=0)
+    assert np.abs(middle - sketch.uv_px[0]).max() < 3
+    assert sketch.visible_share.tolist() == [1.0]
+
+
+def test_rolled_right_side_down_the_right_side_is_lower(plain: Look) -> None:
+    turn = camera_from_horizontal(0.4, 0.0).T
+    u, v = dark(draw(CAMERA, [at(0.5, 0.0, 0.0, turn)], plain)).T
+    assert np.corrcoef(u, v)[0, 1] > 0.3
+
+
+def test_nose_down_its_top_shows_from_behind(plain: Look) -> None:
+    # Seen from behind, the far rotors are lower when the nose is down and higher when up.
+    heights = {}
+    for pitch in (-0.4, 0.4):
+        turn = camera_from_horizontal(0.0, pitch).T
+        far = (DISCS.mean(axis=1) @ turn.T)[DISCS.mean(axis=1)[:, 0] > 0]
+        heights[pitch] = far[:, 2].mean()
+    assert heights[0.4] < 0 < heights[-0.4]
+    down = draw(CAMERA, [at(0.5, 0.0, 0.0, camera_from_horizontal(0, 0.4).T)], plain)
+    level = draw(CAMERA, [at(0.5, 0.0, 0.0)], plain)
+    height = [s.box_px[0, 3] - s.box_px[0, 1] for s in (down, level)]
+    assert height[0] > 1.5 * height[1]
+
+
+def test_twice_the_distance_is_half_the_size(plain: Look) -> None:
+    boxes = [draw(CAMERA, [at(x, 0.0, -0.1 * x)], plain).box_px[0] for x in (0.4, 0.8, 1.6)]
+    widths = [box[2] - box[0] for box in boxes]
+    np.testing.assert_allclose(widths, [widths[0], widths[0] / 2, widths[0] / 4], atol=2)
+    # The two rotors in front, 0.0325 m nearer, set the width.
+    near_m = 0.046 * np.cos(np.pi / 4)
+    assert widths[0] == pytest.approx(2 * (near_m + 0.0235) * 183.73 / (0.4 - near_m), abs=1.5)
+
+
+def test_the_box_holds_every_changed_pixel_and_no_more(plain: Look) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        (pose,) = random_poses(rng, CAMERA, 1)
+        sketch = draw(CAMERA, [pose], plain)
+        changed = dark(sketch)
+        edges = np.concatenate([changed.min(axis=0) - 0.5, changed.max(axis=0) + 0.5])
+        assert np.abs(sketch.box_px[0] - edges).max() <= 1
+
+
+def test_the_nearer_robot_hides_the_farther(plain: Look) -> None:
+    near, far = at(0.5, 0.0, 0.0), at(1.0, 0.05, 0.0)
+    one, other = draw(CAMERA, [near, far], plain), draw(CAMERA, [far, near], plain)
+    np.testing.assert_array_equal(one.rgb, other.rgb)
+    np.testing.assert_array_equal(one.visible_share, other.visible_share[::-1])
+    assert one.visible_share[0] == 1.0
+    assert 0 < one.visible_share[1] < 0.8
+
+
+def test_half_outside_the_image_the_box_ends_there(plain: Look) -> None:
+    sketch = draw(CAMERA, [at(0.3, 0.27, 0.0)], plain)
+    assert sketch.box_px[0, 0] == 0.0
+    assert sketch.box_px[0, 2] < 60
+    outside = draw(CAMERA, [at(0.3, 2.0, 0.0)], plain)
+    assert np.isnan(outside.box_px).all()
+    assert outside.visible_share.tolist() == [0.0]
+    assert (outside.rgb == 255).all()
+
+
+def test_what_cannot_be_drawn_is_refused(plain: Look) -> None:
+    with pytest.raises(ValueError, match="behind the camera"):
+        draw(CAMERA, [at(0.02, 0.0, 0.0)], plain)
+    with pytest.raises(ValueError, match="without distortion"):
+        draw(AIDECK, [], plain)
+
+
+def test_faces_run_anticlockwise_seen_from_outside() -> None:
+    edge = np.diff(MESH.corners, axis=1)
+    turned = np.cross(edge[:, 0], edge[:, 1])
+    assert (np.einsum("fk,fk->f", turned, MESH.normals) > 0).all()
+
+
+def test_the_radius_holds_the_whole_quadrotor() -> None:
+    for corners in (MESH.corners, DISCS):
+        assert np.linalg.norm(corners, axis=-1).max() <= RADIUS_M + 1e-9
+
+
+def test_a_polygon_covers_its_area_exactly_along_rows() -> None:
+    canvas = Canvas(10, 20, 8, 8)
+    canvas.fill(np.array([[11.25, 21], [14.5, 21], [14.5, 24], [11.25, 24]]), np.ones(3), 0.5)
+    rgb, opacity = canvas.result()
+    assert opacity.sum() == pytest.approx(0.5 * 3.25 * 3)
+    np.testing.assert_allclose(opacity[1, :, 0], [0, 0.375, 0.5, 0.5, 0.25, 0, 0, 0])
+    np.testing.assert_allclose(rgb, np.broadcast_to(opacity, rgb.shape))
+
+
+def test_poses_fill_the_image_and_the_depths() -> None:
+    rng = np.random.default_rng(0)
+    xyz = np.array([p.xyz_camera for _ in range(400) for p in random_poses(rng, CAMERA, 3)])
+    uv, depth_m = project(xyz, CAMERA.image_from_optical)
+    assert len(xyz) > 1000
+    assert (depth_m.min(), depth_m.max()) == pytest.approx((0.2, 2.0), rel=0.02)
+    assert np.median(depth_m) == pytest.approx(np.sqrt(0.2 * 2.0), rel=0.1)
+    shares = [np.histogram(uv[:, k], 4, (0, size))[0] for k, size in enumerate((320, 224))]
+    assert np.ptp(np.array(shares) / len(xyz)) < 0.08
+
+
+def test_the_same_random_numbers_give_the_same_picture() -> None:
+    def picture(seed: int) -> Sketch:
+        rng = np.random.default_rng(seed)
+        return draw(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA))
+
+    np.testing.assert_array_equal(picture(3).rgb, picture(3).rgb)
+    assert (picture(3).rgb != picture(4).rgb).mean() > 0.9
+
+
+@pytest.mark.benchmark(group="sketch")
+def test_speed_of_a_picture(benchmark: BenchmarkFixture) -> None:
+    rng = np.random.default_rng(0)
+    benchmark(lambda: draw(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA)))

@@ -1,0 +1,162 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import DmrlError, OutputError, SettingError, SourceError
+from dmrl.geometry import AIDECK
+from dmrl.images import decode, encode_png
+from dmrl.recording import SPLIT_METADATA, read, summary
+from dmrl.stages.convert import Settings, run
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Two labelled pictures."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for k in range(2):
+        rgb = np.full((48, 64, 3), 40 * k, np.uint8)
+        (folder / f"{k}.png").write_bytes(encode_png(rgb))
+    rows = ["file,peer,u_px,v_px,depth_m,split", "0.png,cf2,10,20,0.5,train", "1.png,,,,,test"]
+    (folder / "labels.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def test_pictures_become_a_recording(pictures: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    counts = run(pictures, out, Settings())
+    assert counts == {"/cf1/camera/image": 2, "/cf1/labels": 2}
+    images = list(read(out, "/cf1/camera/image"))
+    assert [i.time_ns for i in images] == [0, 100_000_000]
+    assert images[1].message.data == (pictures / "1.png").read_bytes()
+    assert images[1].message.timestamp.nanos == 100_000_000
+    first, second = (s.message.peers for s in read(out, "/cf1/labels"))
+    assert (first[0].peer, first[0].source, len(second)) == ("cf2", "hand", 0)
+    (split,) = summary(out).metadata[SPLIT_METADATA]
+    assert {k: json.loads(v) for k, v in split.items()} == {
+        "train": [[0, 0]],
+        "test": [[100_000_000, 100_000_000]],
+    }
+
+
+def test_same_source_same_bytes(pictures: Path, tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        run(pictures, tmp_path / name, Settings())
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_size_and_camera_follow_the_settings(pictures: Path, tmp_path: Path) -> None:
+    camera = tmp_path / "mine.toml"
+    camera.write_text(
+        "width_px = 64\nheight_px = 48\nfx_px = 50\nfy_px = 50\ncx_px = 32\ncy_px = 24\n"
+    )
+    out = tmp_path / "out.mcap"
+    run(pictures, out, Settings(camera=camera, width_px=320, height_px=224, robot="a-2"))
+    (calibration,) = read(out, "/a-2/camera/calibration")
+    assert calibration.message.K[0] == pytest.approx(250)
+    assert (calibration.message.K[2], calibration.message.K[5]) == pytest.approx((160, 112))
+    assert decode(next(read(out, "/a-2/camera/image")).message.data).shape == (224, 320, 3)
+    made = summary(out).provenance
+    assert made is not None
+    assert [i.name for i in made.inputs] == ["pictures", "mine.toml"]
+
+
+def test_the_published_set_becomes_a_recording(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "multi.mcap"
+    counts = run(data / "locanet-multi", out, Settings())
+    assert counts["/cf1/camera/image"] == counts["/cf1/labels"] == counts["/cf1/attitude"] == 50
+    assert [counts[f"/cf1/peer/cf{k}/truth"] for k in (2, 3, 4, 5)] == [50, 34, 20, 10]
+    image = next(read(out, "/cf1/camera/image")).message
+    jpeg = data / "locanet-multi" / "synImgsMulti" / "0000.jpg"
+    assert (image.format, image.data) == ("jpeg", jpeg.read_bytes())
+    (calibration,) = read(out, "/cf1/camera/calibration")
+    assert list(calibration.message.K) == [120, 0, 160, 0, 120, 112, 0, 0, 1]
+    labels = next(read(out, "/cf1/labels")).message
+    assert [(p.peer, p.source) for p in labels.peers] == [(f"cf{k}", "truth") for k in (2, 3, 4, 5)]
+    assert labels.peers[0].u_px == pytest.approx(160 + 120 * 0.33636 / 0.45940, abs=0.01)
+    assert list(labels.peers[0].box_px) == [217, 0, 286, 31]
+    truth = next(read(out, "/cf1/peer/cf2/truth")).message
+    assert truth.frame_id == "cf1/horizontal"
+    assert list(truth.covariance) == [0.0] * 9
+    assert SPLIT_METADATA not in summary(out).metadata
+
+
+def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "frames.mcap"
+    counts = run(data / "aideck-frames", out, Settings(camera=Path("aideck")))
+    assert counts == {"/cf1/camera/calibration": 1, "/cf1/camera/image": 4}
+    (calibration,) = read(out, "/cf1/camera/calibration")
+    assert list(calibration.message.D) == list(AIDECK.distortion)
+    assert calibration.message.distortion_model == "plumb_bob"
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind", "message"),
+    [
+        (
+            Settings(source_kind="image"),
+            SourceError,
+            "Did you mean images.* Kinds: locanet, images",
+        ),
+        (Settings(source_kind="rosbag"), SourceError, "no such kind. Kinds: locanet, images"),
+        (Settings(source_kind="locanet"), SourceError, r"no posLabel\.txt"),
+        (Settings(width_px=320), SettingError, "--width-px and --height-px go together"),
+        (Settings(width_px=0, height_px=5), SettingError, "must be over 0"),
+        (Settings(rate_hz=0.0), SettingError, "must be over 0"),
+        (Settings(robot="a/b"), SettingError, "'a/b' cannot stand in a topic"),
+        (Settings(camera=Path("aidek")), SourceError, "no calibration aidek. Name a TOML file"),
+        (Settings(camera=Path("aideck")), SettingError, "is 64x48 px, its camera 320x224"),
+        (Settings(labels=Path("no.csv")), SourceError, "no label file no.csv"),
+    ],
+)
+def test_what_cannot_be_met_is_one_line_and_leaves_nothing(
+    pictures: Path, tmp_path: Path, settings: Settings, kind: type[DmrlError], message: str
+) -> None:
+    with pytest.raises(kind, match=message) as e:
+        run(pictures, tmp_path / "out.mcap", settings)
+    assert "\n" not in str(e.value)
+    assert list(tmp_path.glob("out*")) == []
+
+
+def test_a_picture_that_breaks_half_way_leaves_nothing(pictures: Path, tmp_path: Path) -> None:
+    (pictures / "1.png").write_bytes((pictures / "1.png").read_bytes()[:60])
+    with pytest.raises(SourceError, match=r"1\.png cannot be decoded"):
+        run(pictures, tmp_path / "out.mcap", Settings())
+    assert list(tmp_path.glob("out*")) == []
+
+
+def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"looks like no kind .* Say --from: locanet, images"):
+        run(tmp_path, tmp_path / "out.mcap", Settings())
+    with pytest.raises(SourceError, match="no file or folder"):
+        run(tmp_path / "none", tmp_path / "out.mcap", Settings())
+
+
+def test_recordings_are_never_overwritten(pictures: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    out.write_text("mine")
+    with pytest.raises(OutputError, match="never overwritten"):
+        run(pictures, out, Settings())
+    assert out.read_text() == "mine"
+
+
+def test_the_command_prints_counts_and_exits_by_kind_of_error(
+    pictures: Path, tmp_path: Path
+) -> None:
+    def dmrl(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "dmrl.cli", "convert", *words], capture_output=True, text=True
+        )
+
+    out = tmp_path / "out.mcap"
+    done = dmrl(str(pictures), str(out), "--from", "images", "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["messages"]["/cf1/camera/image"] == 2
+    again = dmrl(str(pictures), str(out))
+    assert (again.returncode, again.stdout) == (1, "")
+    assert again.stderr.startswith("dmrl: ") and again.stderr.count("\n") == 1
+    assert dmrl(str(pictures), str(out), "--rate-hz", "0").returncode == 2

@@ -1,0 +1,224 @@
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dmrl.cli import app
+from dmrl.errors import MissingExtra, OutputError, RecordingError, SettingError
+from dmrl.images import encode_png
+from dmrl.messages import STATUS_AMBIGUOUS, message
+from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
+from dmrl.stages import convert, evaluate, predict
+from dmrl.stages.evaluate import Settings, document, run
+
+Peers = Sequence[Mapping[str, Any]]
+PICTURE = message("CompressedImage")(data=encode_png(np.zeros((48, 64, 3), np.uint8)), format="png")
+FAST = Settings(draws=20)
+
+
+def peer(u_px: float, v_px: float, depth_m: float = 1.2, **more: Any) -> dict[str, Any]:
+    return {"u_px": u_px, "v_px": v_px, "depth_m": depth_m, "source": "truth", **more}
+
+
+def found(
+    u_px: float, v_px: float, confidence: float = 0.9, depth_m: float = 1.0
+) -> dict[str, Any]:
+    return {"u_px": u_px, "v_px": v_px, "depth_m": depth_m, "confidence": confidence}
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[..., Path]:
+    """Writes images of 64 x 48 px with (labels, detections) each; None leaves a message out."""
+
+    def writer(
+        robots: Mapping[str, Sequence[tuple[Peers | None, Peers | None]]],
+        split: Mapping[str, str] | None = None,
+        threshold: float = 0.0,
+    ) -> Path:
+        path = tmp_path / "flight.mcap"
+        with RecordingWriter(path, Provenance("test")) as sink:
+            if split:
+                sink.add_metadata(SPLIT_METADATA, dict(split))
+            for robot, images in robots.items():
+                for k, (peers, detections) in enumerate(images):
+                    sink.write(k, f"/{robot}/camera/image", PICTURE)
+                    if peers is not None:
+                        sink.write(k, f"/{robot}/labels", message("PeerLabels")(peers=peers))
+                    if detections is not None:
+                        own = message("Detections")(detections=detections, threshold=threshold)
+                        sink.write(k, f"/{robot}/detections", own)
+        return path
+
+    return writer
+
+
+def figures(path: Path, settings: Settings = FAST) -> dict[str, Any]:
+    document_ = document(path, settings, run(path, None, settings))
+    overall: dict[str, Any] = document_["overall"]
+    return {k: v["value"] if isinstance(v, dict) else v for k, v in overall.items()}
+
+
+def test_labels_and_detections_of_one_image_meet(write: Callable[..., Path]) -> None:
+    path = write({"cf1": [([peer(10, 10)], [found(13, 14)]), ([peer(40, 10)], [found(40, 10)])]})
+    got = figures(path)
+    assert (got["labels"], got["images"], got["unmatched_labels"]) == (2, 2, 0)
+    assert (got["median_px"], got["mean_px"], got["within_8_px"]) == (2.5, 2.5, 1)
+    assert got["depth_mae_m"] == pytest.approx(0.2)
+
+
+def test_robots_are_not_mixed(write: Callable[..., Path]) -> None:
+    here, there = peer(10, 10), peer(50, 40)
+    path = write({"cf1": [([here], [found(10, 10)])], "cf2": [([there], [found(50, 40)])]})
+    assert figures(path)["mean_px"] == 0
+    assert figures(path)["labels"] == 2
+
+
+def test_only_the_chosen_source_counts(write: Callable[..., Path]) -> None:
+    both = [peer(10, 10), peer(10, 18, source="published")]
+    path = write({"cf1": [(both, [found(10, 10)])]})
+    assert figures(path)["bias_v_px"] == 0
+    assert figures(path, Settings(against="published", draws=5))["bias_v_px"] == 8
+
+
+def test_images_that_cannot_be_judged_are_left_out_and_counted(
+    write: Callable[..., Path],
+) -> None:
+    good = ([peer(10, 10)], [found(10, 10)])
+    path = write(
+        {
+            "cf1": [
+                good,
+                (None, [found(10, 10)]),
+                ([peer(10, 10)], None),
+                ([peer(10, 10, source="hand")], [found(10, 10)]),
+                ([peer(10, 10), peer(20, 10, status=STATUS_AMBIGUOUS)], [found(10, 10)]),
+                ([peer(10, 10), peer(-3, 10)], [found(10, 10)]),
+                ([], [found(10, 10)]),
+            ]
+        }
+    )
+    evaluation = run(path, None, FAST)
+    assert evaluation.pairs.images == 3
+    assert len(evaluation.pairs.labels) == 2
+    assert evaluation.pairs.left_out == {
+        "images without detections": 1,
+        "images with labels from other sources only": 1,
+        "images with a label that is not OK": 1,
+        "labels outside their image": 1,
+    }
+    assert figures(path)["precision"] == pytest.approx(2 / 3)
+
+
+def test_the_split_of_the_source_is_kept_apart(write: Callable[..., Path]) -> None:
+    images = [([peer(10, 10)], [found(10 + 10 * k, 10)]) for k in range(4)]
+    path = write({"cf1": images}, {"train": "[[0, 2]]", "test": "[[3, 3]]"})
+    assert figures(path, Settings(split="test", draws=5))["mean_px"] == 30
+    assert figures(path, Settings(split="train", draws=5))["mean_px"] == 10
+    with pytest.raises(SettingError, match=r"has no split val\. It has: test, train"):
+        run(path, None, Settings(split="val"))
+
+
+def test_the_threshold_is_the_detectors_unless_one_is_given(write: Callable[..., Path]) -> None:
+    path = write({"cf1": [([peer(10, 10)], [found(10, 10, 0.5)])]}, threshold=0.6)
+    assert figures(path)["recall"] == 0
+    assert figures(path, Settings(threshold=0.5, draws=5))["recall"] == 1
+
+
+def test_what_is_missing_is_named(write: Callable[..., Path], dots: Path) -> None:
+    path = write({"cf1": [([peer(10, 10, source="hand")], [found(10, 10)])]})
+    with pytest.raises(SettingError, match=r"no labels from truth\. Give --against one of: hand"):
+        run(path, None, FAST)
+    with pytest.raises(RecordingError, match=r"has no detections\. Try: dmrl predict MODEL"):
+        run(dots, None, FAST)
+
+
+def test_labels_and_detections_at_other_times_are_not_judged(write: Callable[..., Path]) -> None:
+    path = write({"cf1": [([peer(10, 10)], None), (None, [found(10, 10)])]})
+    with pytest.raises(SettingError, match="has no image with labels from truth and detections"):
+        run(path, None, FAST)
+
+
+def test_the_json_document_is_complete_and_clean(
+    dots: Path, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
+    words = ["evaluate", str(tmp_path / "out.mcap"), "--split", "test", "--json", "--draws", "9"]
+    app(words, result_action="return_value")
+    said = json.loads(capsys.readouterr().out)
+    assert said["images"] == said["labels"] == said["overall"]["labels"] == 10
+    assert (said["against"], said["split"], said["threshold"]) == ("truth", "test", 0.4)
+    assert said["recording"]["name"] == "out.mcap"
+    assert [band["from_m"] for band in said["bands"]] == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert said["bands"][-1]["to_m"] is None
+    assert said["bands"][0]["median_px"] == {"value": None, "low": None, "high": None}
+    assert set(said["definitions"]) >= {n for n, v in said["overall"].items() if type(v) is dict}
+
+
+def test_the_table_has_a_column_for_each_band_with_labels(
+    dots: Path, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
+    evaluate.command(tmp_path / "out.mcap", settings=FAST)
+    text = capsys.readouterr().out
+    assert "30 images against truth" in text
+    assert "1 to 1.5 m" in text
+    assert "0.5 to 1 m" not in text
+
+
+def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: Path) -> None:
+    predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
+    for name in ("a", "b"):
+        run(tmp_path / "out.mcap", tmp_path / name, FAST)
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    plots = ("error-by-distance", "error-violins")
+    assert names == [*(f"{p}.{s}" for p in plots for s in ("png", "svg")), "evaluation.json"]
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    with Image.open(tmp_path / "a" / "error-violins.png") as picture:
+        assert len(np.unique(np.asarray(picture.convert("L")))) > 50
+    with pytest.raises(OutputError, match="exists"):
+        run(tmp_path / "out.mcap", tmp_path / "a", FAST)
+
+
+def test_plots_without_matplotlib_name_the_extra(
+    dots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluate, "plots", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[plot\]'"):
+        run(dots, tmp_path / "plots", FAST)
+
+
+@pytest.fixture(scope="module")
+def published(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The published weights on the published set."""
+    folder = tmp_path_factory.mktemp("published")
+    convert.run(data / "locanet-synthetic", folder / "in.mcap", convert.Settings())
+    weights = data / "locanet-weights" / "synthetic.h5"
+    predict.run(weights, folder / "in.mcap", folder / "out.mcap", predict.Settings())
+    return folder / "out.mcap"
+
+
+@pytest.mark.parametrize(
+    ("against", "wanted"),
+    [
+        ("published", {"within_20_px": 0.776, "within_8_px": 0.673, "median_px": 4.30}),
+        ("truth", {"within_20_px": 0.704, "within_8_px": 0.122, "median_px": 11.6}),
+    ],
+)
+def test_published_weights_have_the_published_figures(
+    published: Path, against: Any, wanted: dict[str, float]
+) -> None:
+    got = figures(published, Settings(against=against, split="test", draws=5))
+    assert got["labels"] == 98
+    for name in ("within_20_px", "within_8_px"):
+        assert got[name] == pytest.approx(wanted[name], abs=0.002)
+    assert got["median_px"] == pytest.approx(wanted["median_px"], abs=0.05)
+    assert got["depth_mae_m"] == pytest.approx(0.275, abs=0.002)
+    assert got["depth_rmse_m"] == pytest.approx(0.362, abs=0.002)
+    if against == "published":
+        assert got["f1"] == pytest.approx(0.634, abs=0.02)
+        assert got["ap_16_px"] == pytest.approx(0.681, abs=0.05)

@@ -1,0 +1,137 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
+from dmrl.images import decode, encode_png
+from dmrl.learn.model import load_model
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary
+from dmrl.stages import predict
+from dmrl.stages.predict import Settings, run
+
+OWN = ("/cf1/detections", "/cf1/detections/grid")
+
+
+def recording(path: Path, *sizes_px: tuple[int, int], robot: str = "cf1") -> Path:
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k, (width_px, height_px) in enumerate(sizes_px):
+            data = encode_png(np.full((height_px, width_px, 3), 40 * k, np.uint8))
+            picture = message("CompressedImage")(data=data, format="png")
+            sink.write(k, f"/{robot}/camera/image", picture)
+    return path
+
+
+def test_everything_is_copied_bit_for_bit(dots: Path, model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    result = run(model, dots, out, Settings(batch_size=7))
+    assert result.images == 30
+    copied = [raw for raw in read_raw(out) if raw.topic not in OWN]
+    assert sorted(copied, key=lambda raw: (raw.time_ns, raw.topic)) == sorted(
+        read_raw(dots), key=lambda raw: (raw.time_ns, raw.topic)
+    )
+    assert summary(out).metadata["dmrl.split"] == summary(dots).metadata["dmrl.split"]
+    made = summary(out).provenance
+    assert made is not None
+    assert [source.name for source in made.inputs] == [model.name, "dots.mcap"]
+
+
+def test_detections_have_the_time_of_their_image(dots: Path, model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    run(model, dots, out, Settings())
+    images = [(raw.time_ns, raw.publish_ns) for raw in read_raw(dots, "/cf1/camera/image")]
+    for topic in OWN:
+        assert [(raw.time_ns, raw.publish_ns) for raw in read_raw(out, topic)] == images
+
+
+def test_the_grid_is_what_the_network_says_and_detections_are_its_peaks(
+    dots: Path, model: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.mcap"
+    run(model, dots, out, Settings(min_confidence=0.0, most=3))
+    image = next(read(dots, "/cf1/camera/image")).message
+    confidence, depth_m = load_model(model).grids(decode(image.data)[None])
+    grid = next(read(out, OWN[1])).message
+    assert (grid.rows, grid.cols, grid.stride_px) == (6, 8, 8)
+    assert list(grid.channels) == ["confidence", "depth_m"]
+    got = np.frombuffer(grid.data, "<f4").reshape(2, 6, 8)
+    np.testing.assert_allclose(got, [confidence[0], depth_m[0]], rtol=1e-5)
+    found = next(read(out, OWN[0])).message
+    assert found.threshold == pytest.approx(0.4)
+    assert 1 <= len(found.detections) <= 3
+    best = found.detections[0]
+    row, col = divmod(int(confidence[0].argmax()), 8)
+    assert (best.u_px, best.v_px) == (8 * col + 4, 8 * row + 4)
+    assert best.confidence == pytest.approx(confidence.max(), rel=1e-5)
+    assert best.depth_m == pytest.approx(depth_m[0, row, col], rel=1e-5)
+
+
+def test_detections_of_before_are_replaced(dots: Path, model: Path, tmp_path: Path) -> None:
+    run(model, dots, tmp_path / "once.mcap", Settings())
+    run(model, tmp_path / "once.mcap", tmp_path / "twice.mcap", Settings(threshold=0.9))
+    topics = summary(tmp_path / "twice.mcap").topics
+    assert {topics[topic].count for topic in OWN} == {30}
+    assert next(read(tmp_path / "twice.mcap", OWN[0])).message.threshold == 0.9
+
+
+def test_same_inputs_same_bytes(dots: Path, model: Path, tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        run(model, dots, tmp_path / name, Settings())
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_long_stretches_without_images_are_not_held(
+    dots: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(predict, "HELD_MESSAGES", 4)
+    assert run(model, dots, tmp_path / "out.mcap", Settings(batch_size=50)).images == 30
+    assert summary(tmp_path / "out.mcap").count == 150
+
+
+def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None:
+    mixed = recording(tmp_path / "mixed.mcap", (64, 48), (32, 32), (32, 32), (64, 48))
+    run(model, mixed, tmp_path / "out.mcap", Settings())
+    grids = [s.message for s in read(tmp_path / "out.mcap", OWN[1])]
+    assert [(g.rows, g.cols) for g in grids] == [(6, 8), (4, 4), (4, 4), (6, 8)]
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(dots: Path, model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    odd = recording(tmp_path / "odd.mcap", (60, 48))
+    with pytest.raises(SettingError, match=r"odd\.mcap: the image of .* 60 x 48 px do not divide"):
+        run(model, odd, out, Settings())
+    with RecordingWriter(tmp_path / "blind.mcap", Provenance("test")) as sink:
+        sink.write(0, "/cf1/attitude", message("Attitude")())
+    with pytest.raises(MissingTopic, match=r"no topic /\*/camera/image in"):
+        run(model, tmp_path / "blind.mcap", out, Settings())
+    with RecordingWriter(tmp_path / "noise.mcap", Provenance("test")) as sink:
+        sink.write(0, "/cf1/camera/image", message("CompressedImage")(data=b"noise"))
+    with pytest.raises(SourceError, match=r"noise\.mcap: the image of .* is not a picture"):
+        run(model, tmp_path / "noise.mcap", out, Settings())
+    with pytest.raises(ModelError, match="no model"):
+        run(tmp_path / "nothing", dots, out, Settings())
+    assert not list(tmp_path.glob("out*"))
+    with pytest.raises(OutputError, match="exists"):
+        run(model, odd, odd, Settings())
+
+
+def test_the_weights_decide_the_provenance_and_not_the_log(
+    dots: Path, model: Path, tmp_path: Path
+) -> None:
+    run(model, dots, tmp_path / "a.mcap", Settings())
+    (model / "tensorboard").mkdir()
+    (model / "tensorboard" / "events").write_text("later")
+    run(model, dots, tmp_path / "b.mcap", Settings())
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_json_counts_images_and_detections(
+    dots: Path, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = replace(Settings(), threshold=1.0)
+    predict.command(model, dots, tmp_path / "out.mcap", settings=settings, as_json=True)
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"recording": str(tmp_path / "out.mcap"), "images": 30, "believed": 0}

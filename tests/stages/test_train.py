@@ -1,0 +1,151 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import card, recipe
+from dmrl.cli import app
+from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
+from dmrl.learn.model import load_model
+from dmrl.stages import dataset as dataset_stage
+from dmrl.stages import train
+from dmrl.stages.train import Flags, Settings, run
+
+SETTINGS = Settings(epochs=2, batch_size=4, device="cpu")
+
+
+@pytest.fixture(scope="session")
+def dataset(dots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dataset") / "dots"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(card, "plots", None)  # figures take longer than the rest
+        dataset_stage.run([dots], out, dataset_stage.Settings())
+    return out
+
+
+def test_a_run_folder_says_what_was_trained_on_what(dataset: Path, tmp_path: Path) -> None:
+    result = run(dataset, tmp_path / "run", SETTINGS)
+    assert result.images == 20
+    model = load_model(tmp_path / "run")
+    assert (model.width_px, model.height_px, model.label_source) == (64, 48, "truth")
+    assert model.training["images"] == 20
+    assert [epoch["loss"] for epoch in model.training["history"]][-1] == result.loss
+    made = json.loads((tmp_path / "run" / "provenance.json").read_text())
+    assert made["stage"] == "train"
+    assert made["settings"]["epochs"] == 2
+    assert made["inputs"][0]["provenance"]["inputs"][0]["name"] == "dots.mcap"
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"model.json", "model.safetensors", "provenance.json", "tensorboard"}
+
+
+def test_same_inputs_same_weights(dataset: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        run(dataset, tmp_path / name, SETTINGS)
+    for name in ("model.safetensors", "model.json", "provenance.json"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) -> None:
+    slow = replace(SETTINGS, learning_rate=1e-9, final_learning_rate=0.0)
+    run(dataset, tmp_path / "a", SETTINGS)
+    run(dataset, tmp_path / "b", slow, init=tmp_path / "a")
+    first, second = (load_model(tmp_path / name).network.state_dict() for name in ("a", "b"))
+    np.testing.assert_allclose(first["head.weight"], second["head.weight"], atol=1e-6)
+    made = json.loads((tmp_path / "b" / "provenance.json").read_text())
+    assert [source["name"] for source in made["inputs"]] == ["dots", "a"]
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from dmrl.learn import fit
+from dmrl.stages.train import Settings, run
+step = fit.train_step
+def slow(*args):
+    time.sleep(0.05)
+    return step(*args)
+fit.train_step = slow
+run(Path(sys.argv[1]), Path(sys.argv[2]), Settings(epochs=4, batch_size=4, device="cpu"))
+"""
+
+
+def test_a_killed_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
+    dataset: Path, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, epochs=4)
+    out, partial = tmp_path / "run", tmp_path / "run.partial"
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(dataset), str(out)])
+    deadline = time.monotonic() + 60
+    while not (partial / "checkpoint.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert partial.is_dir()
+    assert not out.exists()
+    with pytest.raises(OutputError, match=r"holds an interrupted training\. Go on with --resume"):
+        run(dataset, out, settings)
+    run(dataset, out, settings, resume=True)
+    run(dataset, tmp_path / "whole", settings)
+    assert not partial.exists()
+    weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "whole")]
+    assert weights[0] == weights[1]
+
+
+def test_a_training_killed_in_its_first_epoch_starts_over(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.partial" / "tensorboard").mkdir(parents=True)
+    run(dataset, tmp_path / "run", SETTINGS, resume=True)
+    (tmp_path / "again.partial" / "tensorboard").mkdir(parents=True)
+    run(dataset, tmp_path / "again", SETTINGS)
+    weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "again")]
+    assert weights[0] == weights[1]
+
+
+def test_what_cannot_be_trained_is_said_in_one_line(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"to resume\. Train without --resume"):
+        run(dataset, tmp_path / "run", SETTINGS, resume=True)
+    with pytest.raises(DatasetError, match="dmrl dataset"):
+        run(tmp_path / "nothing", tmp_path / "run", SETTINGS)
+    with pytest.raises(ModelError, match="no model"):
+        run(dataset, tmp_path / "run", SETTINGS, init=tmp_path / "nothing")
+    with pytest.raises(SettingError, match="no architecture resnet"):
+        run(dataset, tmp_path / "run", replace(SETTINGS, architecture="resnet"))
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(OutputError, match="exists"):
+        run(dataset, tmp_path / "taken", SETTINGS)
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_the_shipped_recipe_is_the_published_schedule() -> None:
+    assert recipe.load("locanet", "train", Settings) == Settings()
+
+
+def test_flags_win_over_the_recipe(dataset: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.toml"
+    mine.write_text(
+        'kind = "train"\nepochs = 7\nbatch_size = 10\nwarmup_epochs = 0\ndevice = "cpu"\n'
+    )
+    words = ["train", str(dataset), str(tmp_path / "run"), "--recipe", str(mine)]
+    app([*words, "--epochs", "1", "--seed", "0"], result_action="return_value")
+    said = load_model(tmp_path / "run").training["settings"]
+    assert (said["epochs"], said["batch_size"], said["warmup_epochs"]) == (1, 10, 0)
+
+
+def test_a_flag_out_of_range_is_one_line() -> None:
+    with pytest.raises(SettingError, match="epochs: must be at least 1"):
+        Flags(epochs=0).over(Settings())
+
+
+def test_json_names_the_model(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train.command(dataset, tmp_path / "run", flags=Flags(epochs=1, device="cpu"), as_json=True)
+    said = json.loads(capsys.readouterr().out)
+    assert said["model"] == str(tmp_path / "run")
+    assert said["images"] == 20

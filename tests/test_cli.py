@@ -1,0 +1,178 @@
+"""The command line as a whole: help, exit status, errors in one line."""
+
+import ast
+import importlib
+import inspect
+import io
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from dmrl import __version__, cli
+from dmrl.cli import COMMANDS, app
+from dmrl.errors import DmrlError
+
+HEAVY = {
+    *("bpy", "datasets", "h5py", "matplotlib", "mcap", "numpy", "pandas", "PIL", "pyarrow"),
+    *("pydantic", "rerun", "tensorboard", "torch"),
+}
+OPTIONAL = ("torch", "safetensors", "tensorboard", "h5py", "rerun", "matplotlib", "pandas")
+STAGES = Path(cli.__file__).parent / "stages"
+
+
+def dmrl(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command, run as a user runs it."""
+    command = [sys.executable, "-m", "dmrl.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], []])
+def test_help_and_version_load_nothing_heavy(arguments: list[str]) -> None:
+    code = (
+        "import sys\n"
+        "from dmrl.cli import app\n"
+        f"try: app({arguments})\n"
+        "except SystemExit as e: assert not e.code, e.code\n"
+        f"print(sorted({HEAVY} & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+
+
+def test_version_is_the_package_s() -> None:
+    done = dmrl("--version")
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, __version__, "")
+
+
+def test_help_lists_every_command_in_the_order_of_the_work(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    app.help_print([])
+    lines = capsys.readouterr().out.splitlines()
+    words = [line.split()[1] for line in lines if line.startswith("│ ") and line[2] != " "]
+    assert words[: len(COMMANDS)] == list(COMMANDS)
+
+
+def test_every_stage_is_in_the_table() -> None:
+    with_command = {
+        path.stem
+        for path in STAGES.glob("*.py")
+        if "\ndef command(" in path.read_text(encoding="utf-8")
+    }
+    assert with_command == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_s_table_line_is_the_first_line_of_its_docstring(name: str) -> None:
+    command = importlib.import_module(f"dmrl.stages.{name}").command
+    assert inspect.getdoc(command).splitlines()[0] == COMMANDS[name]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_argument_and_flag_of_a_command_is_explained(name: str) -> None:
+    arguments = app[name].assemble_argument_collection(parse_docstring=True)
+    shown = [a for a in arguments.filter_by(show=True) if a.parse]
+    assert not [a.name for a in shown if not (a.parameter.help or "").strip()]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command_fits_a_narrow_terminal(name: str) -> None:
+    page = io.StringIO()
+    app.help_print([name], console=Console(file=page, width=50))
+    assert page.getvalue().startswith(f"Usage: dmrl {name}")
+    assert max(map(len, page.getvalue().splitlines())) <= 50
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_without_the_extras_a_command_works_or_names_the_extra(name: str) -> None:
+    hide = f"import sys\nsys.modules.update(dict.fromkeys({OPTIONAL}))\n"
+    code = f"{hide}sys.argv = ['dmrl', {name!r}, '--help']\nfrom dmrl.cli import main\nmain()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        assert done.stdout.startswith(f"Usage: dmrl {name}")
+    else:
+        assert done.returncode == 1, done.stderr
+        assert "Install it with: pip install 'dmrl[" in done.stderr
+        assert done.stderr.count("\n") == 1, done.stderr
+
+
+def test_a_command_that_does_not_exist_is_a_bad_command_line_with_or_without_extras() -> None:
+    hide = f"import sys\nsys.modules.update(dict.fromkeys({OPTIONAL}))\n"
+    code = "sys.argv = ['dmrl', 'trian']\nfrom dmrl.cli import main\nmain()"
+    for script in (f"import sys\n{code}", hide + code):
+        done = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stdout) == (2, ""), done.stderr
+        assert done.stderr == "dmrl: no command trian. Did you mean train?\n"
+
+
+@pytest.mark.parametrize("arguments", [["info"], ["info", "a.mcap", "--colour"]])
+def test_a_bad_command_line_is_told_on_stderr_with_status_2(arguments: list[str]) -> None:
+    done = dmrl(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("dmrl: ")
+    assert "Traceback" not in done.stderr
+
+
+def test_a_known_error_is_one_line_on_stderr_with_status_1(tmp_path: Path) -> None:
+    done = dmrl("info", str(tmp_path / "absent.mcap"))
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("dmrl: ")
+    assert "absent.mcap" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def _end_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "app", fail)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return end.value.code
+
+
+def test_ctrl_c_ends_with_one_line_and_status_130(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _end_with(KeyboardInterrupt(), monkeypatch) == 130
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_our_own_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ZeroDivisionError):
+        _end_with(ZeroDivisionError(), monkeypatch)
+
+
+def _subclasses(error: type[Exception]) -> Iterator[type[Exception]]:
+    for child in error.__subclasses__():
+        yield child
+        yield from _subclasses(child)
+
+
+def test_the_tree_of_errors_in_the_docstring_is_the_tree_of_errors() -> None:
+    tree = sys.modules[DmrlError.__module__].__doc__ or ""
+    drawn = [
+        line.split()[1] for line in tree.splitlines() if line.lstrip()[:2] in ("* ", "- ", "+ ")
+    ]
+    own = [e.__name__ for e in _subclasses(DmrlError) if e.__module__ == DmrlError.__module__]
+    assert sorted(drawn) == sorted(["DmrlError", *own])
+
+
+def _prints(path: Path) -> Iterator[int]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        match node:
+            case ast.Call(func=ast.Name("print"), keywords=words) if "file" in {
+                word.arg for word in words
+            }:
+                yield node.lineno
+
+
+@pytest.mark.parametrize("path", sorted(STAGES.glob("*.py")), ids=lambda p: p.stem)
+def test_stages_print_data_only_and_leave_messages_to_progress(path: Path) -> None:
+    assert list(_prints(path)) == []

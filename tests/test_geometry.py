@@ -1,0 +1,166 @@
+"""Signs, projection and grid labels against drawings and the paper."""
+
+import doctest
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dmrl import geometry, topics
+from dmrl.geometry import (
+    AIDECK,
+    PUBLISHED_RENDER,
+    Array,
+    camera_from_horizontal,
+    grid_label,
+    inside,
+    project,
+)
+
+K = np.array([[184.0, 0.0, 160.0], [0.0, 184.0, 112.0], [0.0, 0.0, 1.0]])
+ANGLE = st.floats(-1.5, 1.5)
+
+
+def pixel(xyz_horizontal: tuple[float, float, float], roll_deg: float, pitch_deg: float) -> Array:
+    """Pixel of a point seen by a robot with this attitude."""
+    turn = camera_from_horizontal(np.radians(roll_deg), np.radians(pitch_deg))
+    uv, _ = project(np.array([xyz_horizontal]) @ turn.T, K)
+    return uv[0]
+
+
+@pytest.mark.parametrize("module", [geometry, topics], ids=lambda m: m.__name__)
+def test_the_examples_in_the_docstrings_run(module: object) -> None:
+    found = doctest.testmod(module)  # type: ignore[arg-type]
+    assert found.attempted > 0
+    assert found.failed == 0
+
+
+def test_straight_ahead_is_the_principal_point_and_depth_is_x() -> None:
+    uv, depth_m = project(np.array([[2.0, 0.0, 0.0]]), K)
+    np.testing.assert_allclose(uv, [[160.0, 112.0]])
+    np.testing.assert_allclose(depth_m, [2.0])
+
+
+def test_left_of_the_robot_is_left_in_the_image_and_above_is_above() -> None:
+    (left, above), depth_m = project(np.array([[2.0, 0.5, 0.0], [2.0, 0.0, 0.5]]), K)
+    np.testing.assert_allclose(left, [160 - 184 / 4, 112])
+    np.testing.assert_allclose(above, [160, 112 - 184 / 4])
+    np.testing.assert_allclose(depth_m, [2.0, 2.0])
+
+
+# Drawn by hand for 30 degrees: sin = 0.5, cos = 0.8660. One metre ahead, camera level.
+def test_rolling_right_side_down_turns_the_scene_anticlockwise() -> None:
+    """With the right side down, the camera's left axis points up.
+
+    A peer on the left, level with the robot, lies below that axis: in the lower left.
+    """
+    u_px, v_px = pixel((1.0, 0.5, 0.0), 30, 0)
+    assert u_px == pytest.approx(160 - 184 * 0.5 * 0.8660254)
+    assert v_px == pytest.approx(112 + 184 * 0.5 * 0.5)
+
+
+def test_rolling_leaves_the_point_ahead_where_it_was() -> None:
+    np.testing.assert_allclose(pixel((1.0, 0.0, 0.0), 30, 0), [160, 112], atol=1e-12)
+
+
+def test_a_nose_down_pitch_lifts_the_horizon() -> None:
+    """The camera looks down at the floor, so what is level with it moves up the image."""
+    u_px, v_px = pixel((1.0, 0.0, 0.0), 0, 10)
+    assert u_px == pytest.approx(160)
+    assert v_px == pytest.approx(112 - 184 * np.tan(np.radians(10)))
+
+
+def test_the_axis_of_a_camera_that_looks_10_degrees_down_hits_the_floor_ahead() -> None:
+    height_m = 1.0
+    ahead_m = height_m / np.tan(np.radians(10))
+    np.testing.assert_allclose(pixel((ahead_m, 0.0, -height_m), 0, 10), [160, 112])
+
+
+def test_pitch_turns_before_roll_when_both_are_there() -> None:
+    """Nose down 90 degrees, then rolled about the camera's own axis, which points down."""
+    turn = camera_from_horizontal(np.radians(90), np.radians(90))
+    down, ahead = np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(turn @ down, [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(turn @ ahead, [0, 1, 0], atol=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(ANGLE, ANGLE)
+def test_the_paper_s_matrix_is_ours_with_both_angles_negated(phi: float, theta: float) -> None:
+    """Eq. 2 of the paper is Rx(phi) Ry(theta), rotations of the right-hand rule."""
+    c, s = np.cos(phi), np.sin(phi)
+    rx = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    c, s = np.cos(theta), np.sin(theta)
+    ry = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    np.testing.assert_allclose(rx @ ry, camera_from_horizontal(-phi, -theta), atol=1e-12)
+
+
+@pytest.mark.parametrize(("tilt_deg", "error_px"), [(3, 19), (6, 38), (10, 64)])
+def test_the_paper_s_signs_taken_as_printed_cost_many_pixels(
+    tilt_deg: float, error_px: float
+) -> None:
+    point = (1.0, 0.0, 0.0)
+    wrong_px = np.asarray(pixel(point, 0, -tilt_deg)) - np.asarray(pixel(point, 0, tilt_deg))
+    assert np.linalg.norm(wrong_px) == pytest.approx(error_px, rel=0.03)
+
+
+@settings(max_examples=50, deadline=None)
+@given(ANGLE, ANGLE)
+def test_a_turn_keeps_lengths_and_hands(roll_rad: float, pitch_rad: float) -> None:
+    turn = camera_from_horizontal(roll_rad, pitch_rad)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+
+
+def test_points_behind_the_camera_are_refused_by_row() -> None:
+    with pytest.raises(ValueError, match=r"1 of 2 points lie behind .* row 1 with x = -0\.500 m"):
+        project(np.array([[1.0, 0, 0], [-0.5, 0, 0]]), K)
+
+
+def test_the_cameras_are_those_of_the_paper_and_of_the_published_images() -> None:
+    np.testing.assert_allclose(
+        AIDECK.image_from_optical, [[183.73, 0, 166.90], [0, 184.12, 77.51], [0, 0, 1]]
+    )
+    centre_px = [PUBLISHED_RENDER.width_px / 2, PUBLISHED_RENDER.height_px / 2]
+    uv, _ = project(np.array([[1.0, 0, 0]]), PUBLISHED_RENDER.image_from_optical)
+    np.testing.assert_allclose(uv[0], centre_px)
+
+
+def test_the_left_and_top_edge_belong_to_the_image_and_the_others_do_not() -> None:
+    uv = np.array([[0, 0], [319.999, 223.999], [320, 100], [100, 224], [-0.001, 5]])
+    assert inside(uv, 320, 224).tolist() == [True, True, False, False, False]
+
+
+def test_a_peer_marks_the_cell_at_row_v_and_column_u() -> None:
+    grid = grid_label(np.array([[100.0, 50.0]]), np.array([1.5]))
+    assert grid.shape == (2, 28, 40)
+    assert grid.dtype == np.float32
+    assert np.argwhere(grid[0]).tolist() == [[50 // 8, 100 // 8]]
+    assert grid[1, 6, 12] == 1.5
+    assert np.count_nonzero(grid) == 2
+
+
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_of_two_peers_in_a_cell_the_nearer_wins(order: list[int]) -> None:
+    uv = np.array([[100.0, 50.0], [101.0, 51.0]])[order]
+    grid = grid_label(uv, np.array([1.5, 0.7])[order])
+    assert grid[1, 6, 12] == np.float32(0.7)
+    assert grid[0].sum() == 1
+
+
+def test_peers_outside_the_image_and_no_peers_leave_the_grid_empty() -> None:
+    outside = np.array([[320.0, 5.0], [5.0, 224.0], [-1.0, 5.0], [5.0, -0.1]])
+    assert not grid_label(outside, np.ones(4)).any()
+    assert not grid_label(np.empty((0, 2)), np.empty(0)).any()
+
+
+def test_the_corner_pixels_mark_the_corner_cells() -> None:
+    uv = np.array([[0.0, 0.0], [319.9, 223.9]])
+    grid = grid_label(uv, np.array([1.0, 2.0]))
+    assert np.argwhere(grid[0]).tolist() == [[0, 0], [27, 39]]
+
+
+def test_other_grids_than_the_paper_s_work_too() -> None:
+    grid = grid_label(np.array([[30.0, 20.0]]), np.array([1.0]), shape=(2, 4), stride_px=16)
+    assert np.argwhere(grid[0]).tolist() == [[1, 1]]

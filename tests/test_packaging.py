@@ -1,0 +1,135 @@
+"""What is installed: every package listed, data files present, one top-level name."""
+
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+import dmrl
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+SETUPTOOLS = PROJECT["tool"]["setuptools"]
+FOLDER_OF: dict[str, str] = SETUPTOOLS["package-dir"]
+MAPPED = [package for package, folder in FOLDER_OF.items() if package.replace(".", "/") != folder]
+
+
+def folder_of(package: str) -> str:
+    """Folder of a package in the checkout."""
+    return FOLDER_OF.get(package, package.replace(".", "/"))
+
+
+def test_every_python_folder_is_listed_as_a_package() -> None:
+    found = {
+        str(path.parent.relative_to(ROOT))
+        for room in set(FOLDER_OF.values())
+        for path in (ROOT / room).rglob("*.py")
+    }
+    assert found == {folder_of(package) for package in SETUPTOOLS["packages"]}
+
+
+@pytest.mark.parametrize("package", SETUPTOOLS["packages"])
+def test_every_package_has_an_init(package: str) -> None:
+    assert (ROOT / folder_of(package) / "__init__.py").is_file()
+
+
+def test_the_version_is_the_project_s() -> None:
+    assert dmrl.__version__ == PROJECT["project"]["version"]
+
+
+def test_every_extra_is_in_the_extra_that_brings_all() -> None:
+    extras = dict(PROJECT["project"]["optional-dependencies"])
+    (everything,) = extras.pop("all")
+    assert everything == f"dmrl[{','.join(extras)}]"
+
+
+def test_constraints_pin_every_direct_dependency_within_its_bounds() -> None:
+    packaging = pytest.importorskip("packaging.requirements")
+    pinned = {
+        _name(line.split("==")[0]): line.split("==")[1]
+        for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+        if "==" in line
+    }
+    listed = [
+        *PROJECT["project"]["dependencies"],
+        *chain.from_iterable(PROJECT["project"]["optional-dependencies"].values()),
+        *PROJECT["dependency-groups"]["dev"],
+    ]
+    for text in listed:
+        wanted = packaging.Requirement(text)
+        if wanted.name != "dmrl":
+            assert wanted.specifier.contains(pinned[_name(wanted.name)]), text
+
+
+def _name(package: str) -> str:
+    return re.sub(r"[-_.]+", "-", package).lower()
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the wheel and the sdist, built from a copy of what git tracks."""
+    source = tmp_path_factory.mktemp("source")
+    out = tmp_path_factory.mktemp("dist")
+    tracked = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        check=False,
+    )
+    if tracked.returncode != 0:
+        pytest.skip("not a git checkout")
+    for name in filter(None, tracked.stdout.decode().split("\0")):
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+    backend = pytest.importorskip("setuptools.build_meta")
+    for build in ("build_sdist", "build_wheel"):
+        code = f"from {backend.__name__} import {build}; {build}({str(out)!r})"
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def wheel(built: Path) -> zipfile.ZipFile:
+    return zipfile.ZipFile(next(built.glob("*.whl")))
+
+
+def test_a_wheel_brings_one_top_level_name(wheel: zipfile.ZipFile) -> None:
+    tops = {name.split("/")[0] for name in wheel.namelist()}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"dmrl"}
+
+
+def test_a_wheel_holds_every_module_and_data_file(wheel: zipfile.ZipFile) -> None:
+    names = set(wheel.namelist())
+    wanted = {"dmrl/py.typed", "dmrl/schemas/dmrl.binpb"}
+    wanted |= {f"dmrl/{p.relative_to(ROOT)}" for p in ROOT.glob("schemas/dmrl/v1/*.proto")}
+    wanted |= {f"dmrl/{p.relative_to(ROOT)}" for p in ROOT.glob("recipes/*.toml")}
+    for package in SETUPTOOLS["packages"]:
+        place = package.replace(".", "/")
+        wanted |= {f"{place}/{p.name}" for p in (ROOT / folder_of(package)).glob("*.py")}
+    assert wanted <= names
+    assert not [name for name in names if "test" in name]
+
+
+def test_a_wheel_holds_the_licence(wheel: zipfile.ZipFile) -> None:
+    (licence,) = [name for name in wheel.namelist() if name.endswith("licenses/LICENSE")]
+    assert b"Apache License" in wheel.read(licence)
+
+
+def test_an_sdist_can_be_built_from(built: Path) -> None:
+    with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    wanted = {"pyproject.toml", "README.md", "LICENSE", "dmrl/py.typed", "schemas/dmrl.binpb"}
+    wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("schemas/dmrl/v1/*.proto")}
+    wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("recipes/*.toml")}
+    wanted |= {f"{FOLDER_OF[package]}/__init__.py" for package in MAPPED}
+    assert wanted <= names

@@ -1,0 +1,125 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from dmrl import pipeline
+from dmrl.errors import RecipeError, SettingError
+
+SMALL = """
+kind = "pipeline"
+
+[[step]]
+stage = "sketch"
+out = "pictures"
+settings = { images = 10 }
+
+[[step]]
+stage = "convert"
+inputs = ["pictures"]
+out = "pictures.mcap"
+
+[[step]]
+stage = "dataset"
+inputs = ["pictures.mcap"]
+out = "dataset"
+
+[[step]]
+stage = "train"
+inputs = ["dataset"]
+out = "model"
+settings = { epochs = 1 }
+
+[[step]]
+stage = "predict"
+inputs = ["model", "pictures.mcap"]
+out = "predictions.mcap"
+
+[[step]]
+stage = "evaluate"
+inputs = ["predictions.mcap"]
+out = "evaluation"
+settings = { draws = 20 }
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "small.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_pipeline_runs_every_step_and_then_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = write(tmp_path, SMALL)
+    done = pipeline.run(recipe, tmp_path / "out")
+    assert [d.stage for d in done] == [
+        "sketch",
+        "convert",
+        "dataset",
+        "train",
+        "predict",
+        "evaluate",
+    ]
+    assert not any(d.skipped for d in done)
+    pipeline.report(done)
+    table = capsys.readouterr().out
+    assert "evaluation" in table
+    assert "error-violins.png" in table
+    again = pipeline.run(recipe, tmp_path / "out")
+    assert all(d.skipped for d in again)
+    pipeline.report(again, as_json=True)
+    assert json.loads(capsys.readouterr().out)["evaluations"]["evaluation"]["against"] == "truth"
+
+
+def test_a_pipeline_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    recipe = write(tmp_path, SMALL.split('[[step]]\nstage = "dataset"')[0])
+    pipeline.run(recipe, tmp_path / "out")
+    (tmp_path / "out" / "pictures.mcap").unlink()
+    done = pipeline.run(recipe, tmp_path / "out")
+    assert [(d.stage, d.skipped) for d in done] == [("sketch", True), ("convert", False)]
+
+
+def test_another_recipe_does_not_reuse_the_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    pipeline.run(write(tmp_path, SMALL.split('\n[[step]]\nstage = "convert"')[0]), out)
+    with pytest.raises(SettingError, match="made by another recipe"):
+        pipeline.run(write(tmp_path, SMALL), out)
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.tex").touch()
+    with pytest.raises(SettingError, match="is not empty"):
+        pipeline.run(write(tmp_path, SMALL), foreign)
+
+
+def test_data_that_does_not_ship_is_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="--data DIR"):
+        pipeline.run("published", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ('inputs = ["pictures"]', 'inputs = ["picures"]', "step 2 (convert) reads picures"),
+        ('inputs = ["model", "pictures.mcap"]', 'inputs = ["model"]', "has 1 inputs, not 2"),
+        ('out = "evaluation"', 'out = "dataset"', "step 6 writes dataset again"),
+        ('stage = "sketch"', 'stage = "skech"', "no stage 'skech'"),
+    ],
+)
+def test_a_wrong_step_is_named_before_anything_is_done(
+    tmp_path: Path, old: str, new: str, complaint: str
+) -> None:
+    with pytest.raises(RecipeError, match=complaint.replace("(", r"\(").replace(")", r"\)")):
+        pipeline.run(write(tmp_path, SMALL.replace(old, new)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_three_wrong_keys_are_all_named(tmp_path: Path) -> None:
+    text = SMALL.replace("images = 10", "imags = 10").replace("epochs = 1", 'epochs = "one"')
+    with pytest.raises(RecipeError) as caught:
+        pipeline.run(write(tmp_path, "sed = 1\n" + text), tmp_path / "out")
+    assert "3 wrong keys" in str(caught.value)
+    for key in ("sed:", "step.1.settings.imags:", "step.4.settings.epochs:"):
+        assert key in str(caught.value)

@@ -1,0 +1,25 @@
+import pytest
+
+from dmrl.progress import say, track
+
+
+def test_a_pipe_sees_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(track(range(5), "Counting")) == [0, 1, 2, 3, 4]
+    assert list(track(iter("ab"), "Counting", 2)) == ["a", "b"]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_sees_a_bar(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    assert list(track(range(3), "Counting")) == [0, 1, 2]
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "Counting" in err
+
+
+def test_news_go_to_standard_error_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    say("left out: [bold]3 " + "x" * 200)
+    assert capsys.readouterr() == ("", "left out: [bold]3 " + "x" * 200 + "\n")

@@ -1,0 +1,203 @@
+"""Recipes: every fault named, nothing done before."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from cyclopts import Parameter
+
+from dmrl import recipe
+from dmrl.cli import COMMANDS
+from dmrl.errors import RecipeError
+from dmrl.recipe import Pipeline, Step
+
+Write = Callable[[str], Path]
+RECIPES = Path(__file__).parents[1] / "recipes"
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of a stage for these tests."""
+
+    images: int = 10
+    rate_hz: float = 1.0
+    label: Literal["truth", "hand"] = "truth"
+    folder: Path | None = None
+    sizes_px: tuple[int, int] = (320, 224)
+    share: Annotated[float, Parameter(help="of something")] = 0.5
+
+    def __post_init__(self) -> None:
+        if self.images < 0:
+            raise ValueError("images: must not be negative")
+
+
+@dataclass(frozen=True, slots=True)
+class Needy:
+    """A stage with a setting that has no default."""
+
+    robot: str
+
+
+SCHEMAS = {"draw": Settings, "fly": Needy}
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    """Writes a recipe and gives its path."""
+
+    def writer(text: str) -> Path:
+        path = tmp_path / "mine.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return writer
+
+
+def test_settings_come_from_the_file_and_the_rest_from_the_defaults(write: Write) -> None:
+    path = write(
+        'kind = "draw"\nimages = 3\nrate_hz = 2\nlabel = "hand"\nfolder = "a/b"\n'
+        "sizes_px = [64, 48]\n"
+    )
+    assert recipe.load(path, "draw", Settings) == Settings(3, 2.0, "hand", Path("a/b"), (64, 48))
+
+
+def test_every_wrong_key_is_named(write: Write) -> None:
+    path = write('kind = "draw"\nimagse = 3\nrate_hz = "fast"\nlabel = "guess"\n')
+    with pytest.raises(RecipeError) as caught:
+        recipe.load(path, "draw", Settings)
+    head, *faults = str(caught.value).splitlines()
+    assert head == f"{path} has 3 wrong keys:"
+    assert sorted(line.split(":")[0].strip() for line in faults) == ["imagse", "label", "rate_hz"]
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("images = 2.5", "images"),
+        ("images = true", "images"),
+        ('images = "3"', "images"),
+        ("sizes_px = [1]", "sizes_px"),
+        ("images = -1", "images"),
+        ("images = [", None),
+    ],
+)
+def test_values_are_not_bent_to_fit(write: Write, line: str, key: str | None) -> None:
+    with pytest.raises(RecipeError) as caught:
+        recipe.load(write(f'kind = "draw"\n{line}\n'), "draw", Settings)
+    assert "is not TOML" in str(caught.value) if key is None else f"  {key}" in str(caught.value)
+
+
+def test_a_setting_without_a_default_must_be_given(write: Write) -> None:
+    with pytest.raises(RecipeError, match=r"has 1 wrong key:\n  robot: field required"):
+        recipe.load(write('kind = "fly"\n'), "fly", Needy)
+
+
+def test_a_recipe_of_another_kind_says_what_is_wanted(write: Write) -> None:
+    with pytest.raises(RecipeError, match=r"is of kind 'fly'\. .* kind = \"draw\""):
+        recipe.load(write('kind = "fly"\n'), "draw", Settings)
+    with pytest.raises(RecipeError, match="has no kind"):
+        recipe.load(write("images = 3\n"), "draw", Settings)
+
+
+def test_a_misspelled_shipped_recipe_is_offered() -> None:
+    with pytest.raises(RecipeError, match=r"no recipe locanett\. Did you mean locanet\?"):
+        recipe.read("locanett")
+
+
+def test_an_unknown_recipe_lists_the_shipped_ones() -> None:
+    with pytest.raises(RecipeError, match=r"no recipe zzz\. Shipped ones: .*locanet"):
+        recipe.read("zzz")
+
+
+def test_an_absent_path_is_a_recipe_error(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="no recipe"):
+        recipe.read(tmp_path / "absent.toml")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(b"\xff\xfe\x00", "cannot be read"), (b"kind = ", "is not TOML"), (b"\x00", "is not TOML")],
+)
+def test_files_that_are_not_toml_are_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "broken.toml"
+    path.write_bytes(content)
+    with pytest.raises(RecipeError, match=words) as caught:
+        recipe.read(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_named_like_a_recipe_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "folder.toml"
+    path.mkdir()
+    with pytest.raises(RecipeError, match="no recipe"):
+        recipe.read(path)
+
+
+PIPELINE = """\
+kind = "pipeline"
+
+[[step]]
+stage = "draw"
+out = "a.mcap"
+inputs = ["{data}/pictures"]
+settings = { images = 3 }
+
+[[step]]
+stage = "fly"
+out = "b.mcap"
+inputs = ["a.mcap"]
+settings = { robot = "cf1" }
+"""
+
+
+def test_a_pipeline_is_its_steps_in_order_and_its_text(write: Write) -> None:
+    found = recipe.load_pipeline(write(PIPELINE), SCHEMAS, SCHEMAS.__getitem__)
+    assert found == Pipeline(
+        (
+            Step("draw", "a.mcap", ("{data}/pictures",), {"images": 3}),
+            Step("fly", "b.mcap", ("a.mcap",), {"robot": "cf1"}),
+        ),
+        PIPELINE,
+    )
+    assert found.needs_data
+
+
+def test_every_fault_of_a_pipeline_is_named_with_its_step(write: Write) -> None:
+    text = PIPELINE.replace("images = 3", "imagse = 3").replace('robot = "cf1"', "robot = 1")
+    with pytest.raises(RecipeError) as caught:
+        recipe.load_pipeline(write(f"seed = 3\n{text}"), SCHEMAS, SCHEMAS.__getitem__)
+    faults = [line.split(":")[0].strip() for line in str(caught.value).splitlines()[1:]]
+    assert faults == ["seed", "step.1.settings.imagse", "step.2.settings.robot"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('kind = "pipeline"', r"step: at least one \[\[step\]\]"),
+        ('kind = "pipeline"\nstep = 3', r"step: at least one \[\[step\]\]"),
+        ('kind = "pipeline"\nstep = [3]', r"step\.1\."),
+        ('kind = "pipeline"\n[[step]]\nstage = "swim"\nout = "a"', "no stage 'swim'; there are"),
+        ('kind = "pipeline"\n[[step]]\nstage = "draw"', r"step\.1\.out: field required"),
+    ],
+)
+def test_broken_pipelines_are_recipe_errors(write: Write, text: str, words: str) -> None:
+    with pytest.raises(RecipeError, match=words):
+        recipe.load_pipeline(write(text), SCHEMAS, SCHEMAS.__getitem__)
+
+
+@pytest.mark.parametrize("name", recipe.names())
+def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> None:
+    head = recipe.text(name).partition("\n\n")[0].splitlines()
+    assert all(line.startswith("# ") for line in head)
+    sentence = " ".join(line for line in head if not line.startswith("# dmrl "))
+    assert sentence.endswith(".")
+    commands = [line.split()[2] for line in head if line.startswith("# dmrl ")]
+    assert commands
+    assert set(commands) <= set(COMMANDS)
+
+
+def test_shipped_recipes_are_those_of_the_folder() -> None:
+    assert recipe.names() == sorted(path.stem for path in RECIPES.glob("*.toml"))

@@ -1,0 +1,62 @@
+"""The table of topics."""
+
+import pytest
+
+from dmrl import topics
+from dmrl.messages import descriptor
+from dmrl.topics import TOPICS, names, robots, row_of
+
+
+@pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.pattern)
+def test_every_row_names_a_message_that_exists(row: topics.Topic) -> None:
+    assert descriptor(row.message).full_name == row.message
+
+
+@pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.pattern)
+def test_a_topic_made_from_a_pattern_is_found_in_its_own_row_only(row: topics.Topic) -> None:
+    topic = row.pattern.format(robot="cf1", peer="cf2")
+    assert [r.pattern for r in TOPICS if names(r.pattern, topic) is not None] == [row.pattern]
+    assert row_of(topic) is row
+
+
+def test_no_pattern_stands_twice() -> None:
+    assert len({row.pattern for row in TOPICS}) == len(TOPICS)
+
+
+def test_every_pattern_of_the_module_is_in_the_table() -> None:
+    patterns = {v for k, v in vars(topics).items() if k.isupper() and isinstance(v, str)}
+    assert patterns == {row.pattern for row in TOPICS}
+
+
+@pytest.mark.parametrize(
+    ("made", "topic"),
+    [
+        (topics.camera_image("cf1"), "/cf1/camera/image"),
+        (topics.calibration("cf1"), "/cf1/camera/calibration"),
+        (topics.attitude("cf1"), "/cf1/attitude"),
+        (topics.labels("cf1"), "/cf1/labels"),
+        (topics.detections("cf1"), "/cf1/detections"),
+        (topics.grid("cf1"), "/cf1/detections/grid"),
+        (topics.truth("cf1", "cf2"), "/cf1/peer/cf2/truth"),
+    ],
+)
+def test_topics_are_spelled_as_other_programs_know_them(made: str, topic: str) -> None:
+    assert made == topic
+
+
+def test_a_robot_s_name_may_hold_any_sign_but_a_slash() -> None:
+    assert names(topics.LABELS, "/cf1.a-b (2)/labels") == {"robot": "cf1.a-b (2)"}
+    assert names(topics.LABELS, "/swarm/cf1/labels") is None
+    assert names(topics.LABELS, "/cf1/labels\n") is None
+
+
+def test_foreign_topics_have_no_row() -> None:
+    assert row_of("/rosout") is None
+    assert row_of("/cf1/camera/image/raw") is None
+
+
+def test_robots_are_found_by_their_images_and_sorted() -> None:
+    listed = ["/cf2/camera/image", "/cf1/camera/image", "/cf3/attitude", "/cf1/labels"]
+    assert robots(listed) == ["cf1", "cf2"]
+    assert robots(listed, topics.ATTITUDE) == ["cf3"]
+    assert robots([]) == []
