@@ -20,6 +20,7 @@ COMMANDS = {
     "demo": "Run the whole pipeline, small, on pictures that dmrl draws itself.",
     "run": "Run every stage of a pipeline recipe, in order; go on where it stopped.",
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
+    "fly": "Simulate a flight of robots that measure themselves and each other.",
     "convert": "Convert SOURCE, a foreign file or folder, into a recording.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
     "card": "Write a dataset's card and figures again.",

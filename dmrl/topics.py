@@ -82,6 +82,21 @@ def attitude(robot: str) -> str:
     return ATTITUDE.format(robot=robot)
 
 
+def velocity(robot: str) -> str:
+    """Topic of a robot's velocity."""
+    return VELOCITY.format(robot=robot)
+
+
+def height(robot: str) -> str:
+    """Topic of a robot's height."""
+    return HEIGHT.format(robot=robot)
+
+
+def uwb_range(robot: str, peer: str) -> str:
+    """Topic of the distances that a robot measures to a peer."""
+    return RANGE.format(robot=robot, peer=peer)
+
+
 def labels(robot: str) -> str:
     """Topic of the labels of a robot's images."""
     return LABELS.format(robot=robot)

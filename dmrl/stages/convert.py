@@ -15,7 +15,7 @@ from typing import Annotated
 from cyclopts import Parameter, validators
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.formats import image_folder, locanet
+from dmrl.formats import flight_csv, image_folder, locanet, uwb_tiers
 from dmrl.formats.camera_toml import read_camera
 from dmrl.formats.sample import Content
 from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
@@ -38,7 +38,7 @@ class Settings:
     Parameters
     ----------
     source_kind
-        What SOURCE is: locanet or images. Guessed where it can be.
+        What SOURCE is: locanet, csv, uwb-tiers or images. Guessed where it can be.
     robot
         Robot that carries the camera.
     rate_hz
@@ -101,6 +101,8 @@ def _camera(source: Path, name: Path | None) -> Camera | None:
 # Looked at in this order: the published set is a folder of pictures too.
 KINDS = {
     "locanet": Kind(locanet.recognises, _locanet),
+    "csv": Kind(flight_csv.recognises, lambda source, _: flight_csv.content(source)),
+    "uwb-tiers": Kind(uwb_tiers.recognises, lambda source, _: uwb_tiers.content(source)),
     "images": Kind(image_folder.recognises, _images),
 }
 
@@ -195,7 +197,8 @@ def command(
     Parameters
     ----------
     source
-        A folder of the published synthetic set, or a folder of pictures.
+        A folder of the published synthetic set, a folder of flight logs, ranges with motion
+        capture, or a folder of pictures.
     out
         Recording to write. Must not exist.
     as_json

@@ -1,0 +1,216 @@
+"""Flights as a folder of CSV files, one ``<robot>.csv`` per robot, on one clock.
+
+Columns, SI units, angles in radians:
+
+* ``time_s, roll_rad, pitch_rad, yaw_rate_radps, vx_mps, vy_mps, height_m`` must be there:
+  velocity in the robot's own horizontal frame (x forward, y left, turning with its yaw),
+  attitude Rz(yaw) Ry(pitch) Rx(roll), z up, so pitch is positive nose down;
+* ``range_<peer>_m`` may be: UWB distance, empty where there was none;
+* ``<peer>_x_m, <peer>_y_m, <peer>_z_m`` may be: true position of the peer in the robot's
+  horizontal frame, empty where it is not known.
+
+Pictures of a robot lie in a folder ``<robot>/``, named by their time in nanoseconds, at least
+12 digits (zeros in front); ``calibration.toml`` there is its camera.
+"""
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.errors import SourceError
+from dmrl.formats import flight_sample, image_folder
+from dmrl.formats.camera_toml import read_camera
+from dmrl.formats.flight_sample import LOG_COLUMNS, in_order, nanoseconds
+from dmrl.formats.sample import Content, Sample
+from dmrl.geometry import Array
+from dmrl.progress import say
+
+TIME = "time_s"
+REQUIRED = (TIME, *LOG_COLUMNS)
+GAP_S = 1.0
+RANGE_MAX_M = 65.0  # radios that found nothing say 65535 mm
+ANGLE_MAX_RAD = np.pi / 2
+YAW_RATE_MAX_RADPS = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """One CSV file: its path and its columns, (N,) each, NaN where a cell is empty."""
+
+    path: Path
+    columns: dict[str, Array]
+
+    @property
+    def robot(self) -> str:
+        """The robot it is of."""
+        return self.path.stem
+
+    @property
+    def time_s(self) -> Array:
+        """(N,) times."""
+        return self.columns[TIME]
+
+    @property
+    def ranged(self) -> list[str]:
+        """Peers that it has ranges to."""
+        return [
+            name[6:-2] for name in self.columns if name.startswith("range_") and name[-2:] == "_m"
+        ]
+
+    @property
+    def seen(self) -> list[str]:
+        """Peers whose true position it has."""
+        return [
+            name[:-4]
+            for name in self.columns
+            if name.endswith("_x_m")
+            and all(f"{name[:-4]}_{axis}_m" in self.columns for axis in "yz")
+        ]
+
+
+def recognises(source: Path) -> bool:
+    """Whether a folder holds a CSV file whose first column is ``time_s``."""
+    return source.is_dir() and any(_header(path)[:1] == [TIME] for path in source.glob("*.csv"))
+
+
+def _header(path: Path) -> list[str]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            return [name.strip() for name in next(csv.reader(stream), [])]
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return []
+
+
+def content(source: Path) -> Content:
+    """Samples of a flight, in time order. Says on stderr what is odd but can be used.
+
+    Parameters
+    ----------
+    source
+        The folder.
+
+    Raises
+    ------
+    SourceError
+        If a column is missing, a cell is no number, time does not increase, or two robots
+        share no time: names the file, and the line.
+    """
+    paths = sorted(source.glob("*.csv")) if source.is_dir() else []
+    if not paths:
+        raise SourceError(f"no <robot>.csv in {source}. Name a folder with a file per robot")
+    logs = [read_log(path) for path in paths]
+    _check_together(logs)
+    streams = [stream for log in logs for stream in _streams(log)]
+    streams += [stream for log in logs for stream in _pictures(source / log.robot)]
+    return Content(in_order(streams))
+
+
+def read_log(path: Path) -> Log:
+    """One robot's file, checked.
+
+    Raises
+    ------
+    SourceError
+        If a column is missing, a cell is no number, or time does not increase.
+    """
+    names = _header(path)
+    if missing := [name for name in REQUIRED if name not in names]:
+        raise SourceError(f"{path} has no column {', '.join(missing)}. Add it, in SI units")
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        reader = csv.reader(stream)
+        next(reader)
+        rows = [_numbers(path, reader.line_num, row, len(names)) for row in reader if row]
+    if len(rows) < 2:
+        raise SourceError(f"{path} has fewer than two rows. Give it a flight, or remove it")
+    log = Log(path, dict(zip(names, np.array(rows).T, strict=True)))
+    _check(log)
+    return log
+
+
+def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
+    if len(row) != width:
+        raise SourceError(f"{path}:{line} has {len(row)} cells, not {width}. Mend the line")
+    try:
+        return [float(cell) if cell.strip() else np.nan for cell in row]
+    except ValueError as e:
+        raise SourceError(f"{path}:{line}: {e}. Mend the line, or leave the cell empty") from None
+
+
+def _check(log: Log) -> None:
+    for name in REQUIRED:
+        if (bad := np.flatnonzero(~np.isfinite(log.columns[name]))).size:
+            raise SourceError(
+                f"{log.path}: {name} is no number in row {bad[0] + 1} of the data. Fill it, or "
+                "drop the row"
+            )
+    steps = np.diff(log.time_s)
+    if (back := np.flatnonzero(steps <= 0)).size:
+        raise SourceError(
+            f"{log.path}: time goes back or stands still at row {back[0] + 2} of the data "
+            f"({log.time_s[back[0] + 1]:.6f} s after {log.time_s[back[0]]:.6f} s). Sort the rows"
+        )
+    if log.time_s[0] < 0:
+        raise SourceError(f"{log.path} begins before time 0. Add a constant to time_s everywhere")
+    if (gaps := np.flatnonzero(steps > GAP_S)).size:
+        at = log.time_s[gaps[0]]
+        say(f"{log.path}: {gaps.size} gaps, the first of {steps[gaps[0]]:.1f} s after {at:.3f} s")
+    _warn_of_degrees(log)
+
+
+def _warn_of_degrees(log: Log) -> None:
+    for name in ("roll_rad", "pitch_rad", "yaw_rate_radps"):
+        most = float(np.abs(log.columns[name]).max())
+        limit = YAW_RATE_MAX_RADPS if name == "yaw_rate_radps" else ANGLE_MAX_RAD
+        if most > limit:
+            say(f"{log.path}: {name} reaches {most:.1f}. Are these degrees? Radians are expected")
+
+
+def _check_together(logs: list[Log]) -> None:
+    for one, other in combinations(logs, 2):
+        apart = max(one.time_s[0], other.time_s[0]) - min(one.time_s[-1], other.time_s[-1])
+        if apart > 0:
+            raise SourceError(
+                f"{one.path} and {other.path} share no time: {apart:.0f} s lie between them. "
+                "Put both on one clock"
+            )
+    known = {log.robot for log in logs}
+    for log in logs:
+        for peer in log.ranged:
+            if peer not in known:
+                say(f"{log.path} has ranges to {peer}, but there is no {peer}.csv beside it")
+
+
+def _streams(log: Log) -> Iterator[Iterator[Sample]]:
+    time_ns = nanoseconds(log.time_s)
+    yield flight_sample.robot_log(log.robot, time_ns, log.columns)
+    for peer in log.ranged:
+        range_m = log.columns[f"range_{peer}_m"]
+        given = ~np.isnan(range_m)
+        usable = given & (range_m > 0) & (range_m < RANGE_MAX_M)
+        if refused := int((given & ~usable).sum()):
+            say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 65 m")
+        yield flight_sample.ranges(log.robot, peer, time_ns[usable], range_m[usable])
+    for peer in log.seen:
+        xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
+        known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+        yield flight_sample.truth(log.robot, peer, time_ns[known], xyz[known])
+
+
+def _pictures(folder: Path) -> Iterator[Iterator[Sample]]:
+    if not folder.is_dir():
+        return
+    for path in sorted(folder.iterdir()):
+        named = path.stem.isdecimal() and len(path.stem) >= image_folder.TIME_DIGITS
+        if path.suffix.lower() in image_folder.SUFFIXES and not named:
+            raise SourceError(
+                f"{path} is not named by its time in nanoseconds, {image_folder.TIME_DIGITS} "
+                "digits or more. Rename it"
+            )
+    own = folder / image_folder.CALIBRATION
+    camera = read_camera(own) if own.is_file() else None
+    options = image_folder.Options(robot=folder.name, camera=camera)
+    yield image_folder.content(folder, options).samples

@@ -1,0 +1,152 @@
+"""Samples of a flight: what robots measure of themselves, of each other, and the truth.
+
+Time goes in as (N,) int64 nanoseconds, values as (N,) arrays.
+"""
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.formats.sample import Sample
+from dmrl.geometry import Array
+
+Times = NDArray[np.int64]
+
+LOG_COLUMNS = (
+    "roll_rad",
+    "pitch_rad",
+    "yaw_rate_radps",
+    "vx_mps",
+    "vy_mps",
+    "height_m",
+)
+"""What a robot's log holds, as ``robot_log`` wants it."""
+
+EXACT = [0.0] * 9
+
+
+def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
+    """Attitude, velocity and height of one robot, three samples per time.
+
+    The yaw of the attitude is the integral of the yaw rate, from 0 at the first time.
+
+    Parameters
+    ----------
+    robot
+        Its name.
+    time_ns
+        (N,) in order.
+    columns
+        (N,) for each of ``LOG_COLUMNS``.
+    """
+    rate = columns["yaw_rate_radps"]
+    turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
+    yaw = np.concatenate([[0.0], np.cumsum(turned)])
+    rows = np.stack([*(columns[name] for name in LOG_COLUMNS), yaw], axis=1).tolist()
+    names = topics.attitude(robot), topics.velocity(robot), topics.height(robot)
+    for moment, row in zip(time_ns.tolist(), rows, strict=True):
+        roll, pitch, yaw_rate, vx, vy, height, yaw_rad = row
+        attitude = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw_rad}
+        yield Sample(moment, names[0], "Attitude", {**attitude, "yaw_rate_radps": yaw_rate})
+        yield Sample(moment, names[1], "Velocity", {"vx_mps": vx, "vy_mps": vy})
+        yield Sample(moment, names[2], "Height", {"height_m": height})
+
+
+def ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sample]:
+    """UWB distances that a robot measured to a peer."""
+    topic = topics.uwb_range(robot, peer)
+    for moment, value in zip(time_ns.tolist(), range_m.tolist(), strict=True):
+        yield Sample(moment, topic, "UwbRange", {"range_m": value})
+
+
+def truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[Sample]:
+    """Exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
+    topic, frame = topics.truth(robot, peer), f"{robot}/horizontal"
+    for moment, (x, y, z) in zip(time_ns.tolist(), xyz_m.tolist(), strict=True):
+        fields = {"frame_id": frame, "x": x, "y": y, "z": z, "covariance": EXACT}
+        yield Sample(moment, topic, "PeerPosition", fields)
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A robot in the world: centre (3,) in metres, attitude Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    xyz_world: Array
+    yaw_rad: float
+    roll_rad: float
+    pitch_rad: float
+
+
+def transforms(time_ns: int, robots: Mapping[str, Placed]) -> Sample:
+    """The horizontal, camera and optical frames of robots, as foxglove.FrameTransforms.
+
+    The camera is taken to be at the robot's centre, looking along its x.
+    """
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    frames = [
+        {"timestamp": {"seconds": seconds, "nanos": nanos}, **frame}
+        for robot, placed in robots.items()
+        for frame in _frames(robot, placed)
+    ]
+    return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": frames})
+
+
+# The rotation camera_from_optical: the transpose of geometry.OPTICAL_FROM_CAMERA.
+CAMERA_FROM_OPTICAL = {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}
+
+
+def _frames(robot: str, placed: Placed) -> Iterator[dict[str, Any]]:
+    cy, sy = np.cos(placed.yaw_rad / 2), np.sin(placed.yaw_rad / 2)
+    cp, sp = np.cos(placed.pitch_rad / 2), np.sin(placed.pitch_rad / 2)
+    cr, sr = np.cos(placed.roll_rad / 2), np.sin(placed.roll_rad / 2)
+    place = dict(zip("xyz", placed.xyz_world.tolist(), strict=True))
+    turn = {"x": 0.0, "y": 0.0, "z": sy, "w": cy}
+    tilt = {"x": cp * sr, "y": sp * cr, "z": -sp * sr, "w": cp * cr}
+    for parent, child, translation, rotation in (
+        ("world", f"{robot}/horizontal", place, turn),
+        (f"{robot}/horizontal", f"{robot}/camera", {}, tilt),
+        (f"{robot}/camera", f"{robot}/optical", {}, CAMERA_FROM_OPTICAL),
+    ):
+        names = {"parent_frame_id": parent, "child_frame_id": child}
+        yield {**names, "translation": translation, "rotation": rotation}
+
+
+def in_order(streams: Iterable[Iterator[Sample]]) -> Iterator[Sample]:
+    """Samples of several streams, each in time order, in time order."""
+    return heapq.merge(*streams, key=lambda sample: sample.time_ns)
+
+
+def nanoseconds(time_s: Array) -> Times:
+    """(N,) seconds as whole nanoseconds."""
+    return np.rint(time_s * 1e9).astype(np.int64)
+
+
+def from_poses(time_s: Array, xy_m: Array, yaw_rad: Array) -> dict[str, Array]:
+    """The log of a robot on level ground that moved like this, by central differences.
+
+    Parameters
+    ----------
+    time_s
+        (N,) in order.
+    xy_m
+        (N, 2) world frame.
+    yaw_rad
+        (N,) against world x; may be wrapped.
+    """
+    yaw = np.unwrap(yaw_rad)
+    vx, vy = np.gradient(xy_m, time_s, axis=0).T
+    c, s = np.cos(yaw), np.sin(yaw)
+    level = np.zeros(len(time_s))
+    return {
+        "roll_rad": level,
+        "pitch_rad": level,
+        "yaw_rate_radps": np.asarray(np.gradient(yaw, time_s)),
+        "vx_mps": c * vx + s * vy,
+        "vy_mps": c * vy - s * vx,
+        "height_m": level,
+    }

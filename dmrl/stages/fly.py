@@ -1,0 +1,284 @@
+"""``dmrl fly``: a simulated flight of several robots, as a recording."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from itertools import permutations
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from cyclopts import Parameter, validators
+
+from dmrl import recipe as recipes
+from dmrl import topics
+from dmrl.errors import SettingError
+from dmrl.flight import NOISE, Clock, Flight, Scenario, Trajectory, Truth, simulate
+from dmrl.formats import flight_sample
+from dmrl.formats.flight_sample import Times, in_order, nanoseconds
+from dmrl.formats.sample import Sample, calibration, image, labels
+from dmrl.geometry import AIDECK, Array
+from dmrl.images import encode_jpeg
+from dmrl.messages import message
+from dmrl.output import refuse_existing
+from dmrl.progress import track
+from dmrl.recording import RecordingWriter, provenance
+from dmrl.rendering.onboard import Body, Renderer, in_front, pose_of, sketched
+from dmrl.rendering.sketch import Sketch
+from dmrl.tables import print_json, print_table
+
+Preset = Literal["ideal", "calibrated", "realistic", "harsh", "published"]
+
+START_NS = 1_000_000_000
+"""Log time of the start: clocks that run late must not show a time before zero."""
+TRUTH_RATE_HZ = 20.0
+CAMERA = replace(AIDECK, distortion=())
+"""The AI-deck's camera without its distortion."""
+JPEG_QUALITY = 92
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Who flies, how, and how wrong the sensors are.
+
+    Parameters
+    ----------
+    robots
+        2 to 20, named cf1, cf2, ...; cf1 leads where a trajectory has a leader.
+    duration_s
+        Length of the flight.
+    trajectory
+        How they move: in_view keeps every other robot in front of cf1, random is the paper's.
+    noise
+        How wrong the sensors are; docs/flights.md has the numbers.
+    seed
+        Another seed gives another flight.
+    yaw_spread_rad
+        Robots start with a yaw within plus and minus this; cf1 with 0.
+    camera
+        Render what the robots' cameras saw, with exact labels.
+    cameras_max
+        The first robots, so many at most, carry a camera.
+    camera_rate_hz
+        Pictures per second and robot.
+    """
+
+    robots: Annotated[int, Parameter(validator=validators.Number(gte=2, lte=20))] = 2
+    duration_s: Annotated[float, Parameter(validator=validators.Number(gte=1, lte=3600))] = 100.0
+    trajectory: Trajectory = "in_view"
+    noise: Preset = "realistic"
+    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0
+    yaw_spread_rad: float = 3.141592653589793
+    camera: bool = False
+    cameras_max: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 20
+    camera_rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=100))] = 5.0
+
+
+def run(out: Path, settings: Settings, *, renderer: Renderer = sketched) -> dict[str, int]:
+    """Messages per pattern of topics of the recording written to ``out``.
+
+    Parameters
+    ----------
+    out
+        Recording to write. Must not exist.
+    settings
+        See `Settings`.
+    renderer
+        What draws the pictures.
+
+    Raises
+    ------
+    SettingError
+        If a setting is out of range.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    refuse_existing(out)
+    _check(settings)
+    scenario = Scenario(
+        settings.robots, settings.duration_s, settings.trajectory, settings.yaw_spread_rad
+    )
+    flight = simulate(scenario, NOISE[settings.noise], settings.seed)
+    streams = [*_measured(flight), *_true(flight)]
+    if settings.camera:
+        streams += _pictures(flight, settings, renderer)
+    made = provenance("fly", settings, seed=settings.seed, libraries=("numpy", "pillow"))
+    counts: Counter[str] = Counter()
+    with RecordingWriter(out, made) as sink:
+        for sample in track(in_order(streams), "Flying", _total(flight, settings)):
+            sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
+            counts[_pattern(sample.topic)] += 1
+    return dict(sorted(counts.items()))
+
+
+def _check(settings: Settings) -> None:
+    if settings.seed < 0 or settings.cameras_max < 1:
+        raise SettingError("--seed must be 0 or more, cameras_max 1 or more. Change them")
+    if not 0 < settings.camera_rate_hz <= 100:
+        raise SettingError(f"--camera-rate-hz {settings.camera_rate_hz}: choose over 0, to 100")
+
+
+def _pattern(topic: str) -> str:
+    row = topics.row_of(topic)
+    return topic if row is None else row.pattern
+
+
+def _total(flight: Flight, settings: Settings) -> int:
+    """How many samples there will be, to within a few."""
+    robots = len(flight.robots)
+    logs = sum(3 * len(log.time_s) for log in flight.robots.values())
+    ranged = sum(len(ranges.time_s) for ranges in flight.ranges.values())
+    truth = int(settings.duration_s * TRUTH_RATE_HZ) * (robots * (robots - 1) + 1)
+    pictures = (
+        2 * min(robots, settings.cameras_max) * int(settings.duration_s * settings.camera_rate_hz)
+    )
+    return logs + ranged + truth + settings.camera * pictures
+
+
+def _stamps(clock: Clock, true_time_s: Array) -> Times:
+    """Log times of what a robot does at true times: its own clock's."""
+    return START_NS + nanoseconds(clock.shows(true_time_s))
+
+
+def _measured(flight: Flight) -> Iterator[Iterator[Sample]]:
+    for robot, log in flight.robots.items():
+        columns = {name: getattr(log, name) for name in flight_sample.LOG_COLUMNS}
+        yield flight_sample.robot_log(robot, START_NS + nanoseconds(log.time_s), columns)
+    for (robot, peer), ranges in flight.ranges.items():
+        time_ns = START_NS + nanoseconds(ranges.time_s)
+        yield flight_sample.ranges(robot, peer, time_ns, ranges.range_m)
+
+
+def _true(flight: Flight) -> Iterator[Iterator[Sample]]:
+    end_s = next(iter(flight.truth.values())).time_s[-1]
+    time_s = np.arange(0.0, end_s, 1.0 / TRUTH_RATE_HZ)
+    for robot, peer in permutations(flight.truth, 2):
+        xyz = flight.peer_in_horizontal(robot, peer, time_s)
+        yield flight_sample.truth(robot, peer, _stamps(flight.clocks[robot], time_s), xyz)
+    yield (_transforms(flight, float(moment)) for moment in time_s)
+
+
+def _transforms(flight: Flight, true_time_s: float) -> Sample:
+    """Every robot's frames, on true time."""
+    bodies = {robot: _body(truth, true_time_s) for robot, truth in flight.truth.items()}
+    attitudes = {
+        robot: flight_sample.Placed(b.xyz_world, b.yaw_rad, b.roll_rad, b.pitch_rad)
+        for robot, b in bodies.items()
+    }
+    time_ns = int(_stamps(Clock(), np.array([true_time_s]))[0])
+    return flight_sample.transforms(time_ns, attitudes)
+
+
+def _body(truth: Truth, true_time_s: float) -> Body:
+    at = np.array([true_time_s])
+    return Body(
+        truth.position_at(at)[0],
+        float(truth.yaw_at(at)[0]),
+        float(np.interp(true_time_s, truth.time_s, truth.roll)),
+        float(np.interp(true_time_s, truth.time_s, truth.pitch)),
+    )
+
+
+def _pictures(flight: Flight, settings: Settings, renderer: Renderer) -> Iterator[Iterator[Sample]]:
+    for k, robot in enumerate(list(flight.truth)[: settings.cameras_max]):
+        yield _camera(flight, robot, k, settings, renderer)
+
+
+def _camera(
+    flight: Flight, robot: str, number: int, settings: Settings, renderer: Renderer
+) -> Iterator[Sample]:
+    """The calibration of one robot's camera, then its pictures, each with its labels."""
+    period_s = 1.0 / settings.camera_rate_hz
+    time_s = np.arange(period_s / 2, settings.duration_s, period_s)
+    yield calibration(START_NS, robot, CAMERA)
+    for k, time_ns in enumerate(_stamps(flight.clocks[robot], time_s).tolist()):
+        here = _body(flight.truth[robot], float(time_s[k]))
+        others = {name: _body(t, float(time_s[k])) for name, t in flight.truth.items()}
+        poses = {
+            name: pose
+            for name, peer in others.items()
+            if name != robot and in_front(pose := pose_of(peer, here))
+        }
+        rng = np.random.default_rng((settings.seed, number, k))
+        picture = renderer(CAMERA, list(poses.values()), rng)
+        yield image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
+        yield labels(time_ns, robot, list(_labels(list(poses), picture)))
+
+
+def _labels(peers: list[str], picture: Sketch) -> Iterator[dict[str, Any]]:
+    for k, peer in enumerate(peers):
+        box = picture.box_px[k]
+        yield {
+            "peer": peer,
+            "u_px": picture.uv_px[k, 0],
+            "v_px": picture.uv_px[k, 1],
+            "depth_m": picture.depth_m[k],
+            "box_px": [] if np.isnan(box).any() else box.tolist(),
+            "visible_share": float(picture.visible_share[k]),
+            "source": "truth",
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Flags:
+    """Settings of the recipe that a flag may overrule.
+
+    Parameters
+    ----------
+    robots
+        2 to 20. Without it, the recipe's.
+    duration_s
+        Length of the flight. Without it, the recipe's.
+    trajectory
+        How they move. Without it, the recipe's.
+    noise
+        How wrong the sensors are. Without it, the recipe's.
+    seed
+        Another seed gives another flight. Without it, the recipe's.
+    camera
+        Render what every camera saw. Without it, as the recipe says.
+    camera_rate_hz
+        Pictures per second and robot. Without it, the recipe's.
+    """
+
+    robots: int | None = None
+    duration_s: float | None = None
+    trajectory: Trajectory | None = None
+    noise: Preset | None = None
+    seed: int | None = None
+    camera: bool | None = None
+    camera_rate_hz: float | None = None
+
+    def over(self, settings: Settings) -> Settings:
+        """The settings, with the flags that were given in their place."""
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return replace(settings, **given)
+
+
+NO_FLAGS = Flags()
+
+
+def command(
+    recipe: str,
+    out: Path,
+    /,
+    *,
+    flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Simulate a flight of robots that measure themselves and each other.
+
+    Parameters
+    ----------
+    recipe
+        A TOML file, or the name of a shipped recipe, such as fly_in_view.
+    out
+        Recording to write. Must not exist.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    counts = run(out, flags.over(recipes.load(recipe, "fly", Settings)))
+    if as_json:
+        print_json({"recording": str(out), "messages": counts})
+        return
+    print_table(str(out), ("topics", "messages"), list(counts.items()))
