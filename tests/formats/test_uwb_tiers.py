@@ -1,0 +1,63 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats import uwb_tiers
+
+
+@pytest.fixture
+def ranges(tmp_path: Path) -> Path:
+    """Two robots, one that drives along x at 1 m/s and looks along y; one range is missing."""
+    path = tmp_path / "two.npz"
+    along = np.arange(10) * 0.1
+    still = np.zeros(10)
+    np.savez(
+        path,
+        uwb_range_3_1_np=np.array([2.0, 0.0, *[2.5] * 8]),
+        optitrack_turtle01_pose_np=np.stack([along, still], axis=1),
+        optitrack_turtle01_orientation_np=still + np.pi / 2,
+        optitrack_turtle03_pose_np=np.stack([still, still + 2], axis=1),
+        optitrack_turtle03_orientation_np=still,
+    )
+    return path
+
+
+def test_ranges_odometry_and_truth_come_out(ranges: Path) -> None:
+    assert uwb_tiers.recognises(ranges)
+    samples = list(uwb_tiers.content(ranges).samples)
+    times = [s.time_ns for s in samples]
+    assert times == sorted(times)
+    measured = [s for s in samples if s.topic == "/turtle3/range/turtle1"]
+    assert [s.time_ns for s in measured] == [0, *(k * 10**8 for k in range(2, 10))]
+    speed = [s.fields for s in samples if s.topic == "/turtle1/velocity"]
+    assert np.allclose([(f["vx_mps"], f["vy_mps"]) for f in speed], (0.0, -1.0))
+    seen = [s.fields for s in samples if s.topic == "/turtle1/peer/turtle3/truth"]
+    assert (seen[0]["x"], seen[0]["y"]) == pytest.approx((2.0, 0.0))
+    assert (seen[-1]["x"], seen[-1]["y"]) == pytest.approx((2.0, 0.9))
+
+
+def test_other_files_are_refused(ranges: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.npz"
+    np.savez(other, speed=np.zeros(3))
+    assert not uwb_tiers.recognises(other)
+    with pytest.raises(SourceError, match="has no uwb_range"):
+        uwb_tiers.content(other)
+    odd = tmp_path / "odd.npz"
+    with np.load(ranges) as archive:
+        arrays = dict(archive)
+    np.savez(odd, **{**arrays, "uwb_range_3_1_np": np.zeros(4)})
+    with pytest.raises(SourceError, match="differ in length"):
+        uwb_tiers.content(odd)
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes(ranges.read_bytes()[:-100])
+    assert not uwb_tiers.recognises(cut)
+
+
+def test_the_public_file_reads(data: Path) -> None:
+    samples = list(uwb_tiers.content(data / "uwb-tiers" / "4robots_data_01.npz").samples)
+    ranged = {s.topic for s in samples if s.message == "UwbRange"}
+    assert len(ranged) == 6
+    assert "/turtle5/range/turtle1" in ranged
+    assert max(s.time_ns for s in samples) == 150_700_000_000

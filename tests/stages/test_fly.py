@@ -1,0 +1,159 @@
+import csv
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import recipe as recipes
+from dmrl.errors import OutputError, RecipeError, SettingError
+from dmrl.flight import NOISE, Scenario, simulate
+from dmrl.formats.flight_sample import LOG_COLUMNS
+from dmrl.recording import check, read, read_table, summary
+from dmrl.stages import convert, fly
+from dmrl.stages.fly import Flags, Settings
+
+SHORT = Settings(duration_s=4.0, seed=3)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four seconds of three robots; the first two carry a camera."""
+    out = tmp_path_factory.mktemp("fly") / "seen.mcap"
+    fly.run(out, Settings(3, 4.0, noise="harsh", seed=3, camera=True, cameras_max=2))
+    return out
+
+
+def test_every_topic_is_there_at_its_rate(seen: Path) -> None:
+    counts = {topic: info.count for topic, info in summary(seen).topics.items()}
+    assert counts["/cf3/attitude"] == counts["/cf3/velocity"] == counts["/cf3/height"] == 401
+    assert counts["/cf2/peer/cf3/truth"] == counts["/tf"] == 80
+    assert counts["/cf1/camera/image"] == counts["/cf1/labels"] == 20
+    assert counts["/cf2/camera/calibration"] == 1
+    assert 120 < counts["/cf3/range/cf1"] < 200
+    assert "/cf3/camera/image" not in counts
+    assert not [f for f in check(seen) if f.level == "error"]
+
+
+def test_what_was_measured_stands_on_the_clock_of_the_robot(seen: Path) -> None:
+    flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
+    table = read_table(seen, "/cf2/velocity")
+    assert np.allclose(table.column("vx_mps").to_numpy(), flight.robots["cf2"].vx_mps)
+    times = table.column("log_time").to_numpy().astype(float) * 1e-9
+    assert np.allclose(times, 1.0 + flight.robots["cf2"].time_s, atol=1e-8)
+    assert abs(times[0] - 1.0) > 1e-3  # harsh clocks are off
+
+
+def test_truth_labels_are_projections_of_the_true_positions(seen: Path) -> None:
+    flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
+    camera = fly.CAMERA
+    for k, stamped in enumerate(read(seen, "/cf1/labels")):
+        time_s = np.array([0.1 + 0.2 * k])
+        assert stamped.time_ns == 1_000_000_000 + round(time_s[0] * 1e9)
+        for label in stamped.message.peers:
+            x, y, z = flight.peer_in_horizontal("cf1", label.peer, time_s)[0]
+            truth = flight.truth["cf1"]
+            roll = np.interp(time_s, truth.time_s, truth.roll)[0]
+            pitch = np.interp(time_s, truth.time_s, truth.pitch)[0]
+            # By hand: pitch about y first, then roll about the nose.
+            x, z = x * np.cos(pitch) - z * np.sin(pitch), x * np.sin(pitch) + z * np.cos(pitch)
+            y, z = y * np.cos(roll) + z * np.sin(roll), -y * np.sin(roll) + z * np.cos(roll)
+            assert label.depth_m == pytest.approx(x)
+            assert label.u_px == pytest.approx(camera.cx_px - camera.fx_px * y / x)
+            assert label.v_px == pytest.approx(camera.cy_px - camera.fy_px * z / x)
+            assert (label.source, label.status) == ("truth", 0)
+
+
+def test_truth_is_exact_and_in_the_frame_of_the_observer(seen: Path) -> None:
+    stamped = next(read(seen, "/cf2/peer/cf3/truth"))
+    flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
+    xyz = flight.peer_in_horizontal("cf2", "cf3", np.zeros(1))[0]
+    assert (stamped.message.x, stamped.message.y, stamped.message.z) == pytest.approx(tuple(xyz))
+    assert list(stamped.message.covariance) == [0.0] * 9
+    assert stamped.message.frame_id == "cf2/horizontal"
+
+
+def test_transforms_lead_from_the_world_to_the_lens(seen: Path) -> None:
+    transforms = next(read(seen, "/tf")).message.transforms
+    names = [(t.parent_frame_id, t.child_frame_id) for t in transforms][:3]
+    assert names == [
+        ("world", "cf1/horizontal"),
+        ("cf1/horizontal", "cf1/camera"),
+        ("cf1/camera", "cf1/optical"),
+    ]
+    for transform in transforms:
+        q = transform.rotation
+        assert q.x**2 + q.y**2 + q.z**2 + q.w**2 == pytest.approx(1.0)
+
+
+def test_the_same_settings_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        fly.run(tmp_path / name, SHORT)
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_a_flight_survives_the_way_through_csv(tmp_path: Path) -> None:
+    flight = simulate(Scenario(duration_s=4.0), NOISE["calibrated"], 3)
+    folder = tmp_path / "csv"
+    folder.mkdir()
+    for robot, log in flight.robots.items():
+        ((_, peer),) = [pair for pair in flight.ranges if pair[0] == robot]
+        ranges = dict(_rows_of_ranges(flight.ranges[robot, peer].time_s, log.time_s))
+        with (folder / f"{robot}.csv").open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["time_s", *LOG_COLUMNS, f"range_{peer}_m"])
+            for k in range(len(log.time_s)):
+                at = ranges.get(k)
+                value = "" if at is None else flight.ranges[robot, peer].range_m[at]
+                columns = [getattr(log, name)[k] for name in LOG_COLUMNS]
+                writer.writerow([1.0 + log.time_s[k], *columns, value])
+    fly.run(tmp_path / "flown.mcap", Settings(duration_s=4.0, noise="calibrated", seed=3))
+    convert.run(folder, tmp_path / "converted.mcap", convert.Settings())
+    for topic in ("/cf1/attitude", "/cf2/velocity", "/cf1/height"):
+        flown, converted = (
+            read_table(tmp_path / f"{name}.mcap", topic) for name in ("flown", "converted")
+        )
+        assert flown.equals(converted)
+    flown, converted = (
+        read_table(tmp_path / f"{name}.mcap", "/cf1/range/cf2") for name in ("flown", "converted")
+    )
+    assert flown.column("range_m").equals(converted.column("range_m"))
+
+
+def _rows_of_ranges(ranged_s: np.ndarray, logged_s: np.ndarray) -> list[tuple[int, int]]:
+    """(row of the log, number of the range): each range goes with the next row."""
+    rows = np.searchsorted(logged_s, ranged_s)
+    assert all(one < other for one, other in pairwise(rows))
+    return [(int(row), k) for k, row in enumerate(rows)]
+
+
+@pytest.mark.parametrize("name", ["fly_in_view", "fly_swarm"])
+def test_shipped_recipes_can_be_flown(name: str, tmp_path: Path) -> None:
+    settings = Flags(duration_s=1.0).over(recipes.load(name, "fly", Settings))
+    assert fly.run(tmp_path / "out.mcap", settings)["/tf"] == 20
+
+
+def test_every_wrong_key_of_a_recipe_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text('kind = "fly"\nrobots = "two"\ntrajectory = "loop"\nwind = 3\n')
+    with pytest.raises(RecipeError) as caught:
+        recipes.load(path, "fly", Settings)
+    assert all(key in str(caught.value) for key in ("robots", "trajectory", "wind"))
+
+
+def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    for bad in (
+        Settings(robots=1),
+        Settings(duration_s=0.1),
+        Settings(seed=-1),
+        Settings(camera_rate_hz=0.0),
+        Settings(cameras_max=0),
+    ):
+        with pytest.raises(SettingError):
+            fly.run(out, bad)
+    out.write_text("mine")
+    with pytest.raises(OutputError, match="never overwritten"):
+        fly.run(out, SHORT)
+    assert out.read_text() == "mine"
+    assert list(tmp_path.iterdir()) == [out]
