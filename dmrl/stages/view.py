@@ -1,7 +1,6 @@
 """``dmrl view``: recordings in rerun, or what it would show as a file or a picture."""
 
 from collections.abc import Sequence
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -32,24 +31,6 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> None:
         save(recordings, out, settings)
     else:
         raise SettingError(f"{out}: view writes .png and .rrd. Name one of them")
-
-
-def run(recordings: Sequence[Path], out: Path, settings: Settings) -> None:
-    """Write what would be shown to ``out``: a .png of the first image, else an .rrd.
-
-    Raises
-    ------
-    RecordingError
-        If no recording has images, or one cannot be read.
-    SettingError
-        If no image lies in the time asked for, or rerun cannot draw here.
-    OutputError
-        If ``out`` exists.
-    """
-    if out.suffix == ".png":
-        screenshot(recordings, out, settings)
-    else:
-        save(recordings, out, settings)
 
 
 def command(
