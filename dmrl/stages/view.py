@@ -59,8 +59,7 @@ def command(
     serve_web
         Show it in a browser of this computer.
     time_s
-        Image of the picture: the one nearest to this time, seconds from the start of the
-        earliest recording. None: the first image shown.
+        Take the picture of the image nearest to this time, seconds from the start.
     """
     if save_to is not None:
         count = save(recording, save_to, settings)
