@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 STRIDE_PX = 8
 """Pixels per cell where a GridMap does not say; the published network's."""
 
-# After Okabe and Ito, told apart by colour-blind eyes. One source, one colour, everywhere.
+# After Okabe and Ito, told apart by colour-blind eyes, but as bright as text on grey must be.
+# One source, one colour, everywhere.
 COLOURS = {
-    "truth": (0, 200, 140),
-    "estimate": (86, 180, 233),
-    "published": (240, 228, 66),
-    "hand": (230, 140, 190),
-    "detection": (255, 110, 30),
-    "other": (170, 170, 170),
+    "truth": (60, 235, 160),
+    "estimate": (110, 200, 255),
+    "published": (250, 240, 90),
+    "hand": (255, 165, 215),
+    "detection": (255, 150, 60),
+    "other": (200, 200, 200),
 }
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 # rerun takes a negative radius in points of the screen: the same at every zoom.

@@ -15,6 +15,8 @@ from dmrl.viewer.legend import HEIGHT_PX, bar_path, legend_path
 
 TIMELINE = "log_time"
 BACKGROUND = (24, 24, 24)
+# Texts stand on a translucent grey, on which they cannot be read over a bright image.
+IMAGE_OPACITY, BELOW_MAP_OPACITY = 0.75, 0.4
 MARGIN_PX = 4
 
 
@@ -79,13 +81,27 @@ def _views(eye: Eye, scales: Mapping[str, Scale], *, alone: bool) -> list[rrb.Vi
         for channel in eye.channels
     }
     if alone and "confidence" in heat:
-        views.append(_view(eye, "confidence over image", [picture, *heat["confidence"]]))
+        views.append(
+            _view(
+                eye,
+                "confidence over image",
+                [picture, *heat["confidence"]],
+                opacity=BELOW_MAP_OPACITY,
+            )
+        )
     for channel, paths in heat.items():
         views.append(_view(eye, scales[channel].title, [*paths, *marks], texts=False))
     return views
 
 
-def _view(eye: Eye, name: str, contents: list[str], *, texts: bool = True) -> rrb.View:
+def _view(
+    eye: Eye,
+    name: str,
+    contents: list[str],
+    *,
+    texts: bool = True,
+    opacity: float = IMAGE_OPACITY,
+) -> rrb.View:
     bounds = rrb.VisualBounds2D(
         x_range=(-MARGIN_PX, eye.width_px + MARGIN_PX),
         y_range=(-MARGIN_PX, eye.height_px + HEIGHT_PX),
@@ -97,5 +113,8 @@ def _view(eye: Eye, name: str, contents: list[str], *, texts: bool = True) -> rr
         contents=contents,
         visual_bounds=bounds,
         background=BACKGROUND,
-        defaults=[kind.from_fields(show_labels=False) for kind in kinds],
+        defaults=[
+            rr.EncodedImage.from_fields(opacity=opacity),
+            *(kind.from_fields(show_labels=False) for kind in kinds),
+        ],
     )
