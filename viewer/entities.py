@@ -29,6 +29,7 @@ COLOURS = {
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 # rerun takes a negative radius in points of the screen: the same at every zoom.
 POINT_UI, FAINT_POINT_UI, LINE_UI = -4.0, -1.5, -1.0
+INVISIBLE = 0.01
 # rerun writes below a point; at the zoom that a layout opens with, this is a line's height.
 TEXT_PX = 14
 
@@ -128,38 +129,38 @@ def labels(topic: str, batch: pa.RecordBatch, sources: set[str]) -> Iterator[Ent
 def _labels_of(
     topic: str, source: str, peers: pa.StructArray, row_of: NDArray[np.intp], rows: int
 ) -> Iterator[Entity]:
-    path, colour = f"{topic}/{source}", COLOURS.get(source, COLOURS["other"])
+    colour = COLOURS.get(source, COLOURS["other"])
     # Where two sources agree, the one named first in the table is seen.
     order = 30.0 - list(COLOURS).index(source if source in COLOURS else "other")
-    uv_px = _positions(peers)
-    points = rr.Points2D.columns(positions=uv_px)
-    style = rr.Points2D.from_fields(colors=[colour], radii=[POINT_UI], draw_order=order)
-    lengths = np.bincount(row_of, minlength=rows)
-    yield Entity(f"{path}/points", points.partition(lengths), (style,))
-
     edges = peers.field("box_px")
     boxed = edges.value_lengths().to_numpy() == 4
     corners = edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
-    centres, half_sizes = corners.mean(axis=1), (corners[:, 1] - corners[:, 0]) / 2
-    boxes = rr.Boxes2D.columns(centers=centres, half_sizes=half_sizes)
-    outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
-    yield Entity(
-        f"{path}/boxes",
-        boxes.partition(np.bincount(row_of[boxed], minlength=rows)),
-        (outline,),
-    )
+    centres = corners.mean(axis=1)
+    uv_px = _positions(peers)
+    top_px = uv_px.copy()
+    top_px[boxed] = np.column_stack([centres[:, 0], corners[:, 0, 1]])
 
-    # Above the peer: below it stands what the network found.
-    above = uv_px.copy()
-    above[boxed] = np.column_stack([centres[:, 0], corners[:, 0, 1]])
-    above[:, 1] = np.maximum(above[:, 1] - TEXT_PX, 0)
-    names, depths_m = (peers.field(key).to_pylist() for key in ("peer", "depth_m"))
-    texts = rr.Points2D.columns(
-        positions=above,
-        labels=[f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)],
+    points = rr.Points2D.columns(positions=uv_px)
+    boxes = rr.Boxes2D.columns(centers=centres, half_sizes=(corners[:, 1] - corners[:, 0]) / 2)
+    dot, dust = (
+        rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
+        for radius in (POINT_UI, INVISIBLE)
     )
-    invisible = rr.Points2D.from_fields(colors=[colour], radii=[0.01], draw_order=order)
-    yield Entity(f"{path}/texts", texts.partition(lengths), (invisible,))
+    outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
+    lengths = np.bincount(row_of, minlength=rows)
+    box_lengths = np.bincount(row_of[boxed], minlength=rows)
+    path = f"{topic}/{source}"
+    yield Entity(f"{path}/points", points.partition(lengths), (dot,))
+    yield Entity(f"{path}/boxes", boxes.partition(box_lengths), (outline,))
+    yield Entity(f"{path}/texts", _label_texts(peers, top_px).partition(lengths), (dust,))
+
+
+def _label_texts(peers: pa.StructArray, top_px: NDArray[np.float64]) -> rr.ComponentColumnList:
+    # Above the peer: below it stands what the network found.
+    above_px = np.column_stack([top_px[:, 0], np.maximum(top_px[:, 1] - TEXT_PX, 0)])
+    names, depths_m = (peers.field(key).to_pylist() for key in ("peer", "depth_m"))
+    texts = [f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)]
+    return rr.Points2D.columns(positions=above_px, labels=texts)
 
 
 def detections(topic: str, batch: pa.RecordBatch) -> Iterator[Entity]:
