@@ -20,6 +20,15 @@ def test_a_terminal_sees_a_bar(
     assert "Counting" in err
 
 
+def test_the_words_before_the_bar_may_follow_the_items(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    assert list(track(range(3), "Counting", describe=lambda k: f"number {k}")) == [0, 1, 2]
+    assert "number 2" in capsys.readouterr().err
+
+
 def test_news_go_to_standard_error_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
     say("left out: [bold]3 " + "x" * 200)
     assert capsys.readouterr() == ("", "left out: [bold]3 " + "x" * 200 + "\n")

@@ -11,12 +11,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 from torch.optim import Optimizer
 
 from dmrl.errors import ModelError, SettingError
-from dmrl.learn.model import set_weights, weights_of
+from dmrl.learn.model import set_weights, weights_of, write_tensors
 from dmrl.learn.network import Network
 
 STATE_NAME = "checkpoint.json"
@@ -54,7 +54,7 @@ def save_checkpoint(folder: Path, network: Network, optimizer: Optimizer, state:
         for name, value in moments.items():
             tensors[f"optimizer.{index}.{name}"] = value.detach().cpu().contiguous()
     name = f"checkpoint-{state.epochs_done:04d}.safetensors"
-    save_file(tensors, folder / name)
+    write_tensors(tensors, folder / name)
     unfinished = folder / f"{STATE_NAME}.partial"
     document = {**asdict(state), "tensors": name}
     unfinished.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from dmrl.errors import ModelError, SettingError
@@ -127,6 +127,11 @@ def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> 
     network.load_state_dict(weights, strict=False)
 
 
+def write_tensors(tensors: dict[str, Tensor], path: Path) -> None:
+    """Write a .safetensors file. A full disk is an OSError, unlike in the library's own way."""
+    path.write_bytes(save(tensors))
+
+
 def describe(model: Model) -> dict[str, Any]:
     """What ``model.json`` says about a model."""
     return {
@@ -144,7 +149,7 @@ def describe(model: Model) -> dict[str, Any]:
 
 def save_model(model: Model, folder: Path) -> None:
     """Write ``model.safetensors`` and ``model.json`` into a folder."""
-    save_file(weights_of(model.network), folder / WEIGHTS_NAME)
+    write_tensors(weights_of(model.network), folder / WEIGHTS_NAME)
     text = json.dumps(describe(model), indent=1) + "\n"
     (folder / DESCRIPTION_NAME).write_text(text, encoding="utf-8")
 

@@ -1,0 +1,234 @@
+"""What is logged, read back from the .rrd files."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from dmrl.errors import OutputError, RecordingError, SettingError, SourceError
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, read_table
+from dmrl.viewer import Settings, save
+from dmrl.viewer.entities import COLOURS
+
+Make = Callable[..., Path]
+IMAGES = "/cf1/camera/image"
+
+
+def logged(path: Path) -> dict[tuple[str, str], int]:
+    """Rows by entity and archetype; what is static counts as "static"."""
+    rows: Counter[tuple[str, str]] = Counter()
+    for chunk in RrdReader(path).stream():
+        kinds = {n.partition(":")[0] for n in chunk.to_record_batch().schema.names if ":" in n}
+        for kind in kinds:
+            rows[str(chunk.entity_path), f"static {kind}" if chunk.is_static else kind] += (
+                chunk.num_rows
+            )
+    return dict(rows)
+
+
+def column(path: Path, entity: str, component: str) -> list[Any]:
+    """Values of a component, row by row."""
+    values: list[Any] = []
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if str(chunk.entity_path) == entity and component in batch.schema.names:
+            values += batch[component].to_pylist()
+    return values
+
+
+def panels(path: Path) -> set[str]:
+    """Names of the views of the layout."""
+    reader = RrdReader(path)
+    names: set[str] = set()
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        if "ViewBlueprint:display_name" in batch.schema.names:
+            names |= {name for (name,) in batch["ViewBlueprint:display_name"].to_pylist()}
+    return names
+
+
+@pytest.fixture
+def rrd(tmp_path: Path) -> Path:
+    return tmp_path / "flight.rrd"
+
+
+def test_every_topic_becomes_its_archetypes(make: Make, rrd: Path) -> None:
+    assert save([make()], rrd, Settings()) == 10
+    found = logged(rrd)
+    assert {key: n for key, n in found.items() if not key[1].startswith("static")} == {
+        ("/cf1/camera/image", "EncodedImage"): 10,
+        ("/cf1/labels/truth/points", "Points2D"): 10,
+        ("/cf1/labels/truth/boxes", "Boxes2D"): 10,
+        ("/cf1/labels/truth/texts", "Points2D"): 10,
+        ("/cf1/labels/published/points", "Points2D"): 10,
+        ("/cf1/labels/published/boxes", "Boxes2D"): 10,
+        ("/cf1/labels/published/texts", "Points2D"): 10,
+        ("/cf1/detections", "Points2D"): 10,
+        ("/cf1/detections/grid/confidence", "DepthImage"): 10,
+        ("/cf1/detections/grid/depth_m", "DepthImage"): 10,
+    }
+    assert {path for path, kind in found if kind == "static LineStrips2D"} == {
+        "/cf1/legend/sources",
+        "/cf1/legend/confidence/ticks",
+        "/cf1/legend/depth_m/ticks",
+    }
+    assert list(rrd.parent.glob("*.partial")) == []
+
+
+def test_images_are_logged_as_they_are(make: Make, rrd: Path) -> None:
+    recording = make()
+    save([recording], rrd, Settings())
+    table = read_table(recording, IMAGES)
+    blobs = [bytes(blob) for (blob,) in column(rrd, IMAGES, "EncodedImage:blob")]
+    assert blobs == table["data"].to_pylist()
+    kinds = [kind for (kind,) in column(rrd, IMAGES, "EncodedImage:media_type")]
+    assert kinds == ["image/jpeg", "image/png"] * 5
+
+
+def test_labels_say_peer_and_depth_and_disappear_with_the_peer(make: Make, rrd: Path) -> None:
+    save([make()], rrd, Settings())
+    texts = column(rrd, "/cf1/labels/truth/texts", "Points2D:labels")
+    assert texts == [["cf2 1.25 m"]] * 9 + [[]]
+    boxes = column(rrd, "/cf1/labels/truth/boxes", "Boxes2D:half_sizes")
+    assert boxes == [[[6.0, 5.0]]] * 9 + [[]]
+    assert column(rrd, "/cf1/labels/published/boxes", "Boxes2D:half_sizes") == [[]] * 10
+    colours = {
+        source: column(rrd, f"/cf1/labels/{source}/points", "Points2D:colors")[0][0] >> 8
+        for source in ("truth", "published")
+    }
+    assert colours == {
+        source: int.from_bytes(bytes(COLOURS[source])) for source in ("truth", "published")
+    }
+
+
+def test_a_detection_below_the_threshold_is_faint_and_has_no_text(make: Make, rrd: Path) -> None:
+    save([make()], rrd, Settings())
+    assert column(rrd, "/cf1/detections", "Points2D:labels") == [["0.90, 1.20 m", ""]] * 10
+    radii = column(rrd, "/cf1/detections", "Points2D:radii")
+    assert radii == [[-4.0, -1.5]] * 10
+
+
+def test_maps_have_fixed_ranges_and_cells_of_eight_pixels(make: Make, rrd: Path) -> None:
+    save([make()], rrd, Settings(depth_max_m=2.5))
+    grid = "/cf1/detections/grid"
+    ranges = {
+        channel: column(rrd, f"{grid}/{channel}", "DepthImage:depth_range")
+        for channel in ("confidence", "depth_m")
+    }
+    assert ranges == {"confidence": [[[0.0, 1.0]]], "depth_m": [[[0.0, 2.5]]]}
+    assert column(rrd, f"{grid}/depth_m", "Transform3D:scale") == [[[8.0, 8.0, 1.0]]]
+    cells = np.frombuffer(bytes(column(rrd, f"{grid}/depth_m", "DepthImage:buffer")[0][0]), "<f4")
+    assert cells.reshape(6, 8)[1, 2] == np.float32(1.2)
+
+
+def test_a_single_robot_gets_four_panels_and_two_get_three_each(make: Make, tmp_path: Path) -> None:
+    save([make()], tmp_path / "one.rrd", Settings())
+    save([make("two.mcap", ("cf1", "cf2"))], tmp_path / "two.rrd", Settings())
+    maps = {"image", "confidence", "depth, m"}
+    over = {"cf1 confidence over image"}
+    assert panels(tmp_path / "one.rrd") == {f"cf1 {name}" for name in maps} | over
+    assert panels(tmp_path / "two.rrd") == {f"cf{k} {name}" for k in (1, 2) for name in maps}
+
+
+def test_a_recording_of_images_only_has_one_panel(make: Make, rrd: Path) -> None:
+    save([make(without=("labels", "detections"))], rrd, Settings())
+    assert panels(rrd) == {"cf1 image"}
+    assert {path for path, kind in logged(rrd) if "static" not in kind} == {IMAGES}
+
+
+def test_from_to_and_every_choose_images_with_what_belongs_to_them(make: Make, rrd: Path) -> None:
+    assert save([make()], rrd, Settings(from_s=0.2, to_s=0.8, every=2)) == 3
+    moving = {n for (_, kind), n in logged(rrd).items() if "static" not in kind}
+    assert moving == {3}
+    times = {
+        ns
+        for chunk in RrdReader(rrd).stream()
+        if not chunk.is_static
+        for ns in chunk.to_record_batch()["log_time"].cast("int64").to_pylist()
+    }
+    assert times == {200_000_000, 400_000_000, 600_000_000}
+
+
+@pytest.mark.parametrize(
+    ("start_ns", "kind"), [(0, "duration[ns]"), (1_700_000_000 * 10**9, "timestamp[ns]")]
+)
+def test_log_time_counts_from_zero_unless_it_is_a_date(
+    make: Make, rrd: Path, start_ns: int, kind: str
+) -> None:
+    save([make(start_ns=start_ns)], rrd, Settings())
+    kinds = {
+        str(chunk.to_record_batch()["log_time"].type)
+        for chunk in RrdReader(rrd).stream()
+        if not chunk.is_static
+    }
+    assert kinds == {kind}
+
+
+def test_recordings_that_belong_together_are_shown_as_one(make: Make, rrd: Path) -> None:
+    pictures = make("pictures.mcap", without=("labels", "detections"))
+    found = make("found.mcap", without=("camera",))
+    assert save([found, pictures], rrd, Settings()) == 10
+    assert logged(rrd)["/cf1/detections/grid/confidence", "DepthImage"] == 10
+
+
+def test_a_robot_may_have_any_name(make: Make, rrd: Path) -> None:
+    save([make(robots=("drone #1 (blue)",))], rrd, Settings())
+    assert logged(rrd)[r"/drone\ \#1\ \(blue\)/camera/image", "EncodedImage"] == 10
+
+
+def test_an_unknown_source_of_labels_is_shown_too(tmp_path: Path, make: Make, rrd: Path) -> None:
+    with RecordingWriter(tmp_path / "odd.mcap", Provenance("test")) as sink:
+        peers = message("PeerLabels")(peers=[{"peer": "cf9", "depth_m": 1, "source": "guess"}])
+        sink.write(0, "/cf1/labels", peers)
+    pictures = make(without=("labels", "detections"))
+    save([pictures, tmp_path / "odd.mcap"], rrd, Settings())
+    assert logged(rrd)["/cf1/labels/guess/points", "Points2D"] == 1
+    assert column(rrd, "/cf1/legend/sources", "LineStrips2D:labels") == [["guess"]]
+
+
+def test_without_images_the_missing_topic_is_named(make: Make, rrd: Path) -> None:
+    recording = make(without=("camera",))
+    with pytest.raises(RecordingError, match=r"no images \(/\*/camera/image\) in .*flight.mcap"):
+        save([recording], rrd, Settings())
+    assert list(rrd.parent.glob("*.rrd*")) == []
+
+
+def test_labels_of_a_robot_without_images_are_not_dropped_in_silence(
+    make: Make, rrd: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures, others = make(), make("others.mcap", ("cf7",), without=("camera",))
+    save([pictures, others], rrd, Settings())
+    assert "cf7 has labels or detections but no images" in capsys.readouterr().err
+
+
+def test_a_time_without_images_is_refused(make: Make, rrd: Path) -> None:
+    with pytest.raises(SettingError, match=r"lasts from 0 to 0.900 s. Change --from-s or --to-s"):
+        save([make()], rrd, Settings(from_s=5.0))
+    assert list(rrd.parent.glob("*.rrd*")) == []
+
+
+def test_an_output_is_never_overwritten(make: Make, rrd: Path) -> None:
+    rrd.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="never overwritten"):
+        save([make()], rrd, Settings())
+    assert rrd.read_bytes() == b"mine"
+
+
+def test_a_recording_that_is_cut_short_leaves_no_file(make: Make, rrd: Path) -> None:
+    recording = make()
+    recording.write_bytes(recording.read_bytes()[:-100])
+    with pytest.raises(RecordingError, match=r"flight\.mcap"):
+        save([recording], rrd, Settings())
+    assert list(rrd.parent.glob("*.rrd*")) == []
+
+
+def test_an_image_that_is_none_is_named(tmp_path: Path, rrd: Path) -> None:
+    with RecordingWriter(tmp_path / "bad.mcap", Provenance("test")) as sink:
+        sink.write(0, IMAGES, message("CompressedImage")(data=b"no picture", format="png"))
+    with pytest.raises(SourceError, match="the first image of /cf1/camera/image"):
+        save([tmp_path / "bad.mcap"], rrd, Settings())

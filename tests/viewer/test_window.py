@@ -1,0 +1,139 @@
+"""Pictures, windows and pages, with rerun's own viewer."""
+
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import OutputError, SettingError
+from dmrl.images import decode
+from dmrl.stages import view as stage
+from dmrl.viewer import Settings, screenshot, view, window
+from dmrl.viewer.layouts import BACKGROUND, IMAGE_OPACITY
+
+Make = Callable[..., Path]
+
+
+@pytest.fixture(scope="session")
+def vulkan() -> None:
+    """Skips where there is no software Vulkan driver to draw with."""
+    folders = (Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d"))
+    if not any(any(folder.glob("lvp*.json")) for folder in folders):
+        pytest.skip("no software Vulkan driver; apt-get install mesa-vulkan-drivers")
+
+
+def panel(picture: Path, row: int, col: int) -> tuple[int, ...]:
+    """Mean colour of the middle of one of four panels."""
+    rgb = decode(picture.read_bytes())
+    v, u = (250, 730)[row], (400, 1200)[col]
+    return tuple(int(value) for value in rgb[v - 40 : v + 40, u - 40 : u + 40].mean(axis=(0, 1)))
+
+
+def test_a_picture_shows_the_image_nearest_to_the_time(
+    make: Make, tmp_path: Path, vulkan: None
+) -> None:
+    picture = tmp_path / "picture.png"
+    assert screenshot([make()], picture, Settings(), time_s=0.43) == pytest.approx(0.4)
+    assert decode(picture.read_bytes()).shape == (1000, 1600, 3)
+    assert np.ptp(panel(picture, 0, 0)) <= 3
+    # The fifth image is grey 80, and lies over the background as light does, not as bytes do.
+    light = IMAGE_OPACITY * 80**2.2 + (1 - IMAGE_OPACITY) * BACKGROUND[0] ** 2.2
+    assert panel(picture, 0, 0)[0] == pytest.approx(light ** (1 / 2.2), abs=2)
+    assert list(tmp_path.glob("*.partial")) == []
+
+
+def test_without_a_vulkan_driver_a_picture_says_how_to_get_one(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
+        monkeypatch.setenv(name, "/nonexistent")
+    with pytest.raises(OutputError, match="apt-get install mesa-vulkan-drivers"):
+        screenshot([make()], tmp_path / "picture.png", Settings())
+    assert list(tmp_path.glob("picture*")) == []
+
+
+def test_a_viewer_that_stops_is_reported_with_its_last_words(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = "import sys; sys.exit('out of luck')"
+    monkeypatch.setattr(window, "_command", lambda *_: [sys.executable, "-c", code])
+    with pytest.raises(OutputError, match=r"viewer stopped: out of luck\. Try: dmrl view --save"):
+        screenshot([make()], tmp_path / "picture.png", Settings())
+    with pytest.raises(SettingError, match=r"viewer stopped: out of luck\. Use --save"):
+        view([make("second.mcap")], Settings())
+
+
+def test_a_picture_is_never_overwritten(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "picture.png").write_bytes(b"mine")
+    with pytest.raises(OutputError, match="never overwritten"):
+        screenshot([make()], tmp_path / "picture.png", Settings())
+    assert (tmp_path / "picture.png").read_bytes() == b"mine"
+
+
+def test_without_a_screen_the_window_says_what_else_there_is(make: Make) -> None:
+    with pytest.raises(SettingError, match=r"no screen.*--save, --screenshot or --serve"):
+        view([make()], Settings())
+
+
+def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
+    command, environment = window._command(), window._environment()
+    assert command[command.index("--bind") + 1] == "127.0.0.1"
+    assert environment["CI"] == "1"
+    assert {environment[name] for name in ("https_proxy", "HTTPS_PROXY")} == {"http://127.0.0.1:9"}
+
+
+def test_the_page_is_served_until_ctrl_c(make: Make) -> None:
+    code = "from dmrl.cli import main; main()"
+    command = [sys.executable, "-c", code, "view", str(make()), "--serve"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stderr is not None
+            address = server.stderr.readline().split()[0]
+            assert address.startswith("http://127.0.0.1:")
+            assert b"<html" in _page(address)
+            server.send_signal(signal.SIGINT)
+            assert server.wait(timeout=10) == 0
+        finally:
+            server.kill()
+
+
+def _page(address: str) -> bytes:
+    """What stands at an address, once somebody serves it."""
+    deadline = time.monotonic() + 10
+    while True:
+        try:
+            with urllib.request.urlopen(address) as answer:
+                return bytes(answer.read())
+        except urllib.error.URLError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+
+
+def test_a_pipeline_writes_by_suffix(make: Make, tmp_path: Path, vulkan: None) -> None:
+    recording = make()
+    for name in ("seen.rrd", "seen.png"):
+        stage.run([recording], tmp_path / name, Settings())
+        assert (tmp_path / name).stat().st_size > 1000
+    with pytest.raises(SettingError, match=r"view writes \.png and \.rrd"):
+        stage.run([recording], tmp_path / "seen.jpg", Settings())
+
+
+def test_without_rerun_the_command_names_the_extra(tmp_path: Path) -> None:
+    (tmp_path / "rerun.py").write_text("raise ImportError('not here')")
+    code = "from dmrl.cli import main; main()"
+    command = [sys.executable, "-c", code, "view", "x.mcap"]
+    done = subprocess.run(
+        command, env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "dmrl: dmrl view needs rerun-sdk. Install it with: pip install 'dmrl[view]'\n"
+    )

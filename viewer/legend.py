@@ -1,0 +1,64 @@
+"""What explains the colours: drawn below the image and the maps, in image pixels."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+
+from dmrl.viewer.entities import COLOURS, LINE_UI, Entity, Scale, map_style
+
+HEIGHT_PX = 26
+"""Room that the legend and the colour bars take below an image, pixels."""
+
+MARK_PX, BAR_PX, BAR_STEPS = 6, 6, 64
+TEXT_COLOUR = (220, 220, 220)
+# The longest name takes about a sixth of the width of a panel.
+ENTRIES_PER_WIDTH = 6
+
+
+def legend_path(robot: str) -> str:
+    """Entity of a robot's legend of sources."""
+    return f"/{robot}/legend/sources"
+
+
+def bar_path(robot: str, channel: str) -> str:
+    """Entity above the colour bar of a channel of the grid, and its ticks."""
+    return f"/{robot}/legend/{channel}"
+
+
+def legend(robot: str, sources: Sequence[str], width_px: int, height_px: int) -> Entity:
+    """A line in the colour of each source, with its name."""
+    left_px = [(k + 0.4) * width_px / ENTRIES_PER_WIDTH for k in range(len(sources))]
+    y_px = height_px + MARK_PX
+    marks = rr.LineStrips2D(
+        [[[x_px, y_px], [x_px + 2 * MARK_PX, y_px]] for x_px in left_px],
+        colors=[COLOURS.get(source, COLOURS["other"]) for source in sources],
+        labels=list(sources),
+        radii=2 * LINE_UI,
+    )
+    return Entity(legend_path(robot), style=(marks,))
+
+
+def colour_bars(
+    robot: str, scales: Mapping[str, Scale], width_px: int, height_px: int
+) -> Iterator[Entity]:
+    """A bar with three ticks for each channel of the grid."""
+    left_px, length_px = width_px / 10, width_px * 8 / 10
+    top_px = height_px + BAR_PX / 2
+    place = rr.Transform3D(
+        translation=[left_px, top_px, 0], scale=[length_px / BAR_STEPS, BAR_PX, 1]
+    )
+    shares = (0.0, 0.5, 1.0)
+    at_px = [left_px + length_px * share for share in shares]
+    for channel, scale in scales.items():
+        steps = np.linspace(0.0, scale.last, BAR_STEPS, dtype=np.float32)
+        ticks = rr.LineStrips2D(
+            [[[x_px, top_px], [x_px, top_px + BAR_PX]] for x_px in at_px],
+            colors=[TEXT_COLOUR],
+            labels=[f"{scale.last * share:g}{scale.unit}" for share in shares],
+            radii=LINE_UI,
+        )
+        path = bar_path(robot, channel)
+        bar = rr.DepthImage(steps[None]), map_style(scale), place
+        yield Entity(f"{path}/bar", style=bar)
+        yield Entity(f"{path}/ticks", style=(ticks,))
