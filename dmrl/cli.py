@@ -26,7 +26,7 @@ COMMANDS = {
     "card": "Write a dataset's card and figures again.",
     "train": "Train a network on a dataset.",
     "predict": "Run a network on every image of a recording.",
-    "evaluate": "Judge a recording's detections against its labels.",
+    "evaluate": "Judge detections against labels, or estimated positions against the truth.",
     "view": "Show recordings in rerun, or save what it would show.",
     "info": "Show what a recording holds and where it comes from.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",

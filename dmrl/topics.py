@@ -112,6 +112,11 @@ def grid(robot: str) -> str:
     return GRID.format(robot=robot)
 
 
+def position(robot: str, peer: str) -> str:
+    """Topic of where a robot estimates a peer to be."""
+    return POSITION.format(robot=robot, peer=peer)
+
+
 def truth(robot: str, peer: str) -> str:
     """Topic of where a peer truly is, seen from a robot."""
     return TRUTH.format(robot=robot, peer=peer)

@@ -214,7 +214,7 @@ def parallel(_rng: Generator, start: Start, leader: Motion | None) -> Motion:
 
 
 def lawn_mower(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
-    """A robot that flies rows to and fro in its own frame, and then the same field back."""
+    """A robot that flies rows up and down in its own frame, and then the same field back."""
     speed = rng.uniform(0.3, 0.6)
     row, gap = ROW_M / speed, ROW_GAP_M / speed
     legs = [(row, (-1) ** k * 1.0) for k in range(ROWS)]

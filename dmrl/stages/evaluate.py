@@ -1,4 +1,4 @@
-"""``dmrl evaluate``: a recording's detections against its labels."""
+"""``dmrl evaluate``: detections against labels, or estimated positions against true ones."""
 
 import json
 import math
@@ -9,11 +9,12 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
+from dmrl import positions, topics
 from dmrl.errors import MissingExtra
 from dmrl.evaluation import Pairs, join
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
 from dmrl.output import partial_folder, refuse_existing
-from dmrl.recording import input_of
+from dmrl.recording import input_of, summary
 from dmrl.tables import print_json, print_table
 
 plots: ModuleType | None
@@ -22,16 +23,21 @@ try:
 except MissingExtra:
     plots = None
 
+Document = dict[str, Any]
 DOCUMENT_NAME = "evaluation.json"
+POSITIONS_NAME = "positions.json"
+PLOTTED_PAIRS = 12
 FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What detections are judged against, and how.
+    """What is judged, against what, and how.
 
     Parameters
     ----------
+    what
+        "auto": detections where there are any, else estimated positions.
     against
         Whose labels.
     split
@@ -43,13 +49,17 @@ class Settings:
         Bootstrap samples behind the 95 % intervals.
     seed
         Of the bootstrap.
+    settle_s
+        positions: errors in the first seconds count for what is kept only.
     """
 
+    what: Literal["auto", "detections", "positions"] = "auto"
     against: Literal["truth", "estimate", "hand", "published"] = "truth"
     split: str | None = None
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
     draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
     seed: int = 0
+    settle_s: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,22 +84,23 @@ class Evaluation:
     threshold: float
 
 
-def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
-    """Judge the detections of ``recording``, robot by robot and image by image.
+def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation | Document:
+    """Judge the detections of ``recording``, or its positions: then as JSON values.
 
     Parameters
     ----------
     recording
-        With images, labels and detections.
+        With images, labels and detections; or with estimated and true positions.
     out
-        Folder to write plots and ``evaluation.json`` to. None: nothing is written.
+        Folder to write plots and ``evaluation.json``, or ``positions.json``, to. None:
+        nothing is written.
     settings
         See `Settings`.
 
     Raises
     ------
     RecordingError
-        If the recording cannot be read, or has no labels, detections or images.
+        If the recording cannot be read, or has nothing to judge, or nothing to judge it by.
     SettingError
         If it has no labels of that source, no such split, or no image to judge.
     MissingExtra
@@ -101,6 +112,36 @@ def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
         refuse_existing(out)
         if plots is None:
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
+    if _judges_positions(recording, settings):
+        return _run_positions(recording, out, settings)
+    return run_detections(recording, out, settings)
+
+
+def _judges_positions(recording: Path, settings: Settings) -> bool:
+    if settings.what != "auto":
+        return settings.what == "positions"
+    detected = topics.robots(list(summary(recording).topics), topics.DETECTIONS)
+    return not detected and positions.has_positions(recording)
+
+
+def _run_positions(recording: Path, out: Path | None, settings: Settings) -> Document:
+    pairs = positions.judge(recording)
+    made = positions.document(recording, pairs, settings.settle_s)
+    if out is not None:
+        with partial_folder(out) as folder:
+            text = json.dumps(made, indent=1, allow_nan=False)
+            (folder / POSITIONS_NAME).write_text(text + "\n", encoding="utf-8")
+            assert plots is not None
+            for pair in pairs[:PLOTTED_PAIRS]:
+                judged, stem = pair.judged, folder / f"position-error-{pair.robot}-{pair.peer}"
+                plots.position_error(
+                    judged.time_s, judged.error_m, judged.sigma_m, judged.kept, pair.name, stem
+                )
+    return made
+
+
+def run_detections(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
+    """Judge the detections of ``recording``, robot by robot and image by image; see `run`."""
     pairs = join(recording, settings.against, settings.split)
     threshold = settings.threshold
     if threshold is None:
@@ -204,6 +245,14 @@ def print_evaluation(recording: Path, settings: Settings, evaluation: Evaluation
     )
 
 
+def print_positions(recording: Path, made: Document) -> None:
+    """Print the figures of positions, one row per pair."""
+    title = f"{recording}: estimated positions against truth"
+    headers = [words for _, words, _ in positions.COLUMNS]
+    print_table(title, ["pair", *headers], positions.rows(made))
+    print(f"{positions.NOTE}; settled after {made['settle_s']:g} s")
+
+
 def _range(band: BandFigures) -> str:
     to = f" to {band.to_m:g} m" if math.isfinite(band.to_m) else " m and more"
     return f"{band.from_m:g}{to}"
@@ -227,19 +276,24 @@ def command(
     plots_to: Annotated[Path | None, Parameter(name="--plots")] = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Judge a recording's detections against its labels.
+    """Judge detections against labels, or estimated positions against the truth.
 
     Parameters
     ----------
     recording
-        Recording with images, labels and detections.
+        Recording with images, labels and detections; or with estimated and true positions.
     plots_to
-        Folder to write plots and evaluation.json to. Must not exist.
+        Folder to write plots and evaluation.json, or positions.json, to. Must not exist.
     as_json
         Print one JSON document in place of the table.
     """
     evaluation = run(recording, plots_to, settings)
-    if as_json:
+    if isinstance(evaluation, dict):
+        if as_json:
+            print_json(evaluation)
+        else:
+            print_positions(recording, evaluation)
+    elif as_json:
         print_json(document(recording, settings, evaluation))
     else:
         print_evaluation(recording, settings, evaluation)

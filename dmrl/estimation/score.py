@@ -1,0 +1,176 @@
+"""How good estimated positions are, and how well they know it. Horizontal errors only.
+
+The vertical comes straight from two height sensors and says nothing about an estimator.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.geometry import Array
+
+Mask = NDArray[np.bool_]
+
+GOOD_M = 0.3
+"""A label that is off by more than this is a bad one."""
+WRONG_SHARE = 0.5
+"""A pair is in the wrong basin when half of its errors are over this share of the distance."""
+CHI2_95_OF_2 = 5.991
+
+DEFINITIONS = {
+    "rmse_m": "root of the mean squared horizontal error, after the settling time",
+    "p95_m": "95th percentile of the horizontal error, after the settling time",
+    "wrong_basin": "median horizontal error over half the median distance, after settling",
+    "nees": "mean of the squared horizontal error over its covariance; 2 if that is honest",
+    "coverage_95": "share of true positions inside the 95 % ellipse, after the settling time",
+    "good": f"share of all samples, from the start, with an error of at most {GOOD_M} m",
+    "kept": "share of all samples, from the start, with status OK",
+    "precision": f"share of the kept samples with an error of at most {GOOD_M} m",
+    "recall": f"share of the samples with an error of at most {GOOD_M} m that are kept",
+    "kept_coverage_95": "share of true positions inside the 95 % ellipse, kept samples",
+    "kept_rmse_m": "root of the mean squared horizontal error of the kept samples",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Estimates of one pair beside the truth, (N, ...) each.
+
+    Parameters
+    ----------
+    time_s
+        From the first estimate of the recording.
+    error_m
+        (N, 2) estimate minus truth, x and y of the observer's horizontal frame.
+    covariance
+        (N, 2, 2) of x and y, square metres; NaN where it is not known.
+    distance_m
+        True horizontal distance.
+    kept
+        Whether the estimator believes it.
+    """
+
+    time_s: Array
+    error_m: Array
+    covariance: Array
+    distance_m: Array
+    kept: Mask
+
+    @property
+    def size_m(self) -> Array:
+        """(N,) lengths of the errors."""
+        return np.asarray(np.linalg.norm(self.error_m, axis=1))
+
+    @property
+    def sigma_m(self) -> Array:
+        """(N, 2) standard deviations of x and y."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What ``DEFINITIONS`` explains; NaN where there is nothing to measure."""
+
+    samples: int
+    rmse_m: float
+    p95_m: float
+    wrong_basin: float
+    nees: float
+    coverage_95: float
+    good: float
+    kept: float
+    precision: float
+    recall: float
+    kept_coverage_95: float
+    kept_rmse_m: float
+
+
+def figures(judged: Judged, settle_s: float) -> Figures:
+    """Figures of one pair.
+
+    Parameters
+    ----------
+    judged
+        Estimates beside the truth.
+    settle_s
+        Errors before this time count for the gate only.
+    """
+    size_m, settled = judged.size_m, judged.time_s >= settle_s
+    late, distance = size_m[settled], judged.distance_m[settled]
+    squared = squared_distances(judged)
+    usable = np.isfinite(squared)
+    good, kept = size_m <= GOOD_M, judged.kept
+    return Figures(
+        samples=len(size_m),
+        rmse_m=_root(late),
+        p95_m=float(np.percentile(late, 95)) if late.size else np.nan,
+        wrong_basin=float(np.median(late) > WRONG_SHARE * np.median(distance))
+        if late.size
+        else np.nan,
+        nees=_mean(squared[usable & settled]),
+        coverage_95=_mean(squared[usable & settled] <= CHI2_95_OF_2),
+        good=_mean(good),
+        kept=_mean(kept),
+        precision=_mean(good[kept]),
+        recall=_mean(kept[good]),
+        kept_coverage_95=_mean(squared[usable & kept] <= CHI2_95_OF_2),
+        kept_rmse_m=_root(size_m[kept]),
+    )
+
+
+def squared_distances(judged: Judged) -> Array:
+    """(N,) squared errors over their covariances; NaN where a covariance is of no use."""
+    (a, b), (_, d) = judged.covariance.transpose(1, 2, 0)
+    x, y = judged.error_m.T
+    determinant = a * d - b * b
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squared = (d * x * x - 2 * b * x * y + a * y * y) / determinant
+    return np.where((a > 0) & (determinant > 0), squared, np.nan)
+
+
+def overall(pairs: list[Figures]) -> Figures:
+    """Figures over all pairs.
+
+    RMSE and percentile are medians of the pairs, the share of wrong basins is one of pairs;
+    shares of samples count every sample of every pair once.
+    """
+    samples = np.array([f.samples for f in pairs], float)
+    kept = samples * [f.kept for f in pairs]
+    good = samples * [f.good for f in pairs]
+    both = good * np.nan_to_num([f.recall for f in pairs])
+    return Figures(
+        samples=int(samples.sum()),
+        rmse_m=_median([f.rmse_m for f in pairs]),
+        p95_m=_median([f.p95_m for f in pairs]),
+        wrong_basin=_mean(_known([f.wrong_basin for f in pairs])),
+        nees=_mean(_known([f.nees for f in pairs])),
+        coverage_95=_mean(_known([f.coverage_95 for f in pairs])),
+        good=_ratio(good.sum(), samples.sum()),
+        kept=_ratio(kept.sum(), samples.sum()),
+        precision=_ratio(both.sum(), kept.sum()),
+        recall=_ratio(both.sum(), good.sum()),
+        kept_coverage_95=_mean(_known([f.kept_coverage_95 for f in pairs])),
+        kept_rmse_m=_median([f.kept_rmse_m for f in pairs]),
+    )
+
+
+def _ratio(part: float, whole: float) -> float:
+    return float(part / whole) if whole else float("nan")
+
+
+def _known(values: list[float]) -> Array:
+    return np.array([value for value in values if np.isfinite(value)])
+
+
+def _mean(values: Array | Mask) -> float:
+    return float(np.mean(values)) if values.size else float("nan")
+
+
+def _median(values: list[float]) -> float:
+    known = _known(values)
+    return float(np.median(known)) if known.size else float("nan")
+
+
+def _root(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

@@ -1,0 +1,189 @@
+"""Estimated positions of a recording beside the true ones, pair by pair."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.errors import RecordingError
+from dmrl.estimation.score import DEFINITIONS, Figures, Judged, figures, overall
+from dmrl.geometry import Array
+from dmrl.messages import STATUS_OK
+from dmrl.recording import input_of, read_table, summary
+
+GAP_S = 0.25
+"""Truth is not interpolated over longer gaps."""
+
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Estimates of one robot about one peer, judged.
+
+    Parameters
+    ----------
+    robot, peer
+        Names.
+    judged
+        The estimates that there is truth for.
+    without_truth
+        How many there is none for.
+    """
+
+    robot: str
+    peer: str
+    judged: Judged
+    without_truth: int
+
+    @property
+    def name(self) -> str:
+        """Words for a table."""
+        return f"{self.robot} sees {self.peer}"
+
+
+def has_positions(recording: Path) -> bool:
+    """Whether a recording holds estimated positions."""
+    return bool(_pairs(recording, topics.POSITION))
+
+
+def _pairs(recording: Path, pattern: str) -> list[tuple[str, str]]:
+    found = (topics.names(pattern, topic) for topic in summary(recording).topics)
+    return sorted((n["robot"], n["peer"]) for n in found if n is not None)
+
+
+def judge(recording: Path) -> list[Pair]:
+    """Every pair with estimates and truth.
+
+    Parameters
+    ----------
+    recording
+        With ``/<robot>/peer/<peer>/position`` and ``.../truth``.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read, or has no pair with both.
+    """
+    estimated = _pairs(recording, topics.POSITION)
+    if not estimated:
+        raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
+    known = set(_pairs(recording, topics.TRUTH))
+    pairs = [_judge(recording, *names) for names in estimated if names in known]
+    pairs = [pair for pair in pairs if len(pair.judged.time_s)]
+    if not pairs:
+        raise RecordingError(
+            f"{recording} has no true position for any estimated one. Judge a simulated flight, "
+            "or one with motion capture"
+        )
+    return pairs
+
+
+def _judge(recording: Path, robot: str, peer: str) -> Pair:
+    estimate = read_table(recording, topics.position(robot, peer))
+    true = read_table(recording, topics.truth(robot, peer))
+    time_ns, true_ns = _column(estimate, "log_time"), _column(true, "log_time")
+    near = _inside(time_ns.astype(np.int64), true_ns.astype(np.int64))
+    truth = np.stack(
+        [np.interp(time_ns[near], true_ns, _column(true, axis)) for axis in "xy"], axis=1
+    )
+    position = np.stack([_column(estimate, axis)[near] for axis in "xy"], axis=1)
+    judged = Judged(
+        time_s=(time_ns[near] - time_ns[0]) * 1e-9 if len(time_ns) else np.zeros(0),
+        error_m=position - truth,
+        covariance=_covariance(estimate)[near],
+        distance_m=np.linalg.norm(truth, axis=1),
+        kept=_column(estimate, "status")[near] == STATUS_OK,
+    )
+    return Pair(robot, peer, judged, int((~near).sum()))
+
+
+def _column(table: pa.Table, name: str) -> Array:
+    values: Array = table.column(name).to_numpy()
+    return values
+
+
+def _covariance(table: pa.Table) -> Array:
+    """(N, 2, 2) of x and y; NaN where it is not given."""
+    rows = table.column("covariance").to_pylist()
+    full = np.array([row if len(row) == 9 else [np.nan] * 9 for row in rows]).reshape(-1, 3, 3)
+    return np.asarray(full[:, :2, :2], float)
+
+
+def _inside(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
+    """(N,) whether truth lies close on both sides of a time."""
+    if not len(true_ns):
+        return np.zeros(len(time_ns), bool)
+    after = np.searchsorted(true_ns, time_ns)
+    exact = true_ns[np.minimum(after, len(true_ns) - 1)] == time_ns
+    between = (after > 0) & (after < len(true_ns))
+    low = true_ns[np.maximum(after - 1, 0)]
+    high = true_ns[np.minimum(after, len(true_ns) - 1)]
+    return np.asarray(exact | (between & (high - low <= GAP_S * 1e9)))
+
+
+def document(recording: Path, pairs: list[Pair], settle_s: float) -> dict[str, Any]:
+    """Everything that was measured, as JSON values; null where there was nothing to measure."""
+    source = input_of(recording)
+    each = [figures(pair.judged, settle_s) for pair in pairs]
+    return {
+        "recording": {"name": source.name, "sha256": source.sha256},
+        "settle_s": settle_s,
+        "overall": _values(overall(each)),
+        "pairs": [
+            {
+                "robot": pair.robot,
+                "peer": pair.peer,
+                "without_truth": pair.without_truth,
+                **_values(measured),
+            }
+            for pair, measured in zip(pairs, each, strict=True)
+        ],
+        "definitions": DEFINITIONS,
+    }
+
+
+def _values(measured: Figures) -> dict[str, float | None]:
+    values = asdict(measured).items()
+    return {name: value if math.isfinite(value) else None for name, value in values}
+
+
+# Name of a figure, its words in the table, and its format.
+COLUMNS = (
+    ("samples", "samples", "d"),
+    ("rmse_m", "RMSE, m", ".2f"),
+    ("p95_m", "95 %, m", ".2f"),
+    ("wrong_basin", "wrong", ".0%"),
+    ("nees", "NEES", ".1f"),
+    ("coverage_95", "in 95 %", ".0%"),
+    ("kept", "kept", ".0%"),
+    ("precision", "good of kept", ".1%"),
+    ("recall", "kept of good", ".0%"),
+    ("kept_rmse_m", "RMSE of kept, m", ".2f"),
+)
+
+
+NOTE = (
+    "horizontal errors; kept: status OK, over the whole flight; good: within 0.3 m; "
+    "RMSE, 95 %, NEES, ellipse: settled"
+)
+
+
+def rows(made: Mapping[str, Any]) -> list[list[str]]:
+    """One row per pair of a ``document``, and one for all where there are several."""
+    named = [(f"{pair['robot']} sees {pair['peer']}", pair) for pair in made["pairs"]]
+    if len(named) > 1:
+        named.append(("all", made["overall"]))
+    return [
+        [name, *(_cell(values[key], form) for key, _, form in COLUMNS)] for name, values in named
+    ]
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+
+from dmrl.estimation.score import DEFINITIONS, Figures, Judged, figures, overall
+from dmrl.geometry import Array
+
+
+def judged(error_m: Array, std_m: float = 0.1, kept: bool | Array = True) -> Judged:
+    """Errors at 10 Hz, one and a half metres away."""
+    count = len(error_m)
+    return Judged(
+        time_s=np.arange(count) / 10,
+        error_m=error_m,
+        covariance=np.tile(np.eye(2) * std_m**2, (count, 1, 1)),
+        distance_m=np.full(count, 1.5),
+        kept=np.broadcast_to(np.asarray(kept), count).copy(),
+    )
+
+
+def test_an_honest_estimator_has_a_nees_of_two_and_covers_95_percent() -> None:
+    rng = np.random.default_rng(0)
+    covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
+    errors = rng.multivariate_normal(np.zeros(2), covariance, 20_000)
+    honest = judged(errors)
+    honest = Judged(
+        honest.time_s,
+        errors,
+        np.tile(covariance, (20_000, 1, 1)),
+        honest.distance_m,
+        honest.kept,
+    )
+    found = figures(honest, 0.0)
+    assert found.nees == pytest.approx(2.0, rel=0.03)
+    assert found.coverage_95 == pytest.approx(0.95, abs=0.005)
+    assert found.rmse_m == pytest.approx(np.sqrt(0.05), rel=0.02)
+
+
+def test_errors_before_settling_count_for_the_gate_only() -> None:
+    errors = np.zeros((100, 2))
+    errors[:50, 0] = 5.0
+    kept = np.arange(100) >= 40
+    found = figures(judged(errors, kept=kept), settle_s=5.0)
+    assert (found.rmse_m, found.p95_m, found.wrong_basin, found.nees) == (0.0, 0.0, 0.0, 0.0)
+    assert (found.kept, found.good) == (0.6, 0.5)
+    assert found.precision == pytest.approx(50 / 60)
+    assert found.recall == 1.0
+    assert found.kept_rmse_m == pytest.approx(5 * np.sqrt(10 / 60))
+
+
+def test_a_mirrored_solution_is_a_wrong_basin() -> None:
+    found = figures(judged(np.tile([0.0, 2.0], (100, 1))), 0.0)
+    assert found.wrong_basin == 1.0
+    assert figures(judged(np.tile([0.0, 0.5], (100, 1))), 0.0).wrong_basin == 0.0
+
+
+def test_covariances_that_are_unknown_or_exact_are_not_judged() -> None:
+    for std_m in (0.0, np.nan):
+        found = figures(judged(np.full((10, 2), 0.1), std_m), 0.0)
+        assert np.isnan(found.nees)
+        assert np.isnan(found.coverage_95)
+        assert found.kept == 1.0
+
+
+def test_nothing_to_measure_is_not_a_number() -> None:
+    found = figures(judged(np.ones((10, 2)), kept=False), settle_s=100.0)
+    assert np.isnan([found.rmse_m, found.wrong_basin, found.precision, found.recall]).all()
+    assert np.isnan(overall([found]).precision)
+
+
+def test_over_all_pairs_every_sample_counts_once() -> None:
+    one = figures(judged(np.zeros((100, 2))), 0.0)
+    other = figures(judged(np.full((300, 2), 0.5), kept=np.arange(300) < 60), 0.0)
+    none = figures(judged(np.zeros((100, 2)), kept=False), 0.0)
+    every = overall([one, other, none])
+    assert every.samples == 500
+    assert every.kept == pytest.approx(160 / 500)
+    assert every.precision == pytest.approx(100 / 160)
+    assert every.recall == pytest.approx(100 / 200)
+    assert every.rmse_m == 0.0
+
+
+def test_every_figure_is_defined() -> None:
+    assert set(DEFINITIONS) == set(Figures.__dataclass_fields__) - {"samples"}

@@ -1,0 +1,101 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import positions
+from dmrl.errors import OutputError, RecordingError
+from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
+from dmrl.recording import Provenance, RecordingWriter
+from dmrl.stages.evaluate import Settings, command, run
+
+Make = Callable[..., Path]
+
+
+def position(x: float, y: float, std_m: float = 0.1, status: int = STATUS_OK) -> object:
+    covariance = (np.eye(3) * std_m**2).ravel().tolist()
+    return message("PeerPosition")(x=x, y=y, covariance=covariance, status=status)
+
+
+@pytest.fixture
+def labelled(tmp_path: Path) -> Path:
+    """Forty seconds: cf1 is 0.1 m off in x, and unsure for ten; cf2 is exact but knows nothing."""
+    path = tmp_path / "labelled.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(800):
+            at = k * 50_000_000
+            for robot, peer in (("cf1", "cf2"), ("cf2", "cf1")):
+                truth = position(1.0 + 0.001 * k, 0.5, 0.0)
+                sink.write(at, f"/{robot}/peer/{peer}/truth", truth)
+            late = at + 25_000_000  # between two truths
+            status = STATUS_UNCONVERGED if k < 200 else STATUS_OK
+            here = position(1.1 + 0.001 * (k + 0.5), 0.5, status=status)
+            sink.write(late, "/cf1/peer/cf2/position", here)
+            unknown = message("PeerPosition")(x=1.0 + 0.001 * k, y=0.5)
+            sink.write(at, "/cf2/peer/cf1/position", unknown)
+    return path
+
+
+def test_positions_are_judged_pair_by_pair(labelled: Path) -> None:
+    one, other = positions.judge(labelled)
+    assert (one.name, other.name) == ("cf1 sees cf2", "cf2 sees cf1")
+    assert one.judged.error_m == pytest.approx(np.tile([0.1, 0.0], (799, 1)))
+    assert one.without_truth == 1  # after the last truth
+    assert other.judged.error_m == pytest.approx(np.zeros((800, 2)))
+    assert np.isnan(other.judged.covariance).all()
+    made = run(labelled, None, Settings())
+    assert isinstance(made, dict)
+    first, second = made["pairs"]
+    assert first["rmse_m"] == pytest.approx(0.1)
+    assert first["nees"] == pytest.approx(1.0)
+    assert first["kept"] == pytest.approx(599 / 799)
+    assert (first["precision"], first["wrong_basin"]) == (1.0, 0.0)
+    assert (second["rmse_m"], second["nees"]) == (pytest.approx(0.0), None)
+    assert made["overall"]["samples"] == 1599
+
+
+def test_figures_and_plots_are_written(labelled: Path, tmp_path: Path) -> None:
+    out = tmp_path / "judged"
+    made = run(labelled, out, Settings(settle_s=5.0))
+    assert json.loads((out / "positions.json").read_text()) == made
+    names = {path.name for path in out.iterdir()}
+    assert {"position-error-cf1-cf2.png", "position-error-cf2-cf1.svg"} <= names
+    with pytest.raises(OutputError):
+        run(labelled, out, Settings())
+
+
+def test_the_table_has_a_row_per_pair_and_one_for_all(
+    labelled: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command(labelled)
+    text = capsys.readouterr().out
+    assert [row in text for row in ("cf1 sees cf2", "cf2 sees cf1", "all")] == [True] * 3
+    command(labelled, as_json=True)
+    assert json.loads(capsys.readouterr().out)["settle_s"] == 20.0
+
+
+def test_truth_is_not_interpolated_over_gaps(tmp_path: Path) -> None:
+    path = tmp_path / "gap.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for at_s in (0.0, 0.2, 5.0):
+            sink.write(round(at_s * 1e9), "/cf1/peer/cf2/truth", position(at_s, 0.0, 0.0))
+        for at_s in (0.1, 0.2, 3.0, 5.0):
+            sink.write(round(at_s * 1e9), "/cf1/peer/cf2/position", position(at_s, 0.0))
+    (pair,) = positions.judge(path)
+    assert pair.judged.error_m == pytest.approx(np.zeros((3, 2)))
+    assert pair.without_truth == 1
+
+
+def test_recordings_with_nothing_to_judge_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "truth.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        sink.write(0, "/cf1/peer/cf2/truth", position(1, 0, 0.0))
+    with pytest.raises(RecordingError, match=r"has no positions\. Try: dmrl label"):
+        run(path, None, Settings(what="positions"))
+    other = tmp_path / "estimate.mcap"
+    with RecordingWriter(other, Provenance("test")) as sink:
+        sink.write(0, "/cf1/peer/cf2/position", position(1, 0))
+    with pytest.raises(RecordingError, match="no true position for any"):
+        run(other, None, Settings())
