@@ -20,7 +20,10 @@ HEAVY = {
     *("bpy", "datasets", "h5py", "matplotlib", "mcap", "numpy", "pandas", "PIL", "pyarrow"),
     *("pydantic", "rerun", "tensorboard", "torch"),
 }
-OPTIONAL = ("torch", "safetensors", "tensorboard", "h5py", "rerun", "matplotlib", "pandas")
+OPTIONAL = (
+    *("torch", "safetensors", "tensorboard", "h5py", "rerun", "rerun_cli", "matplotlib", "pandas"),
+    *("datasets", "foxglove_schemas_protobuf", "grpc_tools", "mcap_protobuf", "scipy"),
+)
 STAGES = Path(cli.__file__).parent / "stages"
 
 
