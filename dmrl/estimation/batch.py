@@ -1,0 +1,115 @@
+"""Gauss-Newton over a whole flight: keyframe states and what is constant, together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmrl.estimation.banded import Normal, log_determinant, normal, solve
+from dmrl.estimation.linear import Linear, linearise, step_variance
+from dmrl.estimation.pair import Array
+from dmrl.estimation.problem import GLOBALS, Noise, Problem
+
+ITERATIONS = 25
+TOLERANCE = 1e-5
+"""Relative change of the cost at which the iteration ends."""
+WEAK: Array = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
+"""Information on every keyframe, in inverse squares of its units: next to none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A flight's solution.
+
+    Parameters
+    ----------
+    state
+        (K, 5) x, y (m), psi (rad), wx, wy (m/s) at the keyframes.
+    constants
+        (G,) as in ``GLOBALS``.
+    cost
+        Half the sum of squares, with the ranges' robust loss.
+    """
+
+    state: Array
+    constants: Array
+    cost: float
+
+
+def solve_batch(problem: Problem, noise: Noise, state: Array) -> Solution:
+    """The most likely flight near a first guess (Levenberg-Marquardt).
+
+    Parameters
+    ----------
+    problem, noise
+        The flight, and what is believed about its sensors.
+    state
+        (K, 3) or (K, 5) first guess.
+    """
+    constants = np.zeros(len(GLOBALS))
+    if state.shape[1] == 3:
+        state = np.column_stack([state, np.zeros((len(state), 2))])
+    linear = linearise(problem, noise, state, constants)
+    best = cost_of(linear, noise, constants)
+    damping = 0.0
+    for _ in range(ITERATIONS):
+        equations = equations_of(problem, noise, linear, constants)
+        change, change_constants, *_ = solve(damped(equations, damping))
+        tried = linearise(problem, noise, state + change, constants + change_constants)
+        cost = cost_of(tried, noise, constants + change_constants)
+        if not cost < best:
+            if damping > 1e4:
+                break
+            damping = max(10 * damping, 1e-2)
+            continue
+        state, constants, linear = state + change, constants + change_constants, tried
+        damping, gained, best = damping / 10, best - cost, cost
+        if gained < TOLERANCE * best:
+            break
+    return Solution(state, constants, best)
+
+
+def evidence(problem: Problem, noise: Noise, solution: Solution) -> float:
+    """Logarithm of how likely the measurements are under a noise model (Laplace).
+
+    Up to a constant that depends on the flight alone, so that noise models can be compared.
+    """
+    linear = linearise(problem, noise, solution.state, solution.constants)
+    equations = equations_of(problem, noise, linear, solution.constants)
+    spread = np.log(step_variance(problem, noise)).sum() / 2
+    spread += len(problem.range_m) * np.log(noise.range_std_m)
+    spread += np.log(noise.prior_std()).sum()
+    return -solution.cost - float(spread) - log_determinant(equations) / 2
+
+
+def cost_of(linear: Linear, noise: Noise, constants: Array) -> float:
+    """Half the sum of squares, with Cauchy's loss on the ranges."""
+    limit = (noise.cauchy_m / noise.range_std_m) ** 2
+    ranges = limit * np.log1p(linear.range**2 / limit).sum()
+    prior = ((constants / noise.prior_std()) ** 2).sum()
+    return float((linear.step**2).sum() + ranges + prior) / 2
+
+
+def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Array) -> Normal:
+    """Normal equations with Cauchy's weights and the globals' prior."""
+    limit = (noise.cauchy_m / noise.range_std_m) ** 2
+    weight = 1 / (1 + linear.range**2 / limit)
+    equations = normal(linear, problem.range_key, weight, WEAK)
+    information = noise.prior_std() ** -2
+    equations.corner[...] += np.diag(information)
+    equations.corner_gradient[...] += information * constants
+    return equations
+
+
+def damped(equations: Normal, damping: float) -> Normal:
+    """The same equations with a step that is shorter, and steeper."""
+    if damping == 0.0:
+        return equations
+    diagonal = equations.diagonal + damping * np.eye(len(WEAK)) * equations.diagonal
+    return Normal(
+        diagonal,
+        equations.above,
+        equations.border,
+        equations.corner,
+        equations.gradient,
+        equations.corner_gradient,
+    )

@@ -1,0 +1,126 @@
+"""Honest covariances: noise does not count as knowledge.
+
+A robot's motion tells where its peer is: turn the whole solution, and the ranges no longer
+fit the motion. Gauss-Newton takes the measured motion for the true one, so the noise in the
+log of a robot that stands still seems to fix the bearing as well as a flight would. The
+covariance is therefore taken not at the solution but at a calmed copy of it: averaged over a
+second or so, with the observer's motion, and the peer's relative to it, shrunk where they are
+no more than their noise. A static observer or parallel flight then leaves the bearing open.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from dmrl.estimation.banded import Normal, block_inverse, solve
+from dmrl.estimation.batch import Solution, equations_of
+from dmrl.estimation.linear import linearise
+from dmrl.estimation.motion import Increments, rotation
+from dmrl.estimation.pair import Array
+from dmrl.estimation.problem import Noise, Problem
+
+CALM_S = 1.5
+"""Moving average: what is faster than robots fly is noise."""
+WINDOW_S = 10.0
+"""Over which motion is held against its noise."""
+NOISE_FACTOR = 1.8
+"""Motion must exceed its noise's energy by this: 10 s of noise reach it in a few per cent."""
+
+
+def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Array, Array]:
+    """Covariances of a solution's keyframes and globals.
+
+    Returns
+    -------
+    keyframes : Array
+        (K, 5, 5) of x, y (m), psi (rad), wx, wy (m/s).
+    constants : Array
+        (G, G), in the order of ``GLOBALS``.
+    """
+    at_solution = linearise(problem, noise, solution.state, solution.constants)
+    calm, state = calmed(problem, noise, solution.state)
+    linear = linearise(calm, noise, state, solution.constants)
+    # The calmed copy does not fit the ranges; their weights come from the solution.
+    linear = replace(linear, range=at_solution.range, step=at_solution.step)
+    equations = equations_of(calm, noise, linear, solution.constants)
+    return _inverse(equations)
+
+
+def plain_covariance(problem: Problem, noise: Noise, solution: Solution) -> Array:
+    """(K, 5, 5) covariances of the keyframes at the solution itself: Gauss-Newton's."""
+    linear = linearise(problem, noise, solution.state, solution.constants)
+    return _inverse(equations_of(problem, noise, linear, solution.constants))[0]
+
+
+def _inverse(equations: Normal) -> tuple[Array, Array]:
+    *_, response, constants = solve(equations)
+    keyframes = block_inverse(equations.diagonal, equations.above)
+    return keyframes + response @ constants @ response.swapaxes(1, 2), constants
+
+
+def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array]:
+    """A flight and its solution without what may be noise, to linearise at.
+
+    Parameters
+    ----------
+    problem, noise
+        The flight, and what is believed about its sensors.
+    state
+        (K, 5) its solution.
+    """
+    step_s = float(np.median(problem.steps_s))
+    own_heading, own = path_of(problem.own)
+    relative = _apply(rotation(own_heading), state[:, :2])
+    single = noise_energy(noise)
+    own_steps = shrunk(np.diff(own, axis=0) / step_s, single, step_s) * step_s
+    relative_steps = shrunk(np.diff(relative, axis=0) / step_s, 2 * single, step_s) * step_s
+    path = np.concatenate([np.zeros((1, 2)), np.cumsum(relative_steps, axis=0)])
+    path += relative.mean(axis=0) - path.mean(axis=0)
+
+    out = np.zeros_like(state)
+    out[:, :2] = _apply(rotation(-own_heading), path)
+    out[:, 2] = state[:, 2]
+    own_shift = _apply(rotation(-own_heading[:-1]), own_steps)
+    peer_heading = own_heading[:-1] + state[:-1, 2]
+    peer_shift = _apply(rotation(-peer_heading), own_steps + relative_steps)
+    return replace(
+        problem,
+        own=replace(problem.own, shift_m=own_shift),
+        peer=replace(problem.peer, shift_m=peer_shift),
+    ), out
+
+
+def noise_energy(noise: Noise) -> float:
+    """Mean square of one velocity's noise after the moving average, both axes, (m/s)^2."""
+    return 2 * noise.velocity_psd / CALM_S
+
+
+def shrunk(velocity: Array, energy: float, step_s: float) -> Array:
+    """(K - 1, 2) averaged velocities, shrunk towards zero by their share of noise.
+
+    Parameters
+    ----------
+    velocity
+        (K - 1, 2) m/s.
+    energy
+        Mean square of their noise after the average, (m/s)^2.
+    step_s
+        Seconds between them.
+    """
+    slow = uniform_filter1d(velocity, max(1, round(CALM_S / step_s)), axis=0, mode="nearest")
+    window = max(1, round(WINDOW_S / step_s))
+    seen = uniform_filter1d((slow**2).sum(axis=1), window, mode="nearest")
+    share = np.sqrt(np.maximum(1 - NOISE_FACTOR * energy / np.maximum(seen, 1e-12), 0.0))
+    return np.asarray(slow * share[:, None])
+
+
+def path_of(moves: Increments) -> tuple[Array, Array]:
+    """Heading (K,) and position (K, 2) of a robot in the frame of its first keyframe."""
+    heading = np.concatenate([[0.0], np.cumsum(moves.turn_rad)])
+    steps = _apply(rotation(heading[:-1]), moves.shift_m)
+    return heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

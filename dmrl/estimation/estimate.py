@@ -1,0 +1,243 @@
+"""Relative positions of many pairs with covariance and status: the entrance of this room."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.estimation import ekf, keyframe_filter
+from dmrl.estimation.batch import Solution, solve_batch
+from dmrl.estimation.confidence import covariance, plain_covariance
+from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, distinct
+from dmrl.estimation.keyframe_filter import QUARTER
+from dmrl.estimation.motion import rotation
+from dmrl.estimation.pair import Array, Pair
+from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+
+KEY_HZ = 10.0
+"""Keyframes per second."""
+OK, UNCONVERGED, AMBIGUOUS = range(3)
+"""Values of ``status``; the same as in ``dmrl.v1.Status``."""
+
+INFLATION = 1.15
+"""Sigmas of the batch solve are multiplied by this, so that the 95 % ellipse holds 95 %."""
+SMOOTHER_INFLATION = 1.5
+OPEN_M = 0.5
+"""A sigma beyond this says that the bearing is open, not that it is imprecise."""
+RIVAL_COST = 25.0
+"""A solution elsewhere whose cost is within this of the best is a rival."""
+RIVAL_M = 0.3
+"""How far elsewhere."""
+CANDIDATES = 3
+"""Distinct smoothed starts that are solved."""
+
+Statuses = NDArray[np.int8]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where a peer was, over a flight. K keyframes or steps.
+
+    Parameters
+    ----------
+    time_s
+        (K,) times, seconds.
+    state
+        (K, 3) x, y (m) in the observer's horizontal frame, heading psi (rad).
+    covariance
+        (K, 3, 3) of the state.
+    status
+        (K,) OK, UNCONVERGED (not precise enough to label) or AMBIGUOUS (more than one
+        solution).
+    constants
+        (G,) what was constant, as in ``GLOBALS``; zeros where the method estimates none.
+    noise
+        What the sensors turned out to be like.
+    """
+
+    time_s: Array
+    state: Array
+    covariance: Array
+    status: Statuses
+    constants: Array
+    noise: Noise
+
+    def swapped(self) -> "Estimate":
+        """The same flight seen from the peer."""
+        back = rotation(-self.state[:, 2])
+        state = -self.state
+        state[:, :2] = _apply(back, state[:, :2])
+        by_state = np.zeros((len(state), 3, 3))
+        by_state[:, :2, :2], by_state[:, 2, 2] = -back, -1.0
+        by_state[:, :2, 2] = -state[:, :2] @ QUARTER.T
+        turned = by_state @ self.covariance @ by_state.swapaxes(1, 2)
+        return replace(self, state=state, covariance=turned)
+
+    def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
+        """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
+
+        Outside the flight the ends are held, and the status is UNCONVERGED at best.
+        """
+        place = np.interp(time_s, self.time_s, np.arange(len(self.time_s)))
+        low = np.clip(place.astype(int), 0, len(self.time_s) - 2)
+        share = (place - low)[:, None]
+        xy = self.state[low, :2] * (1 - share) + self.state[low + 1, :2] * share
+        part = share[..., None]
+        spread = self.covariance[low, :2, :2] * (1 - part) + self.covariance[low + 1, :2, :2] * part
+        status = np.maximum(self.status[low], self.status[low + 1])
+        outside = (time_s < self.time_s[0]) | (time_s > self.time_s[-1])
+        return xy, spread, np.where(outside, np.maximum(status, UNCONVERGED), status)
+
+
+def estimate_pairs(
+    pairs: list[Pair],
+    method: Literal["batch", "smoother"] = "batch",
+    *,
+    noise: Noise | None = None,
+    gate_m: float = 0.15,
+) -> list[Estimate]:
+    """Estimates of several pairs, one per pair.
+
+    Parameters
+    ----------
+    pairs
+        Any number; those of equal length share work.
+    method
+        The batch solve, or the smoother that it starts from.
+    noise
+        What the sensors are like. None: found from the flight.
+    gate_m
+        Largest sigma, along the worst direction, of a position that is OK, metres.
+    """
+    problems = [problem(pair, KEY_HZ) for pair in pairs]
+    first = noise or Noise()
+    out: dict[int, Estimate] = {}
+    lengths = np.array([len(p.key_s) for p in problems], int)
+    for length in np.unique(lengths):
+        numbers = np.flatnonzero(lengths == length)
+        runs, states, covariances = _smoothed([problems[n] for n in numbers], first)
+        for column, number in enumerate(numbers.tolist()):
+            mine = slice(column * KEPT, (column + 1) * KEPT)
+            score, tracks = runs[mine], states[:, mine]
+            if method == "smoother":
+                made = _from_smoother(problems[number], first, score, tracks, covariances[:, mine])
+            else:
+                made = _from_batch(problems[number], noise, score, tracks)
+            out[number] = replace(made[0], status=_status(made[0], made[1], gate_m))
+    return [out[number] for number in range(len(pairs))]
+
+
+def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = 0.15) -> list[Estimate]:
+    """Estimates by the published filter, at every step of the pairs' time grids.
+
+    Parameters
+    ----------
+    pairs
+        Any number.
+    preset
+        One of ``ekf.PRESETS``.
+    gate_m
+        As in `estimate_pairs`.
+    """
+    out = []
+    for pair in pairs:
+        steps = ekf.pair_steps(pair, ekf.PRESETS[preset])
+        state, spread = ekf.filter_many(steps, ekf.PRESETS[preset])
+        status = np.zeros(len(state), np.int8)
+        made = Estimate(
+            pair.time_s, state[:, 0], spread[:, 0], status, np.zeros(len(GLOBALS)), Noise()
+        )
+        out.append(replace(made, status=_status(made, np.zeros(len(state), bool), gate_m)))
+    return out
+
+
+def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Array]:
+    """Scores (P KEPT,), states and covariances (K, P KEPT, ...) of the likely starts."""
+    inputs = keyframe_filter.inputs_of(problems, noise)
+    start = candidates(inputs, KEY_HZ).reshape(-1, 3)
+    count = len(problems[0].key_s)
+    filtered = keyframe_filter.run(inputs.repeated(KEPT, count), start, START_STD)
+    return filtered.log_likelihood, *keyframe_filter.smoothed(filtered)
+
+
+def _from_smoother(
+    flight: Problem, noise: Noise, score: Array, tracks: Array, covariances: Array
+) -> tuple[Estimate, NDArray[np.bool_]]:
+    order = np.argsort(-score)
+    best = int(order[0])
+    rivals = [int(n) for n in order[1:] if score[best] - score[n] < RIVAL_COST]
+    estimate = Estimate(
+        flight.key_s,
+        tracks[:, best],
+        covariances[:, best] * SMOOTHER_INFLATION**2,
+        np.zeros(len(tracks), np.int8),
+        np.zeros(len(GLOBALS)),
+        noise,
+    )
+    return estimate, _rivalled(tracks[:, best], [tracks[:, n] for n in rivals])
+
+
+def _from_batch(
+    flight: Problem, noise: Noise | None, score: Array, tracks: Array
+) -> tuple[Estimate, NDArray[np.bool_]]:
+    first = noise or Noise()
+    chosen = dict.fromkeys(distinct(tracks[len(tracks) // 2], np.argsort(-score), CANDIDATES))
+    solutions = sorted(
+        (solve_batch(flight, first, tracks[:, n]) for n in chosen), key=lambda s: s.cost
+    )
+    best = solutions[0]
+    near = [s.state for s in solutions[1:] if s.cost - best.cost < RIVAL_COST]
+    rivalled = _rivalled(best.state, near)
+    found = first if noise else noise_of(flight, first, best)
+    if not noise:
+        best = solve_batch(flight, found, best.state)
+    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2
+    status = np.zeros(len(tracks), np.int8)
+    return Estimate(
+        flight.key_s, best.state[:, :3], spread, status, best.constants, found
+    ), rivalled
+
+
+def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
+    """What the sensors are like, from how the velocities disagree with the ranges.
+
+    Parameters
+    ----------
+    flight
+        The flight.
+    noise
+        A first guess.
+    solution
+        The flight's solution under that guess.
+    """
+    current = noise
+    for _ in range(2):
+        spread = plain_covariance(flight, current, solution)[:, 3:, 3:]
+        towards = solution.state[:, :2] / np.hypot(*solution.state[:, :2].T)[:, None]
+        error = np.einsum("ki,ki->k", solution.state[:, 3:], towards) ** 2
+        error += np.einsum("ki,kij,kj->k", towards, spread, towards)
+        std = float(np.sqrt(error.mean() / 2))
+        current = replace(noise, velocity_std_mps=std)
+        solution = solve_batch(flight, current, solution.state)
+    # Ranges along the line of sight leave 0.045 m/s even where the velocities have no noise.
+    return noise.graded(float(np.clip((std - 0.045) / (noise.velocity_std_mps - 0.042), 0.5, 3.0)))
+
+
+def _rivalled(state: Array, others: list[Array]) -> NDArray[np.bool_]:
+    """(K,) where another solution as good puts the peer elsewhere."""
+    elsewhere = np.zeros(len(state), bool)
+    for other in others:
+        elsewhere |= np.hypot(*(other - state)[:, :2].T) > RIVAL_M
+    return elsewhere
+
+
+def _status(estimate: Estimate, rivalled: NDArray[np.bool_], gate_m: float) -> Statuses:
+    sigma_m = np.sqrt(np.linalg.eigvalsh(estimate.covariance[:, :2, :2])[:, -1])
+    status = np.where(sigma_m < gate_m, OK, UNCONVERGED)
+    status[rivalled | ~(sigma_m < OPEN_M)] = AMBIGUOUS
+    return status.astype(np.int8)
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

@@ -1,0 +1,96 @@
+"""Where a pair may have started: many guesses on the range circle, told apart by likelihood."""
+
+import numpy as np
+
+from dmrl.estimation import keyframe_filter
+from dmrl.estimation.keyframe_filter import Inputs
+from dmrl.estimation.pair import Array
+
+BEARINGS, HEADINGS = 12, 8
+"""96 starts: bearings of the peer, each with headings of the peer."""
+FIRST_S = 20.0
+"""How long all starts are followed."""
+KEPT = 6
+"""Starts that are followed to the end."""
+START_STD: Array = np.array([0.35, 0.35, 0.45])
+"""Half the distance to the next start, roughly: m, m, rad."""
+APART_M, APART_RAD = 0.4, 0.5
+"""Solutions nearer than both are one."""
+
+
+def starts(range_m: float, height_m: float) -> Array:
+    """(96, 3) starts x, y (m), psi (rad) around an observer.
+
+    Parameters
+    ----------
+    range_m
+        First range, metres.
+    height_m
+        Peer's height less the observer's, metres.
+    """
+    radius = np.sqrt(max(range_m**2 - height_m**2, 0.05**2))
+    bearing = np.repeat(np.arange(BEARINGS) * 2 * np.pi / BEARINGS, HEADINGS)
+    heading = np.tile(np.arange(HEADINGS) * 2 * np.pi / HEADINGS, BEARINGS)
+    # Neighbouring bearings get headings half a step apart, which fills the space better.
+    heading = heading + np.repeat(np.arange(BEARINGS) % 2, HEADINGS) * np.pi / HEADINGS
+    return np.column_stack([radius * np.cos(bearing), radius * np.sin(bearing), heading])
+
+
+def candidates(inputs: Inputs, rate_hz: float) -> Array:
+    """(P, KEPT, 3) likely starts of P pairs, best first, distinct as far as there are such.
+
+    Parameters
+    ----------
+    inputs
+        Of P pairs.
+    rate_hz
+        Keyframes per second.
+    """
+    keyframes = min(len(inputs.range_m), int(FIRST_S * rate_hz))
+    first = [_first(inputs, pair, keyframes) for pair in range(inputs.range_m.shape[1])]
+    count = BEARINGS * HEADINGS
+    run = keyframe_filter.run(
+        inputs.repeated(count, keyframes), np.concatenate(first), START_STD
+    )
+    end = run.state[-1].reshape(-1, count, 3)
+    score = run.log_likelihood.reshape(-1, count)
+    begun = np.stack(first)
+    return np.stack([
+        b[distinct(e, np.argsort(-s), KEPT)] for b, e, s in zip(begun, end, score, strict=True)
+    ])
+
+
+def _first(inputs: Inputs, pair: int, keyframes: int) -> Array:
+    ranges = inputs.range_m[:keyframes, pair]
+    seen = np.flatnonzero(np.isfinite(ranges))
+    # The median of the first second: a single first range may be an outlier.
+    start = float(np.median(ranges[seen[:10]])) if len(seen) else 1.0
+    return starts(start, float(inputs.height_m[seen[0], pair]) if len(seen) else 0.0)
+
+
+def distinct(states: Array, order: Array, count: int) -> list[int]:
+    """Numbers of ``count`` states, in order, that differ; the last is repeated to fill up.
+
+    Parameters
+    ----------
+    states
+        (N, 3) x, y, psi.
+    order
+        (N,) their numbers, best first.
+    count
+        How many.
+    """
+    kept: list[int] = []
+    for number in order.tolist():
+        apart = [not alike(states[number], states[other]) for other in kept]
+        if all(apart):
+            kept.append(number)
+        if len(kept) == count:
+            break
+    return kept + kept[-1:] * (count - len(kept))
+
+
+def alike(one: Array, other: Array) -> bool:
+    """Whether two states are the same solution."""
+    turn = np.angle(np.exp(1j * (one[2] - other[2])))
+    return bool(np.hypot(*(one - other)[:2]) < APART_M and abs(turn) < APART_RAD)

@@ -1,0 +1,146 @@
+"""Residuals of a flight and their analytic Jacobians, by keyframe state and by global.
+
+A keyframe is (x, y, psi, wx, wy): w is the error of the measured relative velocity, in the
+observer's frame, which fades with its correlation time. White noise in its place would cost
+half of what the ranges tell.
+
+With s the velocity scales, the process residual is divided by 1 / (1 + s): without that, a
+scale that shrinks the path shrinks the noise with it and is always welcome.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmrl.estimation.keyframe_filter import QUARTER
+from dmrl.estimation.motion import rotation
+from dmrl.estimation.pair import Array
+from dmrl.estimation.problem import GLOBALS, Noise, Problem
+
+BIAS, SCALE, OWN_GYRO, PEER_GYRO, OWN_SCALE, PEER_SCALE = range(6)
+SIZE = 5
+OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """Whitened residuals and Jacobians at one solution. K keyframes, R ranges, G globals.
+
+    Parameters
+    ----------
+    step
+        (K - 1, 5) residuals of x, y, psi, wx, wy between neighbouring keyframes.
+    step_by_start, step_by_end
+        (K - 1, 5, 5) Jacobians by the keyframe before and after.
+    step_by_globals
+        (K - 1, 5, G).
+    range
+        (R,) residuals of the ranges.
+    range_by_state
+        (R, 5).
+    range_by_globals
+        (R, G).
+    """
+
+    step: Array
+    step_by_start: Array
+    step_by_end: Array
+    step_by_globals: Array
+    range: Array
+    range_by_state: Array
+    range_by_globals: Array
+
+
+def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) -> Linear:
+    """Residuals and Jacobians.
+
+    Parameters
+    ----------
+    problem, noise
+        The flight, and what is believed about its sensors.
+    state
+        (K, 5) x, y (m), psi (rad), wx, wy (m/s).
+    constants
+        (G,) as in ``GLOBALS``.
+    """
+    steps = _steps(problem, noise, state, constants)
+    return Linear(*steps, *_ranges(problem, noise, state, constants))
+
+
+def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> tuple[Array, ...]:
+    steps_s = problem.steps_s
+    own_gain, peer_gain = 1 / (1 + constants[[OWN_SCALE, PEER_SCALE]])
+    own = own_gain * (problem.own.shift_m - problem.own.drift_s @ constants[OWN_VELOCITY])
+    clock = problem.peer_by_clock * constants[CLOCK]
+    biased = problem.peer.drift_s @ constants[PEER_VELOCITY]
+    heading = rotation(state[:-1, 2])
+    peer = _apply(heading, peer_gain * (problem.peer.shift_m + clock - biased))
+    own_turn = problem.own.turn_rad - constants[OWN_GYRO] * steps_s
+    peer_turn = problem.peer.turn_rad - constants[PEER_GYRO] * steps_s
+    turned = rotation(own_turn)
+    ahead = _apply(turned, state[1:, :2])
+
+    share = np.sqrt((own_gain**2 + peer_gain**2) / 2)
+    weight = 1 / np.sqrt(step_variance(problem, noise))
+    weight[:, [0, 1, 3, 4]] /= share
+    half_s, kept = steps_s[:, None] / 2, np.exp(-steps_s / noise.velocity_tau_s)[:, None]
+    error, error_ahead = state[:-1, 3:], _apply(turned, state[1:, 3:])
+    shift = ahead - state[:-1, :2] - peer + own - half_s * (error + error_ahead)
+    turn = state[1:, 2] - state[:-1, 2] - peer_turn + own_turn
+    residual = weight * np.column_stack([shift, turn, error_ahead - kept * error])
+
+    by_start = np.zeros((len(steps_s), SIZE, SIZE))
+    by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0])
+    by_start[:, :2, 2] = -peer @ QUARTER.T
+    by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -half_s, -kept
+    by_end = np.zeros_like(by_start)
+    by_end[:, :2, :2] = by_end[:, 3:, 3:] = turned
+    by_end[:, :2, 3:] = -half_s[:, None] * turned
+    by_end[:, 2, 2] = 1.0
+    by_globals = np.zeros((len(steps_s), SIZE, len(GLOBALS)))
+    moved = ahead - half_s * error_ahead
+    by_globals[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER.T)
+    by_globals[:, 3:, OWN_GYRO] = -steps_s[:, None] * (error_ahead @ QUARTER.T)
+    by_globals[:, 2, OWN_GYRO], by_globals[:, 2, PEER_GYRO] = -steps_s, steps_s
+    by_globals[:, :2, OWN_SCALE], by_globals[:, :2, PEER_SCALE] = -own_gain * own, peer_gain * peer
+    by_globals[:, :2, OWN_VELOCITY] = -own_gain * problem.own.drift_s
+    by_globals[:, :2, PEER_VELOCITY] = peer_gain * (heading @ problem.peer.drift_s)
+    by_globals[:, :2, CLOCK] = -peer_gain * _apply(heading, problem.peer_by_clock)
+    for jacobian in (by_start, by_end, by_globals):
+        jacobian *= weight[:, :, None]
+    # The division by the share depends on the scales too.
+    metric = [0, 1, 3, 4]
+    by_globals[:, metric, OWN_SCALE] += residual[:, metric] * own_gain**3 / (2 * share**2)
+    by_globals[:, metric, PEER_SCALE] += residual[:, metric] * peer_gain**3 / (2 * share**2)
+    return residual, by_start, by_end, by_globals
+
+
+def step_variance(problem: Problem, noise: Noise) -> Array:
+    """(K - 1, 5) variance of each step's residuals, before whitening."""
+    steps_s = problem.steps_s
+    shift = 2 * noise.velocity_white_psd * steps_s + noise.gap_speed_mps**2 * problem.gap_s
+    turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * problem.gap_s
+    faded = 1 - np.exp(-2 * steps_s / noise.velocity_tau_s)
+    error = 2 * noise.velocity_std_mps**2 * faded
+    return np.column_stack([shift, shift, turn, error, error])
+
+
+def _ranges(problem: Problem, noise: Noise, state: Array, constants: Array) -> tuple[Array, ...]:
+    at = state[problem.range_key]
+    peer = _apply(rotation(at[:, 2]), problem.peer_to_range.shift_m)
+    offset = at[:, :2] + peer - problem.own_to_range.shift_m
+    distance = np.sqrt((offset**2).sum(axis=1) + problem.height_m**2) + 1e-6
+    towards = offset / distance[:, None]
+    gain = 1 + constants[SCALE]
+    residual = problem.range_m - gain * distance - constants[BIAS]
+    by_turn = np.einsum("ri,ri->r", towards, peer @ QUARTER.T)
+    by_state = np.zeros((len(at), SIZE))
+    by_state[:, :3] = -gain * np.column_stack([towards, by_turn])
+    by_globals = np.zeros((len(at), len(GLOBALS)))
+    by_globals[:, BIAS], by_globals[:, SCALE] = -1.0, -distance
+    std = noise.range_std_m
+    return residual / std, by_state / std, by_globals / std
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

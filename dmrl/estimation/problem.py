@@ -1,0 +1,176 @@
+"""A pair cut into keyframes: what the filter, the smoother and the batch solve work on."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.estimation.motion import Increments, odometry
+from dmrl.estimation.pair import Array, Pair
+
+SHIFT_S = 0.02
+"""Half the time difference behind the derivative by the peer's clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What the estimators believe about the sensors; one standard deviation each.
+
+    Parameters
+    ----------
+    velocity_std_mps, velocity_tau_s
+        Coloured noise of either robot's velocity, per axis, and its correlation time.
+    velocity_white_psd
+        White noise of either velocity: variance per second of integration, m^2/s.
+    yaw_rate_psd
+        White noise of either yaw rate, rad^2/s.
+    range_std_m
+        White noise of a range.
+    cauchy_m
+        Residual at which a range counts half.
+    bias_std_m, scale_std
+        Offset and scale of a pair's ranges.
+    gyro_std_radps
+        Bias of either yaw rate.
+    velocity_scale_std, velocity_bias_std_mps
+        Scale and bias of either velocity.
+    clock_std_s
+        Offset of the peer's clock.
+    height_std_m
+        Height difference.
+    gap_speed_mps, gap_turn_radps
+        How a robot may move while its sensors are silent, per square root of a second.
+    """
+
+    velocity_std_mps: float = 0.08
+    velocity_tau_s: float = 0.3
+    velocity_white_psd: float = 2e-4
+    yaw_rate_psd: float = 1e-5
+    range_std_m: float = 0.12
+    cauchy_m: float = 0.15
+    bias_std_m: float = 0.10
+    scale_std: float = 0.02
+    gyro_std_radps: float = 0.005
+    velocity_scale_std: float = 0.05
+    velocity_bias_std_mps: float = 0.015
+    clock_std_s: float = 0.02
+    height_std_m: float = 0.04
+    gap_speed_mps: float = 0.5
+    gap_turn_radps: float = 0.5
+
+    @property
+    def velocity_psd(self) -> float:
+        """Either velocity's noise at low frequency: variance per second, m^2/s."""
+        return 2 * self.velocity_tau_s * self.velocity_std_mps**2 + self.velocity_white_psd
+
+    def graded(self, grade: float) -> "Noise":
+        """The same with velocities, yaw rates and constants this many times as noisy."""
+        return replace(
+            self,
+            velocity_std_mps=self.velocity_std_mps * grade,
+            velocity_white_psd=self.velocity_white_psd * grade**2,
+            bias_std_m=self.bias_std_m * grade,
+            scale_std=self.scale_std * grade,
+            gyro_std_radps=self.gyro_std_radps * grade,
+            velocity_scale_std=self.velocity_scale_std * grade,
+            velocity_bias_std_mps=self.velocity_bias_std_mps * grade,
+        )
+
+    def prior_std(self) -> Array:
+        """(11,) of the globals, in the order of ``GLOBALS``."""
+        pairwise = [self.gyro_std_radps] * 2 + [self.velocity_scale_std] * 2
+        velocity = [self.velocity_bias_std_mps] * 4
+        return np.array([self.bias_std_m, self.scale_std, *pairwise, *velocity, self.clock_std_s])
+
+
+GLOBALS = (
+    "range_bias_m",
+    "range_scale",
+    "own_gyro_bias_radps",
+    "peer_gyro_bias_radps",
+    "own_velocity_scale",
+    "peer_velocity_scale",
+    "own_vx_bias_mps",
+    "own_vy_bias_mps",
+    "peer_vx_bias_mps",
+    "peer_vy_bias_mps",
+    "peer_clock_s",
+)
+"""What is constant over a flight, in this order in every vector of globals."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A pair cut into K keyframes, with R ranges.
+
+    Parameters
+    ----------
+    key_s
+        (K,) times of the keyframes, seconds.
+    own, peer
+        K - 1 motions from a keyframe to the next.
+    peer_by_clock
+        (K - 1, 2) change of the peer's shift per second of clock offset, m/s.
+    gap_s
+        (K - 1,) share of the interval, in seconds, in which a robot's sensors were silent.
+    range_key
+        (R,) keyframe at or before each range.
+    range_m
+        (R,) measured ranges, metres.
+    own_to_range, peer_to_range
+        R motions from that keyframe to the range.
+    height_m
+        (R,) peer's height less the observer's, metres.
+    """
+
+    key_s: Array
+    own: Increments
+    peer: Increments
+    peer_by_clock: Array
+    gap_s: Array
+    range_key: NDArray[np.intp]
+    range_m: Array
+    own_to_range: Increments
+    peer_to_range: Increments
+    height_m: Array
+
+    @property
+    def steps_s(self) -> Array:
+        """(K - 1,) seconds between keyframes."""
+        return np.diff(self.key_s)
+
+
+def problem(pair: Pair, rate_hz: float = 10.0) -> Problem:
+    """Keyframes of a pair.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    rate_hz
+        Keyframes per second.
+    """
+    grid = pair.time_s
+    count = max(2, int((grid[-1] - grid[0]) * rate_hz) + 1)
+    key_s = grid[0] + np.arange(count) / rate_hz
+    key_s = np.minimum(key_s, grid[-1])
+    own, peer = odometry(pair.own, grid), odometry(pair.peer, grid)
+    start, end = key_s[:-1], key_s[1:]
+    range_key = np.clip(np.searchsorted(key_s, pair.range_time_s, "right") - 1, 0, count - 1)
+    early, late = (np.clip(edge - SHIFT_S, grid[0], grid[-1]) for edge in (start, end))
+    early_2, late_2 = (np.clip(edge + SHIFT_S, grid[0], grid[-1]) for edge in (start, end))
+    before, after = peer.increments(early, late), peer.increments(early_2, late_2)
+    gap = np.interp(end, grid, np.cumsum((pair.own.gap | pair.peer.gap) * pair.dt_s))
+    height = pair.peer.height_m - pair.own.height_m
+    return Problem(
+        key_s=key_s,
+        own=own.increments(start, end),
+        peer=peer.increments(start, end),
+        peer_by_clock=(after.shift_m - before.shift_m) / (2 * SHIFT_S),
+        gap_s=np.diff(gap, prepend=0.0),
+        range_key=range_key,
+        range_m=pair.range_m,
+        own_to_range=own.increments(key_s[range_key], pair.range_time_s),
+        peer_to_range=peer.increments(key_s[range_key], pair.range_time_s),
+        height_m=np.interp(pair.range_time_s, grid, height),
+    )
