@@ -22,7 +22,9 @@ from dmrl.tables import print_json, print_table
 # They are loaded by name, because stages stand above this module and not below it.
 STAGES: dict[str, int | None] = {
     "sketch": 0,
+    "fly": 0,
     "convert": 1,
+    "label": 1,
     "merge": None,
     "dataset": None,
     "train": 1,

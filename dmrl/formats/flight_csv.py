@@ -32,7 +32,7 @@ from dmrl.progress import say
 TIME = "time_s"
 REQUIRED = (TIME, *LOG_COLUMNS)
 GAP_S = 1.0
-RANGE_MAX_M = 65.0  # radios that found nothing say 65535 mm
+RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios that found nothing say 65535 mm
 ANGLE_MAX_RAD = np.pi / 2
 YAW_RATE_MAX_RADPS = 12.0
 
@@ -192,7 +192,7 @@ def _streams(log: Log) -> Iterator[Iterator[Sample]]:
         given = ~np.isnan(range_m)
         usable = given & (range_m > 0) & (range_m < RANGE_MAX_M)
         if refused := int((given & ~usable).sum()):
-            say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 65 m")
+            say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
         yield flight_sample.ranges(log.robot, peer, time_ns[usable], range_m[usable])
     for peer in log.seen:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)

@@ -1,0 +1,151 @@
+"""Relative positions from simulated UWB and flow: error, honesty, gate and cost.
+
+Run as ``python benchmarks/bench_labels.py [--flights 50] [--only in_view]``. Monte Carlo: for
+each noise preset and trajectory so many flights of 100 s, the position of cf2 as cf1 sees it,
+by the batch solve and by the published filter. Then the cost, in CPU seconds, against the
+length of a flight and the number of robots; ``--plot STEM`` draws it.
+"""
+
+import argparse
+import time
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dmrl.estimation.estimate import OK, Estimate, estimate_ekf, estimate_pairs
+from dmrl.estimation.pair import Pair, Track, resample, usable_ranges
+from dmrl.estimation.score import Figures, Judged, figures, overall
+from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
+from dmrl.geometry import Array
+
+SETTLE_S = 20.0
+EKF = "published-sim"
+PRESETS = ("calibrated", "realistic", "harsh")
+HEAD = (
+    f"{'noise':<11}{'trajectory':<16}{'method':<10}{'RMSE':>7}{'95 %':>7}{'worst':>7}{'wrong':>7}"
+    f"{'NEES':>7}{'cover':>7}{'kept':>7}{'good':>8}{'cover':>7}{'cpu-s':>7}"
+)
+
+
+def pair_of(flight: Flight, robot: str, peer: str) -> Pair:
+    """What cf1 would know: both logs as they are stamped, and its own ranges."""
+    logs = flight.robots[robot], flight.robots[peer]
+    start, end = max(log.time_s[0] for log in logs), min(log.time_s[-1] for log in logs)
+    grid_s = start + np.arange(int((end - start) * 100)) / 100
+    ranges = flight.ranges[robot, peer]
+    inside = (ranges.time_s >= grid_s[0]) & (ranges.time_s <= grid_s[-1])
+    inside &= usable_ranges(ranges.time_s, ranges.range_m)
+    own, other = (track_of(log, grid_s) for log in logs)
+    return Pair(grid_s, own, other, ranges.time_s[inside], ranges.range_m[inside])
+
+
+def track_of(log: RobotLog, grid_s: Array) -> Track:
+    """A robot's log on a common time grid."""
+    columns = np.stack([log.vx_mps, log.vy_mps, log.yaw_rate_radps, log.height_m], axis=1)
+    signals, gap = resample(log.time_s, columns, grid_s)
+    return Track(*signals.T, gap)
+
+
+def judged(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Judged:
+    """An estimate beside the truth, 20 times a second."""
+    time_s = np.arange(estimate.time_s[0], estimate.time_s[-1], 0.05)
+    position, covariance, status = estimate.at(time_s)
+    truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].true_time(time_s))[:, :2]
+    distance = np.linalg.norm(truth, axis=1)
+    return Judged(time_s - time_s[0], position - truth, covariance, distance, status == OK)
+
+
+def monte_carlo(
+    noise: str, trajectory: str, flights: int
+) -> dict[str, tuple[list[Figures], float]]:
+    """Figures of every flight, and CPU seconds of one, by method."""
+    flown = [
+        simulate(Scenario(trajectory=trajectory), NOISE[noise], seed)  # type: ignore[arg-type]
+        for seed in range(flights)
+    ]
+    pairs = [pair_of(flight, "cf1", "cf2") for flight in flown]
+    out = {}
+    for name, solve in (
+        ("batch", lambda: estimate_pairs(pairs)),
+        ("published", lambda: estimate_ekf(pairs, EKF)),
+    ):
+        begun = time.process_time()
+        estimates = solve()
+        cost_s = (time.process_time() - begun) / flights
+        both = zip(flown, estimates, strict=True)
+        found = [figures(judged(f, "cf1", "cf2", e), SETTLE_S) for f, e in both]
+        out[name] = found, cost_s
+    return out
+
+
+def line(noise: str, trajectory: str, method: str, found: list[Figures], cost_s: float) -> str:
+    """One row of the table: medians over flights, shares of flights or of samples."""
+    every, worst = overall(found), max(f.rmse_m for f in found)
+    return (
+        f"{noise:<11}{trajectory:<16}{method:<10}{every.rmse_m:7.3f}{every.p95_m:7.3f}"
+        f"{worst:7.2f}{every.wrong_basin:7.0%}{every.nees:7.1f}{every.coverage_95:7.1%}"
+        f"{every.kept:7.1%}{every.precision:8.2%}{every.kept_coverage_95:7.1%}{cost_s:7.2f}"
+    )
+
+
+def cost(robots: int, duration_s: float) -> float:
+    """CPU seconds for all ordered pairs of a flight, each estimated once both ways."""
+    flight = simulate(Scenario(robots, duration_s, "random"), NOISE["realistic"], 0)
+    names = sorted(flight.robots)
+    pairs = [pair_of(flight, *both) for both in permutations(names, 2) if both[0] < both[1]]
+    begun = time.process_time()
+    for estimate in estimate_pairs(pairs):
+        estimate.swapped()
+    return time.process_time() - begun
+
+
+def costs(stem: Path | None) -> None:
+    """Print, and draw, the cost against length and robots."""
+    lengths = [(s, cost(2, s)) for s in (25.0, 50.0, 100.0, 200.0, 400.0)]
+    swarms = [(n * (n - 1), cost(n, 100.0)) for n in (2, 3, 5, 7, 10)]
+    for what, rows in (("seconds of flight, 2 pairs", lengths), ("pairs, 100 s", swarms)):
+        print(f"\n{what:>28}   cpu-s")
+        for size, seconds in rows:
+            print(f"{size:28.0f}{seconds:8.2f}")
+    if stem is not None:
+        figure = Figure((7.0, 3.0), layout="constrained")
+        for axes, what, rows in zip(
+            figure.subplots(1, 2),
+            ("length of the flight, s", "ordered pairs, 100 s each"),
+            (lengths, swarms),
+            strict=True,
+        ):
+            axes.plot(*zip(*rows, strict=True), "o-")
+            axes.set(xlabel=what, ylabel="CPU seconds", xlim=(0, None), ylim=(0, None))
+            axes.grid(alpha=0.3)
+        figure.savefig(stem.with_suffix(".png"), dpi=150)
+
+
+def main() -> None:
+    """Print every table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--flights", type=int, default=50)
+    parser.add_argument("--only", choices=list(TRAJECTORIES))
+    parser.add_argument("--noise", choices=[n for n in NOISE if n != "ideal"])
+    parser.add_argument("--no-costs", action="store_true")
+    parser.add_argument("--plot", type=Path)
+    given = parser.parse_args()
+    print(f"{given.flights} flights of 100 s each; RMSE, 95 % and coverage after {SETTLE_S:g} s")
+    print("kept: status OK; good: kept samples within 0.3 m; the second coverage: of kept samples")
+    print(HEAD)
+    kept: dict[str, list[Figures]] = {}
+    for noise in [given.noise] if given.noise else PRESETS:
+        for trajectory in [given.only] if given.only else TRAJECTORIES:
+            for method, (found, cost_s) in monte_carlo(noise, trajectory, given.flights).items():
+                print(line(noise, trajectory, method, found, cost_s), flush=True)
+                kept.setdefault(method, []).extend(found)
+    for method, found in kept.items():
+        print(line("all", "all", method, found, float("nan")))
+    if not given.no_costs:
+        costs(given.plot)
+
+
+if __name__ == "__main__":
+    main()
