@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import RecipeError, SettingError
+from dmrl.errors import DmrlError, RecipeError, SettingError
 from dmrl.output import partial_of
 from dmrl.progress import say
 from dmrl.recipe import Pipeline, Step
@@ -131,7 +131,12 @@ def _do(step: Step, folder: Path, data: Path | None, count: str) -> Done:
         return Done(step.stage, out, 0.0, skipped=True)
     say(f"{count} {step.stage}: {out}")
     begun = time.perf_counter()
-    _call(step, [_located(name, folder, data) for name in step.inputs], out)
+    try:
+        _call(step, [_located(name, folder, data) for name in step.inputs], out)
+    except DmrlError as e:
+        if not step.optional:
+            raise
+        say(f"{count} {step.stage}: left out. {e}")
     return Done(step.stage, out, time.perf_counter() - begun, skipped=False)
 
 
@@ -202,4 +207,6 @@ def _row(document: dict[str, Any]) -> list[str]:
 
 
 def _pictures(out: Path) -> list[Path]:
-    return sorted(out.rglob("*.png")) if out.is_dir() else [out] * (out.suffix == ".png")
+    if out.is_dir():
+        return sorted(out.rglob("*.png"))
+    return [out] if out.suffix == ".png" and out.exists() else []

@@ -36,12 +36,15 @@ class Step:
         What it reads: outputs of earlier steps, or ``{data}/...`` below ``--data``.
     settings
         The stage's settings.
+    optional
+        Go on without it where it cannot be done.
     """
 
     stage: str
     out: str
     inputs: tuple[str, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
+    optional: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,10 +150,7 @@ def load_pipeline(
     if faults:
         raise _faulty(name, faults)
     return Pipeline(
-        tuple(
-            Step(s["stage"], s["out"], tuple(s.get("inputs", ())), s.get("settings", {}))
-            for s in steps
-        ),
+        tuple(Step(**{**step, "inputs": tuple(step.get("inputs", ()))}) for step in steps),
         content,
     )
 

@@ -17,11 +17,11 @@ from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import input_of, summary
 from dmrl.tables import print_json, print_table
 
-plots: ModuleType | None
+figures: ModuleType | None
 try:
-    from dmrl import plots
+    from dmrl import figures
 except MissingExtra:
-    plots = None
+    figures = None
 
 Document = dict[str, Any]
 DOCUMENT_NAME = "evaluation.json"
@@ -110,7 +110,7 @@ def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation | D
     """
     if out is not None:
         refuse_existing(out)
-        if plots is None:
+        if figures is None:
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
     if _judges_positions(recording, settings):
         return _run_positions(recording, out, settings)
@@ -153,15 +153,9 @@ def run_detections(recording: Path, out: Path | None, settings: Settings) -> Eva
         with partial_folder(out) as folder:
             text = json.dumps(document(recording, settings, evaluation), indent=1, allow_nan=False)
             (folder / DOCUMENT_NAME).write_text(text + "\n", encoding="utf-8")
-            _draw(folder, scored)
+            assert figures is not None
+            figures.draw(folder, recording, pairs, scored, settings.against, threshold)
     return evaluation
-
-
-def _draw(folder: Path, scored: Scored) -> None:
-    assert plots is not None
-    error, depth_m = scored.label_error, scored.labels.depth_m
-    plots.error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
-    plots.error_by_distance(depth_m, error.norm_px, error.depth_m, folder / "error-by-distance")
 
 
 def document(recording: Path, settings: Settings, evaluation: Evaluation) -> dict[str, Any]:
