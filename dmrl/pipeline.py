@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from dmrl import positions
 from dmrl import recipe as recipes
 from dmrl.errors import DmrlError, RecipeError, SettingError
 from dmrl.output import partial_of
@@ -156,7 +157,7 @@ def _call(step: Step, inputs: list[Path], out: Path) -> None:
     module.run(*sources, out, settings, **extra)
 
 
-EVALUATION_NAME = "evaluation.json"
+EVALUATION_NAME, POSITIONS_NAME = "evaluation.json", "positions.json"
 COLUMNS = {
     "median_px": ("median, px", ".1f"),
     "within_8_px": ("within 8 px", ".1%"),
@@ -177,26 +178,35 @@ def report(done: list[Done], *, as_json: bool = False) -> None:
     as_json
         Print one JSON document instead: seconds per step, evaluations, pictures.
     """
-    evaluations = {
-        d.out.name: json.loads((d.out / EVALUATION_NAME).read_text(encoding="utf-8"))
-        for d in done
-        if (d.out / EVALUATION_NAME).is_file()
-    }
+    evaluations, judged = _documents(done, EVALUATION_NAME), _documents(done, POSITIONS_NAME)
     pictures = [picture for d in done for picture in _pictures(d.out)]
     if as_json:
         print_json(
             {
                 "steps": [asdict(d) for d in done],
                 "evaluations": evaluations,
+                "positions": judged,
                 "pictures": pictures,
             }
         )
         return
+    for name, document in judged.items():
+        headers = [words for _, words, _ in positions.COLUMNS]
+        print_table(name, ["pair", *headers], positions.rows(document))
     rows = [(name, *_row(document)) for name, document in evaluations.items()]
     headers = [words for words, _ in COLUMNS.values()]
     print_table("", ["evaluation", "against", "images", *headers], rows)
     for picture in pictures:
         print(picture)
+
+
+def _documents(done: list[Done], name: str) -> dict[str, dict[str, Any]]:
+    """JSON documents of this name, by the output they stand in."""
+    return {
+        d.out.name: json.loads((d.out / name).read_text(encoding="utf-8"))
+        for d in done
+        if (d.out / name).is_file()
+    }
 
 
 def _row(document: dict[str, Any]) -> list[str]:
