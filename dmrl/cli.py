@@ -22,6 +22,7 @@ COMMANDS = {
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
     "convert": "Convert SOURCE, a foreign file or folder, into a recording.",
+    "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
     "card": "Write a dataset's card and figures again.",
     "train": "Train a network on a dataset.",

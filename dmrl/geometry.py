@@ -167,3 +167,99 @@ def grid_label(
     grid[0, row, col] = 1.0
     grid[1, row, col] = depth_m[order]
     return grid
+
+
+def pixels_from_horizontal(
+    xyz_horizontal: Array,
+    roll_rad: Array,
+    pitch_rad: Array,
+    camera: Camera,
+    *,
+    distorted: bool = True,
+) -> tuple[Array, Array, Array]:
+    """Pixels and depths of points in the horizontal frame, with their derivatives.
+
+    Paper eq. 2 with the sign rule of ``camera_from_horizontal``, then eq. 1.
+
+    Parameters
+    ----------
+    xyz_horizontal
+        (N, 3) points, metres.
+    roll_rad, pitch_rad
+        (N,) attitude of the robot that carries the camera.
+    camera
+        Intrinsics and distortion.
+    distorted
+        Whether the image still has the lens's distortion.
+
+    Returns
+    -------
+    uv : Array
+        (N, 2) pixels, not clipped to the image; NaN at or behind the optical centre.
+    depth_m : Array
+        (N,) along camera x, metres; negative behind.
+    jacobian : Array
+        (N, 3, 5) derivative of u, v (px) and depth (m) by x, y, z (m), roll and pitch (rad).
+    """
+    cr, sr, cp, sp = np.cos(roll_rad), np.sin(roll_rad), np.cos(pitch_rad), np.sin(pitch_rad)
+    zero = np.zeros_like(cr)
+
+    def matrix(*entries: Array) -> Array:
+        return np.stack(entries, axis=-1).reshape(-1, 3, 3)
+
+    # Rows of camera_from_horizontal, and of its derivatives.
+    turn = matrix(cp, zero, -sp, sp * sr, cr, cp * sr, sp * cr, -sr, cp * cr)
+    by_roll = matrix(zero, zero, zero, sp * cr, -sr, cp * cr, -sp * sr, -cr, -cp * sr)
+    by_pitch = matrix(-sp, zero, -cp, cp * sr, zero, -sp * sr, cp * cr, zero, -sp * cr)
+    point = xyz_horizontal[:, :, None]
+    by_state = np.concatenate([turn, by_roll @ point, by_pitch @ point], axis=2)
+    depth, left, up = (turn @ point)[..., 0].T
+    ahead = np.where(depth > 0, depth, np.nan)
+    plane = np.stack([-left / ahead, -up / ahead], axis=-1)
+
+    by_camera = np.zeros((len(plane), 2, 3))
+    by_camera[:, :, 0] = -plane / ahead[:, None]
+    by_camera[:, 0, 1] = by_camera[:, 1, 2] = -1 / ahead
+    bent, by_plane = distort(plane, camera.distortion if distorted else ())
+    focal = np.array([camera.fx_px, camera.fy_px])
+    uv = focal * bent + (camera.cx_px, camera.cy_px)
+    jacobian = np.empty((len(plane), 3, 5))
+    jacobian[:, :2] = focal[:, None] * (by_plane @ by_camera @ by_state)
+    jacobian[:, 2] = by_state[:, 0]
+    return uv, depth, jacobian
+
+
+def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
+    """Where a lens puts points of the plane at unit depth, and the derivatives.
+
+    Parameters
+    ----------
+    plane
+        (N, 2) right and down over depth.
+    distortion
+        k1, k2, p1, p2, k3 of the plumb-bob model; fewer: the rest are zero.
+
+    Returns
+    -------
+    bent : Array
+        (N, 2) in the same plane; NaN so far out that the model folds back.
+    jacobian : Array
+        (N, 2, 2).
+    """
+    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * (5 - len(distortion)))
+    x, y = plane.T
+    square = x**2 + y**2
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    slope = k1 + square * (2 * k2 + square * 3 * k3)
+    radial = np.where(radial + 2 * square * slope > 0, radial, np.nan)
+    bent = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2),
+            y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+    across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    along_x = radial + 2 * x**2 * slope + 2 * p1 * y + 6 * p2 * x
+    along_y = radial + 2 * y**2 * slope + 6 * p1 * y + 2 * p2 * x
+    return bent, np.stack([along_x, across, across, along_y], axis=-1).reshape(-1, 2, 2)

@@ -11,6 +11,7 @@ from dmrl.estimation.batch import Solution, solve_batch
 from dmrl.estimation.confidence import covariance, plain_covariance
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, distinct
 from dmrl.estimation.keyframe_filter import QUARTER
+from dmrl.estimation.linear import CLOCK
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
@@ -31,6 +32,9 @@ RIVAL_M = 0.3
 """How far elsewhere."""
 CANDIDATES = 3
 """Distinct smoothed starts that are solved."""
+
+SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
+"""Order of the globals seen from the peer."""
 
 Statuses = NDArray[np.int8]
 
@@ -72,7 +76,9 @@ class Estimate:
         by_state[:, :2, :2], by_state[:, 2, 2] = -back, -1.0
         by_state[:, :2, 2] = -state[:, :2] @ QUARTER.T
         turned = by_state @ self.covariance @ by_state.swapaxes(1, 2)
-        return replace(self, state=state, covariance=turned)
+        constants = self.constants[SWAPPED]
+        constants[CLOCK] *= -1
+        return replace(self, state=state, covariance=turned, constants=constants)
 
     def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
         """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.

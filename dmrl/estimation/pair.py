@@ -102,7 +102,7 @@ class Pair:
 
 
 def usable_ranges(time_s: Array, range_m: Array) -> Mask:
-    """(R,) which ranges are finite, in (0, 60] m, and later than every range before them.
+    """(R,) which ranges are finite, in (0, 60] m, and no earlier than any range before them.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def usable_ranges(time_s: Array, range_m: Array) -> Mask:
     """
     latest = np.fmax.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]
     good = np.isfinite(range_m) & (range_m > 0) & (range_m <= LONGEST_RANGE_M)
-    return np.asarray(good & (time_s > latest))
+    return np.asarray(good & (time_s >= latest))
 
 
 def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:

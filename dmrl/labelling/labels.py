@@ -1,0 +1,97 @@
+"""Positions of a peer, with their covariance, as labels of a robot's images."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.estimation.pair import Array
+from dmrl.geometry import Camera, pixels_from_horizontal
+from dmrl.messages import STATUS_OK
+
+MARGIN_SIGMAS = 3.0
+"""A peer whose label is this near the image, in its own sigmas, is still named."""
+NEAREST_M = 0.05
+"""Depth below which a peer is not in front of the camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Positions:
+    """Where one peer is at N times, in the observer's horizontal frame.
+
+    Parameters
+    ----------
+    time_ns
+        (N,) log times.
+    xyz_m
+        (N, 3).
+    covariance
+        (N, 3, 3) m^2.
+    status
+        (N,) as in ``dmrl.v1.Status``.
+    """
+
+    time_ns: NDArray[np.int64]
+    xyz_m: Array
+    covariance: Array
+    status: NDArray[np.int8]
+
+
+def image_labels(
+    peer: str,
+    positions: Positions,
+    attitude_rad: Array,
+    camera: Camera,
+    *,
+    attitude_std_rad: float,
+    distorted: bool,
+) -> Iterator[dict[str, Any] | None]:
+    """Fields of the peer's PeerLabel in each image, or None where it is surely out of view.
+
+    A peer that is not located (status not OK) may be in any image: where its best guess is out
+    of view, it is named at the image's centre with sigmas as wide as the image, so that no one
+    takes the image for one without the peer.
+
+    Parameters
+    ----------
+    peer
+        Its name.
+    positions
+        Of the peer at the times of the images.
+    attitude_rad
+        (N, 2) roll and pitch of the observer at those times.
+    camera
+        The observer's.
+    attitude_std_rad
+        Standard deviation of roll and pitch.
+    distorted
+        Whether the images still have the lens's distortion.
+    """
+    uv, depth_m, jacobian = pixels_from_horizontal(
+        positions.xyz_m, *attitude_rad.T, camera, distorted=distorted
+    )
+    joint = np.zeros((len(uv), 5, 5))
+    joint[:, :3, :3] = positions.covariance
+    joint[:, [3, 4], [3, 4]] = attitude_std_rad**2
+    variance = np.einsum("nij,njk,nik->ni", jacobian, joint, jacobian)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    size = np.array([camera.width_px, camera.height_px])
+    reach = MARGIN_SIGMAS * np.minimum(sigma[:, :2], size)
+    near = ((uv > -reach) & (uv < size + reach)).all(axis=1) & (depth_m > NEAREST_M)
+    distance = np.linalg.norm(positions.xyz_m, axis=1)
+    for k, status in enumerate(positions.status.tolist()):
+        if near[k]:
+            yield _label(peer, status, [*uv[k], depth_m[k]], sigma[k])
+        elif status != STATUS_OK:
+            middle = [*size / 2, max(float(distance[k]), NEAREST_M)]
+            yield _label(peer, status, middle, [*size, distance[k]])
+        else:
+            yield None
+
+
+def _label(peer: str, status: int, value: Any, sigma: Any) -> dict[str, Any]:
+    names = ("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m")
+    numbers = zip(names, [*map(float, value), *map(float, sigma)], strict=True)
+    return {"peer": peer, "status": status, "source": "estimate", **dict(numbers)}

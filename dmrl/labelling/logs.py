@@ -1,0 +1,200 @@
+"""What a recording says of every robot and pair, as the estimators want it.
+
+What cannot be used is left out with a line that says so.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.estimation.pair import RATE_HZ, Array, Pair, Track, resample, usable_ranges
+from dmrl.recording import Summary, read_table
+
+LEAST_S = 5.0
+"""Shortest common stretch of two logs that is worth estimating."""
+LEAST_RANGES = 20
+STEEP_RAD, FAST_RADPS = 0.8, 6.0
+"""Tilt and turning rate that no small drone keeps up: probably degrees."""
+
+Signals = tuple[Array, Array]
+"""Times (N,), seconds since the recording's start, and (N, C) values."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLog:
+    """One robot's own sensors, as logged.
+
+    Parameters
+    ----------
+    attitude
+        Roll, pitch (rad), yaw rate (rad/s).
+    velocity
+        Forward, left, m/s.
+    height
+        Metres.
+    """
+
+    attitude: Signals
+    velocity: Signals
+    height: Signals
+
+    @property
+    def start_s(self) -> float:
+        """When the last of the sensors begins, seconds."""
+        return max(float(s[0][0]) for s in (self.attitude, self.velocity, self.height))
+
+    @property
+    def end_s(self) -> float:
+        """When the first of the sensors ends, seconds."""
+        return min(float(s[0][-1]) for s in (self.attitude, self.velocity, self.height))
+
+    def track(self, grid_s: Array) -> Track:
+        """The sensors on a time grid."""
+        attitude, turn_gap = resample(*self.attitude, grid_s)
+        velocity, gap = resample(*self.velocity, grid_s)
+        height, _ = resample(*self.height, grid_s)
+        return Track(
+            velocity[:, 0], velocity[:, 1], attitude[:, 2], height[:, 0], gap | turn_gap
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Logs:
+    """Everything that can be estimated from.
+
+    Parameters
+    ----------
+    start_ns
+        Log time of second zero.
+    robots
+        By name.
+    pairs
+        By (robot, peer) in the order of their names; both directions' ranges together.
+    warnings
+        One line for each thing that was left out or looks wrong.
+    """
+
+    start_ns: int
+    robots: dict[str, RobotLog]
+    pairs: dict[tuple[str, str], Pair]
+    warnings: list[str]
+
+
+def read_logs(path: Path, held: Summary) -> Logs:
+    """The logs of a recording.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    held
+        Its summary.
+
+    Raises
+    ------
+    RecordingError
+        If a topic carries another message, or the file is damaged.
+    """
+    warnings: list[str] = []
+    links = [n for t in held.topics if (n := topics.names(topics.RANGE, t))]
+    names = sorted({name for link in links for name in link.values()})
+    robots = {}
+    for name in names:
+        log = _robot(path, held, name, warnings)
+        if log is not None:
+            robots[name] = log
+    pairs = {}
+    for one, other in combinations(names, 2):
+        ranges = [
+            _signals(path, held, topic, ("range_m",), warnings)
+            for topic in (topics.uwb_range(one, other), topics.uwb_range(other, one))
+            if topic in held.topics
+        ]
+        pair = _pair(robots, one, other, [r for r in ranges if r is not None], warnings)
+        if pair is not None:
+            pairs[one, other] = pair
+    return Logs(held.start_ns, robots, pairs, warnings)
+
+
+def _robot(path: Path, held: Summary, name: str, warnings: list[str]) -> RobotLog | None:
+    wanted = {
+        topics.attitude(name): ("roll_rad", "pitch_rad", "yaw_rate_radps"),
+        topics.velocity(name): ("vx_mps", "vy_mps"),
+        topics.height(name): ("height_m",),
+    }
+    if missing := [topic for topic in wanted if topic not in held.topics]:
+        warnings.append(f"{name}: no {' and no '.join(missing)}; its pairs are left out")
+        return None
+    signals = [_signals(path, held, t, fields, warnings) for t, fields in wanted.items()]
+    attitude, velocity, height = signals
+    if attitude is None or velocity is None or height is None:
+        return None
+    _warn_of_degrees(name, attitude[1], warnings)
+    return RobotLog(attitude, velocity, height)
+
+
+def _warn_of_degrees(name: str, attitude: Array, warnings: list[str]) -> None:
+    tilt, rate = np.quantile(np.abs(attitude[:, :2]), 0.9), np.quantile(np.abs(attitude[:, 2]), 0.9)
+    if tilt > STEEP_RAD or rate > FAST_RADPS:
+        warnings.append(
+            f"{name}: a tilt of {tilt:.3g} rad and a yaw rate of {rate:.3g} rad/s (90 % are "
+            "less) look like degrees; convert them to radians"
+        )
+
+
+def _signals(
+    path: Path, held: Summary, topic: str, fields: tuple[str, ...], warnings: list[str]
+) -> Signals | None:
+    """Finite samples of a topic; None, with a warning, where there is none."""
+    table = read_table(path, topic, fields=fields)
+    values = np.column_stack([table[field].to_numpy() for field in fields]).astype(float)
+    time_ns, received_ns = (table[c].to_numpy() for c in ("log_time", "publish_time"))
+    good = np.isfinite(values).all(axis=1)
+    if bad := int((~good).sum()):
+        warnings.append(f"{topic}: {bad} of {len(good)} samples are not finite; left out")
+    if back := int((np.diff(received_ns) < -1_000_000_000).sum()):
+        warnings.append(f"{topic}: its clock goes back {back} times; samples overlap there")
+    if not good.any():
+        warnings.append(f"{topic}: nothing to use; its pairs are left out")
+        return None
+    return (time_ns[good] - held.start_ns) * 1e-9, values[good]
+
+
+def _pair(
+    robots: dict[str, RobotLog], one: str, other: str, ranges: list[Signals], warnings: list[str]
+) -> Pair | None:
+    """A pair on its common time grid; None, with a warning, where it cannot be used."""
+    name = f"{one}-{other}"
+    if not ranges or one not in robots or other not in robots:
+        return None
+    logs = robots[one], robots[other]
+    start_s, end_s = max(log.start_s for log in logs), min(log.end_s for log in logs)
+    if end_s - start_s < LEAST_S:
+        warnings.append(
+            f"{name}: their logs share {max(end_s - start_s, 0.0):.1f} s, under {LEAST_S:g} s; "
+            "left out. Do their clocks agree?"
+        )
+        return None
+    time_s = np.concatenate([r[0] for r in ranges])
+    range_m = np.concatenate([r[1][:, 0] for r in ranges])
+    order = np.argsort(time_s, kind="stable")
+    time_s, range_m = time_s[order], range_m[order]
+    good = usable_ranges(time_s, range_m)
+    if bad := int((~good).sum()):
+        warnings.append(f"{name}: {bad} of {len(good)} ranges are not in (0, 60] m; left out")
+    good &= (time_s >= start_s) & (time_s <= end_s)
+    if good.sum() < LEAST_RANGES:
+        warnings.append(f"{name}: {good.sum()} usable ranges, under {LEAST_RANGES}; left out")
+        return None
+    grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
+    good &= time_s <= grid_s[-1]
+    tracks = [log.track(grid_s) for log in logs]
+    for robot, track in zip((one, other), tracks, strict=True):
+        if track.gap.any():
+            silent_s = track.gap.sum() / RATE_HZ
+            warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
+    return Pair(grid_s, tracks[0], tracks[1], time_s[good], range_m[good])
+

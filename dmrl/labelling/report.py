@@ -1,0 +1,116 @@
+"""What was estimated of each ordered pair, in numbers."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.estimation.estimate import Estimate
+from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
+from dmrl.labelling.labels import Positions
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
+from dmrl.recording import Summary, read_table
+
+
+@dataclass(frozen=True, slots=True)
+class PairReport:
+    """One ordered pair.
+
+    Parameters
+    ----------
+    observer, peer
+        Their names.
+    positions
+        How many.
+    ok_share, ambiguous_share
+        Shares of them with that status, 0 to 1.
+    range_bias_m
+        Offset of their ranges.
+    gyro_difference_radps
+        Bias of the peer's yaw rate less the observer's.
+    sigma_m
+        Median over the flight of sigma along the worst direction.
+    rmse_ok_m, rmse_m
+        Horizontal error of those that are OK, and of all; None without truth.
+    """
+
+    observer: str
+    peer: str
+    positions: int
+    ok_share: float
+    ambiguous_share: float
+    range_bias_m: float
+    gyro_difference_radps: float
+    sigma_m: float
+    rmse_ok_m: float | None
+    rmse_m: float | None
+
+    @classmethod
+    def columns(cls) -> tuple[str, ...]:
+        """Headers of a table of reports."""
+        return tuple(field.name for field in fields(cls))
+
+    def row(self) -> tuple[Any, ...]:
+        """The values under the headers."""
+        return tuple(getattr(self, name) for name in self.columns())
+
+
+def pair_report(
+    recording: Path,
+    held: Summary,
+    pair: tuple[str, str],
+    positions: Positions,
+    estimate: Estimate,
+) -> PairReport:
+    """The report of one ordered pair.
+
+    Parameters
+    ----------
+    recording, held
+        Where the truth may be, and its summary.
+    pair
+        Observer and peer.
+    positions
+        As written.
+    estimate
+        Where they come from.
+    """
+    ok = positions.status == STATUS_OK
+    error = _errors(recording, held, pair, positions)
+    sigma = np.sqrt(np.linalg.eigvalsh(positions.covariance[:, :2, :2])[:, -1])
+    return PairReport(
+        *pair,
+        positions=len(ok),
+        ok_share=float(ok.mean()),
+        ambiguous_share=float((positions.status == STATUS_AMBIGUOUS).mean()),
+        range_bias_m=float(estimate.constants[BIAS]),
+        gyro_difference_radps=float(estimate.constants[PEER_GYRO] - estimate.constants[OWN_GYRO]),
+        sigma_m=float(np.median(sigma)),
+        rmse_ok_m=_rms(error, ok),
+        rmse_m=_rms(error, np.ones_like(ok)),
+    )
+
+
+def _rms(error: Any, chosen: Any) -> float | None:
+    if error is None:
+        return None
+    square = error[chosen & np.isfinite(error)] ** 2
+    return float(np.sqrt(square.mean())) if len(square) else None
+
+
+def _errors(
+    recording: Path, held: Summary, pair: tuple[str, str], positions: Positions
+) -> Any:
+    """(N,) horizontal errors, metres, NaN outside the truth; None where there is no truth."""
+    topic = topics.truth(*pair)
+    if topic not in held.topics or held.topics[topic].count < 2:
+        return None
+    truth = read_table(recording, topic, fields=("x", "y"))
+    time_ns = truth["log_time"].to_numpy()
+    offsets = [
+        np.interp(positions.time_ns, time_ns, truth[axis].to_numpy(), np.nan, np.nan) - values
+        for axis, values in zip(("x", "y"), positions.xyz_m.T[:2], strict=True)
+    ]
+    return np.hypot(*offsets)
