@@ -11,12 +11,25 @@ from dmrl.images import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored
 from dmrl.plots import Example
+from dmrl.positions import Pair
 from dmrl.recording import read
 
 Array = NDArray[np.float64]
 
 # Places in the order of the error, 0 to 1: what most images look like, and the tail.
 SHARES = (0.2, 0.5, 0.8, 0.95)
+
+
+PLOTTED_PAIRS = 12
+
+
+def draw_positions(folder: Path, pairs: list[Pair]) -> None:
+    """Write the errors of the first twelve pairs, over time, into a folder."""
+    for pair in pairs[:PLOTTED_PAIRS]:
+        judged, stem = pair.judged, folder / f"position-error-{pair.robot}-{pair.peer}"
+        plots.position_error(
+            judged.time_s, judged.error_m, judged.sigma_m, judged.kept, pair.name, stem
+        )
 
 
 def draw(

@@ -26,7 +26,6 @@ except MissingExtra:
 Document = dict[str, Any]
 DOCUMENT_NAME = "evaluation.json"
 POSITIONS_NAME = "positions.json"
-PLOTTED_PAIRS = 12
 FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
 
 
@@ -131,12 +130,8 @@ def _run_positions(recording: Path, out: Path | None, settings: Settings) -> Doc
         with partial_folder(out) as folder:
             text = json.dumps(made, indent=1, allow_nan=False)
             (folder / POSITIONS_NAME).write_text(text + "\n", encoding="utf-8")
-            assert plots is not None
-            for pair in pairs[:PLOTTED_PAIRS]:
-                judged, stem = pair.judged, folder / f"position-error-{pair.robot}-{pair.peer}"
-                plots.position_error(
-                    judged.time_s, judged.error_m, judged.sigma_m, judged.kept, pair.name, stem
-                )
+            assert figures is not None
+            figures.draw_positions(folder, pairs)
     return made
 
 
