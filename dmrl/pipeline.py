@@ -180,7 +180,8 @@ def report(done: list[Done], *, as_json: bool = False) -> None:
         for d in done
         if (d.out / EVALUATION_NAME).is_file()
     }
-    pictures = [picture for d in done for picture in _pictures(d.out)]
+    # What a stage drew for training is data, not a picture of the result.
+    pictures = [picture for d in done if d.stage != "sketch" for picture in _pictures(d.out)]
     if as_json:
         print_json(
             {
