@@ -179,7 +179,8 @@ def report(done: list[Done], *, as_json: bool = False) -> None:
         Print one JSON document instead: seconds per step, evaluations, pictures.
     """
     evaluations, judged = _documents(done, EVALUATION_NAME), _documents(done, POSITIONS_NAME)
-    pictures = [picture for d in done for picture in _pictures(d.out)]
+    # What a stage drew for training is data, not a picture of the result.
+    pictures = [picture for d in done if d.stage != "sketch" for picture in _pictures(d.out)]
     if as_json:
         print_json(
             {

@@ -175,7 +175,9 @@ def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: P
         run(tmp_path / "out.mcap", tmp_path / name, FAST)
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
     plots = ("error-by-distance", "error-violins", "examples")
-    assert names == [*(f"{p}.{s}" for p in plots for s in ("png", "svg")), "evaluation.json"]
+    assert names == sorted(
+        [*(f"{p}.{s}" for p in plots for s in ("png", "svg")), "evaluation.json"]
+    )
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     with Image.open(tmp_path / "a" / "error-violins.png") as picture:
