@@ -1,7 +1,9 @@
 """Signs, projection and grid labels against drawings and the paper."""
 
 import doctest
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +17,7 @@ from dmrl.geometry import (
     camera_from_horizontal,
     grid_label,
     inside,
+    pixels_from_horizontal,
     project,
 )
 
@@ -164,3 +167,66 @@ def test_the_corner_pixels_mark_the_corner_cells() -> None:
 def test_other_grids_than_the_paper_s_work_too() -> None:
     grid = grid_label(np.array([[30.0, 20.0]]), np.array([1.0]), shape=(2, 4), stride_px=16)
     assert np.argwhere(grid[0]).tolist() == [[1, 1]]
+
+
+def test_pixels_of_the_horizontal_frame_are_those_of_opencv_with_distortion() -> None:
+    rng = np.random.default_rng(0)
+    camera = replace(AIDECK, distortion=(-0.0957, 0.0211, 0.003, -0.002, 0.01))
+    roll, pitch = rng.uniform(-0.4, 0.4, (2, 200))
+    xyz = rng.uniform([1.0, -0.8, -0.6], [4.0, 0.8, 0.6], (200, 3))
+    uv, depth_m, _ = pixels_from_horizontal(xyz, roll, pitch, camera)
+    for k in range(200):
+        # OpenCV gets the attitude as a product of single turns, written down by hand.
+        ry = cv2.Rodrigues(np.array([0.0, pitch[k], 0.0]))[0]
+        rx = cv2.Rodrigues(np.array([roll[k], 0.0, 0.0]))[0]
+        turn = geometry.OPTICAL_FROM_CAMERA @ (ry @ rx).T
+        expected, _ = cv2.projectPoints(
+            xyz[k], cv2.Rodrigues(turn)[0], np.zeros(3), camera.image_from_optical,
+            np.array(camera.distortion),
+        )
+        assert uv[k] == pytest.approx(expected[0, 0], abs=1e-6)
+        assert depth_m[k] == pytest.approx((turn @ xyz[k])[2])
+
+
+def test_without_distortion_the_pixels_are_those_of_project() -> None:
+    rng = np.random.default_rng(1)
+    roll, pitch = rng.uniform(-0.4, 0.4, (2, 20))
+    xyz = rng.uniform([1.0, -0.8, -0.6], [4.0, 0.8, 0.6], (20, 3))
+    for camera, distorted in ((PUBLISHED_RENDER, True), (AIDECK, False)):
+        uv, depth_m, _ = pixels_from_horizontal(xyz, roll, pitch, camera, distorted=distorted)
+        for k in range(20):
+            turned = xyz[k : k + 1] @ camera_from_horizontal(roll[k], pitch[k]).T
+            expected, depth = project(turned, camera.image_from_optical)
+            assert uv[k] == pytest.approx(expected[0])
+            assert depth_m[k] == pytest.approx(depth[0])
+
+
+def test_the_derivative_of_the_projection_is_that_of_finite_differences() -> None:
+    rng = np.random.default_rng(2)
+    given_at = np.column_stack(
+        [rng.uniform([1.0, -0.8, -0.6], [4.0, 0.8, 0.6], (50, 3)), rng.uniform(-0.4, 0.4, (50, 2))]
+    )
+
+    def values(at: Array) -> Array:
+        uv, depth_m, _ = pixels_from_horizontal(at[:, :3], at[:, 3], at[:, 4], AIDECK)
+        return np.column_stack([uv, depth_m])
+
+    jacobian = pixels_from_horizontal(given_at[:, :3], *given_at[:, 3:].T, AIDECK)[2]
+    for column in range(5):
+        step = 1e-6 * np.eye(5)[column]
+        slope = (values(given_at + step) - values(given_at - step)) / 2e-6
+        assert np.abs(slope - jacobian[:, :, column]).max() < 1e-4
+
+
+def test_behind_the_camera_there_is_no_pixel() -> None:
+    uv, depth_m, _ = pixels_from_horizontal(
+        np.array([[-1.0, 0.2, 0.1]]), np.zeros(1), np.zeros(1), AIDECK
+    )
+    assert np.isnan(uv).all()
+    assert depth_m[0] == -1.0
+
+
+def test_a_lens_that_folds_back_gives_no_pixel_out_there() -> None:
+    bent, _ = geometry.distort(np.array([[0.1, 0.0], [3.0, 0.0]]), (-0.3,))
+    assert np.isfinite(bent[0]).all()
+    assert np.isnan(bent[1]).any()

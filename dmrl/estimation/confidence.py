@@ -92,8 +92,11 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
 
 
 def noise_energy(noise: Noise) -> float:
-    """Mean square of one velocity's noise after the moving average, both axes, (m/s)^2."""
-    return 2 * noise.velocity_psd / CALM_S
+    """Mean square of one velocity's noise after the moving average, both axes, (m/s)^2.
+
+    At least that of the default: motion that shows how good the logs are is enough motion.
+    """
+    return 2 * max(noise.velocity_psd, Noise().velocity_psd) / CALM_S
 
 
 def shrunk(velocity: Array, energy: float, step_s: float) -> Array:

@@ -21,11 +21,16 @@ KEY_HZ = 10.0
 OK, UNCONVERGED, AMBIGUOUS = range(3)
 """Values of ``status``; the same as in ``dmrl.v1.Status``."""
 
-INFLATION = 1.15
-"""Sigmas of the batch solve are multiplied by this, so that the 95 % ellipse holds 95 %."""
+GATE_M = 0.15
+"""Largest sigma, along the worst direction, of a position that is OK."""
+INFLATION = 0.95
+"""Sigmas of the batch solve are multiplied by this: the 95 % ellipse then holds 93 to 98 %."""
 SMOOTHER_INFLATION = 1.5
-OPEN_M = 0.5
-"""A sigma beyond this says that the bearing is open, not that it is imprecise."""
+OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
+"""Sigma over distance beyond which a bearing is open rather than imprecise; and the median
+over a flight beyond which the motion of the whole flight leaves it open."""
+NEAR_M = 0.5
+"""Distances are taken as at least this: nearer, no one flies and any sigma is an angle."""
 RIVAL_COST = 25.0
 """A solution elsewhere whose cost is within this of the best is a rival."""
 RIVAL_M = 0.3
@@ -67,19 +72,6 @@ class Estimate:
     constants: Array
     noise: Noise
 
-    def swapped(self) -> "Estimate":
-        """The same flight seen from the peer."""
-        back = rotation(-self.state[:, 2])
-        state = -self.state
-        state[:, :2] = _apply(back, state[:, :2])
-        by_state = np.zeros((len(state), 3, 3))
-        by_state[:, :2, :2], by_state[:, 2, 2] = -back, -1.0
-        by_state[:, :2, 2] = -state[:, :2] @ QUARTER.T
-        turned = by_state @ self.covariance @ by_state.swapaxes(1, 2)
-        constants = self.constants[SWAPPED]
-        constants[CLOCK] *= -1
-        return replace(self, state=state, covariance=turned, constants=constants)
-
     def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
         """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
 
@@ -96,14 +88,33 @@ class Estimate:
         return xy, spread, np.where(outside, np.maximum(status, UNCONVERGED), status)
 
 
+def from_peer(state: Array) -> Array:
+    """(K, 3) the same states seen from the peer."""
+    out = -state
+    out[:, :2] = _apply(rotation(-state[:, 2]), out[:, :2])
+    return out
+
+
+def swapped(estimate: Estimate) -> Estimate:
+    """The same flight seen from the peer. The status stays that of the observer."""
+    state = from_peer(estimate.state)
+    by_state = np.zeros((len(state), 3, 3))
+    by_state[:, :2, :2], by_state[:, 2, 2] = -rotation(-estimate.state[:, 2]), -1.0
+    by_state[:, :2, 2] = -state[:, :2] @ QUARTER.T
+    covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
+    constants = estimate.constants[SWAPPED]
+    constants[CLOCK] *= -1
+    return replace(estimate, state=state, covariance=covariance, constants=constants)
+
+
 def estimate_pairs(
     pairs: list[Pair],
     method: Literal["batch", "smoother"] = "batch",
     *,
     noise: Noise | None = None,
-    gate_m: float = 0.15,
-) -> list[Estimate]:
-    """Estimates of several pairs, one per pair.
+    gate_m: float = GATE_M,
+) -> list[tuple[Estimate, Estimate]]:
+    """Estimates of several pairs: of the peer by the observer, and of the observer by the peer.
 
     Parameters
     ----------
@@ -117,24 +128,35 @@ def estimate_pairs(
         Largest sigma, along the worst direction, of a position that is OK, metres.
     """
     problems = [problem(pair, KEY_HZ) for pair in pairs]
-    first = noise or Noise()
-    out: dict[int, Estimate] = {}
+    out: dict[int, tuple[Estimate, Estimate]] = {}
     lengths = np.array([len(p.key_s) for p in problems], int)
     for length in np.unique(lengths):
         numbers = np.flatnonzero(lengths == length)
-        runs, states, covariances = _smoothed([problems[n] for n in numbers], first)
+        scores, states, covariances = _smoothed([problems[n] for n in numbers], noise or Noise())
         for column, number in enumerate(numbers.tolist()):
             mine = slice(column * KEPT, (column + 1) * KEPT)
-            score, tracks = runs[mine], states[:, mine]
+            flight, starts = problems[number], (scores[mine], states[:, mine])
             if method == "smoother":
-                made = _from_smoother(problems[number], first, score, tracks, covariances[:, mine])
+                made = _from_smoother(flight, noise or Noise(), *starts, covariances[:, mine])
             else:
-                made = _from_batch(problems[number], noise, score, tracks)
-            out[number] = replace(made[0], status=_status(made[0], made[1], gate_m))
+                made = _from_batch(flight, noise, *starts)
+            out[number] = _both(flight, *made, gate_m)
     return [out[number] for number in range(len(pairs))]
 
 
-def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = 0.15) -> list[Estimate]:
+def _both(
+    flight: Problem, estimate: Estimate, rivals: list[Array], gate_m: float
+) -> tuple[Estimate, Estimate]:
+    """Estimates seen from either robot, with their statuses."""
+    silent = np.append(flight.gap_s, 0.0) + np.append(0.0, flight.gap_s) > 0
+    back = swapped(estimate)
+    here = np.maximum(_status(estimate, rivals, gate_m), silent * np.int8(UNCONVERGED))
+    there = _status(back, [from_peer(rival) for rival in rivals], gate_m)
+    there = np.maximum(there, silent * np.int8(UNCONVERGED))
+    return replace(estimate, status=here), replace(back, status=there)
+
+
+def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> list[Estimate]:
     """Estimates by the published filter, at every step of the pairs' time grids.
 
     Parameters
@@ -150,11 +172,10 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = 0.15) -> lis
     for pair in pairs:
         steps = ekf.pair_steps(pair, ekf.PRESETS[preset])
         state, spread = ekf.filter_many(steps, ekf.PRESETS[preset])
-        status = np.zeros(len(state), np.int8)
-        made = Estimate(
-            pair.time_s, state[:, 0], spread[:, 0], status, np.zeros(len(GLOBALS)), Noise()
-        )
-        out.append(replace(made, status=_status(made, np.zeros(len(state), bool), gate_m)))
+        none = np.zeros(len(state), np.int8)
+        constants = np.zeros(len(GLOBALS))
+        made = Estimate(pair.time_s, state[:, 0], spread[:, 0], none, constants, Noise())
+        out.append(replace(made, status=_status(made, [], gate_m)))
     return out
 
 
@@ -169,7 +190,7 @@ def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Arra
 
 def _from_smoother(
     flight: Problem, noise: Noise, score: Array, tracks: Array, covariances: Array
-) -> tuple[Estimate, NDArray[np.bool_]]:
+) -> tuple[Estimate, list[Array]]:
     order = np.argsort(-score)
     best = int(order[0])
     rivals = [int(n) for n in order[1:] if score[best] - score[n] < RIVAL_COST]
@@ -181,28 +202,26 @@ def _from_smoother(
         np.zeros(len(GLOBALS)),
         noise,
     )
-    return estimate, _rivalled(tracks[:, best], [tracks[:, n] for n in rivals])
+    return estimate, [tracks[:, n] for n in rivals]
 
 
 def _from_batch(
     flight: Problem, noise: Noise | None, score: Array, tracks: Array
-) -> tuple[Estimate, NDArray[np.bool_]]:
+) -> tuple[Estimate, list[Array]]:
     first = noise or Noise()
     chosen = dict.fromkeys(distinct(tracks[len(tracks) // 2], np.argsort(-score), CANDIDATES))
     solutions = sorted(
         (solve_batch(flight, first, tracks[:, n]) for n in chosen), key=lambda s: s.cost
     )
     best = solutions[0]
-    near = [s.state for s in solutions[1:] if s.cost - best.cost < RIVAL_COST]
-    rivalled = _rivalled(best.state, near)
+    rivals = [s.state[:, :3] for s in solutions[1:] if s.cost - best.cost < RIVAL_COST]
     found = first if noise else noise_of(flight, first, best)
     if not noise:
         best = solve_batch(flight, found, best.state)
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2
-    status = np.zeros(len(tracks), np.int8)
-    return Estimate(
-        flight.key_s, best.state[:, :3], spread, status, best.constants, found
-    ), rivalled
+    none = np.zeros(len(tracks), np.int8)
+    estimate = Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
+    return estimate, rivals
 
 
 def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
@@ -230,19 +249,16 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
     return noise.graded(float(np.clip((std - 0.045) / (noise.velocity_std_mps - 0.042), 0.5, 3.0)))
 
 
-def _rivalled(state: Array, others: list[Array]) -> NDArray[np.bool_]:
-    """(K,) where another solution as good puts the peer elsewhere."""
-    elsewhere = np.zeros(len(state), bool)
-    for other in others:
-        elsewhere |= np.hypot(*(other - state)[:, :2].T) > RIVAL_M
-    return elsewhere
-
-
-def _status(estimate: Estimate, rivalled: NDArray[np.bool_], gate_m: float) -> Statuses:
+def _status(estimate: Estimate, rivals: list[Array], gate_m: float) -> Statuses:
+    """(K,) from the covariance, and from other solutions that are as good."""
     sigma_m = np.sqrt(np.linalg.eigvalsh(estimate.covariance[:, :2, :2])[:, -1])
-    status = np.where(sigma_m < gate_m, OK, UNCONVERGED)
-    status[rivalled | ~(sigma_m < OPEN_M)] = AMBIGUOUS
-    return status.astype(np.int8)
+    status = np.where(sigma_m < gate_m, OK, UNCONVERGED).astype(np.int8)
+    bearing_rad = sigma_m / np.maximum(np.hypot(*estimate.state[:, :2].T), NEAR_M)
+    whole = not np.median(bearing_rad) < OPEN_FLIGHT_RAD
+    status[whole | ~(bearing_rad < OPEN_RAD)] = AMBIGUOUS
+    for rival in rivals:
+        status[np.hypot(*(rival - estimate.state)[:, :2].T) > RIVAL_M] = AMBIGUOUS
+    return status
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:

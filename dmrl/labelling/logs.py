@@ -83,7 +83,7 @@ class Logs:
     warnings: list[str]
 
 
-def read_logs(path: Path, held: Summary) -> Logs:
+def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
     """The logs of a recording.
 
     Parameters
@@ -92,6 +92,8 @@ def read_logs(path: Path, held: Summary) -> Logs:
         A complete recording.
     held
         Its summary.
+    range_offset_m
+        Subtracted from every range.
 
     Raises
     ------
@@ -113,7 +115,8 @@ def read_logs(path: Path, held: Summary) -> Logs:
             for topic in (topics.uwb_range(one, other), topics.uwb_range(other, one))
             if topic in held.topics
         ]
-        pair = _pair(robots, one, other, [r for r in ranges if r is not None], warnings)
+        usable = [(r[0], r[1] - range_offset_m) for r in ranges if r is not None]
+        pair = _pair(robots, one, other, usable, warnings)
         if pair is not None:
             pairs[one, other] = pair
     return Logs(held.start_ns, robots, pairs, warnings)

@@ -31,7 +31,7 @@ from dmrl.recording import (
 from dmrl.tables import print_json, print_table
 
 try:
-    from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+    from dmrl.estimation.estimate import GATE_M, Estimate, estimate_ekf, estimate_pairs
     from dmrl.estimation.pair import Array, Pair
     from dmrl.labelling.labels import Positions, image_labels
     from dmrl.labelling.logs import Logs, read_logs
@@ -64,14 +64,17 @@ class Settings:
         Largest sigma of a position that is labelled OK, metres.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
+    range_offset_m
+        Known offset of every range, subtracted first: an antenna delay, 0.35 m for some.
     undistorted
         The images have no lens distortion any more, whatever the calibration says.
     """
 
     method: Literal["batch", "smoother", "ekf"] = "batch"
     preset: Literal["published-sim", "published-firmware"] = "published-sim"
-    gate_m: Positive = 0.15
+    gate_m: Positive = GATE_M
     attitude_std_rad: Positive = 0.015
+    range_offset_m: float = 0.0
     undistorted: bool = False
 
 
@@ -116,7 +119,7 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     """
     refuse_existing(out)
     held = summary(recording)
-    logs = read_logs(recording, held)
+    logs = read_logs(recording, held, settings.range_offset_m)
     if not logs.pairs:
         why = "; ".join(logs.warnings) or "there are no ranges"
         raise RecordingError(f"{recording}: no pair can be estimated: {why}. Try: dmrl info")
@@ -156,13 +159,14 @@ def _estimates(
     out: dict[Names, Estimate] = {}
     for group in track(groups, "Estimating"):
         if settings.method == "ekf":
-            both = [_oriented(pairs, pair) for pair in group]
-            made = estimate_ekf(both, settings.preset, gate_m=settings.gate_m)
+            oriented = [_oriented(pairs, pair) for pair in group]
+            made = estimate_ekf(oriented, settings.preset, gate_m=settings.gate_m)
+            out |= dict(zip(group, made, strict=True))
         else:
             chosen = [pairs[name] for name in group]
-            made = estimate_pairs(chosen, settings.method, gate_m=settings.gate_m)
-            out |= {n[::-1]: e.swapped() for n, e in zip(group, made, strict=True)}
-        out |= dict(zip(group, made, strict=True))
+            both = estimate_pairs(chosen, settings.method, gate_m=settings.gate_m)
+            for name, (here, there) in zip(group, both, strict=True):
+                out[name], out[name[::-1]] = here, there
     return dict(sorted(out.items()))
 
 

@@ -1,0 +1,35 @@
+"""Simulated flights as pairs, with the truth beside them."""
+
+from functools import cache
+
+import numpy as np
+
+from dmrl.estimation.pair import Array, Pair, Track, resample, usable_ranges
+from dmrl.flight import NOISE, Flight, RobotLog, Scenario, Trajectory, simulate
+
+
+@cache
+def flown(trajectory: Trajectory, noise: str, seed: int, duration_s: float = 40.0) -> Flight:
+    return simulate(Scenario(2, duration_s, trajectory), NOISE[noise], seed)
+
+
+def track(log: RobotLog, grid_s: Array) -> Track:
+    values = np.column_stack([log.vx_mps, log.vy_mps, log.yaw_rate_radps, log.height_m])
+    signals, gap = resample(log.time_s, values, grid_s)
+    return Track(*signals.T, gap)
+
+
+def pair_of(flight: Flight, own: str = "cf1", peer: str = "cf2") -> Pair:
+    """One direction's ranges, on the observer's clock."""
+    grid_s = flight.robots[own].time_s
+    found = flight.ranges[own, peer]
+    good = usable_ranges(found.time_s, found.range_m)
+    good &= (found.time_s >= grid_s[0]) & (found.time_s <= grid_s[-1])
+    tracks = [track(flight.robots[name], grid_s) for name in (own, peer)]
+    return Pair(grid_s, tracks[0], tracks[1], found.time_s[good], found.range_m[good])
+
+
+def truth_at(flight: Flight, time_s: Array, own: str = "cf1", peer: str = "cf2") -> Array:
+    """(N, 2) where the peer truly is at times on the observer's clock."""
+    true_s = flight.clocks[own].true_time(time_s)
+    return flight.peer_in_horizontal(own, peer, true_s)[:, :2]

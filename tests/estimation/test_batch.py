@@ -1,0 +1,114 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation import banded
+from dmrl.estimation.batch import equations_of, solve_batch
+from dmrl.estimation.linear import SIZE, linearise
+from dmrl.estimation.pair import Array
+from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+from .flights import flown, pair_of, truth_at
+
+NOISE = Noise()
+
+
+@pytest.fixture(scope="module")
+def flight() -> Problem:
+    return problem(pair_of(flown("in_view", "realistic", 1000, 10.0)))
+
+
+@pytest.fixture(scope="module")
+def anywhere(flight: Problem) -> tuple[Array, Array]:
+    """A state and globals that are nowhere near the solution."""
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(len(flight.key_s), SIZE)), 0.05 * rng.normal(size=len(GLOBALS))
+
+
+def test_the_jacobian_by_the_globals_is_that_of_finite_differences(
+    flight: Problem, anywhere: tuple[Array, Array]
+) -> None:
+    state, constants = anywhere
+    linear, step = linearise(flight, NOISE, state, constants), 1e-6
+    for column in range(len(GLOBALS)):
+        change = step * np.eye(len(GLOBALS))[column]
+        ahead, behind = (linearise(flight, NOISE, state, constants + s * change) for s in (1, -1))
+        slope = (ahead.step - behind.step) / (2 * step)
+        scale = max(1.0, np.abs(slope).max())
+        assert np.abs(slope - linear.step_by_globals[..., column]).max() < 1e-6 * scale
+        slope = (ahead.range - behind.range) / (2 * step)
+        assert np.abs(slope - linear.range_by_globals[:, column]).max() < 1e-5
+
+
+def test_the_jacobian_by_the_keyframes_is_that_of_finite_differences(
+    flight: Problem, anywhere: tuple[Array, Array]
+) -> None:
+    state, constants = anywhere
+    linear, step = linearise(flight, NOISE, state, constants), 1e-6
+    even = np.arange(len(state)) % 2 == 0
+    for column in range(SIZE):
+        change = np.zeros_like(state)
+        change[even, column] = step
+        ahead, behind = (linearise(flight, NOISE, state + s * change, constants) for s in (1, -1))
+        slope = (ahead.step - behind.step) / (2 * step)
+        own = np.where(even[:-1, None], linear.step_by_start[..., column], 0.0)
+        own += np.where(even[1:, None], linear.step_by_end[..., column], 0.0)
+        assert np.abs(slope - own).max() < 1e-6 * max(1.0, np.abs(slope).max())
+        slope = (ahead.range - behind.range) / (2 * step)
+        expected = np.where(even[flight.range_key], linear.range_by_state[:, column], 0.0)
+        assert np.abs(slope - expected).max() < 1e-2  # ranges near zero bend sharply
+
+
+def dense(equations: banded.Normal) -> Array:
+    keyframes, size = equations.gradient.shape
+    full = np.zeros((keyframes * size,) * 2)
+    for k in range(keyframes):
+        here = slice(k * size, (k + 1) * size)
+        full[here, here] = equations.diagonal[k]
+        if k + 1 < keyframes:
+            after = slice((k + 1) * size, (k + 2) * size)
+            full[here, after], full[after, here] = equations.above[k], equations.above[k].T
+    border = equations.border.reshape(-1, len(equations.corner))
+    return np.block([[full, border], [border.T, equations.corner]])
+
+
+def test_the_banded_solve_is_the_dense_one(
+    flight: Problem, anywhere: tuple[Array, Array]
+) -> None:
+    state, constants = anywhere
+    equations = equations_of(flight, NOISE, linearise(flight, NOISE, state, constants), constants)
+    full = dense(equations)
+    right = np.concatenate([equations.gradient.ravel(), equations.corner_gradient])
+    expected = -np.linalg.solve(full, right)
+    change, change_constants, response, covariance = banded.solve(equations)
+    assert np.allclose(np.concatenate([change.ravel(), change_constants]), expected, rtol=1e-6)
+
+    inverse = np.linalg.inv(full)
+    assert np.allclose(covariance, inverse[change.size :, change.size :], rtol=1e-6)
+    blocks = banded.block_inverse(equations.diagonal, equations.above)
+    blocks += response @ covariance @ response.swapaxes(1, 2)
+    for k in (0, 50, len(blocks) - 1):
+        here = slice(k * SIZE, (k + 1) * SIZE)
+        assert np.allclose(blocks[k], inverse[here, here], rtol=1e-5, atol=1e-9)
+
+
+def test_without_noise_the_solution_is_the_truth_and_the_constants_vanish() -> None:
+    flight = flown("in_view", "ideal", 1000, 30.0)
+    task = problem(pair_of(flight))
+    truth = truth_at(flight, task.key_s)
+    heading = flight.truth["cf2"].yaw_at(task.key_s) - flight.truth["cf1"].yaw_at(task.key_s)
+    start = np.column_stack([truth + 0.1, heading - 0.1])
+    solution = solve_batch(task, NOISE, start)
+    assert np.abs(solution.state[:, :2] - truth).max() < 0.01
+    assert np.abs(solution.constants[:6]).max() < 0.01
+
+
+def test_a_range_bias_is_found_where_it_may_be_large() -> None:
+    flight = flown("random", "ideal", 1003, 30.0)
+    pair = pair_of(flight)
+    task = problem(replace(pair, range_m=pair.range_m + 0.2))
+    truth = truth_at(flight, task.key_s)
+    heading = flight.truth["cf2"].yaw_at(task.key_s) - flight.truth["cf1"].yaw_at(task.key_s)
+    noise = Noise(bias_std_m=0.5, velocity_std_mps=0.02)
+    solution = solve_batch(task, noise, np.column_stack([truth, heading]))
+    assert solution.constants[0] == pytest.approx(0.2, abs=0.03)

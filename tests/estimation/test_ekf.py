@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+from filterpy.kalman import ExtendedKalmanFilter
+
+from dmrl.estimation.ekf import (
+    PRESETS,
+    Steps,
+    filter_many,
+    filter_reference,
+    measured,
+    moved,
+    pair_steps,
+    stack,
+)
+from .flights import flown, pair_of
+
+
+def steps_of(seed: int, preset: str) -> Steps:
+    return pair_steps(pair_of(flown("in_view", "realistic", seed, 8.0)), PRESETS[preset])
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_twin_agrees_with_filterpy(preset: str) -> None:
+    flights = [steps_of(seed, preset) for seed in (1000, 1001)]
+    state, covariance = filter_many(stack(flights), PRESETS[preset])
+    for k, steps in enumerate(flights):
+        reference, reference_covariance = filter_reference(steps, PRESETS[preset])
+        assert np.abs(state[:, k] - reference).max() < 1e-9
+        scale = np.abs(reference_covariance).max()
+        assert np.abs(covariance[:, k] - reference_covariance).max() < 1e-9 * max(scale, 1.0)
+
+
+def test_filterpy_keeps_a_flat_state_flat_and_spoils_a_column() -> None:
+    ekf = ExtendedKalmanFilter(dim_x=3, dim_z=1)
+    assert ekf.x.shape == (3, 1)  # the default, with which a flat gain broadcasts to (3, 3)
+    state, _ = filter_reference(steps_of(1000, "published-sim"), PRESETS["published-sim"])
+    assert state.shape[1:] == (3,)
+
+
+def test_the_published_filter_starts_at_zero_and_first_predicts() -> None:
+    steps = steps_of(1000, "published-sim")
+    silent = Steps(steps.inputs, steps.height_m, steps.range_m * np.nan, steps.dt_s)
+    state, _ = filter_many(silent, PRESETS["published-sim"])
+    expected, _, _ = moved(np.zeros((1, 3)), steps.inputs[0], steps.dt_s)
+    assert np.allclose(state[0], expected)
+
+
+def test_the_jacobians_are_those_of_finite_differences() -> None:
+    rng = np.random.default_rng(0)
+    state, inputs, step = rng.normal(size=(5, 3)), rng.normal(size=(5, 6)), 1e-6
+    _, by_state, by_input = moved(state, inputs, 0.01)
+    for column in range(3):
+        change = step * np.eye(3)[column]
+        ahead, behind = (moved(state + s * change, inputs, 0.01)[0] for s in (1, -1))
+        assert np.allclose((ahead - behind) / (2 * step), by_state[:, :, column], atol=1e-8)
+        ahead, behind = (measured(state + s * change, np.ones(5))[0] for s in (1, -1))
+        row = measured(state, np.ones(5))[1][:, column]
+        assert np.allclose((ahead - behind) / (2 * step), row, atol=1e-3)
+    for column in range(6):
+        change = step * np.eye(6)[column]
+        ahead, behind = (moved(state, inputs + s * change, 0.01)[0] for s in (1, -1))
+        assert np.allclose((ahead - behind) / (2 * step), by_input[:, :, column], atol=1e-8)
+
+
+def test_the_simulation_preset_ignores_heights() -> None:
+    assert not steps_of(1000, "published-sim").height_m.any()
+    assert steps_of(1000, "published-firmware").height_m.any()

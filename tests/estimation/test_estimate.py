@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+
+from dmrl import messages
+from dmrl.estimation import estimate as room
+from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs, from_peer, swapped
+from dmrl.estimation.pair import Pair, Track
+from dmrl.flight import Trajectory
+from .flights import flown, pair_of, truth_at
+
+LONG_S = 60.0
+
+
+def rmse(estimate: Estimate, seed: int, noise: str = "calibrated", own: str = "cf1") -> float:
+    flight = flown("in_view", noise, seed, LONG_S)
+    peer = "cf2" if own == "cf1" else "cf1"
+    error = estimate.state[:, :2] - truth_at(flight, estimate.time_s, own, peer)
+    settled = estimate.time_s - estimate.time_s[0] > 20
+    return float(np.sqrt((error[settled] ** 2).sum(axis=1).mean()))
+
+
+def test_the_statuses_are_those_of_the_schema() -> None:
+    assert (room.OK, room.UNCONVERGED, room.AMBIGUOUS) == (
+        messages.STATUS_OK,
+        messages.STATUS_UNCONVERGED,
+        messages.STATUS_AMBIGUOUS,
+    )
+
+
+def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
+    seeds = (1000, 1001, 1002, 1003)
+    pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
+    published = [rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)]
+    smoother, batch = (
+        [rmse(e, s) for (e, _), s in zip(estimate_pairs(pairs, method), seeds, strict=True)]
+        for method in ("smoother", "batch")
+    )
+    assert np.median(batch) < np.median(smoother) < np.median(published)
+    assert max(batch) < 0.35
+
+
+def test_both_directions_come_from_one_solve() -> None:
+    flight = flown("in_view", "calibrated", 1001, LONG_S)
+    ((here, there),) = estimate_pairs([pair_of(flight)])
+    assert rmse(there, 1001, own="cf2") < 0.35
+    assert np.allclose(from_peer(there.state), here.state)
+    again = swapped(swapped(here))
+    assert np.allclose(again.covariance, here.covariance)
+    assert np.allclose(again.constants, here.constants)
+
+
+@pytest.mark.parametrize("trajectory", ["observer_static", "parallel", "both_static", "hover"])
+def test_motion_that_leaves_the_bearing_open_is_never_ok(trajectory: Trajectory) -> None:
+    pairs = [pair_of(flown(trajectory, "realistic", seed, LONG_S)) for seed in (1000, 1001)]
+    for estimate, _ in estimate_pairs(pairs):
+        assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
+
+
+def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
+    pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
+    gap = (pair.time_s > 30) & (pair.time_s < 33)
+    held = Track(*(np.where(gap, 0.0, signal) for signal in pair.own.values()), gap)
+    ((estimate, _),) = estimate_pairs(
+        [Pair(pair.time_s, held, pair.peer, pair.range_time_s, pair.range_m)]
+    )
+    inside = (estimate.time_s > 30.05) & (estimate.time_s < 32.95)
+    assert (estimate.status[inside] != room.OK).all()
+    assert (estimate.status == room.OK).mean() > 0.2
+
+
+def test_a_flight_without_ranges_is_ambiguous() -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    none = Pair(pair.time_s, pair.own, pair.peer, np.zeros(0), np.zeros(0))
+    ((estimate, _),) = estimate_pairs([none])
+    assert (estimate.status == room.AMBIGUOUS).all()
+
+
+def test_pairs_of_different_length_are_estimated_together_as_alone() -> None:
+    pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 20.0 + k)) for k in range(2)]
+    together = estimate_pairs(pairs, "smoother")
+    for pair, (estimate, _) in zip(pairs, together, strict=True):
+        ((alone, _),) = estimate_pairs([pair], "smoother")
+        assert np.allclose(alone.state, estimate.state)
+
+
+def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() -> None:
+    none = np.zeros(2, np.int8)
+    estimate = Estimate(
+        np.array([0.0, 1.0]),
+        np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]]),
+        np.stack([np.eye(3), 3 * np.eye(3)]),
+        none,
+        np.zeros(11),
+        room.Noise(),
+    )
+    xy, covariance, status = estimate.at(np.array([0.5, 2.0]))
+    assert xy.tolist() == [[0.5, 1.0], [1.0, 2.0]]
+    assert covariance[0].tolist() == (2 * np.eye(2)).tolist()
+    assert status.tolist() == [room.OK, room.UNCONVERGED]
