@@ -181,7 +181,10 @@ def test_pixels_of_the_horizontal_frame_are_those_of_opencv_with_distortion() ->
         rx = cv2.Rodrigues(np.array([roll[k], 0.0, 0.0]))[0]
         turn = geometry.OPTICAL_FROM_CAMERA @ (ry @ rx).T
         expected, _ = cv2.projectPoints(
-            xyz[k], cv2.Rodrigues(turn)[0], np.zeros(3), camera.image_from_optical,
+            xyz[k],
+            cv2.Rodrigues(turn)[0],
+            np.zeros(3),
+            camera.image_from_optical,
             np.array(camera.distortion),
         )
         assert uv[k] == pytest.approx(expected[0, 0], abs=1e-6)

@@ -1,6 +1,7 @@
 """Where a pair may have started: many guesses on the range circle, told apart by likelihood."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.estimation import keyframe_filter
 from dmrl.estimation.keyframe_filter import Inputs
@@ -49,15 +50,13 @@ def candidates(inputs: Inputs, rate_hz: float) -> Array:
     keyframes = min(len(inputs.range_m), int(FIRST_S * rate_hz))
     first = [_first(inputs, pair, keyframes) for pair in range(inputs.range_m.shape[1])]
     count = BEARINGS * HEADINGS
-    run = keyframe_filter.run(
-        inputs.repeated(count, keyframes), np.concatenate(first), START_STD
-    )
+    run = keyframe_filter.run(inputs.repeated(count, keyframes), np.concatenate(first), START_STD)
     end = run.state[-1].reshape(-1, count, 3)
     score = run.log_likelihood.reshape(-1, count)
     begun = np.stack(first)
-    return np.stack([
-        b[distinct(e, np.argsort(-s), KEPT)] for b, e, s in zip(begun, end, score, strict=True)
-    ])
+    return np.stack(
+        [b[distinct(e, np.argsort(-s), KEPT)] for b, e, s in zip(begun, end, score, strict=True)]
+    )
 
 
 def _first(inputs: Inputs, pair: int, keyframes: int) -> Array:
@@ -68,7 +67,7 @@ def _first(inputs: Inputs, pair: int, keyframes: int) -> Array:
     return starts(start, float(inputs.height_m[seen[0], pair]) if len(seen) else 0.0)
 
 
-def distinct(states: Array, order: Array, count: int) -> list[int]:
+def distinct(states: Array, order: NDArray[np.intp], count: int) -> list[int]:
     """Numbers of ``count`` states, in order, that differ; the last is repeated to fill up.
 
     Parameters

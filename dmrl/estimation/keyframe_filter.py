@@ -134,8 +134,10 @@ def run(inputs: Inputs, start: Array, start_std: Array) -> Filtered:
         (3,) their standard deviations.
     """
     count, filters = inputs.range_m.shape
-    shapes = [(3,), (3, 3), (3,), (3, 3), (3, 3)]
-    out = Filtered(*(np.empty((count, filters, *s)) for s in shapes), np.zeros(filters))
+    states = (np.empty((count, filters, 3)) for _ in range(2))
+    matrices = (np.empty((count, filters, 3, 3)) for _ in range(3))
+    (state, prior), (covariance, prior_covariance, step) = states, matrices
+    out = Filtered(state, covariance, prior, prior_covariance, step, np.zeros(filters))
     state = start.copy()
     covariance = np.broadcast_to(np.diag(start_std**2), (filters, 3, 3)).copy()
     for k in range(count):
@@ -167,9 +169,7 @@ def _apply(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
-def _update(
-    state: Array, covariance: Array, inputs: Inputs, k: int, log_likelihood: Array
-) -> None:
+def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelihood: Array) -> None:
     """Put keyframe k's ranges in, in place; far innovations count less."""
     seen = np.isfinite(inputs.range_m[k])
     peer = _apply(rotation(state[:, 2]), inputs.peer_to_range_m[k])

@@ -11,6 +11,7 @@ from dmrl.estimation.pair import Array
 from dmrl.geometry import Camera, pixels_from_horizontal
 from dmrl.messages import STATUS_OK
 
+SOURCE = "estimate"
 MARGIN_SIGMAS = 3.0
 """A peer whose label is this near the image, in its own sigmas, is still named."""
 NEAREST_M = 0.05
@@ -39,14 +40,24 @@ class Positions:
     status: NDArray[np.int8]
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How positions become pixels.
+
+    Parameters
+    ----------
+    attitude_std_rad
+        Standard deviation of roll and pitch.
+    distorted
+        Whether the images still have the lens's distortion.
+    """
+
+    attitude_std_rad: float
+    distorted: bool = True
+
+
 def image_labels(
-    peer: str,
-    positions: Positions,
-    attitude_rad: Array,
-    camera: Camera,
-    *,
-    attitude_std_rad: float,
-    distorted: bool,
+    peer: str, positions: Positions, attitude_rad: Array, camera: Camera, look: Look
 ) -> Iterator[dict[str, Any] | None]:
     """Fields of the peer's PeerLabel in each image, or None where it is surely out of view.
 
@@ -64,17 +75,16 @@ def image_labels(
         (N, 2) roll and pitch of the observer at those times.
     camera
         The observer's.
-    attitude_std_rad
-        Standard deviation of roll and pitch.
-    distorted
-        Whether the images still have the lens's distortion.
+    look
+        How positions become pixels.
     """
+    roll_rad, pitch_rad = attitude_rad.T
     uv, depth_m, jacobian = pixels_from_horizontal(
-        positions.xyz_m, *attitude_rad.T, camera, distorted=distorted
+        positions.xyz_m, roll_rad, pitch_rad, camera, distorted=look.distorted
     )
     joint = np.zeros((len(uv), 5, 5))
     joint[:, :3, :3] = positions.covariance
-    joint[:, [3, 4], [3, 4]] = attitude_std_rad**2
+    joint[:, [3, 4], [3, 4]] = look.attitude_std_rad**2
     variance = np.einsum("nij,njk,nik->ni", jacobian, joint, jacobian)
     sigma = np.sqrt(np.maximum(variance, 0.0))
     size = np.array([camera.width_px, camera.height_px])
@@ -94,4 +104,4 @@ def image_labels(
 def _label(peer: str, status: int, value: Any, sigma: Any) -> dict[str, Any]:
     names = ("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m")
     numbers = zip(names, [*map(float, value), *map(float, sigma)], strict=True)
-    return {"peer": peer, "status": status, "source": "estimate", **dict(numbers)}
+    return {"peer": peer, "status": status, "source": SOURCE, **dict(numbers)}

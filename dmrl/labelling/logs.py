@@ -56,9 +56,7 @@ class RobotLog:
         attitude, turn_gap = resample(*self.attitude, grid_s)
         velocity, gap = resample(*self.velocity, grid_s)
         height, _ = resample(*self.height, grid_s)
-        return Track(
-            velocity[:, 0], velocity[:, 1], attitude[:, 2], height[:, 0], gap | turn_gap
-        )
+        return Track(velocity[:, 0], velocity[:, 1], attitude[:, 2], height[:, 0], gap | turn_gap)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +134,9 @@ def _robot(path: Path, held: Summary, name: str, warnings: list[str]) -> RobotLo
     if attitude is None or velocity is None or height is None:
         return None
     _warn_of_degrees(name, attitude[1], warnings)
+    images = held.topics.get(topics.camera_image(name))
+    if images and topics.calibration(name) not in held.topics:
+        warnings.append(f"{name}: no {topics.calibration(name)}; its images get no labels")
     return RobotLog(attitude, velocity, height)
 
 
@@ -200,4 +201,3 @@ def _pair(
             silent_s = track.gap.sum() / RATE_HZ
             warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
     return Pair(grid_s, tracks[0], tracks[1], time_s[good], range_m[good])
-

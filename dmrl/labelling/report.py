@@ -100,9 +100,7 @@ def _rms(error: Any, chosen: Any) -> float | None:
     return float(np.sqrt(square.mean())) if len(square) else None
 
 
-def _errors(
-    recording: Path, held: Summary, pair: tuple[str, str], positions: Positions
-) -> Any:
+def _errors(recording: Path, held: Summary, pair: tuple[str, str], positions: Positions) -> Any:
     """(N,) horizontal errors, metres, NaN outside the truth; None where there is no truth."""
     topic = topics.truth(*pair)
     if topic not in held.topics or held.topics[topic].count < 2:

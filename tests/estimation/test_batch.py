@@ -8,6 +8,7 @@ from dmrl.estimation.batch import equations_of, solve_batch
 from dmrl.estimation.linear import SIZE, linearise
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+
 from .flights import flown, pair_of, truth_at
 
 NOISE = Noise()
@@ -72,9 +73,7 @@ def dense(equations: banded.Normal) -> Array:
     return np.block([[full, border], [border.T, equations.corner]])
 
 
-def test_the_banded_solve_is_the_dense_one(
-    flight: Problem, anywhere: tuple[Array, Array]
-) -> None:
+def test_the_banded_solve_is_the_dense_one(flight: Problem, anywhere: tuple[Array, Array]) -> None:
     state, constants = anywhere
     equations = equations_of(flight, NOISE, linearise(flight, NOISE, state, constants), constants)
     full = dense(equations)

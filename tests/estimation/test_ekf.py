@@ -12,6 +12,7 @@ from dmrl.estimation.ekf import (
     pair_steps,
     stack,
 )
+
 from .flights import flown, pair_of
 
 

@@ -6,6 +6,7 @@ from dmrl.estimation import estimate as room
 from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs, from_peer, swapped
 from dmrl.estimation.pair import Pair, Track
 from dmrl.flight import Trajectory
+
 from .flights import flown, pair_of, truth_at
 
 LONG_S = 60.0
@@ -30,7 +31,9 @@ def test_the_statuses_are_those_of_the_schema() -> None:
 def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
     seeds = (1000, 1001, 1002, 1003)
     pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
-    published = [rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)]
+    published = [
+        rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)
+    ]
     smoother, batch = (
         [rmse(e, s) for (e, _), s in zip(estimate_pairs(pairs, method), seeds, strict=True)]
         for method in ("smoother", "batch")

@@ -1,0 +1,109 @@
+"""Positions and labels as messages."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.estimation.pair import Array
+from dmrl.geometry import Camera
+from dmrl.labelling.labels import SOURCE, Look, Positions, image_labels
+from dmrl.labelling.logs import Logs
+from dmrl.messages import message
+from dmrl.recording import Summary, read, read_table
+
+Times = NDArray[np.int64]
+
+
+class Timed(NamedTuple):
+    """A message to write at a log time."""
+
+    time_ns: int
+    topic: str
+    message: Any
+
+
+def image_times(recording: Path, held: Summary, robot: str) -> Times:
+    """(N,) log times of a robot's images."""
+    topic = topics.camera_image(robot)
+    if topic not in held.topics:
+        return np.zeros(0, np.int64)
+    return np.asarray(read_table(recording, topic, fields=())["log_time"].to_numpy())
+
+
+def position_messages(observer: str, peer: str, found: Positions) -> Iterator[Timed]:
+    """PeerPosition messages of one pair, in time order."""
+    topic, frame = topics.position(observer, peer), f"{observer}/horizontal"
+    rows = zip(found.time_ns, found.xyz_m, found.covariance, found.status, strict=True)
+    for time_ns, (x, y, z), covariance, status in rows:
+        fields = {"frame_id": frame, "x": x, "y": y, "z": z, "status": int(status)}
+        made = message("PeerPosition")(covariance=covariance.ravel().tolist(), **fields)
+        yield Timed(int(time_ns), topic, made)
+
+
+def label_messages(
+    recording: Path,
+    held: Summary,
+    logs: Logs,
+    robot: str,
+    positions: Mapping[str, Positions],
+    look: Look,
+) -> Iterator[Timed]:
+    """PeerLabels of every image that has a position or had labels, in time order.
+
+    Parameters
+    ----------
+    recording, held
+        Where the images, their labels and the calibration are, and its summary.
+    logs
+        Attitude of the robot.
+    robot
+        It carries the camera.
+    positions
+        By peer.
+    look
+        How positions become pixels.
+    """
+    kept = _of_other_sources(recording, held, topics.labels(robot))
+    fresh: dict[int, list[Any]] = defaultdict(list)
+    camera = camera_of(recording, held, robot)
+    images_ns = image_times(recording, held, robot)
+    for peer, found in positions.items() if camera else ():
+        at = np.isin(found.time_ns, images_ns)
+        mine = Positions(found.time_ns[at], found.xyz_m[at], found.covariance[at], found.status[at])
+        attitude = _attitude(logs, robot, mine.time_ns)
+        labels = image_labels(peer, mine, attitude, camera, look) if camera else iter(())
+        for time_ns, label in zip(mine.time_ns.tolist(), labels, strict=True):
+            fresh[time_ns] += [message("PeerLabel")(**label)] if label else []
+    for time_ns in sorted({*kept, *fresh}):
+        peers = [*kept.get(time_ns, []), *fresh.get(time_ns, [])]
+        yield Timed(time_ns, topics.labels(robot), message("PeerLabels")(peers=peers))
+
+
+def _of_other_sources(recording: Path, held: Summary, topic: str) -> dict[int, list[Any]]:
+    """Entries of the labels that are there, by log time, without earlier estimates."""
+    kept: dict[int, list[Any]] = defaultdict(list)
+    for stamped in read(recording, topic) if topic in held.topics else ():
+        kept[stamped.time_ns] += [p for p in stamped.message.peers if p.source != SOURCE]
+    return kept
+
+
+def _attitude(logs: Logs, robot: str, time_ns: Times) -> Array:
+    """(N, 2) roll and pitch at log times, radians."""
+    at_s, values = logs.robots[robot].attitude
+    time_s = (time_ns - logs.start_ns) * 1e-9
+    return np.column_stack([np.interp(time_s, at_s, column) for column in values[:, :2].T])
+
+
+def camera_of(recording: Path, held: Summary, robot: str) -> Camera | None:
+    """A robot's camera; None where the recording has no calibration."""
+    topic = topics.calibration(robot)
+    if topic not in held.topics:
+        return None
+    found = next(read(recording, topic)).message
+    fx, _, cx, _, fy, cy, *_ = found.K
+    return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D))

@@ -1,0 +1,239 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import OutputError, RecordingError
+from dmrl.geometry import pixels_from_horizontal
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
+from dmrl.recording import (
+    Provenance,
+    RecordingWriter,
+    Stamped,
+    check,
+    read,
+    read_raw,
+    read_table,
+    summary,
+)
+from dmrl.stages import fly, label
+from dmrl.stages.label import Settings
+
+SECOND_NS = 1_000_000_000
+LENIENT = Settings(gate_m=0.5)  # half a minute is short
+Change = Callable[[Stamped], list[Stamped]]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Thirty seconds of two robots with good sensors; cf1 has a camera."""
+    out = tmp_path_factory.mktemp("label") / "flight.mcap"
+    settings = fly.Settings(
+        2, 30.0, noise="calibrated", seed=1001, camera=True, cameras_max=1, camera_rate_hz=2.0
+    )
+    fly.run(out, settings)
+    return out
+
+
+@pytest.fixture(scope="module")
+def labelled(flight: Path) -> Path:
+    out = flight.with_name("labelled.mcap")
+    label.run(flight, out, LENIENT)
+    return out
+
+
+@pytest.fixture
+def changed(flight: Path, tmp_path: Path) -> Callable[[Change], Path]:
+    """The flight's logs, every message through a function."""
+
+    def make(change: Change) -> Path:
+        out = tmp_path / "changed.mcap"
+        with RecordingWriter(out, Provenance("test")) as sink:
+            for stamped in read(flight, "/*/attitude", "/*/velocity", "/*/height", "/*/range/*"):
+                for one in change(stamped):
+                    sink.write(one.time_ns, one.topic, one.message)
+        return out
+
+    return make
+
+
+def test_everything_else_is_copied_bit_for_bit(flight: Path, labelled: Path) -> None:
+    topics = [t for t in summary(flight).topics if t != "/cf1/labels"]
+    assert list(read_raw(labelled, *topics)) == list(read_raw(flight, *topics))
+    assert not [f for f in check(labelled) if f.level == "error"]
+
+
+def test_positions_come_at_20_hz_and_at_every_image(labelled: Path) -> None:
+    there = set(read_table(labelled, "/cf1/peer/cf2/position")["log_time"].to_pylist())
+    images = read_table(labelled, "/cf1/camera/image", fields=())["log_time"].to_pylist()
+    assert set(images) <= there
+    back = read_table(labelled, "/cf2/peer/cf1/position")["log_time"].to_numpy()
+    assert (np.diff(back) == SECOND_NS // 20).all()
+    first = next(read(labelled, "/cf1/peer/cf2/position")).message
+    assert first.frame_id == "cf1/horizontal"
+    assert len(first.covariance) == 9
+
+
+def test_positions_are_near_the_truth(labelled: Path) -> None:
+    for one, other in (("cf1", "cf2"), ("cf2", "cf1")):
+        found = read_table(labelled, f"/{one}/peer/{other}/position")
+        truth = read_table(labelled, f"/{one}/peer/{other}/truth")
+        time_ns = truth["log_time"].to_numpy()
+        errors = [
+            found[axis].to_numpy()
+            - np.interp(found["log_time"].to_numpy(), time_ns, truth[axis].to_numpy())
+            for axis in ("x", "y", "z")
+        ]
+        assert np.median(np.hypot(*errors[:2])) < 0.2
+        assert np.abs(errors[2]).mean() < 0.1
+
+
+def test_labels_stand_beside_those_of_other_sources(flight: Path, labelled: Path) -> None:
+    before = {s.time_ns: s.message for s in read(flight, "/cf1/labels")}
+    after = {s.time_ns: s.message for s in read(labelled, "/cf1/labels")}
+    assert after.keys() == before.keys()
+    for time_ns, peers in after.items():
+        assert [p for p in peers.peers if p.source == "truth"] == list(before[time_ns].peers)
+    ours = [p for m in after.values() for p in m.peers if p.source == "estimate"]
+    assert len(ours) > len(after) / 2
+    assert all(p.peer == "cf2" and p.sigma_u_px > 0 and p.sigma_depth_m > 0 for p in ours)
+
+
+def test_labels_are_projections_of_the_positions(labelled: Path) -> None:
+    attitude = read_table(labelled, "/cf1/attitude")
+    positions = {s.time_ns: s.message for s in read(labelled, "/cf1/peer/cf2/position")}
+    seen = 0
+    for stamped in read(labelled, "/cf1/labels"):
+        at = positions[stamped.time_ns]
+        roll, pitch = (
+            np.interp([stamped.time_ns], attitude["log_time"].to_numpy(), attitude[n].to_numpy())
+            for n in ("roll_rad", "pitch_rad")
+        )
+        uv, depth_m, _ = pixels_from_horizontal(
+            np.array([[at.x, at.y, at.z]]), roll, pitch, fly.CAMERA
+        )
+        for peer in stamped.message.peers:
+            if peer.source == "estimate" and peer.status == STATUS_OK:
+                assert (peer.u_px, peer.v_px) == pytest.approx(tuple(uv[0]))
+                assert peer.depth_m == pytest.approx(depth_m[0])
+                seen += 1
+    assert seen > 5
+
+
+def test_labelling_again_changes_no_position(labelled: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again.mcap"
+    label.run(labelled, out, LENIENT)
+    assert summary(out).topics == summary(labelled).topics
+    assert [s.message for s in read(out, "/*/peer/*/position", "/cf1/labels")] == [
+        s.message for s in read(labelled, "/*/peer/*/position", "/cf1/labels")
+    ]
+
+
+def test_the_same_input_gives_the_same_bytes(flight: Path, labelled: Path, tmp_path: Path) -> None:
+    label.run(flight, tmp_path / "labelled.mcap", LENIENT)
+    assert (tmp_path / "labelled.mcap").read_bytes() == labelled.read_bytes()
+
+
+def test_the_report_knows_the_error_where_the_truth_is_recorded(
+    flight: Path, tmp_path: Path
+) -> None:
+    for method in ("smoother", "ekf"):
+        result = label.run(flight, tmp_path / f"{method}.mcap", Settings(method=method))
+        assert [(p.observer, p.peer) for p in result.pairs] == [("cf1", "cf2"), ("cf2", "cf1")]
+        assert all(p.rmse_m is not None for p in result.pairs)
+        assert not result.warnings
+
+
+def test_an_output_that_exists_is_left_alone(flight: Path) -> None:
+    with pytest.raises(OutputError, match="exists"):
+        label.run(flight, flight, Settings())
+
+
+def warnings_of(path: Path) -> str:
+    out = path.with_name("out.mcap")
+    return "\n".join(label.run(path, out, Settings(method="smoother")).warnings)
+
+
+def test_ranges_that_cannot_be_are_left_out_with_a_word(
+    changed: Callable[[Change], Path],
+) -> None:
+    count = iter(range(10**6))
+    bad = (0.0, -1.0, 65535.0, float("nan"))
+
+    def spoil(stamped: Stamped) -> list[Stamped]:
+        if stamped.topic == "/cf1/range/cf2" and (k := next(count)) % 20 == 0:
+            stamped.message.range_m = bad[k // 20 % 4]
+        return [stamped]
+
+    said = warnings_of(changed(spoil))
+    assert "samples are not finite; left out" in said
+    assert "ranges are not in (0, 60] m; left out" in said
+
+
+def test_a_robot_without_logs_is_left_out_with_a_word(changed: Callable[[Change], Path]) -> None:
+    def third(stamped: Stamped) -> list[Stamped]:
+        if stamped.topic != "/cf1/range/cf2":
+            return [stamped]
+        return [stamped, Stamped(stamped.time_ns, "/cf1/range/cf3", stamped.message)]
+
+    assert "cf3: no /cf3/attitude and no /cf3/velocity" in warnings_of(changed(third))
+
+
+def test_silence_is_bridged_with_a_word(changed: Callable[[Change], Path]) -> None:
+    def silent(stamped: Stamped) -> list[Stamped]:
+        quiet = 10 * SECOND_NS < stamped.time_ns < 13 * SECOND_NS
+        return [] if quiet and stamped.topic == "/cf2/velocity" else [stamped]
+
+    assert "cf2 is silent for" in warnings_of(changed(silent))
+
+
+def test_degrees_are_suspected(changed: Callable[[Change], Path]) -> None:
+    def degrees(stamped: Stamped) -> list[Stamped]:
+        if stamped.topic == "/cf1/attitude":
+            stamped.message.roll_rad *= 57.3
+            stamped.message.pitch_rad *= 57.3
+        return [stamped]
+
+    assert "cf1: a tilt of" in warnings_of(changed(degrees))
+
+
+def test_clocks_an_hour_apart_are_an_error_of_one_line(
+    changed: Callable[[Change], Path], tmp_path: Path
+) -> None:
+    def late(stamped: Stamped) -> list[Stamped]:
+        hour = 3600 * SECOND_NS if stamped.topic.startswith("/cf2") else 0
+        return [Stamped(stamped.time_ns + hour, stamped.topic, stamped.message)]
+
+    with pytest.raises(RecordingError, match=r"share 0\.0 s.*Do their clocks agree") as caught:
+        warnings_of(changed(late))
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_a_recording_without_ranges_says_so(changed: Callable[[Change], Path]) -> None:
+    def none(stamped: Stamped) -> list[Stamped]:
+        return [] if "range" in stamped.topic else [stamped]
+
+    out = changed(lambda s: [s])
+    bare = out.with_name("bare.mcap")
+    with RecordingWriter(bare, Provenance("test")) as sink:
+        for stamped in read(out, "/*/attitude"):
+            sink.write(stamped.time_ns, stamped.topic, stamped.message)
+    with pytest.raises(RecordingError, match="there are no ranges"):
+        label.run(bare, out.with_name("out.mcap"), Settings())
+
+
+def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> None:
+    flown = tmp_path / "still.mcap"
+    fly.run(
+        flown,
+        fly.Settings(
+            2, 20.0, "observer_static", "realistic", seed=1000, camera=True, camera_rate_hz=1.0
+        ),
+    )
+    out = tmp_path / "out.mcap"
+    label.run(flown, out, Settings())
+    for stamped in read(out, "/cf1/labels"):
+        (ours,) = [p for p in stamped.message.peers if p.source == "estimate"]
+        assert ours.status == STATUS_AMBIGUOUS
