@@ -100,9 +100,13 @@ def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None
         (
             Settings(source_kind="image"),
             SourceError,
-            "Did you mean images.* Kinds: locanet, images",
+            "Did you mean images.* Kinds: locanet, csv, uwb-tiers, images",
         ),
-        (Settings(source_kind="rosbag"), SourceError, "no such kind. Kinds: locanet, images"),
+        (
+            Settings(source_kind="rosbag"),
+            SourceError,
+            "no such kind. Kinds: locanet, csv, uwb-tiers, images",
+        ),
         (Settings(source_kind="locanet"), SourceError, r"no posLabel\.txt"),
         (Settings(width_px=320), SettingError, "--width-px and --height-px go together"),
         (Settings(width_px=0, height_px=5), SettingError, "must be over 0"),
@@ -130,7 +134,9 @@ def test_a_picture_that_breaks_half_way_leaves_nothing(pictures: Path, tmp_path:
 
 
 def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"looks like no kind .* Say --from: locanet, images"):
+    with pytest.raises(
+        SourceError, match=r"looks like no kind .* Say --from: locanet, csv, uwb-tiers, images"
+    ):
         run(tmp_path, tmp_path / "out.mcap", Settings())
     with pytest.raises(SourceError, match="no file or folder"):
         run(tmp_path / "none", tmp_path / "out.mcap", Settings())
