@@ -24,7 +24,8 @@ OK, UNCONVERGED, AMBIGUOUS = range(3)
 GATE_M = 0.15
 """Largest sigma, along the worst direction, of a position that is OK."""
 INFLATION = 0.95
-"""Sigmas of the batch solve are multiplied by this: the 95 % ellipse then holds 93 to 98 %."""
+"""Sigmas of the batch solve are multiplied by this, and where the sensors are worse than the
+default by the root of how much worse: the 95 % ellipse then holds 91 to 98 %."""
 SMOOTHER_INFLATION = 1.5
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
 """Sigma over distance beyond which a bearing is open rather than imprecise; and the median
@@ -168,15 +169,18 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
     gate_m
         As in `estimate_pairs`.
     """
-    out = []
-    for pair in pairs:
-        steps = ekf.pair_steps(pair, ekf.PRESETS[preset])
-        state, spread = ekf.filter_many(steps, ekf.PRESETS[preset])
-        none = np.zeros(len(state), np.int8)
-        constants = np.zeros(len(GLOBALS))
-        made = Estimate(pair.time_s, state[:, 0], spread[:, 0], none, constants, Noise())
-        out.append(replace(made, status=_status(made, [], gate_m)))
-    return out
+    steps = [ekf.pair_steps(pair, ekf.PRESETS[preset]) for pair in pairs]
+    out: dict[int, Estimate] = {}
+    lengths = np.array([len(pair.time_s) for pair in pairs], int)
+    for length in np.unique(lengths):
+        numbers = np.flatnonzero(lengths == length).tolist()
+        side_by_side = ekf.stack([steps[n] for n in numbers])
+        state, spread = ekf.filter_many(side_by_side, ekf.PRESETS[preset])
+        for k, n in enumerate(numbers):
+            none, constants = np.zeros(length, np.int8), np.zeros(len(GLOBALS))
+            made = Estimate(pairs[n].time_s, state[:, k], spread[:, k], none, constants, Noise())
+            out[n] = replace(made, status=_status(made, [], gate_m))
+    return [out[n] for n in range(len(pairs))]
 
 
 def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Array]:
@@ -218,7 +222,8 @@ def _from_batch(
     found = first if noise else noise_of(flight, first, best)
     if not noise:
         best = solve_batch(flight, found, best.state)
-    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2
+    worse = max(1.0, found.velocity_std_mps / Noise().velocity_std_mps)
+    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse
     none = np.zeros(len(tracks), np.int8)
     estimate = Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
     return estimate, rivals
