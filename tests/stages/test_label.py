@@ -17,7 +17,7 @@ from dmrl.recording import (
     read_table,
     summary,
 )
-from dmrl.stages import fly, label
+from dmrl.stages import convert, fly, label
 from dmrl.stages.label import Settings
 
 SECOND_NS = 1_000_000_000
@@ -188,6 +188,16 @@ def test_silence_is_bridged_with_a_word(changed: Callable[[Change], Path]) -> No
     assert "cf2 is silent for" in warnings_of(changed(silent))
 
 
+def test_a_clock_that_went_back_is_named(flight: Path, tmp_path: Path) -> None:
+    path = tmp_path / "back.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for one in read(flight, "/*/attitude", "/*/velocity", "/*/height", "/*/range/*"):
+            late = one.topic == "/cf2/velocity" and one.time_ns > 20 * SECOND_NS
+            time_ns = one.time_ns - 5 * SECOND_NS * late
+            sink.write(time_ns, one.topic, one.message, publish_ns=one.time_ns)
+    assert "/cf2/velocity: its clock goes back" in warnings_of(path)
+
+
 def test_degrees_are_suspected(changed: Callable[[Change], Path]) -> None:
     def degrees(stamped: Stamped) -> list[Stamped]:
         if stamped.topic == "/cf1/attitude":
@@ -237,3 +247,20 @@ def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> N
     for stamped in read(out, "/cf1/labels"):
         (ours,) = [p for p in stamped.message.peers if p.source == "estimate"]
         assert ours.status == STATUS_AMBIGUOUS
+
+
+def test_real_ranges_of_moving_robots_are_labelled_and_a_static_observer_is_not(
+    data: Path, tmp_path: Path
+) -> None:
+    source = data / "uwb-tiers" / "4robots_data_01.npz"
+    convert.run(source, tmp_path / "ranges.mcap", convert.Settings())
+    out = tmp_path / "out.mcap"
+    reports = label.run(tmp_path / "ranges.mcap", out, Settings(range_offset_m=0.35)).pairs
+    found = {(p.observer[-1], p.peer[-1]): p for p in reports}
+    for pair in ("13", "14", "34", "43", "41"):
+        error = found[pair[0], pair[1]].rmse_m
+        assert error is not None
+        assert error < 0.29
+    for peer in "134":
+        assert found["5", peer].ambiguous_share == 1.0
+        assert found["5", peer].ok_share == 0.0
