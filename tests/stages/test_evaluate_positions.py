@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import positions
+from dmrl import pipeline, positions
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import Provenance, RecordingWriter
@@ -99,3 +99,15 @@ def test_recordings_with_nothing_to_judge_are_refused(tmp_path: Path) -> None:
         sink.write(0, "/cf1/peer/cf2/position", position(1, 0))
     with pytest.raises(RecordingError, match="no true position for any"):
         run(other, None, Settings())
+
+
+def test_a_pipeline_shows_judged_positions(
+    labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(labelled, tmp_path / "positions", Settings())
+    done = [pipeline.Done("evaluate", tmp_path / "positions", 1.0, skipped=False)]
+    pipeline.report(done)
+    assert "cf1 sees cf2" in capsys.readouterr().out
+    pipeline.report(done, as_json=True)
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["positions"]["positions"]["overall"]["samples"] == 1599
