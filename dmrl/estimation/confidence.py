@@ -118,6 +118,32 @@ def shrunk(velocity: Array, energy: float, step_s: float) -> Array:
     return np.asarray(slow * share[:, None])
 
 
+def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
+    """Mean squares of the averaged velocities of observer, peer, and one against the other.
+
+    Parameters
+    ----------
+    problem
+        The flight.
+    state
+        (K, 3) or (K, 5) its solution.
+
+    Returns
+    -------
+    own, peer, relative : float
+        (m/s)^2, noise included.
+    """
+    step_s = float(np.median(problem.steps_s))
+    heading, own = path_of(problem.own)
+    relative = _apply(rotation(heading), state[:, :2])
+    energies = []
+    for path in (own, path_of(problem.peer)[1], relative):
+        velocity = np.diff(path, axis=0) / step_s
+        slow = uniform_filter1d(velocity, max(1, round(CALM_S / step_s)), axis=0, mode="nearest")
+        energies.append(float((slow**2).sum(axis=1).mean()))
+    return energies[0], energies[1], energies[2]
+
+
 def path_of(moves: Increments) -> tuple[Array, Array]:
     """Heading (K,) and position (K, 2) of a robot in the frame of its first keyframe."""
     heading = np.concatenate([[0.0], np.cumsum(moves.turn_rad)])

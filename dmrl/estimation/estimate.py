@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dmrl.estimation import ekf, keyframe_filter
 from dmrl.estimation.batch import Solution, solve_batch
-from dmrl.estimation.confidence import covariance, plain_covariance
+from dmrl.estimation.confidence import covariance, plain_covariance, restlessness
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, distinct
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK
@@ -30,6 +30,9 @@ SMOOTHER_INFLATION = 1.5
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
 """Sigma over distance beyond which a bearing is open rather than imprecise; and the median
 over a flight beyond which the motion of the whole flight leaves it open."""
+STILL, ALIKE = 0.022, 0.04
+"""Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
+flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
 NEAR_M = 0.5
 """Distances are taken as at least this: nearer, no one flies and any sigma is an angle."""
 RIVAL_COST = 25.0
@@ -151,9 +154,14 @@ def _both(
     """Estimates seen from either robot, with their statuses."""
     silent = np.append(flight.gap_s, 0.0) + np.append(0.0, flight.gap_s) > 0
     back = swapped(estimate)
-    here = np.maximum(_status(estimate, rivals, gate_m), silent * np.int8(UNCONVERGED))
-    there = _status(back, [from_peer(rival) for rival in rivals], gate_m)
-    there = np.maximum(there, silent * np.int8(UNCONVERGED))
+    own, peer, relative = restlessness(flight, estimate.state)
+    floor = silent * np.int8(UNCONVERGED)
+    here = np.maximum(_status(estimate, rivals, gate_m), floor)
+    there = np.maximum(_status(back, [from_peer(rival) for rival in rivals], gate_m), floor)
+    if own < STILL or relative < ALIKE:
+        here[:] = AMBIGUOUS
+    if peer < STILL or relative < ALIKE:
+        there[:] = AMBIGUOUS
     return replace(estimate, status=here), replace(back, status=there)
 
 
