@@ -62,8 +62,8 @@ TOPICS = (
     Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert"),
     Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert"),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
-    Topic(TRUTH, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "per image", "convert"),
-    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "100 Hz", "fly"),
+    Topic(TRUTH, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "convert"),
+    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "fly"),
 )
 
 
