@@ -48,12 +48,16 @@ LABELS = "/{robot}/labels"
 DETECTIONS = "/{robot}/detections"
 GRID = "/{robot}/detections/grid"
 TRACKS = "/{robot}/tracks"
+MASKS = "/{robot}/camera/masks"
+DEPTHS = "/{robot}/camera/depth"
 TRANSFORMS = "/tf"
 
 TOPICS = (
     Topic(CAMERA_IMAGE, "foxglove.CompressedImage", "image", "png or jpeg", "camera", "convert"),
     Topic(CALIBRATION, "foxglove.CameraCalibration", "image", "px", "once", "convert"),
     Topic(LABELS, "dmrl.v1.PeerLabels", "image", "px, m", "per image", "convert"),
+    Topic(MASKS, "foxglove.CompressedImage", "image", "number of the peer", "per image", "render"),
+    Topic(DEPTHS, "foxglove.CompressedImage", "image", "png, mm", "per image", "render"),
     Topic(DETECTIONS, "dmrl.v1.Detections", "image", "px, m", "per image", "predict"),
     Topic(GRID, "dmrl.v1.GridMap", "image grid", "0..1, m", "per image", "predict"),
     Topic(TRACKS, "dmrl.v1.Tracks", "<robot>/horizontal", "m, m/s", "per image", "track"),
@@ -80,6 +84,16 @@ def calibration(robot: str) -> str:
 def attitude(robot: str) -> str:
     """Topic of a robot's attitude."""
     return ATTITUDE.format(robot=robot)
+
+
+def masks(robot: str) -> str:
+    """Topic of images whose values say which peer covers a pixel."""
+    return MASKS.format(robot=robot)
+
+
+def depths(robot: str) -> str:
+    """Topic of images of the distance of peers' surfaces."""
+    return DEPTHS.format(robot=robot)
 
 
 def labels(robot: str) -> str:

@@ -1,0 +1,369 @@
+"""``dmrl render``: a recipe to a recording of rendered images with exact labels."""
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter, validators
+
+from dmrl import recipe as recipes
+from dmrl import topics
+from dmrl.errors import RecipeError, SettingError
+from dmrl.formats.sample import Sample, calibration, image, intervals, labels
+from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Array, Camera, camera_from_horizontal
+from dmrl.images import encode_jpeg, encode_png
+from dmrl.messages import message
+from dmrl.output import refuse_existing
+from dmrl.progress import say, track
+from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter, interrupted, provenance
+from dmrl.rendering.backdrops import Photos
+from dmrl.rendering.environment import ensure
+from dmrl.rendering.randomise import Drawn, World, draw_scene
+from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.settings import PRESETS, Settings
+from dmrl.rendering.shot import Shot
+from dmrl.tables import print_json, print_table
+
+ROBOT = "cf1"
+CAMERAS = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
+PANORAMA_KINDS = (".exr", ".hdr")
+
+Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What was rendered: images, robots in them, images without, broken photos left out."""
+
+    images: int
+    robots: int
+    empty_images: int
+    broken_photos: int
+    resumed_images: int
+
+
+def settings_of(name: str, **changes: Any) -> Settings:
+    """Settings of a recipe, over those of its preset.
+
+    Parameters
+    ----------
+    name
+        Path, or the name of a shipped recipe.
+    changes
+        Settings that come before the recipe's; None: the recipe's.
+
+    Raises
+    ------
+    RecipeError
+        If the recipe is not one of kind "render", or any key is wrong: names every one.
+    """
+    keys = recipes.read(name)
+    if (kind := keys.pop("kind", None)) != "render":
+        raise RecipeError(f'{name} is of kind {kind!r}. This command wants: kind = "render"')
+    preset = keys.pop("preset", "plain")
+    if preset not in PRESETS:
+        raise RecipeError(f"{name}: no preset {preset!r}. There are: {', '.join(PRESETS)}")
+    given = {key: value for key, value in changes.items() if value is not None}
+    return recipes.check(name, PRESETS[preset] | keys | given, Settings)
+
+
+def camera_of(settings: Settings) -> Camera:
+    """The camera that the images are taken with."""
+    camera = CAMERAS[settings.camera]
+    return camera if settings.distorted else replace(camera, distortion=())
+
+
+def run(settings: Settings, out: Path, *, resume: bool = False) -> Result:
+    """Render and write the recording ``out``, as images arrive.
+
+    Parameters
+    ----------
+    settings
+        See `Settings`.
+    out
+        Recording to write. Until it is done it is ``<out>.partial``.
+    resume
+        Go on with the interrupted ``<out>.partial``; the result is the same, byte for byte.
+
+    Raises
+    ------
+    OutputError
+        If ``out`` exists, or an interrupted rendering is in the way.
+    SettingError
+        If model, scale or backgrounds cannot be used.
+    BlenderError
+        If Blender cannot be set up, or does not start.
+    RecordingError
+        If what is to be resumed is of other settings.
+    """
+    refuse_existing(out)
+    before = interrupted(out, resume=resume)
+    photos = None if settings.backgrounds is None else Photos(settings.backgrounds)
+    lights = None if settings.lights is None else _panoramas(settings.lights)
+    model = Model(settings.model, settings.scale, settings.model_up)
+    with ExitStack() as stack:
+        renderer = stack.enter_context(
+            Renderer(
+                ensure(say),
+                model,
+                lights=lights,
+                workers=settings.workers,
+                samples=settings.samples,
+            )
+        )
+        made = _provenance(settings, renderer.version)
+        before.check(made)
+        sink = stack.enter_context(RecordingWriter(out, made, keep_on_error=True))
+        sink.add_metadata(SPLIT_METADATA, _split(settings))
+        done = before.copy(sink)
+        world = World(
+            settings,
+            camera_of(settings),
+            renderer.radius_m,
+            tuple(renderer.lights),
+            cache(renderer.panorama),
+            photos,
+        )
+        counts = _render(world, renderer, sink, done)
+    before.forget()
+    broken = len(photos.broken) if photos is not None else 0
+    return Result(settings.images, *counts, broken, done)
+
+
+def _provenance(settings: Settings, blender: str) -> Provenance:
+    """How the recording is made; the number of workers changes nothing, so it is left out."""
+    inputs = [path for path in (settings.model, settings.backgrounds, settings.lights) if path]
+    plain = replace(settings, workers=0)
+    made = provenance("render", plain, inputs, seed=settings.seed, libraries=("numpy", "pillow"))
+    return replace(made, libraries={**made.libraries, "blender": blender})
+
+
+def _split(settings: Settings) -> dict[str, str]:
+    first_test = settings.images - round(settings.images * settings.test_share)
+    times = (_time_ns(settings, k) for k in range(settings.images))
+    found = intervals((t, "test" if k >= first_test else "train") for k, t in enumerate(times))
+    return {name: json.dumps(parts) for name, parts in found.items()}
+
+
+def _time_ns(settings: Settings, index: int) -> int:
+    return round(index * 1e9 / settings.rate_hz)
+
+
+def _panoramas(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise SettingError(f"no folder {folder} of panoramas. Check lights")
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PANORAMA_KINDS)
+    if not found:
+        kinds = ", ".join(PANORAMA_KINDS)
+        raise SettingError(f"{folder} holds no panorama ({kinds}). Choose another for lights")
+    return found
+
+
+def _render(world: World, renderer: Renderer, sink: RecordingWriter, done: int) -> tuple[int, int]:
+    """Robots and images without robots that were rendered, from image ``done`` on."""
+    settings, camera = world.settings, world.camera
+    if not done:
+        _write(sink, calibration(0, ROBOT, camera))
+    drawn: list[Drawn] = []
+
+    def scenes() -> Iterator[Any]:
+        for index in range(done, settings.images):
+            scene = draw_scene(world, index)
+            drawn.append(scene)
+            yield camera, scene.robots, scene.look
+
+    robots = empty = 0
+    shots = track(renderer.shots(scenes()), "Rendering", settings.images - done)
+    for index, shot in enumerate(shots, done):
+        scene = drawn.pop(0)
+        for sample in samples(_time_ns(settings, index), settings, scene, shot):
+            _write(sink, sample)
+        robots += len(scene.robots)
+        empty += not scene.robots
+    return robots, empty
+
+
+def _write(sink: RecordingWriter, sample: Sample) -> None:
+    sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
+
+
+def peer(number: int) -> str:
+    """Name of the robot of that number in an image, from 0."""
+    return f"cf{number + 2}"
+
+
+def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Iterator[Sample]:
+    """Everything that is recorded of one image.
+
+    Parameters
+    ----------
+    time_ns
+        Of the exposure.
+    settings
+        Which topics are wanted.
+    scene
+        True poses.
+    shot
+        Pixels and labels.
+    """
+    jpeg = settings.image_format == "jpeg"
+    data = encode_jpeg(shot.rgb, scene.jpeg_quality) if jpeg else encode_png(shot.rgb)
+    yield image(time_ns, ROBOT, data, settings.image_format)
+    yield labels(time_ns, ROBOT, list(_peers(shot)))
+    attitude = {"roll_rad": scene.roll_rad, "pitch_rad": scene.pitch_rad}
+    yield Sample(time_ns, topics.attitude(ROBOT), "Attitude", attitude)
+    horizontal_from_camera = camera_from_horizontal(scene.roll_rad, scene.pitch_rad).T
+    for k, robot in enumerate(scene.robots):
+        xyz = horizontal_from_camera @ robot.pose.xyz_camera
+        yield _truth(time_ns, peer(k), xyz)
+    yield _transforms(time_ns, scene, horizontal_from_camera)
+    if settings.masks:
+        mask = encode_png(_mask(shot))
+        yield replace(image(time_ns, ROBOT, mask, "png"), topic=topics.masks(ROBOT))
+    if settings.depths:
+        depth = encode_png(np.round(shot.surface_m * 1000).astype(np.uint16))
+        yield replace(image(time_ns, ROBOT, depth, "png"), topic=topics.depths(ROBOT))
+
+
+def _peers(shot: Shot) -> Iterator[dict[str, Any]]:
+    """Labels of the robots of which anything is seen."""
+    for k, share in enumerate(shot.visible_share.tolist()):
+        if share <= 0 or np.isnan(shot.box_px[k]).any():
+            continue
+        yield {
+            "peer": peer(k),
+            "u_px": float(shot.uv_px[k, 0]),
+            "v_px": float(shot.uv_px[k, 1]),
+            "depth_m": float(shot.depth_m[k]),
+            "box_px": shot.box_px[k].tolist(),
+            "visible_share": share,
+            "source": "truth",
+        }
+
+
+def _mask(shot: Shot) -> Any:
+    """(H, W) uint8: number in the name of the peer that covers most of a pixel; 0: none."""
+    if not len(shot.opacity):
+        return np.zeros(shot.rgb.shape[:2], np.uint8)
+    most = shot.opacity.max(axis=0)
+    return np.where(most > 0, shot.opacity.argmax(axis=0) + 2, 0).astype(np.uint8)
+
+
+def _truth(time_ns: int, name: str, xyz: Array) -> Sample:
+    fields = dict(zip("xyz", xyz.tolist(), strict=True))
+    fields |= {"frame_id": f"{ROBOT}/horizontal", "covariance": [0.0] * 9}
+    return Sample(time_ns, topics.truth(ROBOT, name), "PeerPosition", fields)
+
+
+def _transforms(time_ns: int, scene: Drawn, horizontal_from_camera: Array) -> Sample:
+    """True poses: the observer's horizontal frame is the world; camera and peers in it."""
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    poses = [("world", f"{ROBOT}/horizontal", np.zeros(3), np.eye(3))]
+    poses.append((f"{ROBOT}/horizontal", f"{ROBOT}/camera", np.zeros(3), horizontal_from_camera))
+    for k, robot in enumerate(scene.robots):
+        xyz = horizontal_from_camera @ robot.pose.xyz_camera
+        turn = horizontal_from_camera @ robot.pose.camera_from_body
+        poses.append((f"{ROBOT}/horizontal", peer(k), xyz, turn))
+    transforms = [
+        {
+            "timestamp": {"seconds": seconds, "nanos": nanos},
+            "parent_frame_id": parent,
+            "child_frame_id": child,
+            "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
+            "rotation": dict(zip("xyzw", quaternion(turn), strict=True)),
+        }
+        for parent, child, xyz, turn in poses
+    ]
+    return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": transforms})
+
+
+def quaternion(matrix: Array) -> list[float]:
+    """x, y, z, w of a rotation, w not negative.
+
+    Parameters
+    ----------
+    matrix
+        (3, 3) rotation.
+    """
+    # The eigenvector of Bar-Itzhack's matrix: exact for any angle, without case by case.
+    m = matrix
+    k = np.array(
+        [
+            [m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
+            [0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
+            [0, 0, m[2, 2] - m[0, 0] - m[1, 1], m[1, 0] - m[0, 1]],
+            [0, 0, 0, m[0, 0] + m[1, 1] + m[2, 2]],
+        ]
+    )
+    _, vectors = np.linalg.eigh(k, UPLO="U")
+    found = vectors[:, -1]
+    return [float(value) for value in (found if found[3] >= 0 else -found)]
+
+
+def command(
+    recipe: str | None = None,
+    out: Path | None = None,
+    /,
+    *,
+    images: Count | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    backgrounds: Path | None = None,
+    model: Path | None = None,
+    scale: float | None = None,
+    resume: Annotated[bool, Parameter(negative=())] = False,
+    setup: Annotated[bool, Parameter(negative=())] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Render images of robots with exact labels, as a recipe says, into a recording.
+
+    Parameters
+    ----------
+    recipe
+        A TOML file, or the name of a shipped recipe, such as synthetic_first_look.
+    out
+        Recording to write. Must not exist.
+    images
+        Images to render. Without it, as the recipe says; so for all that follow.
+    seed
+        Another seed renders other images.
+    workers
+        Blender processes; 0: as many as there are cores. Changes no byte of the output.
+    backgrounds
+        Folder of photos to put behind the robots.
+    model
+        .blend, .glb, .obj or .stl of the robot.
+    scale
+        Metres per unit of the model; of the Crazyflie that dmrl draws, times life size.
+    resume
+        Go on with an interrupted OUT.
+    setup
+        Set up Blender, if it is not, and do nothing else if no recipe is given.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    if setup:
+        python = ensure(say)
+        if recipe is None:
+            return print_json({"python": str(python)}) if as_json else say(f"Blender: {python}")
+    if recipe is None or out is None:
+        raise SettingError("render wants a recipe and an output. Try: dmrl render --help")
+    settings = settings_of(
+        recipe,
+        images=images,
+        seed=seed,
+        workers=workers,
+        backgrounds=backgrounds,
+        model=model,
+        scale=scale,
+    )
+    result = run(settings, out, resume=resume)
+    rows = {name.replace("_", " "): value for name, value in asdict(result).items()}
+    if as_json:
+        return print_json({"recording": str(out), **rows})
+    return print_table(str(out), ("what", "count"), list(rows.items()))
