@@ -31,8 +31,9 @@ SENSOR_MM = 32.0
 # A crop's edges in the middle of pixels' quarters, so that rounding cannot move them.
 NUDGE_PX = 0.25
 PASSES = {"Combined": 4, "Depth": 1}
-LIGHT_SIZE_PX = (128, 64)
-LIGHT_CAP = 6.0
+LIGHT_SIZE_PX = (32, 16)
+MEAN_LIGHT = 0.5
+LIGHT_CAP = 8.0
 BLADE_HALF_WIDTH_M = 0.0028
 BETWEEN_ROTORS_RAD = 1.7
 
@@ -102,22 +103,33 @@ class Stage:
         return thing
 
     def world(self, lights):
-        """One world per picture of light; a request names the one it wants."""
-        self.worlds = {}
-        for name in lights:
-            world = bpy.data.worlds.new(Path(name).stem)
-            world.use_nodes = True
-            world.cycles.sampling_method = "NONE"
-            tree = world.node_tree
-            place = tree.nodes.new("ShaderNodeTexCoord")
-            turn = tree.nodes.new("ShaderNodeMapping")
-            image = tree.nodes.new("ShaderNodeTexEnvironment")
-            image.image = bpy.data.images.load(name)
-            _soften(image.image)
-            tree.links.new(place.outputs["Generated"], turn.inputs["Vector"])
-            tree.links.new(turn.outputs["Vector"], image.inputs["Vector"])
-            tree.links.new(image.outputs["Color"], tree.nodes["Background"].inputs["Color"])
-            self.worlds[name] = (world, turn, tree.nodes["Background"])
+        """One world for all panoramas, one above the other in one picture.
+
+        A world for each would be loaded anew at every change, which takes longer than a robot.
+        """
+        columns, rows = LIGHT_SIZE_PX
+        atlas = bpy.data.images.new("light", columns, rows * len(lights), float_buffer=True)
+        atlas.pixels.foreach_set(np.concatenate([_small(name) for name in lights]).ravel())
+        self.numbers = {name: k for k, name in enumerate(lights)}
+        self.scene.world = world = bpy.data.worlds.new("world")
+        world.use_nodes = True
+        world.cycles.sampling_method = "MANUAL"
+        world.cycles.sample_map_resolution = 2 * columns
+        tree = world.node_tree
+        self.background = tree.nodes["Background"]
+        place = tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"]
+        self.turn = _node(tree, "Mapping", place)
+        x, y, z = _node(tree, "SeparateXYZ", self.turn.outputs[0]).outputs
+        turn = _math(tree, "DIVIDE", _math(tree, "ARCTAN2", y, x), -2 * math.pi)
+        height = _math(tree, "DIVIDE", _math(tree, "ARCSINE", z), math.pi)
+        # Half a row from the edges, where the next panorama would shine in.
+        height = _math(tree, "MULTIPLY", _math(tree, "ADD", height, 0.5), (rows - 1) / rows)
+        height = _math(tree, "ADD", height, 0.5 / rows)
+        self.number = _node(tree, "Math", height, 0.0, operation="ADD")
+        up = _math(tree, "DIVIDE", self.number.outputs[0], len(lights))
+        where = _node(tree, "CombineXYZ", _math(tree, "ADD", turn, 0.5), up, 0.0)
+        picture = _node(tree, "TexImage", where.outputs[0], image=atlas)
+        tree.links.new(picture.outputs["Color"], self.background.inputs["Color"])
 
     def drawn(self, head, arrays):
         """The robot that dmrl draws: vertices in metres, triangles, a material each."""
@@ -201,10 +213,9 @@ class Stage:
         )
 
     def light(self, head):
-        world, turn, background = self.worlds[head["light"]]
-        self.scene.world = world
-        turn.inputs["Rotation"].default_value = head["light_turn_rad"]
-        background.inputs["Strength"].default_value = head["light_strength"]
+        self.number.inputs[1].default_value = self.numbers[head["light"]]
+        self.turn.inputs["Rotation"].default_value = head["light_turn_rad"]
+        self.background.inputs["Strength"].default_value = head["light_strength"]
         self.sun.data.energy = head["sun_strength"]
         self.sun.data.color = head["sun_colour"]
         self.sun.data.angle = head["sun_angle_rad"]
@@ -216,19 +227,26 @@ def _take_from_file():
     raise RuntimeError("this Blender does not give its passes")
 
 
-def _soften(image):
-    """Make a picture of light small, as Cycles loads it often, and cap its few huge values.
+def _small(name):
+    """(rows, columns, 4) a panorama's light by large parts, of mean MEAN_LIGHT.
 
-    Those would make fireflies; the sun of the scene is there for hard light.
+    Small hard lights would make fireflies; the sun of the scene is there for them.
     """
-    image.scale(*LIGHT_SIZE_PX)
-    pixels = np.empty(4 * LIGHT_SIZE_PX[0] * LIGHT_SIZE_PX[1], np.float32)
-    image.pixels.foreach_get(pixels)
-    image.pixels.foreach_set(np.minimum(pixels, LIGHT_CAP * pixels.mean()))
+    columns, rows = LIGHT_SIZE_PX
+    wide = _panorama(name)[::-1]
+    height, width, _ = wide.shape
+    down, across = height // rows, width // columns
+    if not (down and across):
+        raise ValueError(f"{name} is smaller than {columns}x{rows} pixels")
+    part = wide[: down * rows, : across * columns]
+    small = part.reshape(rows, down, columns, across, 3).mean(axis=(1, 3))
+    small *= MEAN_LIGHT / max(small.mean(), 1e-9)
+    small = np.minimum(small, LIGHT_CAP * MEAN_LIGHT)
+    return np.dstack([small, np.ones((rows, columns, 1))]).astype(np.float32)
 
 
 def _panorama(name):
-    """(H, W, 3) linear light of a picture, all around."""
+    """(H, W, 3) linear light of a picture, all around, top row first."""
     image = bpy.data.images.load(name)
     width, height = image.size
     pixels = np.empty(4 * width * height, np.float32)
