@@ -36,7 +36,10 @@ MATERIALS = (
 ARM_M = 0.046
 ROTOR_RADIUS_M = 0.0225
 HEIGHT_M = 0.029
-ROTOR_Z_M = HEIGHT_M / 2
+ROTOR_Z_M = HEIGHT_M / 2 - 0.0008
+BLADE_HALF_WIDTH_M = 0.0028
+BETWEEN_ROTORS_RAD = 1.7
+"""How much further each rotor has turned than the one before."""
 BOARD_Z_M = -0.0035
 MOTOR_ANGLES_RAD = np.pi / 4 + np.pi / 2 * np.arange(4)
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
@@ -71,12 +74,13 @@ def mesh() -> Mesh:
     """The whole robot. The same arrays every time: do not write into them."""
     vertices, faces, material, rotor = [], [], [], []
     count = 0
-    for k, (name, points, triangles) in enumerate([*_body(), *_rotors()]):
+    numbered = [(0, part) for part in _body()] + list(enumerate(_rotors()))
+    for number, (name, points, triangles) in numbered:
         vertices.append(points)
         faces.append(triangles + count)
         material.append(np.full(len(triangles), MATERIALS.index(name)))
         hub = points.mean(axis=0) if name == "rotor" else points
-        rotor.append(np.column_stack([(points - hub)[:, :2], np.full(len(points), float(k % 4))]))
+        rotor.append(np.column_stack([(points - hub)[:, :2], np.full(len(points), float(number))]))
         count += len(points)
     parts = (vertices, faces, material, rotor)
     return Mesh(*(np.concatenate(part) for part in parts))
@@ -207,7 +211,7 @@ def _arm(number: int) -> Iterator[Part]:
         yield _round("mount", (ARM_M, 0.0), radius, low, high)
     yield _box("mount", (ARM_M - 0.0075, 0, z - 0.0014), (0.009, 0.0080, 0.0018))
     yield _round("motor", (ARM_M, 0.0), 0.0035, -0.0125, 0.0105)
-    yield _round("mount", (ARM_M, 0.0), 0.0024, 0.0105, ROTOR_Z_M, 10)
+    yield _round("mount", (ARM_M, 0.0), 0.0024, 0.0105, HEIGHT_M / 2, 10)
     yield _box("wire", (ARM_M - 0.014, 0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
     yield _box("wire", (ARM_M - 0.014, -0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
     # As on the Crazyflie: blue behind, red and green in front.
@@ -226,4 +230,33 @@ def _rotors() -> Iterator[Part]:
     for angle in MOTOR_ANGLES_RAD:
         hub = np.array([np.cos(angle), np.sin(angle)]) * ARM_M
         points = np.concatenate([rim, [(0.0, 0.0)]]) + hub
-        yield "rotor", np.column_stack([points, np.full(sides + 1, ROTOR_Z_M - 0.0008)]), fan
+        yield "rotor", np.column_stack([points, np.full(sides + 1, ROTOR_Z_M)]), fan
+
+
+def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
+    """(N, 3) points that reach as far as what is seen of a robot: body, and swept blades.
+
+    Parameters
+    ----------
+    scale
+        Times life size.
+    first_rad
+        Angle of rotor 0 when the shutter opens.
+    sweep_rad
+        How far all rotors turn until it closes.
+    """
+    whole = mesh()
+    body = whole.vertices[np.unique(whole.faces[whole.material != MATERIALS.index("rotor")])]
+    radius = np.linspace(0.004, ROTOR_RADIUS_M, 12)
+    half = BLADE_HALF_WIDTH_M / radius
+    rim = np.linspace(-half[-1], min(sweep_rad, np.pi) + half[-1], 60)
+    angle = np.concatenate([-half, min(sweep_rad, np.pi) + half, rim])
+    radius = np.concatenate([radius, radius, np.full(60, ROTOR_RADIUS_M)])
+    points = [body]
+    for k, arm in enumerate(MOTOR_ANGLES_RAD):
+        for blade in (0.0, np.pi):
+            turn = angle + first_rad + k * BETWEEN_ROTORS_RAD + blade
+            x = np.cos(turn) * radius + np.cos(arm) * ARM_M
+            y = np.sin(turn) * radius + np.sin(arm) * ARM_M
+            points.append(np.column_stack([x, y, np.full(len(x), ROTOR_Z_M)]))
+    return np.concatenate(points) * scale

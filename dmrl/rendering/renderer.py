@@ -57,6 +57,8 @@ def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> S
         "model_scale": model.scale,
         "model_up": model.up,
         "materials": crazyflie.MATERIALS,
+        "blade_half_width_m": crazyflie.BLADE_HALF_WIDTH_M,
+        "between_rotors_rad": crazyflie.BETWEEN_ROTORS_RAD,
     }
     if model.path is not None:
         return Start(python, head)

@@ -34,8 +34,6 @@ PASSES = {"Combined": 4, "Depth": 1}
 LIGHT_SIZE_PX = (32, 16)
 MEAN_LIGHT = 0.5
 LIGHT_CAP = 8.0
-BLADE_HALF_WIDTH_M = 0.0028
-BETWEEN_ROTORS_RAD = 1.7
 
 _taken = {}
 
@@ -140,7 +138,9 @@ class Stage:
         polar.data.foreach_set("vector", arrays["rotor"].astype(np.float32).ravel())
         for k, name in enumerate(head["materials"]):
             material = bpy.data.materials.new(name)
-            _paint(material, k, rotor=name == "rotor")
+            _paint(material, k)
+            if name == "rotor":
+                _show_blades(material, head)
             mesh.materials.append(material)
         mesh.update()
         return self.add("robot", mesh)
@@ -276,7 +276,7 @@ def _property(tree, name):
     return _node(tree, "Attribute", attribute_name=name, attribute_type="OBJECT")
 
 
-def _paint(material, number, *, rotor):
+def _paint(material, number):
     """Colour and roughness from the robot's properties, so that no shader is built anew."""
     material.use_nodes = True
     material.cycles.emission_sampling = "NONE"
@@ -289,35 +289,36 @@ def _paint(material, number, *, rotor):
     tree.links.new(finish.outputs[0], surface.inputs["Roughness"])
     tree.links.new(finish.outputs[1], surface.inputs["Metallic"])
     tree.links.new(finish.outputs[2], surface.inputs["Emission Strength"])
-    if rotor:
-        tree.links.new(_rotor_opacity(tree), surface.inputs["Alpha"])
 
 
-def _rotor_opacity(tree):
-    """Share of the exposure in which one of two blades covers a point of the rotor's disc.
+def _show_blades(material, head):
+    """Opacity of the discs: the share of the exposure in which a blade covers a point.
 
     "rotor" of a point is its place on the disc, x and y in metres, and the rotor's number;
     the robot has the first angle of rotor 0 and how far all turn while the shutter is open.
     """
+    tree = material.node_tree
     place = _node(tree, "Attribute", attribute_name="rotor", attribute_type="GEOMETRY")
     x, y, number = _node(tree, "SeparateXYZ", place.outputs["Vector"]).outputs
     first = _property(tree, "rotor_first_rad").outputs["Fac"]
     sweep = _property(tree, "rotor_sweep_rad").outputs["Fac"]
     # Half a turn of two blades covers all there is to cover.
     sweep = _math(tree, "MINIMUM", _math(tree, "MAXIMUM", sweep, 0.02), math.pi)
-    first = _math(tree, "ADD", first, _math(tree, "MULTIPLY", number, BETWEEN_ROTORS_RAD))
+    first = _math(tree, "ADD", first, _math(tree, "MULTIPLY", number, head["between_rotors_rad"]))
     angle = _math(tree, "SUBTRACT", _math(tree, "ARCTAN2", y, x), first)
     after = _math(tree, "FLOORED_MODULO", angle, math.pi)
     radius = _node(tree, "VectorMath", place.outputs["Vector"], (1, 1, 0), operation="MULTIPLY")
     radius = _node(tree, "VectorMath", radius.outputs[0], operation="LENGTH").outputs["Value"]
-    half = _math(tree, "DIVIDE", BLADE_HALF_WIDTH_M, _math(tree, "MAXIMUM", radius, 0.002))
+    half = _math(tree, "MAXIMUM", radius, 0.002)
+    half = _math(tree, "DIVIDE", head["blade_half_width_m"], half)
     total = None
     for blade in (after, _math(tree, "SUBTRACT", after, math.pi)):
         end = _math(tree, "MINIMUM", _math(tree, "ADD", blade, half), sweep)
         begin = _math(tree, "MAXIMUM", _math(tree, "SUBTRACT", blade, half), 0.0)
         share = _math(tree, "MAXIMUM", _math(tree, "SUBTRACT", end, begin), 0.0)
         total = share if total is None else _math(tree, "ADD", total, share)
-    return _math(tree, "MINIMUM", _math(tree, "DIVIDE", total, sweep), 1.0)
+    opacity = _math(tree, "MINIMUM", _math(tree, "DIVIDE", total, sweep), 1.0)
+    tree.links.new(opacity, tree.nodes["Principled BSDF"].inputs["Alpha"])
 
 
 def _meshes(path):
