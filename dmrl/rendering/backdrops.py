@@ -1,5 +1,6 @@
 """What is behind the robots: photos, or what a panorama shows in the camera's direction."""
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -144,12 +145,12 @@ def _panorama_from_camera(turn_rad: tuple[float, float, float]) -> Array:
     """Rz(turn) Ry(pitch) Rx(roll), as Blender's mapping of XYZ angles."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(turn_rad), np.sin(turn_rad)
     tilt = np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
-    return np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    return np.asarray(np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ tilt)
 
 
 def smeared(picture: Picture, move_px: Sequence[float]) -> Picture:
     """(H, W, 3) picture that moved by so many pixels, u and v, while the shutter was open."""
-    steps = int(np.ceil(np.hypot(*move_px)))
+    steps = int(np.ceil(math.hypot(*move_px)))
     if steps < 1:
         return picture
     shares = np.linspace(-0.5, 0.5, steps + 1)

@@ -81,7 +81,7 @@ def _box(canvas: Canvas, camera: Camera, layer: Layer, seen: NDArray[np.bool_]) 
     outline = np.column_stack([u + layer.left_px, v + layer.top_px]) - canvas.shift_px
     bent = image_from_pinhole(outline, camera)
     box = np.concatenate([bent.min(axis=0), bent.max(axis=0)])
-    return np.clip(box, 0, (camera.width_px, camera.height_px) * 2)
+    return np.asarray(np.clip(box, 0, (camera.width_px, camera.height_px) * 2))
 
 
 def _place(
@@ -152,7 +152,7 @@ def _smeared(light: Picture, places: Picture, move_px: Array) -> Picture:
     total = np.zeros((*places.shape[:2], 4), np.float32)
     for share in (np.arange(taps) + 0.5) / taps - 0.5:
         total += sample(light, places - (share * move_px).astype(np.float32))
-    return total / np.float32(taps)
+    return np.asarray(total / np.float32(taps), np.float32)
 
 
 def _move_px(camera: Camera, robot: Robot) -> Array:

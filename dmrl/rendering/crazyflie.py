@@ -143,7 +143,7 @@ def _rounded(
             (half_x - cut, -half_y),
         ]
     )
-    return name, *_prism(outline + (x, y), z - size[2] / 2, z + size[2] / 2)
+    return name, *_prism(outline + np.array([x, y]), z - size[2] / 2, z + size[2] / 2)
 
 
 def _body() -> Iterator[Part]:

@@ -89,7 +89,7 @@ def _radius2(height: int, width: int) -> Picture:
     """Squared distance from the middle, 1 in the corners."""
     v, u = np.mgrid[:height, :width] + 0.5
     u, v = u / width * 2 - 1, v / height * 2 - 1
-    return ((u * u + v * v) / 2).astype(np.float32)
+    return np.asarray((u * u + v * v) / 2, np.float32)
 
 
 def blur(picture: Picture, sigma_px: float) -> Picture:

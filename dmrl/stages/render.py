@@ -1,6 +1,7 @@
 """``dmrl render``: a recipe to a recording of rendered images with exact labels."""
 
 import json
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
@@ -20,11 +21,18 @@ from dmrl.images import encode_jpeg, encode_png
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
-from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter, interrupted, provenance
+from dmrl.recording import (
+    SPLIT_METADATA,
+    Provenance,
+    RecordingWriter,
+    columns,
+    interrupted,
+    provenance,
+)
 from dmrl.rendering.backdrops import Photos
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.randomise import Drawn, World, draw_scene
-from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.renderer import Model, Renderer, Scene
 from dmrl.rendering.settings import PRESETS, Settings
 from dmrl.rendering.shot import Shot
 from dmrl.tables import print_json, print_table
@@ -38,10 +46,10 @@ Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What was rendered: images, robots in them, images without, broken photos left out."""
+    """What was rendered: images, labels in them, images without, broken photos left out."""
 
     images: int
-    robots: int
+    labels: int
     empty_images: int
     broken_photos: int
     resumed_images: int
@@ -129,10 +137,20 @@ def run(settings: Settings, out: Path, *, resume: bool = False) -> Result:
             cache(renderer.panorama),
             photos,
         )
-        counts = _render(world, renderer, sink, done)
+        _render(world, renderer, sink, done)
     before.forget()
     broken = len(photos.broken) if photos is not None else 0
-    return Result(settings.images, *counts, broken, done)
+    return Result(settings.images, *_counts(out), broken, done)
+
+
+def _counts(out: Path) -> tuple[int, int]:
+    """Labels, and images without, of a recording."""
+    numbers = [
+        len(peers)
+        for batch in columns(out, topics.labels(ROBOT), fields=["peers"])
+        for peers in batch["peers"].to_pylist()
+    ]
+    return sum(numbers), numbers.count(0)
 
 
 def _provenance(settings: Settings, blender: str) -> Provenance:
@@ -164,28 +182,22 @@ def _panoramas(folder: Path) -> list[Path]:
     return found
 
 
-def _render(world: World, renderer: Renderer, sink: RecordingWriter, done: int) -> tuple[int, int]:
-    """Robots and images without robots that were rendered, from image ``done`` on."""
+def _render(world: World, renderer: Renderer, sink: RecordingWriter, done: int) -> None:
+    """Write every image from number ``done`` on, in order, as it arrives."""
     settings, camera = world.settings, world.camera
     if not done:
         _write(sink, calibration(0, ROBOT, camera))
-    drawn: list[Drawn] = []
+    drawn: deque[Drawn] = deque()
 
-    def scenes() -> Iterator[Any]:
+    def scenes() -> Iterator[Scene]:
         for index in range(done, settings.images):
-            scene = draw_scene(world, index)
-            drawn.append(scene)
-            yield camera, scene.robots, scene.look
+            drawn.append(draw_scene(world, index))
+            yield camera, drawn[-1].robots, drawn[-1].look
 
-    robots = empty = 0
     shots = track(renderer.shots(scenes()), "Rendering", settings.images - done)
     for index, shot in enumerate(shots, done):
-        scene = drawn.pop(0)
-        for sample in samples(_time_ns(settings, index), settings, scene, shot):
+        for sample in samples(_time_ns(settings, index), settings, drawn.popleft(), shot):
             _write(sink, sample)
-        robots += len(scene.robots)
-        empty += not scene.robots
-    return robots, empty
 
 
 def _write(sink: RecordingWriter, sample: Sample) -> None:

@@ -7,7 +7,7 @@ library and NumPy.
 import json
 import struct
 from collections.abc import Mapping
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ _LENGTH = struct.Struct("<Q")
 Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
 
-def send(stream: BinaryIO, head: Mapping[str, Any], arrays: Arrays | None = None) -> None:
+def send(stream: IO[bytes], head: Mapping[str, Any], arrays: Arrays | None = None) -> None:
     """Write one message.
 
     Parameters
@@ -37,7 +37,7 @@ def send(stream: BinaryIO, head: Mapping[str, Any], arrays: Arrays | None = None
     stream.flush()
 
 
-def receive(stream: BinaryIO) -> tuple[dict[str, Any], Arrays]:
+def receive(stream: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
     """Read one message: its head and its arrays.
 
     Raises
@@ -55,7 +55,7 @@ def receive(stream: BinaryIO) -> tuple[dict[str, Any], Arrays]:
     return message["head"], arrays
 
 
-def _exactly(stream: BinaryIO, count: int) -> bytes:
+def _exactly(stream: IO[bytes], count: int) -> bytes:
     data = b""
     while len(data) < count:
         part = stream.read(count - len(data))
