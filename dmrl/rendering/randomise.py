@@ -235,6 +235,7 @@ def _sensor(settings: Settings, rng: Generator) -> Sensor:
         brightness=_between(rng, settings.brightness),
         contrast_gamma=_between(rng, settings.contrast_gamma),
         balance=(warmth, 1.0, 1 / warmth),
+        saturation=_between(rng, settings.saturation),
         vignetting=_between(rng, settings.vignetting),
         defocus_px=_between(rng, settings.defocus_px),
         bayer=settings.bayer,

@@ -24,6 +24,8 @@ class Sensor:
         1: values are proportional to light, as raw sensors give; 2.2: as screens expect.
     balance
         Red, green and blue gains.
+    saturation
+        1: colours as they are; 0: grey. Small sensors' filters let other colours through.
     vignetting
         Light lost in the farthest corner, 0 to 1.
     defocus_px
@@ -39,6 +41,7 @@ class Sensor:
     brightness: float = 0.4
     contrast_gamma: float = 2.2
     balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    saturation: float = 1.0
     vignetting: float = 0.0
     defocus_px: float = 0.0
     bayer: bool = False
@@ -62,7 +65,7 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
     mean = max(float(light.reshape(-1, 3).mean(axis=0) @ LUMINANCE), 1e-6)
     gain = np.array(sensor.balance, np.float32) * np.float32(target / mean)
     height, width, _ = light.shape
-    values = blur(light, sensor.defocus_px)
+    values = blur(_mixed(light, sensor.saturation), sensor.defocus_px)
     if sensor.vignetting > 0:
         falloff = 1 - np.float32(sensor.vignetting) * _radius2(height, width)
         values = values * falloff[..., None]
@@ -73,6 +76,14 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
     if sensor.contrast_gamma != 1:
         values = np.power(values, np.float32(1 / sensor.contrast_gamma))
     return np.asarray(np.clip(values * 255 + 0.5, 0, 255), np.uint8)
+
+
+def _mixed(light: Picture, saturation: float) -> Picture:
+    if saturation == 1:
+        return light
+    mix = np.float32(saturation) * np.eye(3, dtype=np.float32)
+    mix += np.float32(1 - saturation) * LUMINANCE
+    return light @ mix.T
 
 
 def _noisy(values: Picture, sensor: Sensor, rng: Generator) -> Picture:

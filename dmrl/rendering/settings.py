@@ -36,6 +36,7 @@ LIMITS: dict[str, Range] = {
     "brightness": (0.02, 0.98),
     "contrast_gamma": (0.5, 3),
     "warmth": (0.2, 5),
+    "saturation": (0, 1),
     "vignetting": (0, 1),
     "defocus_px": (0, 10),
     "shot_noise": (0, 0.1),
@@ -120,6 +121,8 @@ class Settings:
         Range of the response: 1 is proportional to light, 2.2 as screens expect.
     warmth
         Range of red over blue; every factor is as likely.
+    saturation
+        Range of how well the sensor tells colours apart, 0 to 1.
     vignetting
         Range of light lost in the corners, 0 to 1.
     defocus_px
@@ -171,6 +174,7 @@ class Settings:
     brightness: Range = (0.3, 0.6)
     contrast_gamma: Range = (2.2, 2.2)
     warmth: Range = (0.9, 1.1)
+    saturation: Range = (1.0, 1.0)
     vignetting: Range = (0.0, 0.0)
     defocus_px: Range = (0.0, 0.0)
     bayer: bool = False
@@ -211,15 +215,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         "shutter_s": [0.002, 0.012],
         "shake_max_dps": 40.0,
         "background_blur_px": [0.2, 1.2],
-        "robot_gain": [0.25, 1.2],
+        "robot_gain": [0.2, 1.0],
         "brightness": [0.22, 0.5],
-        "contrast_gamma": [1.0, 1.4],
-        "warmth": [0.6, 3.0],
-        "vignetting": [0.45, 0.85],
-        "defocus_px": [0.5, 1.1],
+        "contrast_gamma": [1.2, 1.9],
+        "warmth": [0.5, 4.0],
+        "saturation": [0.4, 0.8],
+        "vignetting": [0.5, 0.9],
+        "defocus_px": [0.6, 1.4],
         "bayer": True,
-        "shot_noise": [0.001, 0.005],
-        "read_noise": [0.008, 0.03],
+        "shot_noise": [0.0005, 0.003],
+        "read_noise": [0.004, 0.015],
         "jpeg_quality": [80, 95],
     },
     # The authors' renders: f = 120 px about the middle, twice life size, a clean camera.
