@@ -17,6 +17,8 @@ from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch import Pose
 
 TRIES = 30
+# Of panoramas, whose suns and lamps would leave nothing else to see; photos end below.
+HIGHLIGHTS = 3.0
 
 # Base colour, roughness, metallic, glow of every material; linear light.
 PALETTE: Mapping[str, tuple[tuple[float, float, float], float, float, float]] = {
@@ -207,7 +209,7 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
     shake = rng.normal(size=2)
     shake *= np.radians(settings.shake_max_dps) * rng.random() / np.linalg.norm(shake)
     backdrop = smeared(backdrop, (shake * shutter_s * world.camera.fx_px).tolist())
-    backdrop = np.minimum(backdrop, 4 * max(float(backdrop.mean()), 1e-3))
+    backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
     gain = _factor(rng, settings.robot_gain) * float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
     return Look(backdrop, _light(settings, rng, name, turn), _sensor(settings, rng), gain, seed)

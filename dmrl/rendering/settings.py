@@ -216,7 +216,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "shake_max_dps": 40.0,
         "background_blur_px": [0.2, 1.2],
         "robot_gain": [0.2, 1.0],
-        "brightness": [0.22, 0.5],
+        "brightness": [0.28, 0.55],
         "contrast_gamma": [1.2, 1.9],
         "warmth": [0.5, 4.0],
         "saturation": [0.4, 0.8],
