@@ -31,8 +31,8 @@ class Pairs:
 
     Parameters
     ----------
-    images
-        Number of images.
+    at
+        Robot and log time of each image.
     labels
         Those inside the image, from one source.
     detections
@@ -43,11 +43,16 @@ class Pairs:
         Why images and labels were left out, and how many.
     """
 
-    images: int
+    at: list[tuple[str, int]]
     labels: Points
     detections: Points
     threshold: float = 0.0
     left_out: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def images(self) -> int:
+        """Number of images."""
+        return len(self.at)
 
 
 def join(recording: Path, against: str, split: str | None = None) -> Pairs:
@@ -130,7 +135,8 @@ def _join_robot(
     every = _column(detected, "detections")
     detections = _points(every, None, in_detections, len(detected))
     threshold = float(np.max(_column(detected, "threshold").to_numpy(), initial=0.0))
-    return Pairs(len(judged), labels.select(inside), detections, threshold, left_out)
+    at = [(robot, int(time_ns)) for time_ns in judged]
+    return Pairs(at, labels.select(inside), detections, threshold, left_out)
 
 
 def _usable(
@@ -177,7 +183,7 @@ def _together(parts: list[Pairs]) -> Pairs:
     for part in parts:
         left_out.update(part.left_out)
     return Pairs(
-        int(first[-1]),
+        [at for part in parts for at in part.at],
         Points.concatenate([p.labels for p in parts], first),
         Points.concatenate([p.detections for p in parts], first),
         max(part.threshold for part in parts),

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import RecipeError, SettingError
+from dmrl.errors import DmrlError, RecipeError, SettingError
 from dmrl.output import partial_of
 from dmrl.progress import say
 from dmrl.recipe import Pipeline, Step
@@ -129,7 +129,12 @@ def _do(step: Step, folder: Path, data: Path | None, count: str) -> Done:
         return Done(step.stage, out, 0.0, skipped=True)
     say(f"{count} {step.stage}: {out}")
     begun = time.perf_counter()
-    _call(step, [_located(name, folder, data) for name in step.inputs], out)
+    try:
+        _call(step, [_located(name, folder, data) for name in step.inputs], out)
+    except DmrlError as e:
+        if not step.optional:
+            raise
+        say(f"{count} {step.stage}: left out. {e}")
     return Done(step.stage, out, time.perf_counter() - begun, skipped=False)
 
 
@@ -175,7 +180,8 @@ def report(done: list[Done], *, as_json: bool = False) -> None:
         for d in done
         if (d.out / EVALUATION_NAME).is_file()
     }
-    pictures = [picture for d in done for picture in _pictures(d.out)]
+    # What a stage drew for training is data, not a picture of the result.
+    pictures = [picture for d in done if d.stage != "sketch" for picture in _pictures(d.out)]
     if as_json:
         print_json(
             {
@@ -200,4 +206,6 @@ def _row(document: dict[str, Any]) -> list[str]:
 
 
 def _pictures(out: Path) -> list[Path]:
-    return sorted(out.rglob("*.png")) if out.is_dir() else [out] * (out.suffix == ".png")
+    if out.is_dir():
+        return sorted(out.rglob("*.png"))
+    return [out] if out.suffix == ".png" and out.exists() else []

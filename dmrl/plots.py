@@ -1,12 +1,14 @@
 """Figures of datasets and evaluations, as PNG and SVG. The only home of matplotlib and pandas."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.colours import RGB
 from dmrl.errors import MissingExtra
 
 try:
@@ -218,3 +220,87 @@ def _medians(
         for k in range(len(edges) - 1)
     ]
     return edges, np.array(medians)
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """One image with its labels and what the network made of it.
+
+    Parameters
+    ----------
+    title
+        Line above it.
+    rgb
+        (H, W, 3) uint8.
+    confidence, depth_m
+        (rows, cols) of the network.
+    labels_px, detections_px
+        (N, 2) pixels, u right and v down.
+    source
+        Source of the labels.
+    """
+
+    title: str
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float64]
+    depth_m: NDArray[np.float64]
+    labels_px: NDArray[np.float64]
+    detections_px: NDArray[np.float64]
+    source: str
+
+
+def examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) -> None:
+    """A row per example: image with labels and detections, confidence map, depth map.
+
+    Parameters
+    ----------
+    shown
+        At least one.
+    stem
+        Path without suffix.
+    depth_max_m
+        Depth of the last colour, metres.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure((10.5, 2.6 * len(shown) + 0.6), layout="constrained")
+        grid = figure.subplots(len(shown), 3, squeeze=False)
+        maps: list[Any] = []
+        for row, example in zip(grid, shown, strict=True):
+            height, width = example.rgb.shape[:2]
+            at = {"extent": (0, width, height, 0)}  # pixel-edge coordinates
+            row[0].imshow(example.rgb, **at)
+            row[0].set_title(example.title, fontsize=9, loc="left")
+            maps = [
+                row[1].imshow(example.confidence, vmin=0, vmax=1, cmap="inferno", **at),
+                row[2].imshow(example.depth_m, vmin=0, vmax=depth_max_m, cmap="turbo", **at),
+            ]
+            for axes in row:
+                _mark(axes, example)
+                axes.set(xticks=[], yticks=[])
+        for column, (image, name) in enumerate(
+            zip(maps, ("confidence", "depth, m"), strict=True), start=1
+        ):
+            figure.colorbar(image, ax=grid[:, column], location="bottom", shrink=0.8, label=name)
+        handles, names = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower left", ncols=2, frameon=False)
+    save(figure, stem)
+
+
+def _mark(axes: Any, example: Example) -> None:
+    """Labels as squares, detections as crosses, in their colours with a dark rim."""
+    marks = (
+        (example.labels_px, "s", 9, example.source, f"label ({example.source})"),
+        (example.detections_px, "x", 6, "detection", "detection"),
+    )
+    for uv_px, marker, points, kind, name in marks:
+        colour = tuple(value / 255 for value in RGB.get(kind, RGB["other"]))
+        for edge, ink, words in ((2.6, "black", None), (1.3, colour, name)):
+            axes.plot(
+                *uv_px.reshape(-1, 2).T,
+                marker,
+                markersize=points,
+                markerfacecolor="none",
+                markeredgecolor=ink,
+                markeredgewidth=edge,
+                label=words,
+            )

@@ -36,12 +36,15 @@ class Step:
         What it reads: outputs of earlier steps, or ``{data}/...`` below ``--data``.
     settings
         The stage's settings.
+    optional
+        Go on without it where it cannot be done.
     """
 
     stage: str
     out: str
     inputs: tuple[str, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
+    optional: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,19 +141,16 @@ def load_pipeline(
     content = text(name)
     keys = _parse(name, content)
     _check_kind(name, keys, "pipeline")
-    faults = [f"  {k}: extra inputs are not permitted" for k in keys if k not in ("kind", "step")]
+    faults = [f"{k}: extra inputs are not permitted" for k in keys if k not in ("kind", "step")]
     steps = keys.get("step")
     if not isinstance(steps, list) or not steps:
-        raise _faulty(name, [*faults, "  step: at least one [[step]] is required"])
+        raise _faulty(name, [*faults, "step: at least one [[step]] is required"])
     for k, step in enumerate(steps):
-        faults += [f"  step.{k + 1}.{fault}" for fault in _step_faults(step, stages, schema_of)]
+        faults += [f"step.{k + 1}.{fault}" for fault in _step_faults(step, stages, schema_of)]
     if faults:
         raise _faulty(name, faults)
     return Pipeline(
-        tuple(
-            Step(s["stage"], s["out"], tuple(s.get("inputs", ())), s.get("settings", {}))
-            for s in steps
-        ),
+        tuple(Step(**{**step, "inputs": tuple(step.get("inputs", ()))}) for step in steps),
         content,
     )
 
@@ -164,7 +164,7 @@ def check(name: str | Path, keys: Mapping[str, Any], schema: type[Settings]) -> 
         Naming the recipe and every wrong key.
     """
     if faults := _faults(keys, schema):
-        raise _faulty(name, [f"  {fault}" for fault in faults])
+        raise _faulty(name, faults)
     return _instance(keys, schema)
 
 
@@ -188,7 +188,7 @@ def _check_kind(name: str | Path, keys: Mapping[str, Any], kind: str) -> None:
 def _faulty(name: str | Path, faults: Iterable[str]) -> RecipeError:
     lines = list(faults)
     keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
-    return RecipeError("\n".join([f"{name} has {keys}:", *lines]))
+    return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Mend them all")
 
 
 def _step_faults(

@@ -22,7 +22,7 @@ HEAVY = {
 }
 OPTIONAL = (
     *("torch", "safetensors", "tensorboard", "h5py", "rerun", "rerun_cli", "matplotlib", "pandas"),
-    *("datasets", "foxglove_schemas_protobuf", "grpc_tools", "mcap_protobuf", "scipy"),
+    *("datasets", "foxglove_schemas_protobuf", "grpc_tools", "mcap_protobuf"),
 )
 STAGES = Path(cli.__file__).parent / "stages"
 

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from dmrl import pipeline
-from dmrl.errors import RecipeError, SettingError
+from dmrl.errors import DmrlError, RecipeError, SettingError
 
 SMALL = """
 kind = "pipeline"
@@ -123,3 +123,25 @@ def test_three_wrong_keys_are_all_named(tmp_path: Path) -> None:
     assert "3 wrong keys" in str(caught.value)
     for key in ("sed:", "step.1.settings.imags:", "step.4.settings.epochs:"):
         assert key in str(caught.value)
+
+
+def test_an_optional_step_that_fails_is_left_out_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (
+        SMALL.split('[[step]]\nstage = "dataset"')[0]
+        + """
+[[step]]
+stage = "evaluate"
+inputs = ["pictures.mcap"]
+out = "evaluation"
+optional = true
+"""
+    )
+    done = pipeline.run(write(tmp_path, text), tmp_path / "out")
+    assert not done[-1].out.exists()
+    assert "evaluate: left out." in capsys.readouterr().err
+    pipeline.report(done)
+    with pytest.raises(DmrlError, match="has no detections"):
+        recipe = write(tmp_path, text.replace("optional = true", ""))
+        pipeline.run(recipe, tmp_path / "again")

@@ -63,13 +63,18 @@ def test_settings_come_from_the_file_and_the_rest_from_the_defaults(write: Write
     assert recipe.load(path, "draw", Settings) == Settings(3, 2.0, "hand", Path("a/b"), (64, 48))
 
 
+def keys_of(error: RecipeError) -> list[str]:
+    """Keys that a one-line error names."""
+    faults = str(error).split(" wrong key", 1)[1].split(": ", 1)[1]
+    return [fault.split(":")[0] for fault in faults.split("; ")]
+
+
 def test_every_wrong_key_is_named(write: Write) -> None:
     path = write('kind = "draw"\nimagse = 3\nrate_hz = "fast"\nlabel = "guess"\n')
     with pytest.raises(RecipeError) as caught:
         recipe.load(path, "draw", Settings)
-    head, *faults = str(caught.value).splitlines()
-    assert head == f"{path} has 3 wrong keys:"
-    assert sorted(line.split(":")[0].strip() for line in faults) == ["imagse", "label", "rate_hz"]
+    assert str(caught.value).startswith(f"{path} has 3 wrong keys: ")
+    assert sorted(keys_of(caught.value)) == ["imagse", "label", "rate_hz"]
 
 
 @pytest.mark.parametrize(
@@ -86,11 +91,14 @@ def test_every_wrong_key_is_named(write: Write) -> None:
 def test_values_are_not_bent_to_fit(write: Write, line: str, key: str | None) -> None:
     with pytest.raises(RecipeError) as caught:
         recipe.load(write(f'kind = "draw"\n{line}\n'), "draw", Settings)
-    assert "is not TOML" in str(caught.value) if key is None else f"  {key}" in str(caught.value)
+    if key is None:
+        assert "is not TOML" in str(caught.value)
+    else:
+        assert keys_of(caught.value)[0].startswith(key)
 
 
 def test_a_setting_without_a_default_must_be_given(write: Write) -> None:
-    with pytest.raises(RecipeError, match=r"has 1 wrong key:\n  robot: field required"):
+    with pytest.raises(RecipeError, match=r"has 1 wrong key: robot: field required"):
         recipe.load(write('kind = "fly"\n'), "fly", Needy)
 
 
@@ -169,8 +177,7 @@ def test_every_fault_of_a_pipeline_is_named_with_its_step(write: Write) -> None:
     text = PIPELINE.replace("images = 3", "imagse = 3").replace('robot = "cf1"', "robot = 1")
     with pytest.raises(RecipeError) as caught:
         recipe.load_pipeline(write(f"seed = 3\n{text}"), SCHEMAS, SCHEMAS.__getitem__)
-    faults = [line.split(":")[0].strip() for line in str(caught.value).splitlines()[1:]]
-    assert faults == ["seed", "step.1.settings.imagse", "step.2.settings.robot"]
+    assert keys_of(caught.value) == ["seed", "step.1.settings.imagse", "step.2.settings.robot"]
 
 
 @pytest.mark.parametrize(

@@ -13,19 +13,11 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
+from dmrl.colours import RGB
+
 STRIDE_PX = 8
 """Pixels per cell where a GridMap does not say; the published network's."""
 
-# After Okabe and Ito, told apart by colour-blind eyes, but as bright as text on grey must be.
-# One source, one colour, everywhere.
-COLOURS = {
-    "truth": (60, 235, 160),
-    "estimate": (110, 200, 255),
-    "published": (250, 240, 90),
-    "hand": (255, 165, 215),
-    "detection": (255, 150, 60),
-    "other": (200, 200, 200),
-}
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 # rerun takes a negative radius in points of the screen: the same at every zoom.
 POINT_UI, FAINT_POINT_UI, LINE_UI = -4.0, -1.5, -1.0
@@ -129,9 +121,9 @@ def labels(topic: str, batch: pa.RecordBatch, sources: set[str]) -> Iterator[Ent
 def _labels_of(
     topic: str, source: str, peers: pa.StructArray, row_of: NDArray[np.intp], rows: int
 ) -> Iterator[Entity]:
-    colour = COLOURS.get(source, COLOURS["other"])
+    colour = RGB.get(source, RGB["other"])
     # Where two sources agree, the one named first in the table is seen.
-    order = 30.0 - list(COLOURS).index(source if source in COLOURS else "other")
+    order = 30.0 - list(RGB).index(source if source in RGB else "other")
     edges = peers.field("box_px")
     boxed = edges.value_lengths().to_numpy() == 4
     corners = edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
@@ -178,7 +170,7 @@ def detections(topic: str, batch: pa.RecordBatch) -> Iterator[Entity]:
         labels=texts,
         radii=np.where(believed, POINT_UI, FAINT_POINT_UI),
     )
-    style = rr.Points2D.from_fields(colors=[COLOURS["detection"]], draw_order=40.0)
+    style = rr.Points2D.from_fields(colors=[RGB["detection"]], draw_order=40.0)
     yield Entity(topic, columns.partition(column.value_lengths().to_numpy()), (style,))
 
 

@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from dmrl.viewer.entities import COLOURS, LINE_UI, Entity, Scale, map_style
+from dmrl.colours import RGB
+from dmrl.viewer.entities import LINE_UI, Entity, Scale, map_style
 
 HEIGHT_PX = 26
 """Room that the legend and the colour bars take below an image, pixels."""
@@ -32,7 +33,7 @@ def legend(robot: str, sources: Sequence[str], width_px: int, height_px: int) ->
     y_px = height_px + MARK_PX
     marks = rr.LineStrips2D(
         [[[x_px, y_px], [x_px + 2 * MARK_PX, y_px]] for x_px in left_px],
-        colors=[COLOURS.get(source, COLOURS["other"]) for source in sources],
+        colors=[RGB.get(source, RGB["other"]) for source in sources],
         labels=list(sources),
         radii=2 * LINE_UI,
     )

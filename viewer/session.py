@@ -10,6 +10,7 @@ import pyarrow as pa
 import rerun as rr
 
 from dmrl import images, topics
+from dmrl.colours import RGB
 from dmrl.errors import OutputError
 from dmrl.output import partial_file
 from dmrl.progress import track
@@ -110,7 +111,7 @@ def _log_robot(
         stream.send_columns(escaped(entity.path), times, entity.columns)
     if topics.detections(eye.robot) in styled:
         sources.add("detection")
-    shown = [source for source in entities.COLOURS if source in sources]
+    shown = [source for source in RGB if source in sources]
     shown += sorted(sources - set(shown))
     _log_style(stream, legend(eye.robot, shown, eye.width_px, eye.height_px))
     bars = {channel: scales[channel] for channel in eye.channels}

@@ -1,4 +1,4 @@
-"""Which detection belongs to which label. NumPy only.
+"""Which detection belongs to which label.
 
 Two questions, two rules. *How far off is the network* (``errors``): an image with N labels
 has its N most confident detections matched one-to-one with the least total distance; for one
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -119,57 +120,10 @@ def partners(labels: Points, detections: Points) -> Index:
             labels.u_px[rows, None] - detections.u_px[columns],
             labels.v_px[rows, None] - detections.v_px[columns],
         )
-        chosen = assign(distance_px)
-        out[rows] = np.where(chosen < 0, -1, first[start] + chosen)
+        taken, chosen = linear_sum_assignment(distance_px)
+        out[rows] = -1
+        out[start + taken] = first[start] + chosen
     return out
-
-
-def assign(cost: Array) -> Index:
-    """(rows,) column of each row with the least total cost, -1 for rows without one.
-
-    Shortest augmenting paths (Jonker and Volgenant 1987) on a dense (rows, cols) matrix.
-    """
-    if cost.shape[0] > cost.shape[1]:
-        row_of = assign(cost.T)
-        out = np.full(cost.shape[0], -1, np.int64)
-        out[row_of] = np.arange(cost.shape[1])
-        return out
-    rows, cols = cost.shape
-    row_price, col_price = np.zeros(rows), np.zeros(cols + 1)
-    row_of = np.full(cols + 1, -1)  # the last column is where each new row starts
-    for row in range(rows):
-        row_of[cols] = row
-        col, came_from = _shortest_path(cost, row_of, row_price, col_price)
-        while col != cols:
-            row_of[col] = row_of[came_from[col]]
-            col = int(came_from[col])
-    out = np.empty(rows, np.int64)
-    taken = np.flatnonzero(row_of[:cols] >= 0)
-    out[row_of[taken]] = taken
-    return out
-
-
-def _shortest_path(
-    cost: Array, row_of: Index, row_price: Array, col_price: Array
-) -> tuple[int, Index]:
-    """The free column that the last column of ``row_of`` reaches, and the way back to it."""
-    cols = cost.shape[1]
-    distance = np.full(cols, np.inf)
-    came_from = np.full(cols, cols)
-    visited = np.zeros(cols + 1, bool)
-    col = cols
-    while row_of[col] >= 0:
-        visited[col] = True
-        row = row_of[col]
-        reduced = cost[row] - row_price[row] - col_price[:cols]
-        nearer = ~visited[:cols] & (reduced < distance)
-        distance[nearer], came_from[nearer] = reduced[nearer], col
-        col = int(np.argmin(np.where(visited[:cols], np.inf, distance)))
-        step = distance[col]
-        row_price[row_of[visited]] += step
-        col_price[visited] -= step
-        distance[~visited[:cols]] -= step
-    return col, came_from
 
 
 def hits(labels: Points, detections: Points, radius_px: float) -> Index:

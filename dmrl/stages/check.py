@@ -2,13 +2,18 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from dmrl.recording import check as findings_of
 from dmrl.recording import summary
 from dmrl.tables import print_json
 
 
-def command(recording: Path, /, *, json: bool = False) -> int:
+def command(
+    recording: Path, /, *, as_json: Annotated[bool, Parameter(name="--json", negative=())] = False
+) -> int:
     """Check a recording: schemas, times, gaps, calibration, labels.
 
     Exit status 1 if there are errors; warnings alone leave it 0.
@@ -17,12 +22,12 @@ def command(recording: Path, /, *, json: bool = False) -> int:
     ----------
     recording
         A recording.
-    json
+    as_json
         Print one JSON document instead of lines.
     """
     findings = findings_of(recording)
     errors = sum(f.level == "error" for f in findings)
-    if json:
+    if as_json:
         print_json({"recording": recording.name, "findings": [asdict(f) for f in findings]})
     else:
         for finding in findings:

@@ -16,11 +16,11 @@ from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import input_of
 from dmrl.tables import print_json, print_table
 
-plots: ModuleType | None
+figures: ModuleType | None
 try:
-    from dmrl import plots
+    from dmrl import figures
 except MissingExtra:
-    plots = None
+    figures = None
 
 DOCUMENT_NAME = "evaluation.json"
 FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
@@ -99,7 +99,7 @@ def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
     """
     if out is not None:
         refuse_existing(out)
-        if plots is None:
+        if figures is None:
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
     pairs = join(recording, settings.against, settings.split)
     threshold = settings.threshold
@@ -112,15 +112,9 @@ def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
         with partial_folder(out) as folder:
             text = json.dumps(document(recording, settings, evaluation), indent=1, allow_nan=False)
             (folder / DOCUMENT_NAME).write_text(text + "\n", encoding="utf-8")
-            _draw(folder, scored)
+            assert figures is not None
+            figures.draw(folder, recording, pairs, scored, settings.against, threshold)
     return evaluation
-
-
-def _draw(folder: Path, scored: Scored) -> None:
-    assert plots is not None
-    error, depth_m = scored.label_error, scored.labels.depth_m
-    plots.error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
-    plots.error_by_distance(depth_m, error.norm_px, error.depth_m, folder / "error-by-distance")
 
 
 def document(recording: Path, settings: Settings, evaluation: Evaluation) -> dict[str, Any]:

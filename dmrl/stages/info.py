@@ -1,24 +1,28 @@
 """info: what a recording holds and where it comes from."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import Parameter
 
 from dmrl.recording import Provenance, Summary, summary
 from dmrl.tables import print_json, print_table
 
 
-def command(recording: Path, /, *, json: bool = False) -> None:
+def command(
+    recording: Path, /, *, as_json: Annotated[bool, Parameter(name="--json", negative=())] = False
+) -> None:
     """Show what a recording holds and where it comes from.
 
     Parameters
     ----------
     recording
         A recording.
-    json
+    as_json
         Print one JSON document instead of tables.
     """
     found = summary(recording)
-    if json:
+    if as_json:
         print_json(document(recording, found))
         return
     print(headline(recording, found))

@@ -22,12 +22,13 @@ def run(recordings: Sequence[Path], out: Path, _settings: Settings) -> int:
 
 
 def command(
-    *recordings: Annotated[Path, Parameter(help="Two or more recordings, then OUT.")],
+    *recordings: Annotated[
+        Path, Parameter(name="IN... OUT", help="Two recordings or more, then the one to write.")
+    ],
 ) -> None:
     """Merge recordings into one, by time.
 
-    The last name is the recording to write: dmrl merge A.mcap B.mcap OUT.mcap. Of equal
-    times, messages of the earlier named recording come first.
+    Of equal times, messages of the earlier named recording come first.
     """
     if len(recordings) < 3:
         raise SettingError(

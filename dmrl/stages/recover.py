@@ -2,12 +2,21 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from dmrl.recording import recover
 from dmrl.tables import print_json
 
 
-def command(recording: Path, out: Path, /, *, json: bool = False) -> None:
+def command(
+    recording: Path,
+    out: Path,
+    /,
+    *,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
     """Bring back the messages of a recording that was cut short.
 
     Every message before the damage is kept, bit for bit; a chunk that fails its CRC is left
@@ -19,11 +28,11 @@ def command(recording: Path, out: Path, /, *, json: bool = False) -> None:
         A damaged recording, or the .partial file of a killed run.
     out
         Recording to write. Must not exist.
-    json
+    as_json
         Print one JSON document instead of a line.
     """
     result = recover(recording, out)
-    if json:
+    if as_json:
         print_json(asdict(result))
         return
     lost = "nothing was lost"

@@ -15,7 +15,7 @@ def command(
     *,
     from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None,
     to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None,
-    topic: list[str] | None = None,
+    topic: Annotated[list[str] | None, Parameter(negative=())] = None,
 ) -> None:
     """Keep a stretch of a recording, or some of its topics.
 
@@ -32,7 +32,7 @@ def command(
     to_s
         First time left out, seconds from the recording's start.
     topic
-        Topic to keep, or a pattern such as /*/labels. Repeat for more. None: all.
+        Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
     """
     start_ns = summary(recording).start_ns
     count = trim(

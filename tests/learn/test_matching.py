@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dmrl.learn.matching import Points, assign, errors, hits, partners
+from dmrl.learn.matching import Points, errors, hits, partners
 
 
 def points(*rows: tuple[int, float, float, float, float]) -> Points:
@@ -15,22 +15,27 @@ def points(*rows: tuple[int, float, float, float, float]) -> Points:
     return Points(columns[0].astype(np.int64), *columns[1:])
 
 
-SHAPES = st.tuples(st.integers(1, 4), st.integers(1, 5))
+PIXELS = st.integers(0, 9).map(float)
 
 
-@given(SHAPES.flatmap(lambda s: arrays(float, s, elements=st.integers(0, 9).map(float))))
-def test_assignment_is_the_cheapest_of_all(cost: np.ndarray) -> None:
-    rows, cols = cost.shape
-    got = assign(cost)
-    used = got[got >= 0]
-    assert len(set(used)) == len(used) == min(rows, cols)
-    total = cost[np.flatnonzero(got >= 0), used].sum()
-    table = cost if rows <= cols else cost.T
-    best = min(
+@given(arrays(float, st.tuples(st.integers(1, 4), st.just(2)), elements=PIXELS),
+       arrays(float, st.tuples(st.integers(1, 4), st.just(2)), elements=PIXELS))  # fmt: skip
+def test_labels_and_detections_pair_at_the_least_total_distance(
+    label_px: np.ndarray, found_px: np.ndarray
+) -> None:
+    labels = points(*[(0, u, v, 1, 1) for u, v in label_px])
+    found = points(*[(0, u, v, 1, 1) for u, v in found_px])
+    got = partners(labels, found)
+    # Only as many detections as there are labels take part, the most confident ones.
+    cost = np.hypot(*(label_px[:, None] - found_px[None, : len(label_px)]).transpose(2, 0, 1))
+    paired = np.flatnonzero(got >= 0)
+    assert len(set(got[paired])) == len(paired) == min(cost.shape)
+    table = cost if cost.shape[0] <= cost.shape[1] else cost.T
+    least = min(
         sum(table[i, j] for i, j in enumerate(p))
         for p in permutations(range(table.shape[1]), table.shape[0])
     )
-    assert total == best
+    assert cost[paired, got[paired]].sum() == pytest.approx(least)
 
 
 def test_one_label_takes_the_most_confident_detection_not_the_nearest() -> None:

@@ -174,8 +174,10 @@ def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: P
     for name in ("a", "b"):
         run(tmp_path / "out.mcap", tmp_path / name, FAST)
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
-    plots = ("error-by-distance", "error-violins")
-    assert names == [*(f"{p}.{s}" for p in plots for s in ("png", "svg")), "evaluation.json"]
+    plots = ("error-by-distance", "error-violins", "examples")
+    assert names == sorted(
+        [*(f"{p}.{s}" for p in plots for s in ("png", "svg")), "evaluation.json"]
+    )
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     with Image.open(tmp_path / "a" / "error-violins.png") as picture:
@@ -187,7 +189,7 @@ def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: P
 def test_plots_without_matplotlib_name_the_extra(
     dots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evaluate, "plots", None)
+    monkeypatch.setattr(evaluate, "figures", None)
     with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[plot\]'"):
         run(dots, tmp_path / "plots", FAST)
 

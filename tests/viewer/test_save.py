@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from dmrl.colours import RGB
 from dmrl.errors import OutputError, RecordingError, SettingError, SourceError
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read_table
 from dmrl.viewer import Settings, save
-from dmrl.viewer.entities import COLOURS
 
 Make = Callable[..., Path]
 IMAGES = "/cf1/camera/image"
@@ -102,7 +102,7 @@ def test_labels_say_peer_and_depth_and_disappear_with_the_peer(make: Make, rrd: 
         for source in ("truth", "published")
     }
     assert colours == {
-        source: int.from_bytes(bytes(COLOURS[source])) for source in ("truth", "published")
+        source: int.from_bytes(bytes(RGB[source])) for source in ("truth", "published")
     }
 
 

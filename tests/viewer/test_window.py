@@ -92,7 +92,14 @@ def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
 def test_the_page_is_served_until_ctrl_c(make: Make) -> None:
     code = "from dmrl.cli import main; main()"
     command = [sys.executable, "-c", code, "view", str(make()), "--serve"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+
+    def heed_ctrl_c() -> None:
+        # A shell starts its background jobs deaf to it, and children inherit that.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c
+    ) as server:
         try:
             assert server.stderr is not None
             address = server.stderr.readline().split()[0]
