@@ -37,6 +37,7 @@ def prepare(job):
     camera.matrix_world = WORLD_FROM_CAMERA
     camera.data.lens = 120.0 * camera.data.sensor_width / 320
     scene.use_nodes = True
+    scene.node_tree.nodes["Scale"].frame_method = "CROP"  # the file has one that 4.5 lacks
     return scene
 
 

@@ -3,7 +3,7 @@
 import subprocess
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,7 +68,7 @@ class Worker:
             self.version, self.points = self._greet(start)
         except (EOFError, OSError) as e:
             self.close()
-            raise BlenderError(f"Blender did not start: {self._why()}. {HINT}") from e
+            raise BlenderError(f"Blender did not start: {self.why()}. {HINT}") from e
 
     def _greet(self, start: Start) -> tuple[str, Array]:
         head, arrays = self.ask(start.head, start.arrays)
@@ -100,7 +100,8 @@ class Worker:
             if line.strip():
                 self._last_words.append(line)
 
-    def _why(self) -> str:
+    def why(self) -> str:
+        """What it said last, or how it ended."""
         words = self._last_words[-1].decode(errors="replace").strip() if self._last_words else ""
         return words or f"exit {self._process.poll()}"
 
@@ -168,6 +169,7 @@ class Pool:
             If three workers died of it.
         """
         worker = self._idle.get()
+        why = ""
         try:
             for _ in range(TRIES):
                 try:
@@ -177,12 +179,14 @@ class Pool:
                     if worker is not None:
                         self._all.remove(worker)
                         worker.close()
+                        why = worker.why()
                     worker = None
                     self.replaced += 1
         finally:
             self._idle.put(worker)
         raise BlenderError(
-            f"Blender died {TRIES} times on one image. Free memory, or use fewer --workers"
+            f"Blender died {TRIES} times on one image: {why}. Free memory, use fewer --workers, "
+            "or set Blender up anew"
         )
 
     def map(self, job: Callable[[Worker, Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
@@ -209,8 +213,3 @@ class Pool:
         for worker in self._all:
             worker.close()
         self._threads.shutdown(wait=True)
-
-
-def ask_all(worker: Worker, heads: Sequence[dict[str, Any]]) -> list[Arrays]:
-    """A worker's answers to several requests."""
-    return [worker.ask(head)[1] for head in heads]

@@ -189,7 +189,7 @@ class Stage:
         _taken.clear()
         bpy.ops.render.render()
         if len(_taken) != len(PASSES):
-            _take_from_file()
+            raise RuntimeError(f"Blender {bpy.app.version_string} does not hand over its passes")
         return {"light": _taken["Combined"], "depth": _taken["Depth"][..., 0]}
 
     def aim(self, head):
@@ -220,11 +220,6 @@ class Stage:
         self.sun.data.color = head["sun_colour"]
         self.sun.data.angle = head["sun_angle_rad"]
         self.sun.matrix_world = Matrix(head["sun_matrix"])
-
-
-def _take_from_file():
-    """Passes by way of a file, for Blenders that do not let us read them in memory."""
-    raise RuntimeError("this Blender does not give its passes")
 
 
 def _small(name):
