@@ -20,7 +20,8 @@ from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot
-from dmrl.stages.render import camera_of, quaternion, run
+from dmrl.shots import quaternion
+from dmrl.stages.render import camera_of, run
 
 SMALL = Settings(
     images=6, robots_max=3, empty_share=0.2, seed=3, workers=1, samples=4, masks=True, depths=True
