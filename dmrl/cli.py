@@ -19,6 +19,7 @@ from dmrl.errors import DmrlError
 COMMANDS = {
     "demo": "Run the whole pipeline, small, on pictures that dmrl draws itself.",
     "run": "Run every stage of a pipeline recipe, in order; go on where it stopped.",
+    "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
     "convert": "Convert SOURCE, a foreign file or folder, into a recording.",

@@ -9,6 +9,7 @@
   - ModelError        weights or a run folder cannot be used
   - RecipeError       the TOML does not describe a run
   - SettingError      a setting cannot be met by this input
+  - BlenderError      Blender cannot be set up, does not start, or cannot use a model
   - MissingExtra      a package that an optional room needs is not installed
 """
 
@@ -65,6 +66,10 @@ class RecipeError(DmrlError):
 
 class SettingError(DmrlError):
     """A setting cannot be met by this input."""
+
+
+class BlenderError(DmrlError):
+    """Blender cannot be set up, does not start, or cannot use a model."""
 
 
 class MissingExtra(DmrlError):

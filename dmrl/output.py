@@ -43,8 +43,15 @@ def as_output_error(path: Path, error: OSError) -> OutputError:
 
 
 @contextmanager
-def partial_file(path: Path) -> Iterator[Path]:
+def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
     """Path to write to; it becomes ``path`` when the block ends without an error.
+
+    Parameters
+    ----------
+    path
+        The final file.
+    keep_on_error
+        Leave the partial file: for work that can be resumed.
 
     Raises
     ------
@@ -61,7 +68,8 @@ def partial_file(path: Path) -> Iterator[Path]:
             raise
         raise as_output_error(path, e) from e
     finally:
-        partial.unlink(missing_ok=True)
+        if not keep_on_error:
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from dmrl.tables import print_json, print_table
 # Stages that a step may name, and how many inputs each takes; None: a list of any length.
 # They are loaded by name, because stages stand above this module and not below it.
 STAGES: dict[str, int | None] = {
+    "render": 0,
     "sketch": 0,
     "fly": 0,
     "convert": 1,
@@ -33,6 +34,8 @@ STAGES: dict[str, int | None] = {
     "evaluate": 1,
     "view": None,
 }
+# These go on with what a killed run has left.
+RESUMABLE = ("train", "render")
 RECIPE_FILE = "recipe.toml"
 
 
@@ -151,7 +154,7 @@ def _call(step: Step, inputs: list[Path], out: Path) -> None:
     module = _module(step.stage)
     settings = recipes.check(f"step {step.stage}", step.settings, settings_of(step.stage))
     extra: dict[str, Any] = {}
-    if step.stage == "train" and partial_of(out).exists():
+    if step.stage in RESUMABLE and partial_of(out).exists():
         extra["resume"] = True
     sources = [inputs] if STAGES[step.stage] is None else inputs
     module.run(*sources, out, settings, **extra)

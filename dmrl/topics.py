@@ -25,7 +25,7 @@ class Topic:
     rate
         How often, as a rule.
     written_by
-        Commands that write it.
+        Commands that write it, with commas between.
     """
 
     pattern: str
@@ -48,22 +48,49 @@ LABELS = "/{robot}/labels"
 DETECTIONS = "/{robot}/detections"
 GRID = "/{robot}/detections/grid"
 TRACKS = "/{robot}/tracks"
+MASKS = "/{robot}/camera/masks"
+DEPTHS = "/{robot}/camera/depth"
 TRANSFORMS = "/tf"
 
 TOPICS = (
-    Topic(CAMERA_IMAGE, "foxglove.CompressedImage", "image", "png or jpeg", "camera", "convert"),
-    Topic(CALIBRATION, "foxglove.CameraCalibration", "image", "px", "once", "convert"),
-    Topic(LABELS, "dmrl.v1.PeerLabels", "image", "px, m", "per image", "convert"),
+    Topic(
+        CAMERA_IMAGE,
+        "foxglove.CompressedImage",
+        "image",
+        "png or jpeg",
+        "camera",
+        "convert, render, fly",
+    ),
+    Topic(CALIBRATION, "foxglove.CameraCalibration", "image", "px", "once", "convert, render, fly"),
+    Topic(
+        LABELS, "dmrl.v1.PeerLabels", "image", "px, m", "per image", "convert, render, fly, label"
+    ),
+    Topic(MASKS, "foxglove.CompressedImage", "image", "number of the peer", "per image", "render"),
+    Topic(DEPTHS, "foxglove.CompressedImage", "image", "png, mm", "per image", "render"),
     Topic(DETECTIONS, "dmrl.v1.Detections", "image", "px, m", "per image", "predict"),
     Topic(GRID, "dmrl.v1.GridMap", "image grid", "0..1, m", "per image", "predict"),
     Topic(TRACKS, "dmrl.v1.Tracks", "<robot>/horizontal", "m, m/s", "per image", "track"),
-    Topic(ATTITUDE, "dmrl.v1.Attitude", "<robot>/horizontal", "rad, rad/s", "100 Hz", "convert"),
-    Topic(VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert"),
-    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert"),
-    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert"),
+    Topic(
+        ATTITUDE,
+        "dmrl.v1.Attitude",
+        "<robot>/horizontal",
+        "rad, rad/s",
+        "100 Hz",
+        "convert, render, fly",
+    ),
+    Topic(VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert, fly"),
+    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert, fly"),
+    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert, fly"),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
-    Topic(TRUTH, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "convert"),
-    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "fly"),
+    Topic(
+        TRUTH,
+        "dmrl.v1.PeerPosition",
+        "<robot>/horizontal",
+        "m, m^2",
+        "20 Hz",
+        "convert, render, fly",
+    ),
+    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "fly, render"),
 )
 
 
@@ -95,6 +122,16 @@ def height(robot: str) -> str:
 def uwb_range(robot: str, peer: str) -> str:
     """Topic of the distances that a robot measures to a peer."""
     return RANGE.format(robot=robot, peer=peer)
+
+
+def masks(robot: str) -> str:
+    """Topic of images whose values say which peer covers a pixel."""
+    return MASKS.format(robot=robot)
+
+
+def depths(robot: str) -> str:
+    """Topic of images of the distance of peers' surfaces."""
+    return DEPTHS.format(robot=robot)
 
 
 def labels(robot: str) -> str:

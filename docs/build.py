@@ -42,7 +42,9 @@ def topics() -> str:
             f"`{t.frame}`" if "<" in t.frame else t.frame,
             t.units,
             t.rate,
-            t.written_by if t.written_by in COMMANDS else f"({t.written_by}, not there yet)",
+            ", ".join(
+                w if w in COMMANDS else f"({w}, not there yet)" for w in t.written_by.split(", ")
+            ),
         )
         for t in TOPICS
     ]

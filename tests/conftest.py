@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from dmrl.rendering import environment
+
 REPOSITORY = Path(__file__).parents[1]
 
 
@@ -15,3 +17,12 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip("no real data; set DMRL_DATA to the folder that holds it")
     return folder
+
+
+@pytest.fixture(scope="session")
+def blender() -> Path:
+    """Python of Blender's environment. Skips where it is not set up."""
+    python = environment.python()
+    if python is None:
+        pytest.skip("Blender is not set up; run: dmrl render --setup")
+    return python

@@ -11,6 +11,7 @@ from dmrl.recording.inputs import input_of, provenance
 from dmrl.recording.provenance import Input, Provenance
 from dmrl.recording.reader import Stamped, columns, matching, read, read_raw, read_table
 from dmrl.recording.recover import Recovery, recover
+from dmrl.recording.resume import Interrupted, interrupted
 from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Channel",
     "Finding",
     "Input",
+    "Interrupted",
     "Provenance",
     "RawMessage",
     "RecordingWriter",
@@ -29,6 +31,7 @@ __all__ = [
     "columns",
     "copy_extras",
     "input_of",
+    "interrupted",
     "matching",
     "merge",
     "provenance",

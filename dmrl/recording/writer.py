@@ -87,6 +87,8 @@ class RecordingWriter:
         Stage, settings and inputs; written before the first message.
     recipe
         Text of the recipe that was run. None: the settings as TOML.
+    keep_on_error
+        Leave ``<name>.partial`` when the work stops: for work that can be resumed.
 
     Raises
     ------
@@ -94,13 +96,20 @@ class RecordingWriter:
         If the file exists, its folder does not, or the disk is full.
     """
 
-    def __init__(self, path: Path, provenance: Provenance, *, recipe: str | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        provenance: Provenance,
+        *,
+        recipe: str | None = None,
+        keep_on_error: bool = False,
+    ) -> None:
         self._path = path
         self._channels: dict[Channel, int] = {}
         self._known: dict[str, Channel] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._resources = ExitStack()
-        partial = self._resources.enter_context(partial_file(path))
+        partial = self._resources.enter_context(partial_file(path, keep_on_error=keep_on_error))
         try:
             raw = self._resources.enter_context(io.FileIO(partial, "wb"))
             self._writer = Writer(

@@ -1,0 +1,276 @@
+"""Figures of dmrl render: reprojection, cost against the published way, memory.
+
+    python benchmarks/bench_render.py reprojection [--images 500]
+    python benchmarks/bench_render.py speed --model crazyflie-published.blend --backgrounds DIR
+    python benchmarks/bench_render.py memory [--images 3000]
+
+CPU seconds are those of all processes together, start-up included.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.geometry import Array, Camera, project
+from dmrl.progress import say
+from dmrl.rendering import crazyflie
+from dmrl.rendering.environment import ensure
+from dmrl.rendering.lens import image_from_pinhole
+from dmrl.rendering.randomise import World, draw_scene
+from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.sketch import Pose
+from dmrl.stages.render import camera_of, run, settings_of
+
+PUBLISHED_WAY = Path(__file__).parent / "published_way.py"
+MM_PER_UNIT = 0.002  # the published model, at twice life size as the authors rendered it
+
+
+def mesh_box(camera: Camera, pose: Pose, points: Array) -> Array:
+    """Left, top, right, bottom of a mesh's corners in the image, clipped to it.
+
+    Parameters
+    ----------
+    camera
+        Takes the image.
+    pose
+        Of the robot.
+    points
+        (N, 3) corners, body frame.
+    """
+    xyz = points @ pose.camera_from_body.T + pose.xyz_camera
+    uv, _ = project(xyz[xyz[:, 0] > 0.01], camera.image_from_optical)
+    uv = image_from_pinhole(uv, camera)
+    box = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+    return np.clip(box, 0, (camera.width_px, camera.height_px) * 2)
+
+
+def reprojection(recipe: str, images: int) -> dict[str, float]:
+    """Distance of alpha boxes' edges from the mesh's, pixels, robots that nothing hides.
+
+    Parameters
+    ----------
+    recipe
+        Preset to draw from.
+    images
+        How many.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recipe.toml"
+        path.write_text(f'kind = "render"\npreset = "{recipe}"\nempty_share = 0.0\n')
+        settings = settings_of(str(path), images=images)
+    camera = camera_of(settings)
+    model = Model(settings.model, settings.scale, settings.model_up)
+    errors, middles = [], []
+    with Renderer(ensure(say), model) as renderer:
+        world = World(
+            settings, camera, renderer.radius_m, tuple(renderer.lights), renderer.panorama, None
+        )
+        world = replace(world, panorama=lambda name: np.full((8, 16, 3), 0.3, np.float32))
+        scenes = [draw_scene(world, k) for k in range(images)]
+        shots = renderer.shots((camera, scene.robots, scene.look) for scene in scenes)
+        for scene, shot in zip(scenes, shots, strict=True):
+            for k, robot in enumerate(scene.robots):
+                if shot.visible_share[k] < 1 or np.isnan(shot.box_px[k]).any():
+                    continue
+                turn = (robot.paint["rotor_first_rad"], robot.paint["rotor_sweep_rad"])
+                points = crazyflie.outline(settings.scale, *turn)
+                box = mesh_box(camera, robot.pose, points)
+                errors.append(shot.box_px[k] - box)
+                middles.append((shot.box_px[k] - box).reshape(2, 2).mean(axis=0))
+    edges = np.array(errors)
+    return {
+        "robots": len(edges),
+        "median_px": float(np.median(np.abs(edges))),
+        "p95_px": float(np.percentile(np.abs(edges), 95)),
+        **{
+            f"median_{name}_px": float(value)
+            for name, value in zip(
+                ("left", "top", "right", "bottom"), np.median(edges, axis=0), strict=True
+            )
+        },
+        "median_middle_px": float(np.median(np.abs(middles))),
+    }
+
+
+def _children_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _own_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def published_way(model: Path, backgrounds: Path, images: int, samples: int) -> dict[str, float]:
+    """CPU seconds per image of the published way, start-up included, on our own scenes.
+
+    Parameters
+    ----------
+    model
+        crazyflie-published.blend.
+    backgrounds
+        Folder of photos.
+    images
+        How many.
+    samples
+        Light paths per pixel.
+    """
+    settings = replace(settings_of("synthetic_paper"), images=images, robots_max=1)
+    world = World(
+        settings,
+        camera_of(settings),
+        0.1,
+        ("none",),
+        lambda name: np.full((8, 16, 3), 0.3, np.float32),
+        None,
+    )
+    photos = sorted(backgrounds.glob("*.jpg"))
+    listed = []
+    for k in range(images):
+        matrices = []
+        for robot in draw_scene(world, k).robots:
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = robot.pose.camera_from_body, robot.pose.xyz_camera
+            matrices.append(matrix.tolist())
+        listed.append({"background": str(photos[k % len(photos)]), "robots": matrices})
+    with tempfile.TemporaryDirectory() as folder:
+        job = {"model": str(model), "samples": samples, "folder": folder, "images": listed}
+        (Path(folder) / "job.json").write_text(json.dumps(job))
+        before, begin = _children_s(), time.monotonic()
+        subprocess.run(
+            [ensure(say), PUBLISHED_WAY, Path(folder) / "job.json"],
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
+        wall_s = time.monotonic() - begin
+        cpu_s = _children_s() - before
+    return {"cpu_s_per_image": cpu_s / images, "images_per_s": images / wall_s}
+
+
+def ours(recipe: str, images: int, workers: int, **changes: object) -> dict[str, float]:
+    """CPU seconds per image of ``dmrl render``, start-up and recording included.
+
+    Parameters
+    ----------
+    recipe
+        Name of a recipe.
+    images
+        How many.
+    workers
+        Blender processes.
+    changes
+        Settings over the recipe's.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        settings = settings_of(recipe, images=images, workers=workers, **changes)
+        before, own, begin = _children_s(), _own_s(), time.monotonic()
+        run(Path(folder) / "out.mcap", settings)
+        wall_s = time.monotonic() - begin
+        workers_s, own_s = _children_s() - before, _own_s() - own
+    return {
+        "cpu_s_per_image": (workers_s + own_s) / images,
+        "of_it_blender": workers_s / images,
+        "images_per_s": images / wall_s,
+    }
+
+
+def memory(images: int) -> dict[str, float]:
+    """Resident memory of this process and the workers early and late in one run, MB.
+
+    Parameters
+    ----------
+    images
+        How many to render; the first and last thousand, or third, are compared.
+    """
+    seen: list[float] = []
+    stop = threading.Event()
+
+    def watch() -> None:
+        while not stop.wait(0.5):
+            seen.append(_resident_mb())
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        rates = ours("synthetic_paper", images, 0)
+    finally:
+        stop.set()
+        thread.join()
+    third = len(seen) // 3
+    first, last = np.median(seen[2 : third + 2]), np.median(seen[-third:])
+    return {"first_mb": float(first), "last_mb": float(last), "growth": last / first - 1, **rates}
+
+
+def _resident_mb() -> float:
+    """Memory of the benchmark and its children."""
+    own = os.getpid()
+    total = 0
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rsplit(")", 1)[1].split()
+            if int(stat.parent.name) == own or int(fields[1]) == own:
+                total += int(fields[21])
+        except (OSError, IndexError):
+            continue  # it has ended meanwhile
+    return total * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def speed(model: Path, backgrounds: Path, images: int) -> dict[str, dict[str, float]]:
+    """The published way, and ours with its model and with our own, in one run.
+
+    Parameters
+    ----------
+    model
+        crazyflie-published.blend.
+    backgrounds
+        Folder of photos.
+    images
+        How many of ours; the published way gets a twentieth, its start-up taken off.
+    """
+    few, many = (published_way(model, backgrounds, n, 16) for n in (4, 4 + images // 20))
+    spent_s = [few["cpu_s_per_image"] * 4, many["cpu_s_per_image"] * (4 + images // 20)]
+    as_published = {"model": model, "scale": MM_PER_UNIT, "model_up": "y"}
+    return {
+        "published way, 16 samples": {
+            "cpu_s_per_image": (spent_s[1] - spent_s[0]) / (images // 20),
+        },
+        "ours, published model": ours(
+            "synthetic_paper", images, 2, backgrounds=backgrounds, **as_published
+        ),
+        "ours, default model": ours("synthetic_paper", images, 2, backgrounds=backgrounds),
+        "ours, himax": ours("synthetic_large", images, 2, backgrounds=backgrounds, robots_max=1),
+    }
+
+
+def main() -> None:
+    """Print the figures that were asked for, as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("reprojection", "speed", "memory"))
+    parser.add_argument("--images", type=int, default=500)
+    parser.add_argument("--model", type=Path)
+    parser.add_argument("--backgrounds", type=Path)
+    asked = parser.parse_args()
+    if asked.what == "reprojection":
+        result: object = {p: reprojection(p, asked.images) for p in ("published", "himax")}
+    elif asked.what == "memory":
+        result = memory(asked.images)
+    else:
+        if asked.model is None or asked.backgrounds is None:
+            sys.exit("speed needs --model crazyflie-published.blend and --backgrounds DIR")
+        result = speed(asked.model, asked.backgrounds, asked.images)
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The published way of rendering, as a baseline: run in Blender's Python.
+
+One full-frame render with the background in the compositor, one more full-frame render per
+robot for its box, pictures through files, nothing kept between images; Cycles, because
+there is no screen. Reads a JSON job: model, samples, folder, and of every image the
+background and each robot's matrix in camera coordinates.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+UNITS_PER_M = 500.0  # the published model is in these, which makes it twice life size
+WORLD_FROM_CAMERA = Matrix(((0, 0, -1, 0), (-1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
+Z_FROM_Y_UP = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
+
+
+def prepare(job):
+    bpy.ops.wm.open_mainfile(filepath=job["model"])
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.cycles.device = "CPU"
+    scene.cycles.samples = job["samples"]
+    scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
+    scene.render.threads_mode, scene.render.threads = "FIXED", 1
+    scene.render.use_persistent_data = False
+    scene.render.film_transparent = True
+    scene.render.resolution_x, scene.render.resolution_y = 320, 224
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.image_settings.color_mode = "RGBA"
+    camera = bpy.data.objects["Camera"]
+    camera.matrix_world = WORLD_FROM_CAMERA
+    camera.data.lens = 120.0 * camera.data.sensor_width / 320
+    scene.use_nodes = True
+    scene.node_tree.nodes["Scale"].frame_method = "CROP"  # the file has one that 4.5 lacks
+    return scene
+
+
+def robots_of(scene, matrices):
+    first = bpy.data.objects["crazyflie"]
+    robots = [first]
+    for _ in matrices[1:]:
+        robots.append(first.copy())
+        scene.collection.objects.link(robots[-1])
+    for robot, matrix in zip(robots, matrices, strict=True):
+        place = Matrix(matrix)
+        place.translation *= UNITS_PER_M
+        robot.matrix_world = place @ Z_FROM_Y_UP
+    return robots
+
+
+def box(path):
+    """First and last column and row of a picture's pixels that are not clear."""
+    image = bpy.data.images.load(str(path))
+    width, height = image.size
+    alpha = np.array(image.pixels[:]).reshape(height, width, 4)[::-1, :, 3]
+    bpy.data.images.remove(image)
+    rows, cols = np.nonzero(alpha)
+    return (cols.min(), rows.min(), cols.max(), rows.max()) if len(rows) else None
+
+
+def main(job):
+    scene = prepare(job)
+    nodes = scene.node_tree.nodes
+    out = Path(job["folder"])
+    for k, image in enumerate(job["images"]):
+        robots = robots_of(scene, image["robots"])
+        background = bpy.data.images.load(image["background"])
+        nodes["Image"].image = background
+        scene.render.use_compositing = True
+        scene.render.filepath = str(out / f"{k:04d}.png")
+        bpy.ops.render.render(write_still=True)
+        scene.render.use_compositing = False
+        for robot in robots:
+            for other in robots:
+                other.hide_render = other is not robot
+            scene.render.filepath = str(out / "mask.png")
+            bpy.ops.render.render(write_still=True)
+            box(out / "mask.png")
+        for robot in robots:
+            robot.hide_render = False
+        for robot in robots[1:]:
+            bpy.data.objects.remove(robot)
+        bpy.data.images.remove(background)
+
+
+main(json.loads(Path(sys.argv[1]).read_text()))

@@ -1,0 +1,164 @@
+"""What is behind the robots: photos, or what a panorama shows in the camera's direction."""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.geometry import Array, Camera
+from dmrl.images import Rgb, crop_and_scale, decode, size
+from dmrl.rendering.lens import Picture, sample, undistort
+
+PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm")
+KEPT = 64
+"""Decoded photos that are kept; bounds memory."""
+
+
+def _table() -> Picture:
+    """Light for each of the 256 values of a photo, sRGB's curve."""
+    value = np.arange(256) / 255
+    low = value <= 0.04045
+    return np.where(low, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+LIGHT_OF = _table()
+
+
+class Photos:
+    """A folder of photos, fitted to an image.
+
+    Parameters
+    ----------
+    folder
+        Every picture in it counts, in order of names.
+
+    Raises
+    ------
+    SettingError
+        If it holds none that can be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise SettingError(f"no folder {folder} of backgrounds. Check --backgrounds")
+        found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_KINDS)
+        self.broken = [path for path in found if not _begins(path)]
+        self.paths = [path for path in found if path not in set(self.broken)]
+        self._load = lru_cache(KEPT)(self._decoded)
+        if not self.paths:
+            why = f", {len(self.broken)} are broken" if self.broken else ""
+            raise SettingError(
+                f"{folder} holds no photo that can be read{why} "
+                f"({', '.join(PHOTO_KINDS)}). Choose another --backgrounds"
+            )
+
+    def _decoded(self, number: int) -> Rgb | None:
+        try:
+            return decode(self.paths[number].read_bytes(), self.paths[number])
+        except SourceError:
+            return None
+
+    def photo(self, number: int) -> Rgb:
+        """Photo of that number, or the next one that is whole.
+
+        Raises
+        ------
+        SettingError
+            If none is.
+        """
+        for step in range(len(self.paths)):
+            here = (number + step) % len(self.paths)
+            photo = self._load(here)
+            if photo is not None:
+                return photo
+            if self.paths[here] not in self.broken:
+                self.broken.append(self.paths[here])
+        raise SettingError("every photo is broken. Choose another --backgrounds")
+
+    def backdrop(self, rng: Generator, camera: Camera, zoom: float) -> Picture:
+        """(H, W, 3) linear light of a photo at random, cropped to fill the image.
+
+        Parameters
+        ----------
+        rng
+            Chooses the photo, the part, and whether it is mirrored.
+        camera
+            Gives the size.
+        zoom
+            1: as much of the photo as fits; 2: half its width and height.
+        """
+        number, place_u, place_v, mirrored = rng.random(4)
+        photo = self.photo(int(number * len(self.paths)))
+        height, width, _ = photo.shape
+        fit = min(width / camera.width_px, height / camera.height_px) / zoom
+        part_u, part_v = camera.width_px * fit, camera.height_px * fit
+        left, top = (width - part_u) * place_u, (height - part_v) * place_v
+        box = (left, top, left + part_u, top + part_v)
+        rgb = crop_and_scale(photo, box, camera.width_px, camera.height_px)
+        return LIGHT_OF[rgb[:, ::-1] if mirrored < 0.5 else rgb]
+
+
+def _begins(path: Path) -> bool:
+    try:
+        size(path.read_bytes(), path)
+    except (SourceError, OSError):
+        return False
+    return True
+
+
+def panorama_view(
+    panorama: Picture, camera: Camera, turn_rad: tuple[float, float, float]
+) -> Picture:
+    """(H, W, 3) linear light of a panorama as the camera sees it.
+
+    Parameters
+    ----------
+    panorama
+        (h, w, 3) all around: the middle column looks along -x, the top row up.
+    camera
+        With its distortion.
+    turn_rad
+        Roll and pitch of the camera, and the panorama's turn about the vertical.
+    """
+    rays = _rays(camera) @ _panorama_from_camera(turn_rad).T
+    height, width, _ = panorama.shape
+    u = (0.5 - np.arctan2(rays[..., 1], rays[..., 0]) / (2 * np.pi)) * width
+    v = (0.5 - np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1])) / np.pi) * height
+    round_about = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
+    v = np.clip(v, 0.5, height - 0.5)
+    return sample(round_about, np.stack([u + 1, v], axis=-1).astype(np.float32))
+
+
+def _rays(camera: Camera) -> Array:
+    v, u = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
+    right = (u - camera.cx_px) / camera.fx_px
+    down = (v - camera.cy_px) / camera.fy_px
+    xy = undistort(np.stack([right, down], axis=-1), camera.distortion)
+    return np.stack([np.ones_like(u), -xy[..., 0], -xy[..., 1]], axis=-1)
+
+
+def _panorama_from_camera(turn_rad: tuple[float, float, float]) -> Array:
+    """Rz(turn) Ry(pitch) Rx(roll), as Blender's mapping of XYZ angles."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(turn_rad), np.sin(turn_rad)
+    tilt = np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
+    return np.asarray(np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ tilt)
+
+
+def smeared(picture: Picture, move_px: Sequence[float]) -> Picture:
+    """(H, W, 3) picture that moved by so many pixels, u and v, while the shutter was open."""
+    steps = int(np.ceil(math.hypot(*move_px)))
+    if steps < 1:
+        return picture
+    shares = np.linspace(-0.5, 0.5, steps + 1)
+    shifts = np.round(np.outer(shares, move_px)).astype(int)
+    pad = int(np.abs(shifts).max())
+    wide = np.pad(picture, ((pad, pad), (pad, pad), (0, 0)), mode="edge")
+    height, width, _ = picture.shape
+    total = np.zeros_like(picture)
+    for u, v in shifts:
+        total += wide[pad - v : pad - v + height, pad - u : pad - u + width]
+    return np.asarray(total / np.float32(len(shifts)), np.float32)

@@ -1,0 +1,1 @@
+"""What runs in Blender's own Python, and the protocol that both sides speak."""

@@ -1,0 +1,246 @@
+"""Poses and looks drawn at random from the ranges of the settings."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from dmrl.geometry import Array, Camera, camera_from_horizontal
+from dmrl.rendering.backdrops import Photos, panorama_view, smeared
+from dmrl.rendering.crazyflie import MATERIALS
+from dmrl.rendering.lens import Picture, pinhole_from_image
+from dmrl.rendering.sensor import Sensor, blur
+from dmrl.rendering.settings import Range, Settings
+from dmrl.rendering.shot import Light, Look, Robot
+from dmrl.rendering.sketch import Pose
+
+TRIES = 30
+# Of panoramas, whose suns and lamps would leave nothing else to see; photos end below.
+HIGHLIGHTS = 3.0
+
+# Base colour, roughness, metallic, glow of every material; linear light.
+PALETTE: Mapping[str, tuple[tuple[float, float, float], float, float, float]] = {
+    "board": ((0.012, 0.012, 0.014), 0.45, 0.0, 0.0),
+    "deck": ((0.012, 0.014, 0.020), 0.45, 0.0, 0.0),
+    "battery": ((0.45, 0.46, 0.48), 0.35, 0.3, 0.0),
+    "label": ((0.50, 0.48, 0.40), 0.5, 0.0, 0.0),
+    "motor": ((0.50, 0.50, 0.50), 0.3, 0.9, 0.0),
+    "mount": ((0.015, 0.015, 0.015), 0.5, 0.0, 0.0),
+    "pins": ((0.60, 0.42, 0.15), 0.35, 0.9, 0.0),
+    "header": ((0.010, 0.010, 0.010), 0.5, 0.0, 0.0),
+    "chip": ((0.010, 0.010, 0.010), 0.4, 0.0, 0.0),
+    "connector": ((0.55, 0.55, 0.55), 0.4, 0.5, 0.0),
+    "wire": ((0.25, 0.02, 0.02), 0.5, 0.0, 0.0),
+    "antenna": ((0.45, 0.45, 0.45), 0.35, 0.8, 0.0),
+    "lens": ((0.003, 0.003, 0.004), 0.1, 0.0, 0.0),
+    "red": ((1.0, 0.04, 0.02), 0.4, 0.0, 4.0),
+    "green": ((0.04, 1.0, 0.1), 0.4, 0.0, 4.0),
+    "blue": ((0.05, 0.15, 1.0), 0.4, 0.0, 4.0),
+    "rotor": ((0.012, 0.012, 0.012), 0.4, 0.0, 0.0),
+}
+# Colours that the parts are sold in, beside those above.
+OTHERS: Mapping[str, tuple[tuple[float, float, float], ...]] = {
+    "deck": ((0.01, 0.02, 0.08), (0.01, 0.05, 0.02)),
+    "battery": ((0.02, 0.02, 0.02), (0.05, 0.08, 0.3), (0.6, 0.6, 0.6)),
+    "label": ((0.6, 0.1, 0.05), (0.05, 0.2, 0.5), (0.02, 0.02, 0.02)),
+    "mount": ((0.5, 0.5, 0.5), (0.25, 0.25, 0.25)),
+    "rotor": ((0.5, 0.5, 0.5), (0.3, 0.3, 0.3), (0.5, 0.25, 0.02)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """Where looks come from.
+
+    Parameters
+    ----------
+    settings
+        Ranges.
+    camera
+        Its image is filled.
+    radius_m
+        Of a ball that holds a robot.
+    lights
+        Panoramas by name.
+    panorama
+        Gives a panorama's picture.
+    photos
+        Backgrounds; None: the panoramas.
+    """
+
+    settings: Settings
+    camera: Camera
+    radius_m: float
+    lights: tuple[str, ...]
+    panorama: Callable[[str], Picture]
+    photos: Photos | None
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A scene: attitude of the camera, robots, look, and how the picture is stored."""
+
+    roll_rad: float
+    pitch_rad: float
+    robots: tuple[Robot, ...]
+    look: Look
+    jpeg_quality: int
+
+
+def draw_scene(world: World, index: int) -> Drawn:
+    """Scene number ``index``, the same whatever else is drawn.
+
+    Parameters
+    ----------
+    world
+        Where it comes from.
+    index
+        Number of the image, from 0.
+    """
+    settings = world.settings
+    rng = np.random.default_rng((settings.seed, index))
+    tilt_rad = np.radians(settings.camera_tilt_max_deg)
+    roll, pitch = rng.uniform(-tilt_rad, tilt_rad, 2).tolist()
+    shutter_s = _between(rng, settings.shutter_s)
+    poses = _poses(world, rng, camera_from_horizontal(roll, pitch))
+    robots = tuple(_robot(settings, rng, pose, shutter_s) for pose in poses)
+    look = _look(world, rng, (roll, pitch), shutter_s)
+    low, high = settings.jpeg_quality
+    return Drawn(roll, pitch, robots, look, int(rng.integers(low, high + 1)))
+
+
+def _between(rng: Generator, limits: Range) -> float:
+    return float(rng.uniform(*limits))
+
+
+def _factor(rng: Generator, limits: Range) -> float:
+    """Between limits, every factor as likely."""
+    return float(np.exp(rng.uniform(*np.log(limits))))
+
+
+def _poses(world: World, rng: Generator, tilt: Array) -> list[Pose]:
+    settings = world.settings
+    empty = rng.random() < settings.empty_share
+    count = 0 if empty else int(rng.integers(1, settings.robots_max + 1))
+    poses: list[Pose] = []
+    for _ in range(count * TRIES):
+        if len(poses) == count:
+            break
+        pose = Pose(_place(world, rng), tilt @ _attitude(settings, rng))
+        apart = (np.linalg.norm(pose.xyz_camera - other.xyz_camera) for other in poses)
+        if all(distance > 2 * world.radius_m for distance in apart):
+            poses.append(pose)
+    return poses
+
+
+def _place(world: World, rng: Generator) -> Array:
+    """Uniform in the image as it is seen, distorted; every factor of depth as likely."""
+    camera = world.camera
+    uv = rng.uniform((0, 0), (camera.width_px, camera.height_px))
+    u_px, v_px = pinhole_from_image(uv, camera)
+    depth_m = _factor(rng, world.settings.depth_m)
+    left = (camera.cx_px - u_px) / camera.fx_px
+    up = (camera.cy_px - v_px) / camera.fy_px
+    return np.array([depth_m, depth_m * left, depth_m * up])
+
+
+def _attitude(settings: Settings, rng: Generator) -> Array:
+    """Rotation horizontal_from_body: Rz(yaw) Ry(pitch) Rx(roll)."""
+    tilt_rad = np.radians(settings.robot_tilt_max_deg)
+    roll, pitch = rng.uniform(-tilt_rad, tilt_rad, 2).tolist()
+    yaw = rng.uniform(-np.pi, np.pi)
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(turn @ camera_from_horizontal(roll, pitch).T)
+
+
+def _robot(settings: Settings, rng: Generator, pose: Pose, shutter_s: float) -> Robot:
+    velocity = rng.normal(size=3)
+    velocity *= settings.speed_max_mps * rng.random() / np.linalg.norm(velocity)
+    stopped = rng.random() < settings.rotors_stopped_share
+    # Without a shutter time, rotors are as at 10 ms: a disc.
+    open_s = shutter_s or 0.01
+    sweep = 0.0 if stopped else 2 * np.pi * _between(rng, settings.rotor_speed_rps) * open_s
+    paint = random_paint(rng, _between(rng, settings.wear), settings.colour_spread)
+    paint |= {"rotor_first_rad": float(rng.uniform(0, np.pi)), "rotor_sweep_rad": float(sweep)}
+    return Robot(pose, paint, velocity * shutter_s)
+
+
+def random_paint(rng: Generator, wear: float, spread: float) -> dict[str, Any]:
+    """Colour and finish of every material, as the worker's shaders read them.
+
+    Parameters
+    ----------
+    rng
+        Where the randomness comes from.
+    wear
+        0: new; 1: grey and dull.
+    spread
+        How far colours vary, 0 to 1.
+    """
+    paint: dict[str, Any] = {}
+    for k, name in enumerate(MATERIALS):
+        base, roughness, metallic, glow = PALETTE[name]
+        others = OTHERS.get(name, ())
+        if others and rng.random() < spread:
+            base = others[int(rng.integers(len(others)))]
+        colour = np.array(base) * np.exp(rng.normal(0, spread, 3) * 0.5 + rng.normal(0, spread))
+        dust = wear * rng.random()
+        colour = np.clip(colour * (1 - 0.5 * dust) + 0.06 * dust, 0, 1)
+        rough = float(np.clip(roughness + 0.5 * dust + rng.normal(0, 0.1), 0.05, 1))
+        shine = metallic * (1 - 0.6 * dust)
+        paint[f"colour_{k}"] = colour.tolist()
+        paint[f"finish_{k}"] = [rough, shine, glow * float(rng.uniform(0, 2))]
+    return paint
+
+
+def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s: float) -> Look:
+    settings = world.settings
+    name = world.lights[int(rng.integers(len(world.lights)))]
+    turn = (*tilt_rad, float(rng.uniform(-np.pi, np.pi)))
+    zoom = _between(rng, settings.background_zoom)
+    if world.photos is not None:
+        backdrop = world.photos.backdrop(rng, world.camera, zoom)
+    else:
+        backdrop = panorama_view(world.panorama(name), world.camera, turn)
+    backdrop = blur(backdrop, _between(rng, settings.background_blur_px))
+    shake = rng.normal(size=2)
+    shake *= np.radians(settings.shake_max_dps) * rng.random() / np.linalg.norm(shake)
+    backdrop = smeared(backdrop, (shake * shutter_s * world.camera.fx_px).tolist())
+    backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
+    gain = _factor(rng, settings.robot_gain) * float(backdrop.mean()) / 0.3
+    seed = int(rng.integers(2**31))
+    return Look(backdrop, _light(settings, rng, name, turn), _sensor(settings, rng), gain, seed)
+
+
+def _light(
+    settings: Settings, rng: Generator, name: str, turn: tuple[float, float, float]
+) -> Light:
+    towards = rng.normal((0.0, 0.0, 1.2), 1.0)
+    warm = float(rng.normal(0, 0.12))
+    return Light(
+        name=name,
+        turn_rad=turn,
+        strength=_between(rng, settings.light_strength),
+        sun_camera=camera_from_horizontal(*turn[:2]) @ (towards / np.linalg.norm(towards)),
+        sun_strength=_between(rng, settings.sun_strength),
+        sun_colour=(1 + warm, 1.0, 1 - warm),
+        sun_angle_rad=_between(rng, (0.01, 0.6)),
+    )
+
+
+def _sensor(settings: Settings, rng: Generator) -> Sensor:
+    warmth = _factor(rng, settings.warmth) ** 0.5
+    return Sensor(
+        brightness=_between(rng, settings.brightness),
+        contrast_gamma=_between(rng, settings.contrast_gamma),
+        balance=(warmth, 1.0, 1 / warmth),
+        saturation=_between(rng, settings.saturation),
+        vignetting=_between(rng, settings.vignetting),
+        defocus_px=_between(rng, settings.defocus_px),
+        bayer=settings.bayer,
+        shot_noise=_between(rng, settings.shot_noise),
+        read_noise=_between(rng, settings.read_noise),
+    )

@@ -1,0 +1,204 @@
+"""Renders shots: camera, robots and look in, pixels and truth out, in the order asked.
+
+with Renderer(ensure(say), Model()) as renderer:
+    for shot in renderer.shots((camera, robots, look) for ...):
+        ...
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+
+from dmrl.errors import SettingError
+from dmrl.geometry import Array, Camera
+from dmrl.rendering import crazyflie
+from dmrl.rendering.compose import compose
+from dmrl.rendering.lens import Picture
+from dmrl.rendering.pool import Pool, Start, Worker
+from dmrl.rendering.shot import Layer, Look, Robot, Shot, requests
+
+MODEL_KINDS = (".blend", ".glb", ".gltf", ".obj", ".stl")
+SMALLEST_M, LARGEST_M = 0.01, 3.0
+SAMPLES = 16
+BOUNCES = 2
+
+Scene = tuple[Camera, Sequence[Robot], Look]
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What the robots look like.
+
+    Parameters
+    ----------
+    path
+        .blend, .glb, .obj or .stl; None: the Crazyflie that dmrl draws.
+    scale
+        Metres per unit of the file; of the drawn one, times its life size.
+    up
+        Axis of the file that points up.
+    """
+
+    path: Path | None = None
+    scale: float = 1.0
+    up: Literal["y", "z"] = "z"
+
+
+def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> Start:
+    head: dict[str, Any] = {
+        "samples": samples,
+        "bounces": BOUNCES,
+        "lights": list(lights),
+        "model": None if model.path is None else str(model.path),
+        "model_scale": model.scale,
+        "model_up": model.up,
+        "materials": crazyflie.MATERIALS,
+        "blade_half_width_m": crazyflie.BLADE_HALF_WIDTH_M,
+        "between_rotors_rad": crazyflie.BETWEEN_ROTORS_RAD,
+    }
+    if model.path is not None:
+        return Start(python, head)
+    mesh = crazyflie.mesh()
+    arrays = {"vertices": mesh.vertices * model.scale, "faces": mesh.faces}
+    return Start(python, head, {**arrays, "material": mesh.material, "rotor": mesh.rotor})
+
+
+class Renderer:
+    """Workers with one model and the panoramas that may light it.
+
+    Parameters
+    ----------
+    python
+        Of Blender's environment, see ``environment.ensure``.
+    model
+        The robot.
+    lights
+        Panoramas (.exr, .hdr) by path. None: those that come with Blender.
+    workers
+        Processes. 0: as many as there are cores.
+    samples
+        Light paths per pixel.
+
+    Raises
+    ------
+    BlenderError
+        If Blender does not start.
+    ModelError
+        If the model cannot be used.
+    SettingError
+        If the scale makes a robot that is no small drone.
+    """
+
+    def __init__(
+        self,
+        python: Path,
+        model: Model,
+        *,
+        lights: Sequence[Path] | None = None,
+        workers: int = 0,
+        samples: int = SAMPLES,
+    ) -> None:
+        _check_model(model)
+        self.lights = [str(p) for p in (shipped_lights(python) if lights is None else lights)]
+        cores = len(os.sched_getaffinity(0))
+        self._pool = Pool(_start(python, model, self.lights, samples), workers or cores)
+        self.version = self._pool.version
+        self.points = _outermost(self._pool.points)
+        size_m = float(np.ptp(self._pool.points, axis=0).max())
+        if not SMALLEST_M <= size_m <= LARGEST_M:
+            self._pool.__exit__()
+            raise SettingError(
+                f"--scale {model.scale:g} makes robots of {size_m:.3g} m; they must be "
+                f"{SMALLEST_M:g} to {LARGEST_M:g} m. Change --scale, metres per unit of the model"
+            )
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of a ball about the origin that holds a robot."""
+        return float(np.linalg.norm(self.points, axis=1).max())
+
+    @property
+    def pool(self) -> Pool:
+        """The processes."""
+        return self._pool
+
+    def shots(self, scenes: Iterable[Scene]) -> Iterator[Shot]:
+        """Shots of scenes, in their order; few scenes are taken ahead.
+
+        Raises
+        ------
+        BlenderError
+            If Blender dies again and again on one scene.
+        """
+        return self._pool.map(self._shot, scenes)
+
+    def _shot(self, worker: Worker, scene: Scene) -> Shot:
+        return shoot(worker, scene, self.points)
+
+    def panorama(self, name: str) -> Picture:
+        """(H, W, 3) linear light of a panorama, all around."""
+        _, arrays = self._pool.call(lambda worker: worker.ask({"panorama": name}))
+        return np.array(arrays["panorama"], np.float32)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.__exit__()
+
+
+def shoot(worker: Worker, scene: Scene, points: Array) -> Shot:
+    """One shot by one worker.
+
+    Parameters
+    ----------
+    worker
+        Renders it.
+    scene
+        Camera, robots and look.
+    points
+        (N, 3) points whose hull holds a robot, body frame.
+
+    Raises
+    ------
+    EOFError, OSError
+        If the worker has died.
+    """
+    camera, robots, look = scene
+    layers = {}
+    for number, asked in requests(camera, robots, look, points):
+        _, arrays = worker.ask(asked)
+        left, top, _, _ = asked["crop_px"]
+        layers[number] = Layer(left, top, arrays["light"], arrays["depth"])
+    return compose(camera, robots, look, layers)
+
+
+def shipped_lights(python: Path) -> list[Path]:
+    """Panoramas that come with Blender, sorted."""
+    found = python.parent.parent.glob(
+        "lib/python*/site-packages/bpy/*/datafiles/studiolights/world"
+    )
+    return sorted(path for folder in found for path in folder.glob("*.exr"))
+
+
+def _check_model(model: Model) -> None:
+    if model.path is not None:
+        if not model.path.is_file():
+            raise SettingError(f"no model {model.path}. Check --model")
+        if model.path.suffix.lower() not in MODEL_KINDS:
+            raise SettingError(f"{model.path} is no model. Known: {', '.join(MODEL_KINDS)}")
+    if not np.isfinite(model.scale) or model.scale <= 0:
+        raise SettingError(f"--scale {model.scale:g} is not over 0. Give metres per unit")
+
+
+def _outermost(points: Array) -> Array:
+    """The points that lie farthest in some of many directions: they hold all others, nearly."""
+    k = np.arange(400) + 0.5  # directions on a golden spiral
+    z, turn = 1 - 2 * k / 400, np.pi * (1 + 5**0.5) * k
+    ring = np.sqrt(1 - z * z)
+    directions = np.column_stack([np.cos(turn) * ring, np.sin(turn) * ring, z])
+    return np.asarray(points[np.unique((points @ directions.T).argmax(axis=0))])

@@ -1,0 +1,153 @@
+"""From light to the bytes of a small camera: lens, Bayer mosaic, noise, exposure."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from dmrl.rendering.lens import Picture
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """How one picture is taken.
+
+    Parameters
+    ----------
+    brightness
+        Mean of the picture, 0 to 1, before vignetting: what automatic exposure aims at.
+    contrast_gamma
+        1: values are proportional to light, as raw sensors give; 2.2: as screens expect.
+    balance
+        Red, green and blue gains.
+    saturation
+        1: colours as they are; 0: grey. Small sensors' filters let other colours through.
+    vignetting
+        Light lost in the farthest corner, 0 to 1.
+    defocus_px
+        Standard deviation of the lens' blur, pixels.
+    bayer
+        Whether each pixel measures one colour, the others filled in from its neighbours.
+    shot_noise
+        Variance of the noise per unit of light; full scale is 1.
+    read_noise
+        Standard deviation of the noise in the dark; full scale is 1.
+    """
+
+    brightness: float = 0.4
+    contrast_gamma: float = 2.2
+    balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    saturation: float = 1.0
+    vignetting: float = 0.0
+    defocus_px: float = 0.0
+    bayer: bool = False
+    shot_noise: float = 0.0
+    read_noise: float = 0.0
+
+
+def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 picture of linear light.
+
+    Parameters
+    ----------
+    light
+        (H, W, 3) linear, any scale; not changed.
+    sensor
+        How it is taken.
+    rng
+        Where the noise comes from.
+    """
+    target = sensor.brightness**sensor.contrast_gamma
+    mean = max(float(light.reshape(-1, 3).mean(axis=0) @ LUMINANCE), 1e-6)
+    gain = np.array(sensor.balance, np.float32) * np.float32(target / mean)
+    height, width, _ = light.shape
+    values = blur(_mixed(light, sensor.saturation), sensor.defocus_px)
+    if sensor.vignetting > 0:
+        falloff = 1 - np.float32(sensor.vignetting) * _radius2(height, width)
+        values = values * falloff[..., None]
+    if sensor.bayer:
+        values = demosaic(_noisy(mosaic(values * gain), sensor, rng))
+    else:
+        values = _noisy(values * gain, sensor, rng)
+    if sensor.contrast_gamma != 1:
+        values = np.power(values, np.float32(1 / sensor.contrast_gamma))
+    return np.asarray(np.clip(values * 255 + 0.5, 0, 255), np.uint8)
+
+
+def _mixed(light: Picture, saturation: float) -> Picture:
+    if saturation == 1:
+        return light
+    mix = np.float32(saturation) * np.eye(3, dtype=np.float32)
+    mix += np.float32(1 - saturation) * LUMINANCE
+    return light @ mix.T
+
+
+def _noisy(values: Picture, sensor: Sensor, rng: Generator) -> Picture:
+    values = np.clip(values, 0, 1)
+    if sensor.shot_noise or sensor.read_noise:
+        spread = np.sqrt(values * np.float32(sensor.shot_noise) + np.float32(sensor.read_noise**2))
+        values += spread * rng.standard_normal(values.shape, np.float32)
+        np.clip(values, 0, 1, out=values)
+    return values
+
+
+@cache
+def _radius2(height: int, width: int) -> Picture:
+    """Squared distance from the middle, 1 in the corners."""
+    v, u = np.mgrid[:height, :width] + 0.5
+    u, v = u / width * 2 - 1, v / height * 2 - 1
+    return np.asarray((u * u + v * v) / 2, np.float32)
+
+
+def blur(picture: Picture, sigma_px: float) -> Picture:
+    """(H, W, C) picture under a Gaussian; edges are continued."""
+    reach = int(np.ceil(2.5 * sigma_px))
+    if sigma_px < 0.2:
+        return picture
+    steps = np.arange(-reach, reach + 1)
+    weights = np.exp(-0.5 * (steps / sigma_px) ** 2)
+    weights = (weights / weights.sum()).astype(np.float32)
+    for axis in (0, 1):
+        pad = [(reach, reach) if k == axis else (0, 0) for k in range(3)]
+        padded = np.pad(picture, pad, mode="edge")
+        size = picture.shape[axis]
+        total = np.zeros_like(picture)
+        for k, weight in enumerate(weights):
+            part = padded[k : k + size] if axis == 0 else padded[:, k : k + size]
+            total += weight * part
+        picture = total
+    return picture
+
+
+def mosaic(picture: Picture) -> Picture:
+    """(H, W) what a sensor with red, green / green, blue squares measures of (H, W, 3)."""
+    raw = picture[..., 1].copy()
+    raw[::2, ::2] = picture[::2, ::2, 0]
+    raw[1::2, 1::2] = picture[1::2, 1::2, 2]
+    return raw
+
+
+def demosaic(raw: Picture) -> Picture:
+    """(H, W, 3) picture from a mosaic, each colour linear between where it was measured."""
+    height, width = raw.shape
+    across = np.pad(raw, ((0, 0), (1, 1)), mode="reflect")
+    sides = (across[:, :-2] + across[:, 2:]) * np.float32(0.5)
+    down = np.pad(raw, ((1, 1), (0, 0)), mode="reflect")
+    ends = (down[:-2] + down[2:]) * np.float32(0.5)
+    both = np.pad(sides, ((1, 1), (0, 0)), mode="reflect")
+    corners = (both[:-2] + both[2:]) * np.float32(0.5)
+    out = np.empty((height, width, 3), np.float32)
+    for channel, row, col in ((0, 0, 0), (2, 1, 1)):
+        here, there = np.s_[row::2, col::2], np.s_[1 - row :: 2, 1 - col :: 2]
+        out[..., channel][here] = raw[here]
+        out[..., channel][row::2, 1 - col :: 2] = sides[row::2, 1 - col :: 2]
+        out[..., channel][1 - row :: 2, col::2] = ends[1 - row :: 2, col::2]
+        out[..., channel][there] = corners[there]
+    cross = (sides + ends) * np.float32(0.5)
+    out[..., 1] = raw
+    out[::2, ::2, 1], out[1::2, 1::2, 1] = cross[::2, ::2], cross[1::2, 1::2]
+    return out

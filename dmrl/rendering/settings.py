@@ -1,0 +1,246 @@
+"""What a run of renders may look like: every range that poses and looks are drawn from."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+Range = tuple[float, float]
+
+ANY = (-float("inf"), float("inf"))
+# Least and greatest sensible value of every key that is a number or a range of numbers.
+LIMITS: dict[str, Range] = {
+    "images": (1, 9_999_999),
+    "seed": (0, 2**31 - 1),
+    "workers": (0, 256),
+    "samples": (1, 4096),
+    "scale": (1e-9, 1e9),
+    "rate_hz": (1e-3, 1e4),
+    "test_share": (0, 1),
+    "empty_share": (0, 1),
+    "robots_max": (1, 20),
+    "depth_m": (0.08, 50.0),
+    "robot_tilt_max_deg": (0, 90),
+    "camera_tilt_max_deg": (0, 60),
+    "speed_max_mps": (0, 20),
+    "shutter_s": (0, 0.1),
+    "shake_max_dps": (0, 500),
+    "rotor_speed_rps": (0, 1000),
+    "rotors_stopped_share": (0, 1),
+    "wear": (0, 1),
+    "colour_spread": (0, 1),
+    "light_strength": (0, 20),
+    "sun_strength": (0, 50),
+    "robot_gain": (0.05, 20),
+    "background_zoom": (1, 8),
+    "background_blur_px": (0, 20),
+    "brightness": (0.02, 0.98),
+    "contrast_gamma": (0.5, 3),
+    "warmth": (0.2, 5),
+    "saturation": (0, 1),
+    "vignetting": (0, 1),
+    "defocus_px": (0, 10),
+    "shot_noise": (0, 0.1),
+    "read_noise": (0, 0.3),
+    "jpeg_quality": (1, 100),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is rendered. A range is drawn from anew for every image.
+
+    Parameters
+    ----------
+    images
+        Images to render.
+    seed
+        Another seed renders other images.
+    workers
+        Blender processes. 0: as many as there are cores. Changes no byte of the output.
+    samples
+        Light paths per pixel.
+    camera
+        aideck: the paper's calibration. published: that of the published renders.
+    distorted
+        Whether images have the camera's lens distortion.
+    model
+        .blend, .glb, .obj or .stl of the robot. Without it, the Crazyflie that dmrl draws.
+    model_up
+        Axis of the model's file that points up.
+    scale
+        Metres per unit of the model; without a model, times life size.
+    backgrounds
+        Folder of photos. Without it, what the panoramas show.
+    lights
+        Folder of panoramas (.exr, .hdr). Without it, those that come with Blender.
+    masks
+        Whether to write a mask of every robot.
+    depths
+        Whether to write a depth image.
+    rate_hz
+        Images per second of the recording's time.
+    test_share
+        Share of images, the last ones, that form the test split, 0 to 1.
+    empty_share
+        Share of images without a robot, 0 to 1.
+    robots_max
+        Robots in an image, at most; every number is as likely.
+    depth_m
+        Range of depths; every factor is as likely.
+    robot_tilt_max_deg
+        Roll and pitch of the robots, at most.
+    camera_tilt_max_deg
+        Roll and pitch of the camera, at most.
+    speed_max_mps
+        Speed of the robots seen from the camera, at most.
+    shutter_s
+        Range of exposure times, with which speed and shake smear.
+    shake_max_dps
+        Turning rate of the camera, at most, degrees per second.
+    rotor_speed_rps
+        Range of rotor speeds, turns per second.
+    rotors_stopped_share
+        Share of robots whose rotors stand still.
+    wear
+        Range of wear: worn robots are duller and greyer.
+    colour_spread
+        How far colours of parts vary, 0 to 1.
+    light_strength
+        Range of the panorama's light on the robots.
+    sun_strength
+        Range of the sun's or lamp's light on the robots, watts per square metre.
+    robot_gain
+        Range of the light of robots over that of the background; every factor is as likely.
+    background_zoom
+        Range of how far photos are zoomed into.
+    background_blur_px
+        Range of the background's blur, a standard deviation, pixels.
+    brightness
+        Range of the mean of the image, 0 to 1.
+    contrast_gamma
+        Range of the response: 1 is proportional to light, 2.2 as screens expect.
+    warmth
+        Range of red over blue; every factor is as likely.
+    saturation
+        Range of how well the sensor tells colours apart, 0 to 1.
+    vignetting
+        Range of light lost in the corners, 0 to 1.
+    defocus_px
+        Range of the lens' blur, a standard deviation, pixels.
+    bayer
+        Whether the sensor measures one colour per pixel.
+    shot_noise
+        Range of the noise's variance per unit of light.
+    read_noise
+        Range of the noise's standard deviation in the dark, full scale 1.
+    image_format
+        Of the images in the recording.
+    jpeg_quality
+        Range of qualities, 1 to 100.
+    """
+
+    images: int = 1000
+    seed: int = 0
+    workers: int = 0
+    samples: int = 16
+    camera: Literal["aideck", "published"] = "aideck"
+    distorted: bool = True
+    model: Path | None = None
+    model_up: Literal["y", "z"] = "z"
+    scale: float = 1.0
+    backgrounds: Path | None = None
+    lights: Path | None = None
+    masks: bool = False
+    depths: bool = False
+    rate_hz: float = 10.0
+    test_share: float = 0.2
+    empty_share: float = 0.1
+    robots_max: int = 1
+    depth_m: Range = (0.2, 2.0)
+    robot_tilt_max_deg: float = 20.0
+    camera_tilt_max_deg: float = 20.0
+    speed_max_mps: float = 0.0
+    shutter_s: Range = (0.0, 0.0)
+    shake_max_dps: float = 0.0
+    rotor_speed_rps: Range = (200.0, 350.0)
+    rotors_stopped_share: float = 0.1
+    wear: Range = (0.0, 0.6)
+    colour_spread: float = 0.3
+    light_strength: Range = (0.5, 1.5)
+    sun_strength: Range = (0.0, 3.0)
+    robot_gain: Range = (0.5, 1.5)
+    background_zoom: Range = (1.0, 2.0)
+    background_blur_px: Range = (0.0, 1.0)
+    brightness: Range = (0.3, 0.6)
+    contrast_gamma: Range = (2.2, 2.2)
+    warmth: Range = (0.9, 1.1)
+    saturation: Range = (1.0, 1.0)
+    vignetting: Range = (0.0, 0.0)
+    defocus_px: Range = (0.0, 0.0)
+    bayer: bool = False
+    shot_noise: Range = (0.0, 0.0)
+    read_noise: Range = (0.0, 0.0)
+    image_format: Literal["jpeg", "png"] = "jpeg"
+    jpeg_quality: tuple[int, int] = (95, 95)
+
+    def __post_init__(self) -> None:
+        if faults := list(_faults(self)):
+            raise ValueError("; ".join(faults))
+
+
+def _faults(settings: Settings) -> list[str]:
+    """Every value that is out of its limits, and every range that is upside down."""
+    faults = []
+    for key in fields(settings):
+        low, high = LIMITS.get(key.name, ANY)
+        value: Any = getattr(settings, key.name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if key.name not in LIMITS:
+            continue
+        if not all(low <= number <= high for number in numbers):
+            faults.append(f"{key.name}: {value} is not within {low:g} to {high:g}")
+        elif list(numbers) != sorted(numbers):
+            faults.append(f"{key.name}: {value} ends before it begins")
+    return faults
+
+
+# Defaults of a recipe that says `preset`; its own keys come before them.
+PRESETS: dict[str, dict[str, Any]] = {
+    # The HM01B0 of the AI-deck: raw response, no white balance, small lens, much noise.
+    "himax": {
+        "camera": "aideck",
+        "distorted": True,
+        "robots_max": 1,
+        "speed_max_mps": 0.6,
+        "shutter_s": [0.002, 0.012],
+        "shake_max_dps": 40.0,
+        "background_blur_px": [0.2, 1.2],
+        "robot_gain": [0.2, 1.0],
+        "brightness": [0.28, 0.55],
+        "contrast_gamma": [1.2, 1.9],
+        "warmth": [0.5, 4.0],
+        "saturation": [0.4, 0.8],
+        "vignetting": [0.5, 0.9],
+        "defocus_px": [0.6, 1.4],
+        "bayer": True,
+        "shot_noise": [0.0005, 0.003],
+        "read_noise": [0.004, 0.015],
+        "jpeg_quality": [80, 95],
+    },
+    # The authors' renders: f = 120 px about the middle, twice life size, a clean camera.
+    "published": {
+        "camera": "published",
+        "distorted": False,
+        "robots_max": 1,
+        "empty_share": 0.0,
+        "scale": 2.0,
+        "depth_m": [0.2, 2.0],
+        "rotors_stopped_share": 1.0,
+        "background_zoom": [1.0, 1.0],
+        "background_blur_px": [0.0, 0.0],
+        "wear": [0.0, 0.0],
+        "brightness": [0.35, 0.55],
+        "jpeg_quality": [90, 90],
+    },
+    "plain": {},
+}

@@ -1,0 +1,224 @@
+"""One picture with its exact labels: camera, robots and look in, pixels and truth out.
+
+Nothing here is random but the sensor's noise, which is keyed by the look's seed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.geometry import Array, Camera, project
+from dmrl.rendering.lens import Canvas, Picture, canvas_of
+from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.sketch import Pose
+
+Part = tuple[slice, slice]
+"""Rows and columns of a picture."""
+PAD_PX = 2
+NEAREST_M = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What shines on the robots.
+
+    Parameters
+    ----------
+    name
+        Panorama: a file the renderer was started with.
+    turn_rad
+        Roll and pitch of the camera, and the panorama's turn about the vertical.
+    strength
+        Of the panorama; 1: as it was photographed.
+    sun_camera
+        (3,) unit vector towards the sun or lamp, camera frame.
+    sun_strength
+        Watts per square metre.
+    sun_colour
+        Red, green, blue.
+    sun_angle_rad
+        Apparent size: large is soft.
+    """
+
+    name: str
+    turn_rad: tuple[float, float, float]
+    strength: float
+    sun_camera: Array
+    sun_strength: float
+    sun_colour: tuple[float, float, float]
+    sun_angle_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A robot before the camera.
+
+    Parameters
+    ----------
+    pose
+        At the middle of the exposure.
+    paint
+        Properties of its materials, as the worker's shaders read them.
+    move_camera_m
+        (3,) how far it moves in the camera frame while the shutter is open, metres.
+    """
+
+    pose: Pose
+    paint: Mapping[str, Any] = field(default_factory=dict)
+    move_camera_m: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Everything that changes pixels and no label.
+
+    Parameters
+    ----------
+    backdrop
+        (H, W, 3) linear light behind the robots.
+    light
+        What shines on the robots.
+    sensor
+        What the camera makes of it.
+    robot_gain
+        Light of the robots over that of the backdrop.
+    seed
+        Of the renderer's and the sensor's noise.
+    """
+
+    backdrop: Picture
+    light: Light
+    sensor: Sensor
+    robot_gain: float = 1.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A picture and its exact labels, robots in the order in which they were given.
+
+    Parameters
+    ----------
+    rgb
+        (H, W, 3) uint8.
+    uv_px
+        (N, 2) pixels of the robots' centres, with the camera's distortion.
+    depth_m
+        (N,) distance of the centres along camera x.
+    box_px
+        (N, 4) left, top, right, bottom of the visible part; NaN where nothing is visible.
+    visible_share
+        (N,) share of a robot's opacity in the image that no nearer robot hides.
+    opacity
+        (N, H, W) uint8, visible opacity of each robot, without blur.
+    surface_m
+        (H, W) distance of the nearest surface along camera x; 0 where there is no robot.
+    """
+
+    rgb: NDArray[np.uint8]
+    uv_px: Array
+    depth_m: Array
+    box_px: Array
+    visible_share: Array
+    opacity: NDArray[np.uint8]
+    surface_m: Picture
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One robot alone on the canvas: premultiplied light and opacity, and depth, of a crop."""
+
+    left_px: int
+    top_px: int
+    light: Picture
+    depth_m: Picture
+
+    @property
+    def part(self) -> Part:
+        """Rows and columns of the canvas that it covers."""
+        height, width = self.depth_m.shape
+        return np.s_[self.top_px : self.top_px + height, self.left_px : self.left_px + width]
+
+
+def crop_of(canvas: Canvas, pose: Pose, points: Array) -> tuple[int, int, int, int] | None:
+    """Left, top, right, bottom of the part of the canvas that can show a robot; None if none.
+
+    Parameters
+    ----------
+    canvas
+        Of the camera.
+    pose
+        Of the robot.
+    points
+        (N, 3) points whose convex hull holds the robot, body frame.
+    """
+    limit = np.array([canvas.pinhole.width_px, canvas.pinhole.height_px])
+    xyz = points @ pose.camera_from_body.T + pose.xyz_camera
+    if (xyz[:, 0] < NEAREST_M).all():
+        return None
+    if (xyz[:, 0] < NEAREST_M).any():
+        return 0, 0, int(limit[0]), int(limit[1])
+    uv, _ = project(xyz, canvas.pinhole.image_from_optical)
+    low = np.clip(np.floor(uv.min(axis=0)) - PAD_PX, 0, limit).astype(int)
+    high = np.clip(np.ceil(uv.max(axis=0)) + PAD_PX, 0, limit).astype(int)
+    if (low >= high).any():
+        return None
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def request(
+    canvas: Canvas, crop: tuple[int, int, int, int], robot: Robot, look: Look, number: int
+) -> dict[str, Any]:
+    """What a worker is asked for one robot."""
+    camera = canvas.pinhole
+    light = look.light
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = robot.pose.camera_from_body, robot.pose.xyz_camera
+    return {
+        "size_px": (camera.width_px, camera.height_px),
+        "intrinsics_px": (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
+        "crop_px": crop,
+        "camera_from_body": matrix.tolist(),
+        "paint": dict(robot.paint),
+        "seed": (look.seed + number) % 2**31,
+        "light": light.name,
+        "light_turn_rad": light.turn_rad,
+        "light_strength": light.strength,
+        "sun_strength": light.sun_strength,
+        "sun_colour": light.sun_colour,
+        "sun_angle_rad": light.sun_angle_rad,
+        "sun_matrix": _pointing(light.sun_camera).tolist(),
+    }
+
+
+def _pointing(towards: Array) -> Array:
+    """(4, 4) rotation whose z axis points that way."""
+    aside = np.cross(towards, (0.0, 0.0, 1.0) if abs(towards[2]) < 0.9 else (1.0, 0.0, 0.0))
+    aside /= np.linalg.norm(aside)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.column_stack([aside, np.cross(towards, aside), towards])
+    return matrix
+
+
+def requests(
+    camera: Camera, robots: Sequence[Robot], look: Look, points: Array
+) -> list[tuple[int, dict[str, Any]]]:
+    """Number of every robot that can be seen, and what a worker is asked for it.
+
+    Parameters
+    ----------
+    camera, robots, look
+        The scene.
+    points
+        (N, 3) points whose convex hull holds a robot, body frame.
+    """
+    canvas = canvas_of(camera)
+    crops = [crop_of(canvas, robot.pose, points) for robot in robots]
+    return [
+        (k, request(canvas, crop, robots[k], look, k))
+        for k, crop in enumerate(crops)
+        if crop is not None
+    ]

@@ -1,0 +1,134 @@
+"""Messages of a rendered image: picture, labels, true poses, masks, depth.
+
+One moment of a recording, whoever chose the poses.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.formats.sample import Sample, image, labels
+from dmrl.geometry import Array, camera_from_horizontal
+from dmrl.images import encode_jpeg, encode_png
+from dmrl.rendering.randomise import Drawn
+from dmrl.rendering.settings import Settings
+from dmrl.rendering.shot import Shot
+
+ROBOT = "cf1"
+"""The robot that carries the camera."""
+
+
+def peer(number: int) -> str:
+    """Name of the robot of that number in an image, from 0."""
+    return f"cf{number + 2}"
+
+
+def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Iterator[Sample]:
+    """Everything that is recorded of one image.
+
+    Parameters
+    ----------
+    time_ns
+        Of the exposure.
+    settings
+        Which topics are wanted.
+    scene
+        True poses.
+    shot
+        Pixels and labels.
+    """
+    jpeg = settings.image_format == "jpeg"
+    data = encode_jpeg(shot.rgb, scene.jpeg_quality) if jpeg else encode_png(shot.rgb)
+    yield image(time_ns, ROBOT, data, settings.image_format)
+    yield labels(time_ns, ROBOT, list(_peers(shot)))
+    attitude = {"roll_rad": scene.roll_rad, "pitch_rad": scene.pitch_rad}
+    yield Sample(time_ns, topics.attitude(ROBOT), "Attitude", attitude)
+    horizontal_from_camera = camera_from_horizontal(scene.roll_rad, scene.pitch_rad).T
+    for k, robot in enumerate(scene.robots):
+        xyz = horizontal_from_camera @ robot.pose.xyz_camera
+        yield _truth(time_ns, peer(k), xyz)
+    yield _transforms(time_ns, scene, horizontal_from_camera)
+    if settings.masks:
+        mask = encode_png(_mask(shot))
+        yield replace(image(time_ns, ROBOT, mask, "png"), topic=topics.masks(ROBOT))
+    if settings.depths:
+        depth = encode_png(np.round(shot.surface_m * 1000).astype(np.uint16))
+        yield replace(image(time_ns, ROBOT, depth, "png"), topic=topics.depths(ROBOT))
+
+
+def _peers(shot: Shot) -> Iterator[dict[str, Any]]:
+    """Labels of the robots of which anything is seen."""
+    for k, share in enumerate(shot.visible_share.tolist()):
+        if share <= 0 or np.isnan(shot.box_px[k]).any():
+            continue
+        yield {
+            "peer": peer(k),
+            "u_px": float(shot.uv_px[k, 0]),
+            "v_px": float(shot.uv_px[k, 1]),
+            "depth_m": float(shot.depth_m[k]),
+            "box_px": shot.box_px[k].tolist(),
+            "visible_share": share,
+            "source": "truth",
+        }
+
+
+def _mask(shot: Shot) -> Any:
+    """(H, W) uint8: number in the name of the peer that covers most of a pixel; 0: none."""
+    if not len(shot.opacity):
+        return np.zeros(shot.rgb.shape[:2], np.uint8)
+    most = shot.opacity.max(axis=0)
+    return np.where(most > 0, shot.opacity.argmax(axis=0) + 2, 0).astype(np.uint8)
+
+
+def _truth(time_ns: int, name: str, xyz: Array) -> Sample:
+    fields = dict(zip("xyz", xyz.tolist(), strict=True))
+    fields |= {"frame_id": f"{ROBOT}/horizontal", "covariance": [0.0] * 9}
+    return Sample(time_ns, topics.truth(ROBOT, name), "PeerPosition", fields)
+
+
+def _transforms(time_ns: int, scene: Drawn, horizontal_from_camera: Array) -> Sample:
+    """True poses: the observer's horizontal frame is the world; camera and peers in it."""
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    poses = [("world", f"{ROBOT}/horizontal", np.zeros(3), np.eye(3))]
+    poses.append((f"{ROBOT}/horizontal", f"{ROBOT}/camera", np.zeros(3), horizontal_from_camera))
+    for k, robot in enumerate(scene.robots):
+        xyz = horizontal_from_camera @ robot.pose.xyz_camera
+        turn = horizontal_from_camera @ robot.pose.camera_from_body
+        poses.append((f"{ROBOT}/horizontal", peer(k), xyz, turn))
+    transforms = [
+        {
+            "timestamp": {"seconds": seconds, "nanos": nanos},
+            "parent_frame_id": parent,
+            "child_frame_id": child,
+            "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
+            "rotation": dict(zip("xyzw", quaternion(turn), strict=True)),
+        }
+        for parent, child, xyz, turn in poses
+    ]
+    return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": transforms})
+
+
+def quaternion(matrix: Array) -> list[float]:
+    """x, y, z, w of a rotation, w not negative.
+
+    Parameters
+    ----------
+    matrix
+        (3, 3) rotation.
+    """
+    # The eigenvector of Bar-Itzhack's matrix: exact for any angle, without case by case.
+    m = matrix
+    k = np.array(
+        [
+            [m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
+            [0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
+            [0, 0, m[2, 2] - m[0, 0] - m[1, 1], m[1, 0] - m[0, 1]],
+            [0, 0, 0, m[0, 0] + m[1, 1] + m[2, 2]],
+        ]
+    )
+    _, vectors = np.linalg.eigh(k, UPLO="U")
+    found = vectors[:, -1]
+    return [float(value) for value in (found if found[3] >= 0 else -found)]

@@ -1,0 +1,265 @@
+"""``dmrl render``: a recipe to a recording of rendered images with exact labels."""
+
+import json
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter, validators
+
+from dmrl import recipe as recipes
+from dmrl import topics
+from dmrl.errors import RecipeError, SettingError
+from dmrl.formats.sample import Sample, calibration, intervals
+from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
+from dmrl.messages import message
+from dmrl.output import refuse_existing
+from dmrl.progress import say, track
+from dmrl.recording import (
+    SPLIT_METADATA,
+    Provenance,
+    RecordingWriter,
+    columns,
+    interrupted,
+    provenance,
+)
+from dmrl.rendering.backdrops import Photos
+from dmrl.rendering.environment import ensure
+from dmrl.rendering.randomise import Drawn, World, draw_scene
+from dmrl.rendering.renderer import Model, Renderer, Scene
+from dmrl.rendering.settings import PRESETS, Settings
+from dmrl.shots import ROBOT, samples
+from dmrl.tables import print_json, print_table
+
+CAMERAS = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
+PANORAMA_KINDS = (".exr", ".hdr")
+
+Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What was rendered: images, labels in them, images without, broken photos left out."""
+
+    images: int
+    labels: int
+    empty_images: int
+    broken_photos: int
+    resumed_images: int
+
+
+def settings_of(name: str, **changes: Any) -> Settings:
+    """Settings of a recipe, over those of its preset.
+
+    Parameters
+    ----------
+    name
+        Path, or the name of a shipped recipe.
+    changes
+        Settings that come before the recipe's; None: the recipe's.
+
+    Raises
+    ------
+    RecipeError
+        If the recipe is not one of kind "render", or any key is wrong: names every one.
+    """
+    keys = recipes.read(name)
+    if (kind := keys.pop("kind", None)) != "render":
+        raise RecipeError(f'{name} is of kind {kind!r}. This command wants: kind = "render"')
+    preset = keys.pop("preset", "plain")
+    if preset not in PRESETS:
+        raise RecipeError(f"{name}: no preset {preset!r}. There are: {', '.join(PRESETS)}")
+    given = {key: value for key, value in changes.items() if value is not None}
+    return recipes.check(name, PRESETS[preset] | keys | given, Settings)
+
+
+def camera_of(settings: Settings) -> Camera:
+    """The camera that the images are taken with."""
+    camera = CAMERAS[settings.camera]
+    return camera if settings.distorted else replace(camera, distortion=())
+
+
+def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
+    """Render and write the recording ``out``, as images arrive.
+
+    Parameters
+    ----------
+    out
+        Recording to write. Until it is done it is ``<out>.partial``.
+    settings
+        See `Settings`.
+    resume
+        Go on with the interrupted ``<out>.partial``; the result is the same, byte for byte.
+
+    Raises
+    ------
+    OutputError
+        If ``out`` exists, or an interrupted rendering is in the way.
+    SettingError
+        If model, scale or backgrounds cannot be used.
+    BlenderError
+        If Blender cannot be set up, or does not start.
+    RecordingError
+        If what is to be resumed is of other settings.
+    """
+    refuse_existing(out)
+    before = interrupted(out, resume=resume)
+    photos = None if settings.backgrounds is None else Photos(settings.backgrounds)
+    lights = None if settings.lights is None else _panoramas(settings.lights)
+    model = Model(settings.model, settings.scale, settings.model_up)
+    with ExitStack() as stack:
+        renderer = stack.enter_context(
+            Renderer(
+                ensure(say),
+                model,
+                lights=lights,
+                workers=settings.workers,
+                samples=settings.samples,
+            )
+        )
+        made = _provenance(settings, renderer.version)
+        before.check(made)
+        sink = stack.enter_context(RecordingWriter(out, made, keep_on_error=True))
+        sink.add_metadata(SPLIT_METADATA, _split(settings))
+        done = before.copy(sink)
+        world = World(
+            settings,
+            camera_of(settings),
+            renderer.radius_m,
+            tuple(renderer.lights),
+            cache(renderer.panorama),
+            photos,
+        )
+        _render(world, renderer, sink, done)
+    before.forget()
+    broken = len(photos.broken) if photos is not None else 0
+    return Result(settings.images, *_counts(out), broken, done)
+
+
+def _counts(out: Path) -> tuple[int, int]:
+    """Labels, and images without, of a recording."""
+    numbers = [
+        len(peers)
+        for batch in columns(out, topics.labels(ROBOT), fields=["peers"])
+        for peers in batch["peers"].to_pylist()
+    ]
+    return sum(numbers), numbers.count(0)
+
+
+def _provenance(settings: Settings, blender: str) -> Provenance:
+    """How the recording is made; the number of workers changes nothing, so it is left out."""
+    inputs = [path for path in (settings.model, settings.backgrounds, settings.lights) if path]
+    plain = replace(settings, workers=0)
+    made = provenance("render", plain, inputs, seed=settings.seed, libraries=("numpy", "pillow"))
+    return replace(made, libraries={**made.libraries, "blender": blender})
+
+
+def _split(settings: Settings) -> dict[str, str]:
+    first_test = settings.images - round(settings.images * settings.test_share)
+    times = (_time_ns(settings, k) for k in range(settings.images))
+    found = intervals((t, "test" if k >= first_test else "train") for k, t in enumerate(times))
+    return {name: json.dumps(parts) for name, parts in found.items()}
+
+
+def _time_ns(settings: Settings, index: int) -> int:
+    return round(index * 1e9 / settings.rate_hz)
+
+
+def _panoramas(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise SettingError(f"no folder {folder} of panoramas. Check lights")
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PANORAMA_KINDS)
+    if not found:
+        kinds = ", ".join(PANORAMA_KINDS)
+        raise SettingError(f"{folder} holds no panorama ({kinds}). Choose another for lights")
+    return found
+
+
+def _render(world: World, renderer: Renderer, sink: RecordingWriter, done: int) -> None:
+    """Write every image from number ``done`` on, in order, as it arrives."""
+    settings, camera = world.settings, world.camera
+    if not done:
+        _write(sink, calibration(0, ROBOT, camera))
+    drawn: deque[Drawn] = deque()
+
+    def scenes() -> Iterator[Scene]:
+        for index in range(done, settings.images):
+            drawn.append(draw_scene(world, index))
+            yield camera, drawn[-1].robots, drawn[-1].look
+
+    shots = track(renderer.shots(scenes()), "Rendering", settings.images - done)
+    for index, shot in enumerate(shots, done):
+        for sample in samples(_time_ns(settings, index), settings, drawn.popleft(), shot):
+            _write(sink, sample)
+
+
+def _write(sink: RecordingWriter, sample: Sample) -> None:
+    sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
+
+
+def command(
+    recipe: str | None = None,
+    out: Path | None = None,
+    /,
+    *,
+    images: Count | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    backgrounds: Path | None = None,
+    model: Path | None = None,
+    scale: float | None = None,
+    resume: Annotated[bool, Parameter(negative=())] = False,
+    setup: Annotated[bool, Parameter(negative=())] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Render images of robots with exact labels, as a recipe says, into a recording.
+
+    Parameters
+    ----------
+    recipe
+        A TOML file, or the name of a shipped recipe, such as synthetic_first_look.
+    out
+        Recording to write. Must not exist.
+    images
+        Images to render. Without it, as the recipe says; so for all that follow.
+    seed
+        Another seed renders other images.
+    workers
+        Blender processes; 0: as many as there are cores. Changes no byte of the output.
+    backgrounds
+        Folder of photos to put behind the robots.
+    model
+        .blend, .glb, .obj or .stl of the robot.
+    scale
+        Metres per unit of the model; of the Crazyflie that dmrl draws, times life size.
+    resume
+        Go on with an interrupted OUT.
+    setup
+        Set up Blender, if it is not, and do nothing else if no recipe is given.
+    as_json
+        Print one JSON document in place of the table.
+    """
+    if setup:
+        python = ensure(say)
+        if recipe is None:
+            return print_json({"python": str(python)}) if as_json else say(f"Blender: {python}")
+    if recipe is None or out is None:
+        raise SettingError("render wants a recipe and an output. Try: dmrl render --help")
+    settings = settings_of(
+        recipe,
+        images=images,
+        seed=seed,
+        workers=workers,
+        backgrounds=backgrounds,
+        model=model,
+        scale=scale,
+    )
+    result = run(out, settings, resume=resume)
+    rows = {name.replace("_", " "): value for name, value in asdict(result).items()}
+    if as_json:
+        return print_json({"recording": str(out), **rows})
+    return print_table(str(out), ("what", "count"), list(rows.items()))

@@ -1,0 +1,81 @@
+"""Going on with an interrupted recording."""
+
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import OutputError, RecordingError
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, interrupted
+
+MADE = Provenance("test", settings={"range_m": (1.0, 2.0)})
+MOMENTS = 3000
+# Enough that chunks of the file fill.
+PADDING = "x" * 300
+
+
+def write(sink: RecordingWriter, first: int, last: int) -> None:
+    """Two messages at every moment."""
+    for k in range(first, last):
+        for topic in ("/a", "/b"):
+            text = message("Log")(message=f"{k * 7919}{topic}{PADDING[k % 300 :]}")
+            sink.write(k, topic, text)
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    """What an uninterrupted run writes."""
+    path = tmp_path / "whole.mcap"
+    with RecordingWriter(path, MADE) as sink:
+        write(sink, 0, MOMENTS)
+    return path
+
+
+@pytest.fixture
+def stopped(tmp_path: Path) -> Path:
+    """Where a run was stopped by an error after most of it."""
+    path = tmp_path / "out.mcap"
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, MADE, keep_on_error=True) as sink:
+        write(sink, 0, MOMENTS - 50)
+        raise KeyboardInterrupt
+    return path
+
+
+def test_a_stopped_recording_goes_on_to_the_same_bytes(whole: Path, stopped: Path) -> None:
+    before = interrupted(stopped, resume=True)
+    before.check(MADE)
+    with RecordingWriter(stopped, MADE, keep_on_error=True) as sink:
+        done = before.copy(sink)
+        assert 0 < done < MOMENTS - 50
+        write(sink, done, MOMENTS)
+    before.forget()
+    assert stopped.read_bytes() == whole.read_bytes()
+    assert sorted(p.name for p in stopped.parent.iterdir()) == ["out.mcap", "whole.mcap"]
+
+
+def test_stopped_twice_it_keeps_the_longer_part(stopped: Path) -> None:
+    kept = interrupted(stopped, resume=True)
+    count = sum(1 for _ in kept.moments())
+    with (
+        pytest.raises(KeyboardInterrupt),
+        RecordingWriter(stopped, MADE, keep_on_error=True) as sink,
+    ):
+        write(sink, 0, 10)
+        raise KeyboardInterrupt
+    assert sum(1 for _ in interrupted(stopped, resume=True).moments()) == count
+
+
+def test_other_settings_are_refused(stopped: Path) -> None:
+    before = interrupted(stopped, resume=True)
+    with pytest.raises(RecordingError, match="other settings"):
+        before.check(Provenance("test", settings={"range_m": (1.0, 3.0)}))
+
+
+def test_what_is_left_is_not_silently_overwritten(stopped: Path) -> None:
+    with pytest.raises(OutputError, match=r"Go on with --resume, or remove it"):
+        interrupted(stopped, resume=False)
+
+
+def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"to resume\. Run without --resume"):
+        interrupted(tmp_path / "none.mcap", resume=True)

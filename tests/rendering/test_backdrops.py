@@ -1,0 +1,73 @@
+"""Photos and panoramas behind the robots."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SettingError
+from dmrl.geometry import AIDECK
+from dmrl.images import encode_jpeg
+from dmrl.rendering.backdrops import LIGHT_OF, Photos, panorama_view, smeared
+
+CAMERA = replace(AIDECK, distortion=())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """One whole photo, one cut short, one that is none, and a text."""
+    photo = np.random.default_rng(0).integers(0, 255, (300, 400, 3), np.uint8)
+    data = encode_jpeg(photo)
+    (tmp_path / "a.jpg").write_bytes(data[: len(data) // 2])
+    (tmp_path / "b.jpg").write_bytes(data)
+    (tmp_path / "c.jpg").write_bytes(b"no photo")
+    (tmp_path / "licence.txt").write_text("free")
+    return tmp_path
+
+
+def test_broken_photos_are_skipped_and_counted(folder: Path) -> None:
+    photos = Photos(folder)
+    for seed in range(6):
+        backdrop = photos.backdrop(np.random.default_rng(seed), CAMERA, zoom=1.5)
+        assert backdrop.shape == (224, 320, 3)
+    assert sorted(path.name for path in photos.broken) == ["a.jpg", "c.jpg"]
+
+
+def test_a_folder_without_a_photo_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"holds no photo .*Choose another --backgrounds"):
+        Photos(tmp_path)
+    with pytest.raises(SettingError, match="no folder"):
+        Photos(tmp_path / "none")
+
+
+def test_the_light_of_a_photo_follows_the_curve_of_screens() -> None:
+    assert LIGHT_OF[[0, 255]].tolist() == [0, 1]
+    assert LIGHT_OF[188] == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("turn_rad", "column", "row"),
+    [
+        ((0.0, 0.0, 0.0), 0.5, 0.5),  # x forward is the middle of the panorama
+        ((0.0, 0.0, np.pi / 2), 0.25, 0.5),  # turned left by a quarter
+        ((0.0, np.pi / 4, 0.0), 0.5, 0.75),  # nose down
+    ],
+)
+def test_the_camera_sees_the_right_part_of_a_panorama(
+    turn_rad: tuple[float, float, float], column: float, row: float
+) -> None:
+    v, u = (np.mgrid[:64, :128] + 0.5) / np.array([64, 128])[:, None, None]
+    panorama = np.stack([u, v, u], axis=-1).astype(np.float32)
+    view = panorama_view(panorama, CAMERA, turn_rad)
+    middle = view[int(CAMERA.cy_px), int(CAMERA.cx_px)]
+    assert middle[:2] == pytest.approx([column, row], abs=0.01)
+
+
+def test_a_smear_keeps_the_light_and_the_middle() -> None:
+    picture = np.zeros((11, 21, 3), np.float32)
+    picture[5, 10] = 1
+    out = smeared(picture, (6.0, 0.0))
+    assert out.sum() == pytest.approx(3, abs=1e-4)
+    assert np.flatnonzero(out[5, :, 0]).tolist() == list(range(7, 14))
+    assert smeared(picture, (0.0, 0.0)) is picture

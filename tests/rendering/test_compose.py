@@ -1,0 +1,97 @@
+"""Labels of robots laid over a backdrop, from layers made by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.geometry import AIDECK, Camera
+from dmrl.rendering.compose import compose
+from dmrl.rendering.lens import canvas_of, image_from_pinhole
+from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.shot import Layer, Light, Look, Robot, crop_of
+from dmrl.rendering.sketch import Pose
+
+PINHOLE = replace(AIDECK, distortion=())
+LIGHT = Light("x", (0.0, 0.0, 0.0), 1.0, np.array([0.0, 0.0, 1.0]), 0.0, (1.0, 1.0, 1.0), 0.1)
+
+
+def look(camera: Camera) -> Look:
+    grey = np.full((camera.height_px, camera.width_px, 3), 0.2, np.float32)
+    return Look(grey, LIGHT, Sensor(contrast_gamma=1.0))
+
+
+def robot(depth_m: float, move_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Robot:
+    return Robot(Pose(np.array([depth_m, 0.0, 0.0]), np.eye(3)), {}, np.array(move_m))
+
+
+def square(left: int, top: int, size: int, depth_m: float) -> Layer:
+    light = np.ones((size, size, 4), np.float32)
+    return Layer(left, top, light, np.full((size, size), depth_m, np.float32))
+
+
+def test_a_box_holds_exactly_the_covered_pixels() -> None:
+    shot = compose(PINHOLE, [robot(1.0)], look(PINHOLE), {0: square(100, 50, 20, 1.0)})
+    assert shot.box_px[0].tolist() == [100, 50, 120, 70]
+    assert shot.visible_share.tolist() == [1.0]
+    assert shot.uv_px[0].tolist() == [PINHOLE.cx_px, PINHOLE.cy_px]
+    assert (shot.opacity[0] == 255).sum() == 400
+    assert (shot.surface_m[50:70, 100:120] == 1.0).all()
+    assert np.count_nonzero(shot.surface_m) == 400
+
+
+def test_a_near_robot_hides_a_far_one_whatever_their_order() -> None:
+    layers = {0: square(100, 50, 20, 2.0), 1: square(110, 50, 20, 1.0)}
+    shot = compose(PINHOLE, [robot(2.0), robot(1.0)], look(PINHOLE), layers)
+    assert shot.visible_share.tolist() == [0.5, 1.0]
+    assert shot.box_px[0].tolist() == [100, 50, 110, 70]
+    assert shot.surface_m[60, 115] == 1.0
+
+
+def test_a_robot_wholly_hidden_has_no_box() -> None:
+    layers = {0: square(100, 50, 20, 2.0), 1: square(90, 40, 40, 1.0)}
+    shot = compose(PINHOLE, [robot(2.0), robot(1.0)], look(PINHOLE), layers)
+    assert shot.visible_share[0] == 0
+    assert np.isnan(shot.box_px[0]).all()
+
+
+def test_the_lens_bends_box_and_centre_alike() -> None:
+    canvas = canvas_of(AIDECK)
+    corner = np.array([30, 150])
+    layer = square(*(corner + canvas.shift_px.astype(int)).tolist(), 20, 1.0)
+    shot = compose(AIDECK, [robot(1.0)], look(AIDECK), {0: layer})
+    edges = [(30.0, 150.0), (50.0, 150.0), (30.0, 170.0), (50.0, 170.0)]
+    bent = image_from_pinhole(np.array(edges), AIDECK)
+    wanted = [*bent.min(axis=0), *bent.max(axis=0)]
+    assert shot.box_px[0] == pytest.approx(wanted, abs=0.05)
+    rows, cols = np.nonzero(shot.opacity[0])
+    assert cols.min() == pytest.approx(shot.box_px[0, 0], abs=1)
+    assert rows.max() + 1 == pytest.approx(shot.box_px[0, 3], abs=1)
+
+
+def test_movement_smears_the_picture_and_no_label() -> None:
+    layers = {0: square(150, 70, 10, 1.0)}
+    still = compose(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
+    moved = compose(PINHOLE, [robot(1.0, (0.0, 0.05, 0.0))], look(PINHOLE), layers)
+    assert np.array_equal(still.box_px, moved.box_px)
+    bright = [
+        np.count_nonzero(shot.rgb[75, :, 0] > shot.rgb[0, 0, 0] + 2) for shot in (still, moved)
+    ]
+    assert bright[0] == 10
+    assert bright[1] == pytest.approx(10 + 0.05 * PINHOLE.fx_px, abs=2)
+
+
+def test_an_empty_scene_is_its_backdrop() -> None:
+    shot = compose(AIDECK, [], look(AIDECK), {})
+    assert len(shot.uv_px) == len(shot.box_px) == 0
+    assert np.ptp(shot.rgb) == 0
+
+
+def test_a_robot_behind_the_camera_or_outside_is_not_rendered() -> None:
+    points = np.array([[-0.05, -0.05, -0.01], [0.05, 0.05, 0.01]])
+    canvas = canvas_of(PINHOLE)
+    assert crop_of(canvas, Pose(np.array([-1.0, 0.0, 0.0]), np.eye(3)), points) is None
+    assert crop_of(canvas, Pose(np.array([1.0, 5.0, 0.0]), np.eye(3)), points) is None
+    crop = crop_of(canvas, Pose(np.array([1.0, 0.0, 0.0]), np.eye(3)), points)
+    assert crop is not None
+    assert crop[0] < PINHOLE.cx_px < crop[2]

@@ -1,0 +1,47 @@
+"""Blender's environment where it cannot be made."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import BlenderError
+from dmrl.rendering import environment
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def test_without_python_311_and_uv_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    monkeypatch.setattr(environment, "_python_311", lambda: None)
+    with pytest.raises(BlenderError, match=r"needs Python 3.11.*nor uv.*pip install uv"):
+        environment.ensure(lambda _: None)
+    assert list((tmp_path / "dmrl").iterdir()) == []
+
+
+def test_offline_it_says_so_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        code = 1 if "install" in command else 0
+        return subprocess.CompletedProcess(command, code, "True\n", "ERROR: No route to host\n")
+
+    monkeypatch.setattr(subprocess, "run", fail)
+    with pytest.raises(BlenderError, match=r"No route to host. Check the connection"):
+        environment.ensure(lambda _: None)
+    assert list((tmp_path / "dmrl").iterdir()) == []
+
+
+def test_an_environment_that_is_there_is_used(tmp_path: Path) -> None:
+    python = environment.folder() / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.symlink_to(sys.executable)
+    assert environment.python() == python
+    assert environment.ensure(lambda _: pytest.fail("nothing to say")) == python

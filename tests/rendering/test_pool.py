@@ -1,0 +1,86 @@
+"""Workers over a pipe: protocol, order, and what happens when one dies."""
+
+import sys
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import BlenderError
+from dmrl.rendering import pool
+from dmrl.rendering.blender import protocol
+from dmrl.rendering.pool import Pool, Start, Worker
+
+# Doubles numbers as a worker would; dies once of 5 and always of 13.
+FAKE = f"""
+import os, sys
+sys.path.insert(0, {str(Path(protocol.__file__).parent)!r})
+import numpy as np
+from pathlib import Path
+from protocol import receive, send
+head, arrays = receive(sys.stdin.buffer)
+died = Path(head["died"])
+if head["model"] == "bad":
+    send(sys.stdout.buffer, {{"error": "bad is no model"}})
+    sys.exit()
+send(sys.stdout.buffer, {{"version": "fake"}}, {{"points": np.zeros((1, 3))}})
+while True:
+    try:
+        head, arrays = receive(sys.stdin.buffer)
+    except EOFError:
+        break
+    number = head["number"]
+    if number == 13 or (number == 5 and not died.exists()):
+        died.touch()
+        os._exit(7)
+    send(sys.stdout.buffer, {{}}, {{"out": arrays["in"] * 2}})
+"""
+
+
+@pytest.fixture
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Start:
+    script = tmp_path / "worker.py"
+    script.write_text(FAKE)
+    monkeypatch.setattr(pool, "WORKER", script)
+    return Start(Path(sys.executable), {"died": str(tmp_path / "died"), "model": None})
+
+
+def double(worker: Worker, number: int) -> float:
+    _, arrays = worker.ask({"number": number}, {"in": np.array([float(number)])})
+    return float(arrays["out"][0])
+
+
+def test_messages_come_back_as_they_were_sent() -> None:
+    stream = BytesIO()
+    arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.zeros((0, 4), np.int64)}
+    protocol.send(stream, {"name": "ü", "n": [1, 2]}, arrays)
+    stream.seek(0)
+    head, back = protocol.receive(stream)
+    assert head == {"name": "ü", "n": [1, 2]}
+    assert all(np.array_equal(back[k], arrays[k]) for k in arrays)
+    with pytest.raises(EOFError):
+        protocol.receive(stream)
+
+
+def test_a_dead_worker_is_replaced_and_its_job_done_again(start: Start) -> None:
+    with Pool(start, 2) as workers:
+        assert list(workers.map(double, range(12))) == [2.0 * k for k in range(12)]
+        assert workers.replaced == 1
+
+
+def test_a_job_that_kills_every_worker_is_an_error(start: Start) -> None:
+    with Pool(start, 1) as workers, pytest.raises(BlenderError, match="died 3 times"):
+        list(workers.map(double, [1, 13]))
+
+
+def test_what_the_worker_says_of_a_model_is_the_error(start: Start) -> None:
+    start.head["model"] = "bad"
+    with pytest.raises(BlenderError, match="bad is no model"):
+        Pool(start, 1)
+
+
+def test_a_worker_that_does_not_start_says_why(start: Start) -> None:
+    pool.WORKER.write_text("import nothing_of_that_name")
+    with pytest.raises(BlenderError, match=r"nothing_of_that_name.*dmrl render --setup"):
+        Pool(start, 1)

@@ -1,0 +1,60 @@
+"""The simulated sensor."""
+
+import numpy as np
+import pytest
+
+from dmrl.rendering.sensor import Sensor, blur, demosaic, expose, mosaic
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_a_mosaic_of_one_colour_comes_back_whole() -> None:
+    picture = np.broadcast_to(np.array([0.2, 0.5, 0.8], np.float32), (8, 10, 3))
+    assert np.allclose(demosaic(mosaic(picture)), picture)
+
+
+def test_a_mosaic_keeps_what_each_pixel_measured() -> None:
+    picture = rng().random((8, 10, 3), np.float32)
+    back = demosaic(mosaic(picture))
+    assert np.array_equal(back[::2, ::2, 0], picture[::2, ::2, 0])
+    assert np.array_equal(back[1::2, 1::2, 2], picture[1::2, 1::2, 2])
+    assert np.array_equal(back[::2, 1::2, 1], picture[::2, 1::2, 1])
+
+
+def test_a_blur_keeps_the_light_and_the_middle() -> None:
+    picture = np.zeros((31, 31, 1), np.float32)
+    picture[15, 15] = 1
+    out = blur(picture, 1.5)
+    v, u = np.mgrid[:31, :31]
+    assert out.sum() == pytest.approx(1, abs=1e-5)
+    assert (out[..., 0] * u).sum() == pytest.approx(15, abs=1e-4)
+    spread = (out[..., 0] * (v - 15) ** 2).sum() ** 0.5
+    assert spread == pytest.approx(1.5, rel=0.05)
+
+
+def test_exposure_aims_at_the_brightness() -> None:
+    light = np.full((20, 20, 3), 7.0, np.float32)
+    rgb = expose(light, Sensor(brightness=0.4), rng())
+    assert rgb.dtype == np.uint8
+    assert np.abs(rgb.astype(int) - 102).max() <= 1
+
+
+def test_corners_are_darker_under_vignetting() -> None:
+    light = np.ones((20, 20, 3), np.float32)
+    rgb = expose(light, Sensor(brightness=0.5, contrast_gamma=1.0, vignetting=0.8), rng())
+    assert rgb[0, 0, 1] < 0.4 * rgb[10, 10, 1]
+
+
+def test_noise_has_the_spread_that_was_asked_for() -> None:
+    light = np.ones((200, 200, 3), np.float32)
+    sensor = Sensor(brightness=0.5, contrast_gamma=1.0, shot_noise=0.002, read_noise=0.01)
+    rgb = expose(light, sensor, rng()) / 255
+    assert rgb.std() == pytest.approx((0.002 * 0.5 + 0.01**2) ** 0.5, rel=0.05)
+
+
+def test_the_same_noise_comes_from_the_same_seed() -> None:
+    light = rng().random((20, 20, 3), np.float32)
+    sensor = Sensor(bayer=True, shot_noise=0.01, saturation=0.5)
+    assert np.array_equal(expose(light, sensor, rng()), expose(light, sensor, rng()))

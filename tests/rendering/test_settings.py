@@ -1,0 +1,47 @@
+"""Ranges of renders, presets and shipped recipes."""
+
+import pytest
+
+from dmrl.errors import RecipeError
+from dmrl.rendering.settings import PRESETS, Settings
+from dmrl.stages.render import settings_of
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_can_be_rendered(name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("recipe") / "r.toml"
+    path.write_text(f'kind = "render"\npreset = "{name}"\nimages = 3\n')
+    assert settings_of(str(path)).images == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "images"),
+    [("synthetic_first_look", 40), ("synthetic_paper", 1000), ("synthetic_large", 20_000)],
+)
+def test_shipped_recipes_hold(name: str, images: int) -> None:
+    assert settings_of(name).images == images
+    assert settings_of(name, images=2, seed=None).images == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"depth_m": (3.0, 1.0)}, "depth_m: .* ends before it begins"),
+        ({"robots_max": 0}, "robots_max: 0 is not within 1 to 20"),
+        ({"scale": -1.0}, "scale: -1.0 is not within"),
+        ({"brightness": (float("nan"), 0.5)}, "brightness"),
+    ],
+)
+def test_impossible_values_are_refused(changes: dict[str, object], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        Settings(**changes)  # type: ignore[arg-type]
+
+
+def test_a_wrong_preset_or_kind_is_named(tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("recipe") / "r.toml"
+    path.write_text('kind = "render"\npreset = "himx"\n')
+    with pytest.raises(RecipeError, match=r"no preset 'himx'. There are: himax"):
+        settings_of(str(path))
+    path.write_text('kind = "train"\n')
+    with pytest.raises(RecipeError, match="kind 'train'"):
+        settings_of(str(path))

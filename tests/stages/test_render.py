@@ -1,0 +1,198 @@
+"""Rendering to recordings, by Blender. Skips where that is not set up."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import BlenderError, OutputError, RecordingError, SettingError
+from dmrl.geometry import Array, Camera, project
+from dmrl.images import decode
+from dmrl.recording import check, read, read_table, summary
+from dmrl.rendering import crazyflie
+from dmrl.rendering.lens import image_from_pinhole
+from dmrl.rendering.randomise import World, draw_scene
+from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.settings import Settings
+from dmrl.rendering.shot import Robot
+from dmrl.shots import quaternion
+from dmrl.stages.render import camera_of, run
+
+SMALL = Settings(
+    images=6, robots_max=3, empty_share=0.2, seed=3, workers=1, samples=4, masks=True, depths=True
+)
+
+
+@pytest.fixture(scope="module")
+def recording(blender: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six images with up to three robots."""
+    out = tmp_path_factory.mktemp("render") / "six.mcap"
+    run(out, SMALL)
+    return out
+
+
+def test_a_recording_holds_images_labels_and_truth(recording: Path) -> None:
+    found = summary(recording).topics
+    per_image = ("camera/image", "camera/masks", "camera/depth", "labels", "attitude")
+    assert {found[f"/cf1/{name}"].count for name in per_image} == {6}
+    assert found["/cf1/camera/calibration"].count == 1
+    assert found["/tf"].count == 6
+    assert check(recording) == []
+
+
+def test_masks_depths_and_labels_agree(recording: Path) -> None:
+    topics = ("/cf1/labels", "/cf1/camera/masks")
+    samples = list(read(recording, *topics))
+    labels = {s.time_ns: s.message.peers for s in samples if s.topic == topics[0]}
+    seen = 0
+    for sample in samples:
+        if sample.topic != topics[1]:
+            continue
+        mask = decode(sample.message.data)[..., 0]
+        for label in labels[sample.time_ns]:
+            rows, cols = np.nonzero(mask == int(label.peer[2:]))
+            if label.visible_share < 1 or not len(rows):
+                continue
+            edges = [cols.min(), rows.min(), cols.max() + 1, rows.max() + 1]
+            assert np.abs(np.array(edges) - label.box_px).max() <= 1.5
+            seen += 1
+    assert seen
+
+
+def test_the_number_of_workers_changes_no_byte(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "two.mcap"
+    run(out, Settings(**{**_fields(SMALL), "workers": 2}))
+    assert out.read_bytes() == recording.read_bytes()
+
+
+def _fields(settings: Settings) -> dict[str, object]:
+    return {name: getattr(settings, name) for name in Settings.__dataclass_fields__}
+
+
+def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -> None:
+    # Pictures without loss, so that chunks of the file fill and are written early.
+    recipe = tmp_path / "r.toml"
+    recipe.write_text('kind = "render"\nimages = 14\nsamples = 1\nimage_format = "png"\n')
+    whole, killed = tmp_path / "whole.mcap", tmp_path / "killed.mcap"
+    command = [sys.executable, "-m", "dmrl.cli", "render", str(recipe)]
+    subprocess.run([*command, str(whole), "--workers", "1"], check=True, capture_output=True)
+    partial = tmp_path / "killed.mcap.partial"
+    with subprocess.Popen([*command, str(killed)], stdout=subprocess.DEVNULL) as process:
+        while not (partial.exists() and partial.stat().st_size > 300_000):
+            assert process.poll() is None, "it ended before it could be killed"
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+    assert not killed.exists()
+    again = subprocess.run([*command, str(killed)], capture_output=True, text=True, check=False)
+    assert again.returncode == 1
+    assert "--resume" in again.stderr
+    resumed = subprocess.run(
+        [*command, str(killed), "--resume", "--json"], check=True, capture_output=True, text=True
+    )
+    assert '"resumed images": 0' not in resumed.stdout
+    assert killed.read_bytes() == whole.read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["killed.mcap", "r.toml", "whole.mcap"]
+
+
+def test_what_is_resumed_must_be_of_the_same_settings(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "out.mcap.partial").write_bytes(recording.read_bytes())
+    with pytest.raises(RecordingError, match="other settings"):
+        run(tmp_path / "out.mcap", Settings(images=6), resume=True)
+    with pytest.raises(RecordingError, match="to resume"):
+        run(tmp_path / "none.mcap", SMALL, resume=True)
+
+
+def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
+    settings = Settings(images=6, robots_max=2, empty_share=0.0, samples=2)
+    camera = camera_of(settings)
+    grey = np.full((8, 16, 3), 0.3, np.float32)
+    shots = []
+    for kill in (False, True):
+        with Renderer(blender, Model(), workers=1) as renderer:
+            lights = tuple(renderer.lights)
+            world = World(settings, camera, renderer.radius_m, lights, lambda _: grey, None)
+            scenes = [draw_scene(world, k) for k in range(6)]
+            if kill:
+                os.kill(renderer.pool.pids[0], signal.SIGKILL)
+            found = list(renderer.shots((camera, s.robots, s.look) for s in scenes))
+            assert renderer.pool.replaced == kill
+        shots.append(np.stack([shot.rgb for shot in found]))
+    assert np.array_equal(*shots)
+
+
+def test_boxes_are_where_the_mesh_is(blender: Path) -> None:
+    settings = Settings(images=30, empty_share=0.0, depth_m=(0.3, 1.0), seed=1)
+    camera = camera_of(settings)
+    grey = np.full((8, 16, 3), 0.3, np.float32)
+    errors = []
+    with Renderer(blender, Model()) as renderer:
+        lights = tuple(renderer.lights)
+        world = World(settings, camera, renderer.radius_m, lights, lambda _: grey, None)
+        scenes = [draw_scene(world, k) for k in range(30)]
+        shots = renderer.shots((camera, s.robots, s.look) for s in scenes)
+        for scene, shot in zip(scenes, shots, strict=True):
+            errors.append(shot.box_px[0] - _mesh_box(scene.robots[0], camera))
+    assert np.median(np.abs(errors)) < 0.5
+    assert np.percentile(np.abs(errors), 90) < 1.5
+
+
+def _mesh_box(robot: Robot, camera: Camera) -> Array:
+    turns = (robot.paint["rotor_first_rad"], robot.paint["rotor_sweep_rad"])
+    points = crazyflie.outline(1.0, *turns)
+    xyz = points @ robot.pose.camera_from_body.T + robot.pose.xyz_camera
+    uv = image_from_pinhole(project(xyz, camera.image_from_optical)[0], camera)
+    box = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+    return np.clip(box, 0, (camera.width_px, camera.height_px) * 2)
+
+
+CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
+    "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
+)
+
+
+def test_a_model_of_the_user_s_is_rendered_about_its_middle(blender: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cube.obj"
+    path.write_text(CUBE)
+    out = tmp_path / "out.mcap"
+    run(out, Settings(images=3, model=path, scale=0.1, empty_share=0.0, samples=2, workers=1))
+    labels = read_table(out, "/cf1/labels")["peers"].to_pylist()
+    assert all(len(peers) == 1 for peers in labels)
+    with pytest.raises(SettingError, match=r"robots of 100 m.*Change --scale"):
+        run(tmp_path / "big.mcap", Settings(images=3, model=path, scale=100.0, workers=1))
+    assert not (tmp_path / "big.mcap").exists()
+
+
+@pytest.mark.parametrize("kind", ["glb", "stl", "blend", "obj"])
+def test_a_file_that_is_no_model_is_refused(blender: Path, tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"no.{kind}"
+    path.write_text("this is no model\n")
+    with pytest.raises(BlenderError, match=r"no\.\w+ is no model that Blender reads"):
+        run(tmp_path / "out.mcap", Settings(images=1, model=path, workers=1))
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_models_of_other_kinds_are_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "m.txt").write_text("x")
+    with pytest.raises(SettingError, match="no model"):
+        Renderer(Path("none"), Model(tmp_path / "m.txt"))
+    with pytest.raises(SettingError, match="Check --model"):
+        Renderer(Path("none"), Model(tmp_path / "none.glb"))
+
+
+def test_outputs_are_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "out.mcap").write_text("mine")
+    with pytest.raises(OutputError, match="never overwritten"):
+        run(tmp_path / "out.mcap", SMALL)
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1.0, 3.0])
+def test_a_quaternion_turns_as_its_matrix(angle_rad: float) -> None:
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    wanted = [0, 0, np.sin(angle_rad / 2), np.cos(angle_rad / 2)]
+    assert quaternion(turn) == pytest.approx(wanted, abs=1e-9)
