@@ -13,9 +13,11 @@ from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.messages import descriptor, pool_of
-from dmrl.recording.blocks import Block, blocks
+from dmrl.recording.block import Block
+from dmrl.recording.blocks import blocks
 from dmrl.recording.index import damaged, summary
-from dmrl.recording.wire import WireError, decode
+from dmrl.recording.values import WireError
+from dmrl.recording.wire import decode
 from dmrl.recording.writer import Channel, RawMessage
 from dmrl.topics import row_of
 

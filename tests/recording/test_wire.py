@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dmrl.messages import message
-from dmrl.recording.wire import WireError, decode
+from dmrl.recording.values import WireError
+from dmrl.recording.wire import decode
 
 F = FieldDescriptorProto
 TYPES = {

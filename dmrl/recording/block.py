@@ -1,0 +1,83 @@
+"""Some thousand messages as arrays of offsets into the bytes that hold them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Messages whose payloads lie in one run of bytes.
+
+    Parameters
+    ----------
+    data
+        The bytes.
+    channel, time_ns, publish_ns
+        (N,) channel number and times of each message.
+    start, end
+        (N,) where its payload lies in ``data``.
+    """
+
+    data: Bytes
+    channel: Ints
+    time_ns: Ints
+    publish_ns: Ints
+    start: Ints
+    end: Ints
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def take(self, rows: Ints | NDArray[np.bool_]) -> "Block":
+        """The same bytes with only these messages."""
+        return Block(
+            self.data,
+            self.channel[rows],
+            self.time_ns[rows],
+            self.publish_ns[rows],
+            self.start[rows],
+            self.end[rows],
+        )
+
+    def compact(self) -> "Block":
+        """A copy that holds no bytes but its own messages'."""
+        view = self.data.data
+        size = self.end - self.start
+        end = np.cumsum(size)
+        data = b"".join(
+            view[a:b] for a, b in zip(self.start.tolist(), self.end.tolist(), strict=True)
+        )
+        return Block(
+            np.frombuffer(data, np.uint8),
+            self.channel,
+            self.time_ns,
+            self.publish_ns,
+            end - size,
+            end,
+        )
+
+    def sorted(self) -> "Block":
+        """By log time; messages of one time keep their order in the file."""
+        if len(self) < 2 or bool((self.time_ns[1:] >= self.time_ns[:-1]).all()):
+            return self
+        return self.take(np.argsort(self.time_ns, kind="stable"))
+
+
+def concatenate(first: Block | None, second: Block) -> Block:
+    """Both blocks' messages over one run of bytes."""
+    if first is None or not len(first):
+        return second
+    shift = len(first.data)
+    return Block(
+        np.concatenate([first.data, second.data]),
+        np.concatenate([first.channel, second.channel]),
+        np.concatenate([first.time_ns, second.time_ns]),
+        np.concatenate([first.publish_ns, second.publish_ns]),
+        np.concatenate([first.start, second.start + shift]),
+        np.concatenate([first.end, second.end + shift]),
+    )
