@@ -21,7 +21,7 @@ KEY_HZ = 10.0
 OK, UNCONVERGED, AMBIGUOUS = range(3)
 """Values of ``status``; the same as in ``dmrl.v1.Status``."""
 
-GATE_M = 0.15
+GATE_M = 0.17
 """Largest sigma, along the worst direction, of a position that is OK."""
 INFLATION = 0.9
 """Sigmas of the batch solve are multiplied by this, and where biases are larger than the
