@@ -47,12 +47,6 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
     return _inverse(equations)
 
 
-def plain_covariance(problem: Problem, noise: Noise, solution: Solution) -> Array:
-    """(K, 5, 5) covariances of the keyframes at the solution itself: Gauss-Newton's."""
-    linear = linearise(problem, noise, solution.state, solution.constants)
-    return _inverse(equations_of(problem, noise, linear, solution.constants))[0]
-
-
 def _inverse(equations: Normal) -> tuple[Array, Array]:
     *_, response, constants = solve(equations)
     keyframes = block_inverse(equations.diagonal, equations.above)

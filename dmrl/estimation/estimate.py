@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation import ekf, keyframe_filter
-from dmrl.estimation.batch import Solution, solve_batch
-from dmrl.estimation.confidence import covariance, plain_covariance, restlessness
-from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, distinct
+from dmrl.estimation.batch import Solution, evidence, solve_batch
+from dmrl.estimation.confidence import covariance, restlessness
+from dmrl.estimation.hypotheses import KEPT, START_STD, candidates
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK
 from dmrl.estimation.motion import rotation
@@ -21,11 +21,11 @@ KEY_HZ = 10.0
 OK, UNCONVERGED, AMBIGUOUS = range(3)
 """Values of ``status``; the same as in ``dmrl.v1.Status``."""
 
-GATE_M = 0.15
+GATE_M = 0.17
 """Largest sigma, along the worst direction, of a position that is OK."""
-INFLATION = 0.95
-"""Sigmas of the batch solve are multiplied by this, and where the sensors are worse than the
-default by the root of how much worse: the 95 % ellipse then holds 91 to 98 %."""
+INFLATION = 0.9
+"""Sigmas of the batch solve are multiplied by this, and where biases are larger than the
+default's by the fourth root of how much: the 95 % ellipse then holds 95 to 98 % in view."""
 SMOOTHER_INFLATION = 1.5
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
 """Sigma over distance beyond which a bearing is open rather than imprecise; and the median
@@ -39,8 +39,15 @@ RIVAL_COST = 25.0
 """A solution elsewhere whose cost is within this of the best is a rival."""
 RIVAL_M = 0.3
 """How far elsewhere."""
-CANDIDATES = 3
-"""Distinct smoothed starts that are solved."""
+HOPELESS = 100.0
+"""Smoothed starts whose log likelihood is this far below the best's are not solved."""
+GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
+"""Noise against the default's, weighed by how likely each makes the flight."""
+CAUTION = 1.25
+"""The sensors are taken for this much worse than is likeliest."""
+CONSTANTS = (0.55, 0.75, 3.5), (0.6, 1.1, 3.5)
+"""Grades of noise, and those of what is constant over a flight. A flight shows a bias once at
+most, so that only low noise, the mark of sensors that were calibrated, speaks for a small one."""
 
 SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
 """Order of the globals seen from the peer."""
@@ -221,16 +228,16 @@ def _from_batch(
     flight: Problem, noise: Noise | None, score: Array, tracks: Array
 ) -> tuple[Estimate, list[Array]]:
     first = noise or Noise()
-    chosen = dict.fromkeys(distinct(tracks[len(tracks) // 2], np.argsort(-score), CANDIDATES))
-    solutions = sorted(
-        (solve_batch(flight, first, tracks[:, n]) for n in chosen), key=lambda s: s.cost
-    )
+    # Even starts that look alike half-way may pass the peer on different sides: all are solved
+    # that are not hopeless.
+    starts = tracks.swapaxes(0, 1)[score > score.max() - HOPELESS]
+    solutions = sorted((solve_batch(flight, first, s) for s in starts), key=lambda s: s.cost)
     best = solutions[0]
     rivals = [s.state[:, :3] for s in solutions[1:] if s.cost - best.cost < RIVAL_COST]
     found = first if noise else noise_of(flight, first, best)
     if not noise:
         best = solve_batch(flight, found, best.state)
-    worse = max(1.0, found.velocity_std_mps / Noise().velocity_std_mps)
+    worse = max(1.0, found.bias_std_m / Noise().bias_std_m) ** 0.5
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse
     none = np.zeros(len(tracks), np.int8)
     estimate = Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
@@ -238,7 +245,7 @@ def _from_batch(
 
 
 def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
-    """What the sensors are like, from how the velocities disagree with the ranges.
+    """What the sensors are like: the grade of noise under which the flight is likeliest.
 
     Parameters
     ----------
@@ -249,17 +256,23 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
     solution
         The flight's solution under that guess.
     """
-    current = noise
-    for _ in range(2):
-        spread = plain_covariance(flight, current, solution)[:, 3:, 3:]
-        towards = solution.state[:, :2] / np.hypot(*solution.state[:, :2].T)[:, None]
-        error = np.einsum("ki,ki->k", solution.state[:, 3:], towards) ** 2
-        error += np.einsum("ki,kij,kj->k", towards, spread, towards)
-        std = float(np.sqrt(error.mean() / 2))
-        current = replace(noise, velocity_std_mps=std)
-        solution = solve_batch(flight, current, solution.state)
-    # Ranges along the line of sight leave 0.045 m/s even where the velocities have no noise.
-    return noise.graded(float(np.clip((std - 0.045) / (noise.velocity_std_mps - 0.042), 0.5, 3.0)))
+    tried: dict[int, float] = {}
+    middle, last = 2, len(GRADES) - 2
+    while True:
+        for number in range(middle - 1, middle + 2):
+            if number not in tried:
+                graded = noise.graded(GRADES[number])
+                solved = solve_batch(flight, graded, solution.state)
+                tried[number] = evidence(flight, graded, solved)
+        best = max(tried, key=lambda number: tried[number])
+        if min(max(best, 1), last) == middle:
+            break
+        middle = min(max(best, 1), last)
+    near = range(middle - 1, middle + 2)
+    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in near]), [tried[n] for n in near], 2)
+    peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
+    grade = CAUTION * float(np.clip(peak, GRADES[0], GRADES[-1]))
+    return noise.graded(grade, float(np.interp(grade, *CONSTANTS)))
 
 
 def _status(estimate: Estimate, rivals: list[Array], gate_m: float) -> Statuses:

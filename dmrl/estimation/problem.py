@@ -63,17 +63,18 @@ class Noise:
         """Either velocity's noise at low frequency: variance per second, m^2/s."""
         return 2 * self.velocity_tau_s * self.velocity_std_mps**2 + self.velocity_white_psd
 
-    def graded(self, grade: float) -> "Noise":
-        """The same with velocities, yaw rates and constants this many times as noisy."""
+    def graded(self, grade: float, constants: float | None = None) -> "Noise":
+        """The same with velocities this many times as noisy, and constants, as much if None."""
+        worse = grade if constants is None else constants
         return replace(
             self,
             velocity_std_mps=self.velocity_std_mps * grade,
             velocity_white_psd=self.velocity_white_psd * grade**2,
-            bias_std_m=self.bias_std_m * grade,
-            scale_std=self.scale_std * grade,
-            gyro_std_radps=self.gyro_std_radps * grade,
-            velocity_scale_std=self.velocity_scale_std * grade,
-            velocity_bias_std_mps=self.velocity_bias_std_mps * grade,
+            bias_std_m=self.bias_std_m * worse,
+            scale_std=self.scale_std * worse,
+            gyro_std_radps=self.gyro_std_radps * worse,
+            velocity_scale_std=self.velocity_scale_std * worse,
+            velocity_bias_std_mps=self.velocity_bias_std_mps * worse,
         )
 
     def prior_std(self) -> Array:
