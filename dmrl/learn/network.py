@@ -5,6 +5,7 @@ per ``stride_px`` pixels both ways: channel 0 is log depth (metres), channel 1 t
 confidence that a robot's centre lies in the cell.
 """
 
+from abc import ABC, abstractmethod
 from typing import ClassVar
 
 import torch
@@ -18,7 +19,7 @@ CHANNELS = 3
 CONFIDENCE_BIAS = -4.0
 
 
-class Network(nn.Module):
+class Network(nn.Module, ABC):
     """What training, prediction and export ask of a network.
 
     ``stride_px`` is the side of a grid cell; images are a whole number of cells.
@@ -26,9 +27,9 @@ class Network(nn.Module):
 
     stride_px: ClassVar[int] = 8
 
+    @abstractmethod
     def forward(self, images: Tensor) -> Tensor:
         """(N, 2, rows, cols) log depth and confidence logit of (N, 3, H, W) images."""
-        raise NotImplementedError
 
 
 class LocaNet(Network):

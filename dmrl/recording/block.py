@@ -81,3 +81,7 @@ def concatenate(first: Block | None, second: Block) -> Block:
         np.concatenate([first.start, second.start + shift]),
         np.concatenate([first.end, second.end + shift]),
     )
+
+
+_NONE: Ints = np.empty(0, np.int64)
+EMPTY = Block(np.empty(0, np.uint8), _NONE, _NONE, _NONE, _NONE, _NONE)

@@ -20,7 +20,6 @@ from dmrl.recording.blocks import in_file_order
 from dmrl.recording.index import Summary, summary
 from dmrl.recording.reader import columns, read_table
 from dmrl.topics import (
-    CALIBRATION,
     CAMERA_IMAGE,
     LABELS,
     calibration,
@@ -37,8 +36,6 @@ BIAS_MIN_LABELS = 20
 BIAS_MIN_PX = 1.5
 BIAS_MIN_SIGMAS = 5.0
 BORDER_PX = 1.0  # a box this near the border is cut by it, so its middle says nothing
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,13 +221,21 @@ def _without_image(
 
 def _bounds(path: Path, found: Summary, robot: str) -> tuple[int, int] | None:
     """Width and height of the robot's images, from the calibration or the first image."""
-    if CALIBRATION.format(robot=robot) in found.topics:
-        first = next(columns(path, calibration(robot), fields=["width", "height"]))
-        return first["width"][0].as_py(), first["height"][0].as_py()
-    if camera_image(robot) in found.topics:
-        known = [k for k in _image_sizes(path, camera_image(robot)) if k is not None]
-        return known[0] if known else None
-    return None
+    if _count(found, calibration(robot)):
+        known = next(columns(path, calibration(robot), fields=["width", "height"]))
+        return known["width"][0].as_py(), known["height"][0].as_py()
+    if not _count(found, camera_image(robot)):
+        return None
+    image = next(columns(path, camera_image(robot), fields=["data"]))
+    try:
+        width_px, height_px, _ = size(image["data"][0].as_py())
+    except (DmrlError, ValueError):
+        return None  # said already
+    return width_px, height_px
+
+
+def _count(found: Summary, topic: str) -> int:
+    return found.topics[topic].count if topic in found.topics else 0
 
 
 def _values(

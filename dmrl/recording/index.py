@@ -153,6 +153,15 @@ def channel_of(
     )
 
 
+def channel_on(path: Path, topic: str) -> Channel:
+    """The first channel of a topic that an indexed recording has."""
+    with opened(path) as stream:
+        found = SeekingReader(stream).get_summary()
+        assert found is not None
+        number = min(n for n, channel in found.channels.items() if channel.topic == topic)
+        return channel_of(number, found.channels, found.schemas)
+
+
 def summary(path: Path) -> Summary:
     """What a recording holds; reads its summary, metadata and attachments only.
 

@@ -13,9 +13,9 @@ from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.messages import descriptor, pool_of
-from dmrl.recording.block import Block
+from dmrl.recording.block import EMPTY, Block
 from dmrl.recording.blocks import blocks
-from dmrl.recording.index import damaged, summary
+from dmrl.recording.index import channel_on, damaged, summary
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
 from dmrl.recording.writer import Channel, RawMessage
@@ -214,6 +214,8 @@ def read_table(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> pa.Table:
-    """One topic as an Arrow table, all in memory; see ``columns``."""
-    batches = columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns)
-    return pa.Table.from_batches(list(batches))
+    """One topic as an Arrow table, all in memory; see ``columns``. It may have no rows."""
+    batches = list(columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns))
+    if not batches:
+        batches = [_batch(EMPTY, descriptor_of(path, channel_on(path, topic)), fields)]
+    return pa.Table.from_batches(batches)

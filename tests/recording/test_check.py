@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from dmrl.images import encode_png
-from dmrl.messages import message
+from dmrl.messages import message, schema_bytes
 from dmrl.recording import Provenance, RecordingWriter, check
 
 PNG = encode_png(np.zeros((224, 320, 3), np.uint8))
@@ -122,3 +123,23 @@ def test_labels_without_their_image_are_found(tmp_path: Path) -> None:
 
 def test_an_empty_recording_is_an_error(tmp_path: Path) -> None:
     assert record(tmp_path / "a.mcap", lambda _: None) == ["error  has no messages"]
+
+
+def test_a_topic_without_messages_is_no_trouble(tmp_path: Path) -> None:
+    """Other writers announce topics that nothing is ever sent on."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, name in (
+            ("/cf1/camera/image", "CompressedImage"),
+            ("/cf1/camera/calibration", "CameraCalibration"),
+            ("/cf1/labels", "PeerLabels"),
+        ):
+            full = message(name).DESCRIPTOR.full_name
+            schema = writer.register_schema(full, "protobuf", schema_bytes(name))
+            channel = writer.register_channel(topic, "protobuf", schema)
+        empty = message("PeerLabels")(peers=[label(5.0, 5.0)]).SerializeToString()
+        writer.add_message(channel, 0, empty, 0)
+        writer.finish()
+    assert [f.text for f in check(path)] == ["1 of 1 messages have no image at their time"]

@@ -233,3 +233,10 @@ def test_an_empty_recording_has_no_messages(tmp_path: Path) -> None:
     assert list(read(path)) == []
     assert summary(path).count == 0
     assert io.BytesIO(path.read_bytes()).read(8) == b"\x89MCAP0\r\n"
+
+
+def test_a_stretch_without_messages_is_a_table_without_rows(flight: Path) -> None:
+    table = read_table(flight, "/cf1/attitude", start_ns=10**15)
+    assert table.num_rows == 0
+    assert table.schema == read_table(flight, "/cf1/attitude").schema
+    assert read_table(flight, "/cf1/attitude", fields=["roll_rad"], end_ns=0).num_rows == 0
