@@ -1,7 +1,8 @@
 """Recordings in rerun: a window, a file, a web page or a picture. The only home of rerun.
 
-``entities`` turns a topic's columns into archetypes, ``layouts`` arranges them, ``session``
-reads and logs what ``selection`` chose, ``window`` runs rerun's viewer. One timeline, ``log_time``.
+``entities`` (images), ``space`` (3D) and ``plots`` turn a topic's columns into archetypes,
+``layouts`` arranges them; ``flight``, ``compare`` and ``browse`` say what a layout shows;
+``session`` logs what ``selection`` chose, ``window`` runs rerun's viewer.
 """
 
 from dmrl.errors import MissingExtra
@@ -9,8 +10,8 @@ from dmrl.errors import MissingExtra
 try:
     from dmrl.viewer.selection import Settings
     from dmrl.viewer.session import save
-    from dmrl.viewer.window import screenshot, serve, view
+    from dmrl.viewer.window import Page, Web, page, screenshot, serve, view
 except ImportError as e:
     raise MissingExtra("rerun-sdk", "view", "dmrl view") from e
 
-__all__ = ["Settings", "save", "screenshot", "serve", "view"]
+__all__ = ["Page", "Settings", "Web", "page", "save", "screenshot", "serve", "view"]

@@ -1,11 +1,11 @@
-"""Columns of a topic to rerun archetypes: one function per message type.
+"""What lies in an image, to rerun archetypes: one function per message type.
 
-Everything in two dimensions is in the ``image`` frame, pixels, u right and v down, so that
-maps, labels and detections lie over the image where they belong.
+All of it is in the ``<robot>/image`` frame, so that maps, labels and detections lie over the
+image where they belong.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,14 +14,22 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
+from dmrl.viewer.entity import (
+    ELLIPSE_SIGMAS,
+    FAINT_POINT_UI,
+    INVISIBLE,
+    LINE_UI,
+    POINT_UI,
+    Entity,
+)
+
+Colour = tuple[int, int, int]
 
 STRIDE_PX = 8
 """Pixels per cell where a GridMap does not say; the published network's."""
 
 MEDIA_TYPES = {"jpg": "image/jpeg"}
-# rerun takes a negative radius in points of the screen: the same at every zoom.
-POINT_UI, FAINT_POINT_UI, LINE_UI = -4.0, -1.5, -1.0
-INVISIBLE = 0.01
+CELL_COLOUR = (255, 255, 255)
 # rerun writes below a point; at the zoom that a layout opens with, this is a line's height.
 TEXT_PX = 14
 
@@ -48,25 +56,6 @@ class Scale:
     unit: str
 
 
-@dataclass(frozen=True, slots=True)
-class Entity:
-    """Some rows of one entity.
-
-    Parameters
-    ----------
-    path
-        Where it stands, as a topic.
-    columns
-        One row per message; none for what does not move.
-    style
-        What never changes; logged once.
-    """
-
-    path: str
-    columns: Iterable[rr.ComponentColumn] = ()
-    style: tuple[rr.AsComponents, ...] = ()
-
-
 def scales(depth_max_m: float) -> dict[str, Scale]:
     """Colours of the channels that are shown, by name of the channel."""
     return {
@@ -75,33 +64,28 @@ def scales(depth_max_m: float) -> dict[str, Scale]:
     }
 
 
-def escaped(path: str) -> str:
-    """A topic as rerun writes an entity's path; robots may have any name."""
-    return rr.new_entity_path(path.strip("/").split("/"))
-
-
 def channel_path(topic: str, channel: str) -> str:
     """Entity of one channel of a grid."""
     return f"{topic}/{channel}"
 
 
-def images(topic: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+def images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     """Compressed images, as they are."""
     formats = batch["format"].to_pylist()
     columns = rr.EncodedImage.columns(
         blob=batch["data"].to_pylist(),
         media_type=[MEDIA_TYPES.get(name, f"image/{name}") for name in formats],
     )
-    yield Entity(topic, columns)
+    yield Entity(path, columns, frame=frame)
 
 
-def labels(topic: str, batch: pa.RecordBatch, sources: set[str]) -> Iterator[Entity]:
-    """Points and boxes of every source of labels.
+def labels(path: str, frame: str, batch: pa.RecordBatch, sources: set[str]) -> Iterator[Entity]:
+    """Points, boxes and ellipses of every source of labels.
 
     Parameters
     ----------
-    topic
-        Where the labels stand.
+    path, frame
+        Where the labels stand, and in which image.
     batch
         Columns of PeerLabels.
     sources
@@ -115,36 +99,56 @@ def labels(topic: str, batch: pa.RecordBatch, sources: set[str]) -> Iterator[Ent
     sources.update(source_of)
     for source in sorted(sources):
         (at,) = np.nonzero(source_of == source)
-        yield from _labels_of(topic, source, peers.take(at), row_of[at], batch.num_rows)
+        mine = _Labels(peers.take(at), row_of[at], batch.num_rows)
+        for entity in mine.entities(f"{path}/{source}", source):
+            yield replace(entity, frame=frame)
 
 
-def _labels_of(
-    topic: str, source: str, peers: pa.StructArray, row_of: NDArray[np.intp], rows: int
-) -> Iterator[Entity]:
-    colour = RGB.get(source, RGB["other"])
-    # Where two sources agree, the one named first in the table is seen.
-    order = 30.0 - list(RGB).index(source if source in RGB else "other")
-    edges = peers.field("box_px")
-    boxed = edges.value_lengths().to_numpy() == 4
-    corners = edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
-    centres = corners.mean(axis=1)
-    uv_px = _positions(peers)
-    top_px = uv_px.copy()
-    top_px[boxed] = np.column_stack([centres[:, 0], corners[:, 0, 1]])
+@dataclass(frozen=True, slots=True)
+class _Labels:
+    """The labels of one source, one after another; ``row_of`` says in which image."""
 
-    points = rr.Points2D.columns(positions=uv_px)
-    boxes = rr.Boxes2D.columns(centers=centres, half_sizes=(corners[:, 1] - corners[:, 0]) / 2)
-    dot, dust = (
-        rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
-        for radius in (POINT_UI, INVISIBLE)
-    )
-    outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
-    lengths = np.bincount(row_of, minlength=rows)
-    box_lengths = np.bincount(row_of[boxed], minlength=rows)
-    path = f"{topic}/{source}"
-    yield Entity(f"{path}/points", points.partition(lengths), (dot,))
-    yield Entity(f"{path}/boxes", boxes.partition(box_lengths), (outline,))
-    yield Entity(f"{path}/texts", _label_texts(peers, top_px).partition(lengths), (dust,))
+    peers: pa.StructArray
+    row_of: NDArray[np.intp]
+    rows: int
+
+    def entities(self, path: str, source: str) -> Iterator[Entity]:
+        colour = RGB.get(source, RGB["other"])
+        # Where two sources agree, the one named first in the table is seen.
+        order = 30.0 - list(RGB).index(source if source in RGB else "other")
+        edges = self.peers.field("box_px")
+        boxed = edges.value_lengths().to_numpy() == 4
+        corners = edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
+        centres = corners.mean(axis=1)
+        uv_px = _positions(self.peers)
+        top_px = uv_px.copy()
+        top_px[boxed] = np.column_stack([centres[:, 0], corners[:, 0, 1]])
+
+        points = rr.Points2D.columns(positions=uv_px)
+        boxes = rr.Boxes2D.columns(centers=centres, half_sizes=(corners[:, 1] - corners[:, 0]) / 2)
+        dot, dust = (
+            rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
+            for radius in (POINT_UI, INVISIBLE)
+        )
+        outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
+        yield Entity(f"{path}/points", self._rows(points), (dot,))
+        yield Entity(f"{path}/boxes", self._rows(boxes, boxed), (outline,))
+        yield Entity(f"{path}/texts", self._rows(_label_texts(self.peers, top_px)), (dust,))
+        sigmas_px = _columns(self.peers, ("sigma_u_px", "sigma_v_px"))
+        if (unsure := (sigmas_px > 0).all(axis=1)).any():
+            ellipses = rr.Ellipses2D.columns(
+                centers=uv_px[unsure], half_sizes=ELLIPSE_SIGMAS * sigmas_px[unsure]
+            )
+            style = rr.Ellipses2D.from_fields(
+                colors=[colour], line_radii=[LINE_UI], draw_order=order - 10.0
+            )
+            yield Entity(f"{path}/sigmas", self._rows(ellipses, unsure), (style,))
+
+    def _rows(
+        self, columns: rr.ComponentColumnList, kept: NDArray[np.bool_] | None = None
+    ) -> rr.ComponentColumnList:
+        row_of = self.row_of if kept is None else self.row_of[kept]
+        return columns.partition(np.bincount(row_of, minlength=self.rows))
 
 
 def _label_texts(peers: pa.StructArray, top_px: NDArray[np.float64]) -> rr.ComponentColumnList:
@@ -155,7 +159,9 @@ def _label_texts(peers: pa.StructArray, top_px: NDArray[np.float64]) -> rr.Compo
     return rr.Points2D.columns(positions=above_px, labels=texts)
 
 
-def detections(topic: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+def detections(
+    path: str, frame: str, batch: pa.RecordBatch, colour: Colour = RGB["detection"]
+) -> Iterator[Entity]:
     """Points with confidence and depth; without text and faint below the model's threshold."""
     column = batch["detections"]
     found = column.flatten()
@@ -170,34 +176,92 @@ def detections(topic: str, batch: pa.RecordBatch) -> Iterator[Entity]:
         labels=texts,
         radii=np.where(believed, POINT_UI, FAINT_POINT_UI),
     )
-    style = rr.Points2D.from_fields(colors=[RGB["detection"]], draw_order=40.0)
-    yield Entity(topic, columns.partition(column.value_lengths().to_numpy()), (style,))
+    style = rr.Points2D.from_fields(colors=[colour], draw_order=40.0)
+    yield Entity(path, columns.partition(column.value_lengths().to_numpy()), (style,), frame)
 
 
-def grids(topic: str, batch: pa.RecordBatch, scales: Mapping[str, Scale]) -> Iterator[Entity]:
-    """Heat maps of confidence and depth, each cell as large as the pixels it stands for."""
+def grids(
+    path: str,
+    frame: str,
+    batch: pa.RecordBatch,
+    scales: Mapping[str, Scale],
+    *,
+    smooth: bool = False,
+) -> Iterator[Entity]:
+    """Heat maps of confidence and depth, and the cell with the highest confidence.
+
+    Parameters
+    ----------
+    path, frame
+        Where the grid stands, and in which image.
+    batch
+        Columns of GridMap.
+    scales
+        Colours of the channels that are shown.
+    smooth
+        Scale the maps up smoothly; otherwise each cell is a square of the pixels it stands for.
+    """
     sizes = zip(batch["cols"].to_pylist(), batch["rows"].to_pylist(), strict=True)
     formats = [
         rr.components.ImageFormat(width=cols, height=rows, channel_datatype="F32")
         for cols, rows in sizes
     ]
     stride_px = batch["stride_px"][0].as_py() or STRIDE_PX
-    place = rr.Transform3D(scale=[stride_px, stride_px, 1])
     # A topic's channels do not change from message to message.
     names = batch["channels"][0].as_py()
     for index, channel in enumerate(names):
         if channel in scales:
             buffers = [_share(data, index, len(names)) for data in batch["data"].to_pylist()]
             columns = rr.DepthImage.columns(buffer=buffers, format=formats)
-            yield Entity(channel_path(topic, channel), columns, (map_style(scales[channel]), place))
+            yield map_entity(
+                channel_path(path, channel),
+                frame,
+                scales[channel],
+                columns,
+                stride_px=stride_px,
+                smooth=smooth,
+            )
+            if channel == "confidence":
+                yield _best_cells(f"{path}/best", frame, buffers, formats, stride_px)
 
 
-def map_style(scale: Scale) -> rr.DepthImage:
-    """Colours of a map: fixed range, cells with sharp edges."""
+def map_entity(
+    path: str,
+    frame: str,
+    scale: Scale,
+    columns: Iterable[rr.ComponentColumn],
+    *,
+    stride_px: int = STRIDE_PX,
+    smooth: bool = False,
+) -> Entity:
+    """A map that is laid over an image, each cell as large as the pixels it stands for."""
+    own = f"{frame}{path}"
+    place = rr.Transform3D(scale=[stride_px, stride_px, 1], child_frame=own, parent_frame=frame)
+    return Entity(path, columns, (map_style(scale, smooth=smooth), place), own)
+
+
+def _best_cells(
+    path: str,
+    frame: str,
+    buffers: Sequence[bytes],
+    formats: Sequence[rr.components.ImageFormat],
+    stride_px: int,
+) -> Entity:
+    """An outline of the cell with the highest confidence."""
+    best = np.array([np.frombuffer(buffer, "<f4").argmax() for buffer in buffers])
+    cols = np.array([form.width for form in formats])
+    centres = (np.column_stack([best % cols, best // cols]) + 0.5) * stride_px
+    columns = rr.Boxes2D.columns(centers=centres, half_sizes=np.full((len(best), 2), stride_px / 2))
+    style = rr.Boxes2D.from_fields(colors=[CELL_COLOUR], radii=[LINE_UI], draw_order=35.0)
+    return Entity(path, columns, (style,), frame)
+
+
+def map_style(scale: Scale, *, smooth: bool = False) -> rr.DepthImage:
+    """Colours of a map: fixed range; cells with sharp edges unless they are smoothed."""
     return rr.DepthImage.from_fields(
         colormap=scale.colormap,
         depth_range=[0.0, scale.last],
-        magnification_filter="nearest",
+        magnification_filter="linear" if smooth else "nearest",
     )
 
 
@@ -211,4 +275,8 @@ def _row_of(column: pa.ListArray) -> NDArray[np.intp]:
 
 
 def _positions(points: pa.StructArray) -> NDArray[np.float64]:
-    return np.column_stack([points.field(key).to_numpy() for key in ("u_px", "v_px")])
+    return _columns(points, ("u_px", "v_px"))
+
+
+def _columns(points: pa.StructArray, names: Sequence[str]) -> NDArray[np.float64]:
+    return np.column_stack([points.field(name).to_numpy() for name in names])

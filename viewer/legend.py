@@ -1,12 +1,12 @@
 """What explains the colours: drawn below the image and the maps, in image pixels."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import rerun as rr
 
-from dmrl.colours import RGB
-from dmrl.viewer.entities import LINE_UI, Entity, Scale, map_style
+from dmrl.viewer.entities import Colour, Scale, map_style
+from dmrl.viewer.entity import LINE_UI, Entity, image_frame
 
 HEIGHT_PX = 26
 """Room that the legend and the colour bars take below an image, pixels."""
@@ -27,17 +27,18 @@ def bar_path(robot: str, channel: str) -> str:
     return f"/{robot}/legend/{channel}"
 
 
-def legend(robot: str, sources: Sequence[str], width_px: int, height_px: int) -> Entity:
+def legend(robot: str, colours: Mapping[str, Colour], width_px: int, height_px: int) -> Entity:
     """A line in the colour of each source, with its name."""
-    left_px = [(k + 0.4) * width_px / ENTRIES_PER_WIDTH for k in range(len(sources))]
+    per_width = max(ENTRIES_PER_WIDTH, len(colours))
+    left_px = [(k + 0.4) * width_px / per_width for k in range(len(colours))]
     y_px = height_px + MARK_PX
     marks = rr.LineStrips2D(
         [[[x_px, y_px], [x_px + 2 * MARK_PX, y_px]] for x_px in left_px],
-        colors=[RGB.get(source, RGB["other"]) for source in sources],
-        labels=list(sources),
+        colors=list(colours.values()),
+        labels=list(colours),
         radii=2 * LINE_UI,
     )
-    return Entity(legend_path(robot), style=(marks,))
+    return Entity(legend_path(robot), style=(marks,), frame=image_frame(robot))
 
 
 def colour_bars(
@@ -46,9 +47,6 @@ def colour_bars(
     """A bar with three ticks for each channel of the grid."""
     left_px, length_px = width_px / 10, width_px * 8 / 10
     top_px = height_px + BAR_PX / 2
-    place = rr.Transform3D(
-        translation=[left_px, top_px, 0], scale=[length_px / BAR_STEPS, BAR_PX, 1]
-    )
     shares = (0.0, 0.5, 1.0)
     at_px = [left_px + length_px * share for share in shares]
     for channel, scale in scales.items():
@@ -60,6 +58,13 @@ def colour_bars(
             radii=LINE_UI,
         )
         path = bar_path(robot, channel)
+        frame = f"{image_frame(robot)}/bar/{channel}"
+        place = rr.Transform3D(
+            translation=[left_px, top_px, 0],
+            scale=[length_px / BAR_STEPS, BAR_PX, 1],
+            child_frame=frame,
+            parent_frame=image_frame(robot),
+        )
         bar = rr.DepthImage(steps[None]), map_style(scale), place
-        yield Entity(f"{path}/bar", style=bar)
-        yield Entity(f"{path}/ticks", style=(ticks,))
+        yield Entity(f"{path}/bar", style=bar, frame=frame)
+        yield Entity(f"{path}/ticks", style=(ticks,), frame=image_frame(robot))

@@ -1,9 +1,9 @@
-"""Which images of which recordings are shown."""
+"""Which images and which stretch of which recordings are shown."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from cyclopts import Parameter, validators
@@ -12,22 +12,35 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.progress import say
-from dmrl.recording import Summary, columns, summary
+from dmrl.recording import Summary, stretches, summary
 
 # Log times below this do not count from 1970 but from the start of a simulation.
 DURATION_BELOW_NS = 10 * 365 * 86400 * 10**9
 
 MARKS = (topics.LABELS, topics.DETECTIONS, topics.GRID)
+PAIRWISE = (topics.RANGE, topics.POSITION, topics.TRUTH)
+FLIGHT = (*PAIRWISE, topics.TRACKS, topics.ATTITUDE, topics.HEIGHT)
+"""Topics that the layout ``flight`` is for."""
 
+MANY_PAIRS = 6
+
+Layout = Literal["auto", "image", "flight", "compare", "dataset"]
 Times = NDArray[np.int64]
+Names = tuple[str, str]
+Pixels = Annotated[float | None, Parameter(validator=validators.Number(gte=0))]
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What of the recordings is shown.
+    """What is shown, and how.
 
     Parameters
     ----------
+    layout
+        image: images and maps. flight: 3D, plots and images. compare: two models, one recording
+        each. dataset: a dataset, worst first. auto: what fits.
+    robot
+        Only what this robot sees. Without it: every robot, in compare the first.
     from_s
         First image shown, seconds from the start of the earliest recording.
     to_s
@@ -36,98 +49,159 @@ class Settings:
         Show one image in so many, with what belongs to it.
     depth_max_m
         Depth of the last colour of depth maps, metres. The first is 0 m.
+    overlay
+        Lay the maps over the image, scaled up smoothly.
+    most
+        dataset: show so many rows at most.
+    split
+        dataset: only rows of this split.
+    error_from_px
+        dataset: only rows with an error of at least this, pixels.
+    error_to_px
+        dataset: only rows with a smaller error, pixels.
     """
 
+    layout: Layout = "auto"
+    robot: str | None = None
     from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
     to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None
     every: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1
     depth_max_m: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 3.0
+    overlay: bool = False
+    most: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 200
+    split: str | None = None
+    error_from_px: Pixels = None
+    error_to_px: Pixels = None
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Recordings, and the log times of the images that are shown.
+    """Recordings, and what of them is shown.
 
     Parameters
     ----------
     recordings
         Path to summary.
+    layout
+        Never ``auto``.
     start_ns
         Start of the earliest recording.
+    shown_ns
+        First log time that is shown, and the first that is not.
     image_ns
-        Robot to sorted log times, at least one each.
+        Robot to sorted log times of its images, at least one each.
     all_images
-        Nothing between the first and the last is left out.
+        None between the first and the last is left out.
     """
 
     recordings: Mapping[Path, Summary]
+    layout: Layout
     start_ns: int
+    shown_ns: tuple[int, int]
     image_ns: Mapping[str, Times]
     all_images: bool
 
     @property
-    def first_ns(self) -> int:
-        """Log time of the first image."""
-        return min(int(times[0]) for times in self.image_ns.values())
+    def images(self) -> int:
+        """Number of images."""
+        return sum(times.size for times in self.image_ns.values())
 
     @property
-    def last_ns(self) -> int:
-        """Log time of the last image."""
-        return max(int(times[-1]) for times in self.image_ns.values())
+    def last_image_ns(self) -> int:
+        """Log time of the last image; without images, of the first message."""
+        return max((int(t[-1]) for t in self.image_ns.values()), default=self.shown_ns[0])
 
     @property
     def on_wall_clock(self) -> bool:
         """Whether log times count from 1970."""
-        return self.last_ns >= DURATION_BELOW_NS
+        return self.shown_ns[1] > DURATION_BELOW_NS
+
+    def found(self, pattern: str) -> list[dict[str, str]]:
+        """Robots and peers of the topics of a pattern that hold messages, sorted."""
+        every = {t for kept in self.recordings.values() for t, i in kept.topics.items() if i.count}
+        names = (topics.names(pattern, topic) for topic in sorted(every))
+        return [n for n in names if n is not None]
+
+    def pairs(self, robot: str | None) -> list[Names]:
+        """Who sees or measures whom; only what one robot sees, if one is named."""
+        found = {(n["robot"], n["peer"]) for p in PAIRWISE for n in self.found(p)}
+        return sorted(pair for pair in found if robot in (None, pair[0]))
 
 
 def select(paths: Sequence[Path], settings: Settings) -> Selection:
-    """The images that the settings ask for.
+    """What the settings ask for.
 
     Raises
     ------
     RecordingError
-        If no recording has images, or one cannot be read.
+        If no recording has what the layout shows, or one cannot be read.
     SettingError
-        If no image lies between ``from_s`` and ``to_s``.
+        If nothing lies between ``from_s`` and ``to_s``, or the robot is not there.
     """
     found = {path: summary(path) for path in dict.fromkeys(paths)}
-    pairs = [
-        (robot, path) for path, kept in found.items() for robot in topics.robots(list(kept.topics))
-    ]
     names = ", ".join(str(path) for path in found)
-    if not pairs:
+    every = sorted({t for kept in found.values() for t, info in kept.topics.items() if info.count})
+    layout = settings.layout if settings.layout != "auto" else _fitting(every)
+    if layout == "dataset":
+        raise SettingError(f"{names}: layout dataset is for datasets. Make one: dmrl dataset")
+    robots = _robots(every, names, settings.robot)
+    if not robots and (layout != "flight" or not _of(every, FLIGHT)):
         raise RecordingError(
             f"no images (/*/camera/image) in {names}. Name the recording with the images as well"
         )
-    _say_blind(found)
+    if settings.robot is None:
+        _say_blind(every)
     start_ns = min(kept.start_ns for kept in found.values() if kept.count)
+    last_ns = max(kept.end_ns for kept in found.values() if kept.count)
     lower_ns, upper_ns = (
-        None if s is None else start_ns + round(s * 1e9) for s in (settings.from_s, settings.to_s)
+        other if s is None else start_ns + round(s * 1e9)
+        for s, other in ((settings.from_s, start_ns), (settings.to_s, last_ns + 1))
     )
-    image_ns: dict[str, Times] = {}
-    for robot, path in pairs:
-        times = _image_times(path, robot, lower_ns, upper_ns)
-        image_ns[robot] = np.union1d(image_ns.get(robot, times), times)
+    image_ns = _image_times(found, robots, lower_ns, upper_ns)
     chosen = {r: times[:: settings.every] for r, times in image_ns.items() if times.size}
-    if not chosen:
-        length_s = (max(kept.end_ns for kept in found.values()) - start_ns) / 1e9
+    empty = upper_ns <= max(lower_ns, start_ns) or lower_ns > last_ns
+    if empty or (robots and not chosen and layout != "flight"):
         raise SettingError(
-            f"no image of {names} in that time; it lasts from 0 to {length_s:.3f} s. "
-            "Change --from-s or --to-s"
+            f"no image of {names} in that time; it lasts from 0 to "
+            f"{(last_ns - start_ns) / 1e9:.3f} s. Change --from-s or --to-s"
         )
-    return Selection(found, start_ns, chosen, settings.every == 1)
+    if layout != "flight":
+        # What lies before the first image and after the last belongs to none.
+        lower_ns = min(int(times[0]) for times in chosen.values())
+        upper_ns = max(int(times[-1]) for times in chosen.values()) + 1
+    shown_ns = max(lower_ns, start_ns), min(upper_ns, last_ns + 1)
+    return Selection(found, layout, start_ns, shown_ns, chosen, settings.every == 1)
 
 
-def _say_blind(found: Mapping[Path, Summary]) -> None:
-    every = [topic for kept in found.values() for topic in kept.topics]
+def _fitting(every: Sequence[str]) -> Layout:
+    measured = _of(every, (topics.RANGE, topics.POSITION, topics.TRACKS))
+    blind = not topics.robots(list(every))
+    return "flight" if measured or (blind and _of(every, FLIGHT)) else "image"
+
+
+def _of(every: Iterable[str], patterns: Sequence[str]) -> bool:
+    return any(topics.names(p, topic) for topic in every for p in patterns)
+
+
+def _robots(every: list[str], names: str, wanted: str | None) -> list[str]:
+    """Robots with images, or the one that is wanted."""
+    robots = topics.robots(every)
+    if wanted is None:
+        return robots
+    known = sorted({topic.split("/")[1] for topic in every if topic.count("/") > 1})
+    if wanted not in known:
+        raise SettingError(f"no robot {wanted} in {names}. It has: {', '.join(known)}")
+    return [robot for robot in robots if robot == wanted]
+
+
+def _say_blind(every: list[str]) -> None:
     marked = {r for pattern in MARKS for r in topics.robots(every, pattern)}
     for robot in sorted(marked - set(topics.robots(every))):
         say(f"{robot} has labels or detections but no images: they are not shown")
 
 
 def at_time(selection: Selection, time_s: float | None) -> Selection:
-    """One image of each robot: the one nearest to a time.
+    """One image of each robot: the one nearest to a time. A flight stays whole around it.
 
     Parameters
     ----------
@@ -136,16 +210,39 @@ def at_time(selection: Selection, time_s: float | None) -> Selection:
     time_s
         Seconds from the start of the earliest recording. None: the first image.
     """
-    wanted_ns = selection.first_ns
+    wanted_ns = min((int(t[0]) for t in selection.image_ns.values()), default=selection.shown_ns[0])
     if time_s is not None:
         wanted_ns = selection.start_ns + round(time_s * 1e9)
     nearest = {
         robot: times[[np.abs(times - wanted_ns).argmin()]]
         for robot, times in selection.image_ns.items()
     }
-    return Selection(selection.recordings, selection.start_ns, nearest, False)
+    moment = replace(selection, image_ns=nearest, all_images=False)
+    if selection.layout == "flight":
+        return moment
+    first = min(int(times[0]) for times in nearest.values())
+    return replace(moment, shown_ns=(first, moment.last_image_ns + 1))
 
 
-def _image_times(path: Path, robot: str, start_ns: int | None, end_ns: int | None) -> Times:
-    batches = columns(path, topics.camera_image(robot), fields=[], start_ns=start_ns, end_ns=end_ns)
-    return np.concatenate([np.zeros(0, np.int64), *(b["log_time"].to_numpy() for b in batches)])
+def moment_ns(selection: Selection, time_s: float | None) -> int:
+    """Log time that a picture shows: of the image that was chosen, or the time asked for."""
+    if selection.image_ns or time_s is None:
+        return selection.last_image_ns
+    first, end = selection.shown_ns
+    return min(max(selection.start_ns + round(time_s * 1e9), first), end - 1)
+
+
+def _image_times(
+    found: Mapping[Path, Summary], robots: Sequence[str], start_ns: int, end_ns: int
+) -> dict[str, Times]:
+    of_topic = {topics.camera_image(robot): robot for robot in robots}
+    fields: dict[str, Sequence[str]] = dict.fromkeys(of_topic, ())
+    parts: dict[str, list[Times]] = {robot: [] for robot in robots}
+    for path in found:
+        for stretch in stretches(path, fields, start_ns=start_ns, end_ns=end_ns):
+            for topic, batch in stretch.items():
+                parts[of_topic[topic]].append(batch["log_time"].to_numpy())
+    return {
+        robot: np.unique(np.concatenate([np.zeros(0, np.int64), *times]))
+        for robot, times in parts.items()
+    }

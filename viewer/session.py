@@ -1,27 +1,23 @@
-"""What is selected, into a rerun stream or file."""
+"""What is asked for, into a rerun stream or file."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import pyarrow as pa
 import rerun as rr
 
-from dmrl import images, topics
+from dmrl import topics
 from dmrl.colours import RGB
 from dmrl.errors import OutputError
 from dmrl.output import partial_file
-from dmrl.progress import track
-from dmrl.recording import columns
 from dmrl.viewer import entities, layouts
-from dmrl.viewer.entities import Entity, Scale, escaped
-from dmrl.viewer.layouts import TIMELINE, Eye
-from dmrl.viewer.legend import colour_bars, legend
-from dmrl.viewer.selection import Selection, Settings, Times, select
-
-Draw = Callable[[str, pa.RecordBatch], Iterator[Entity]]
+from dmrl.viewer.browse import browse
+from dmrl.viewer.compare import compare_scene
+from dmrl.viewer.flight import flight_scene
+from dmrl.viewer.layouts import TIMELINE
+from dmrl.viewer.scene import Scene, bars, eye_of, logged, model_draws, picture_draws
+from dmrl.viewer.selection import Selection, Settings, at_time, moment_ns, select
+from dmrl.viewer.show import Logger, Show, cursor_at, stream_of
 
 
 def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
@@ -34,20 +30,53 @@ def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
 
     Raises
     ------
+    DatasetError
+        If a folder is not a dataset.
     OutputError
         If ``out`` exists or cannot be written.
     RecordingError
-        If no recording has images, or one cannot be read.
+        If no recording has what the layout shows, or one cannot be read.
     SettingError
-        If no image lies in the time asked for.
+        If nothing lies in the time asked for, or the layout does not fit.
     """
-    selection = select(paths, settings)
+    show = prepare(paths, settings)
     with partial_file(out) as unfinished:
-        write(selection, unfinished, settings)
-    return sum(times.size for times in selection.image_ns.values())
+        write(show, unfinished)
+    return show.images
 
 
-def write(selection: Selection, path: Path, settings: Settings) -> None:
+def prepare(
+    paths: Sequence[Path],
+    settings: Settings,
+    *,
+    picture: bool = False,
+    time_s: float | None = None,
+    rank: int = 1,
+) -> Show:
+    """What the settings ask for; ``picture``: one image only, at a time or of a rank.
+
+    Raises
+    ------
+    As `save`.
+    """
+    if any(path.is_dir() for path in paths):
+        return browse(paths, settings, rank=rank if picture else None)
+    selection = select(paths, settings)
+    if picture:
+        selection = at_time(selection, time_s)
+    scene = _SCENES[selection.layout](selection, settings)
+    shown_ns = moment_ns(selection, time_s)
+    return Show(
+        " + ".join(recording.stem for recording in selection.recordings),
+        scene.blueprint,
+        partial(logged, selection, scene),
+        selection.images,
+        cursor_at(TIMELINE, shown_ns, on_wall_clock=selection.on_wall_clock),
+        f"at {(shown_ns - selection.start_ns) / 1e9:.3f} s",
+    )
+
+
+def write(show: Show, path: Path) -> None:
     """Write an .rrd file, whatever stands at ``path``.
 
     Raises
@@ -55,19 +84,10 @@ def write(selection: Selection, path: Path, settings: Settings) -> None:
     OutputError
         If the disk is full, or refuses.
     """
-    # Misuse of rerun becomes an error, where it would log a warning and go on.
-    rr.set_strict_mode(True)
-    scales = entities.scales(settings.depth_max_m)
-    eyes = [_eye(selection, robot, scales) for robot in sorted(selection.image_ns)]
-    stream = rr.RecordingStream("dmrl")
-    stream.save(path, default_blueprint=layouts.image(eyes, scales))
-    # rerun's own log_time is the time of the call.
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    stream.send_recording_name(" + ".join(recording.stem for recording in selection.recordings))
-    for eye in eyes:
-        _log_robot(stream, selection, eye, scales)
+    stream = stream_of()
+    stream.save(path, default_blueprint=show.blueprint)
     try:
+        log(show, stream)
         stream.flush()
     except RuntimeError as e:
         # All that rerun tells of a failed write, after the reason went to standard error.
@@ -76,78 +96,32 @@ def write(selection: Selection, path: Path, settings: Settings) -> None:
         stream.disconnect()
 
 
-def _eye(selection: Selection, robot: str, scales: Mapping[str, Scale]) -> Eye:
-    topic = topics.camera_image(robot)
-    data = _first(selection, topic, "data")
-    width_px, height_px, _ = images.size(data, f"the first image of {topic}")
-    channels = _first(selection, topics.grid(robot), "channels") or ()
-    return Eye(robot, width_px, height_px, tuple(name for name in channels if name in scales))
+def log(show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lambda: True) -> None:
+    """Log everything to a stream, as long as it is wanted."""
+    stream.send_recording_name(show.title)
+    logger = Logger(stream)
+    for times, entity in show.logged():
+        if not wanted():
+            return
+        logger.log(times, entity)
 
 
-def _first(selection: Selection, topic: str, field: str) -> Any:
-    for path, kept in selection.recordings.items():
-        if topic in kept.topics:
-            for batch in columns(path, topic, fields=[field]):
-                return batch[field][0].as_py()
-    return None
+def image_scene(selection: Selection, settings: Settings) -> Scene:
+    """Images and maps of every robot."""
+    scales = entities.scales(settings.depth_max_m)
+    eyes = [eye_of(selection, robot, scales) for robot in sorted(selection.image_ns)]
+    scene = Scene(layouts.image(eyes, scales, overlay=settings.overlay), [], [], eyes)
+    for eye in eyes:
+        scene.draws += picture_draws(eye, scene.sources.setdefault(eye.robot, set()))
+        scene.draws += model_draws(eye, scales, smooth=settings.overlay)
+        scene.stills += bars(eye, scales)
+        if any(n["robot"] == eye.robot for n in selection.found(topics.DETECTIONS)):
+            scene.named["detection"] = RGB["detection"]
+    return scene
 
 
-def _log_robot(
-    stream: rr.RecordingStream, selection: Selection, eye: Eye, scales: Mapping[str, Scale]
-) -> None:
-    sources: set[str] = set()
-    styled: set[str] = set()
-    draws: dict[str, Draw] = {
-        topics.camera_image(eye.robot): entities.images,
-        topics.labels(eye.robot): partial(entities.labels, sources=sources),
-        topics.detections(eye.robot): entities.detections,
-        topics.grid(eye.robot): partial(entities.grids, scales=scales),
-    }
-    for time_ns, entity in track(_rows(selection, eye.robot, draws), f"Reading {eye.robot}"):
-        if entity.path not in styled:
-            styled.add(entity.path)
-            _log_style(stream, entity)
-        times = [_time_column(selection, time_ns)]
-        stream.send_columns(escaped(entity.path), times, entity.columns)
-    if topics.detections(eye.robot) in styled:
-        sources.add("detection")
-    shown = [source for source in RGB if source in sources]
-    shown += sorted(sources - set(shown))
-    _log_style(stream, legend(eye.robot, shown, eye.width_px, eye.height_px))
-    bars = {channel: scales[channel] for channel in eye.channels}
-    for entity in colour_bars(eye.robot, bars, eye.width_px, eye.height_px):
-        _log_style(stream, entity)
-
-
-def _log_style(stream: rr.RecordingStream, entity: Entity) -> None:
-    for part in entity.style:
-        stream.log(escaped(entity.path), part, static=True)
-
-
-def _rows(
-    selection: Selection, robot: str, draws: Mapping[str, Draw]
-) -> Iterator[tuple[Times, Entity]]:
-    for topic, draw in draws.items():
-        for batch in _batches(selection, robot, topic):
-            time_ns = batch["log_time"].to_numpy()
-            for entity in draw(topic, batch):
-                yield time_ns, entity
-
-
-def _batches(selection: Selection, robot: str, topic: str) -> Iterator[pa.RecordBatch]:
-    first_ns, end_ns = selection.first_ns, selection.last_ns + 1
-    for path, kept in selection.recordings.items():
-        if topic not in kept.topics:
-            continue
-        for batch in columns(path, topic, start_ns=first_ns, end_ns=end_ns):
-            if not selection.all_images:
-                shown = np.isin(batch["log_time"].to_numpy(), selection.image_ns[robot])
-                batch = batch.filter(pa.array(shown))
-            if batch.num_rows:
-                yield batch
-
-
-def _time_column(selection: Selection, time_ns: Times) -> rr.TimeColumn:
-    if selection.on_wall_clock:
-        return rr.TimeColumn(TIMELINE, timestamp=time_ns.astype("datetime64[ns]"))
-    return rr.TimeColumn(TIMELINE, duration=time_ns.astype("timedelta64[ns]"))
+_SCENES: dict[str, Callable[[Selection, Settings], Scene]] = {
+    "image": image_scene,
+    "flight": flight_scene,
+    "compare": compare_scene,
+}

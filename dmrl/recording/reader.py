@@ -1,11 +1,12 @@
 """Messages of a recording, one at a time or as Arrow columns, in log-time order."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError
@@ -13,13 +14,16 @@ from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.messages import descriptor, pool_of
-from dmrl.recording.block import EMPTY, Block
+from dmrl.recording.block import EMPTY, Block, concatenate
 from dmrl.recording.blocks import blocks
 from dmrl.recording.index import channel_on, damaged, summary
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
 from dmrl.recording.writer import Channel, RawMessage
 from dmrl.topics import row_of
+
+STRETCH_BYTES = 4 << 20
+"""Bytes of messages that `stretches` decodes at once: few calls, little memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,14 +194,88 @@ def columns(
         If the file is not a complete recording, or a message is not of its type.
     """
     for block, channels in blocks(path, matching(path, [topic]), start_ns=start_ns, end_ns=end_ns):
-        # One topic may have several channels, after a merge for instance.
         kinds = {descriptor_of(path, channel) for channel in channels.values()}
-        if len(kinds) != 1:
-            raise RecordingError(f"{path}: {topic} mixes message types. Split it: dmrl trim --help")
-        try:
-            yield _batch(block, kinds.pop(), fields)
-        except WireError as e:
-            raise damaged(path, f"{topic}: {e}") from e
+        yield _decoded(path, topic, block, one_type(path, topic, kinds), fields)
+
+
+def stretches(
+    path: Path,
+    fields: Mapping[str, Sequence[str] | None],
+    *,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Iterator[dict[str, pa.RecordBatch]]:
+    """Several topics as Arrow columns in one pass, one stretch of time after another.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    fields
+        Topics, and which fields of each; None: all. Topics that the recording lacks are
+        left out.
+    start_ns, end_ns
+        Only log times in [start_ns, end_ns), nanoseconds.
+
+    Yields
+    ------
+    dict
+        Topic to columns, as `columns` gives them, for those with messages in the stretch.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording, or a message is not of its type.
+    """
+    names = matching(path, [topic for topic in fields if topic in summary(path).topics])
+    held: Block | None = None
+    channels: dict[int, Channel] = {}
+    for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):
+        held = concatenate(held, block)
+        if len(held.data) >= STRETCH_BYTES:
+            yield _by_topic(path, held, channels, fields)
+            held = None
+    if held is not None:
+        yield _by_topic(path, held, channels, fields)
+
+
+def _by_topic(
+    path: Path,
+    block: Block,
+    channels: Mapping[int, Channel],
+    fields: Mapping[str, Sequence[str] | None],
+) -> dict[str, pa.RecordBatch]:
+    numbers: dict[str, list[int]] = {}
+    for number in np.unique(block.channel).tolist():
+        numbers.setdefault(channels[number].topic, []).append(number)
+    out = {}
+    for topic, own in numbers.items():
+        mine = block.take(np.isin(block.channel, own))
+        kind = one_type(path, topic, {descriptor_of(path, channels[number]) for number in own})
+        out[topic] = _decoded(path, topic, mine, kind, fields[topic])
+    return out
+
+
+def one_type(path: Path, topic: str, kinds: set[Descriptor]) -> Descriptor:
+    """The type of a topic's messages. It may have several channels, after a merge for instance.
+
+    Raises
+    ------
+    RecordingError
+        If they differ.
+    """
+    if len(kinds) != 1:
+        raise RecordingError(f"{path}: {topic} mixes message types. Split it: dmrl trim --help")
+    return kinds.pop()
+
+
+def _decoded(
+    path: Path, topic: str, block: Block, kind: Descriptor, fields: Sequence[str] | None
+) -> pa.RecordBatch:
+    try:
+        return _batch(block, kind, fields)
+    except WireError as e:
+        raise damaged(path, f"{topic}: {e}") from e
 
 
 def _batch(block: Block, kind: Descriptor, fields: Sequence[str] | None) -> pa.RecordBatch:

@@ -7,9 +7,10 @@ from typing import Annotated
 from cyclopts import Group, Parameter, validators
 
 from dmrl.errors import SettingError
-from dmrl.viewer import Settings, save, screenshot, serve, view
+from dmrl.viewer import Settings, Web, save, screenshot, serve, view
 
 DEFAULTS = Settings()
+WEB = Web()
 OUTPUT = Group("Output, at most one", validator=validators.mutually_exclusive)
 
 
@@ -41,33 +42,38 @@ def command(
     screenshot_to: Annotated[Path | None, Parameter(name="--screenshot", group=OUTPUT)] = None,
     serve_web: Annotated[bool, Parameter(name="--serve", negative="", group=OUTPUT)] = False,
     time_s: Annotated[float | None, Parameter(name=["--time-s", "--time"])] = None,
+    rank: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1,
+    web: Annotated[Web, Parameter(name="*")] = WEB,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
 ) -> None:
     """Show recordings in rerun, or save what it would show.
 
     Labels, detections and maps lie over the image they belong to; several recordings share
-    one timeline.
+    one timeline. A dataset is shown row by row, worst first if recordings with a model's
+    detections stand beside it.
 
     Parameters
     ----------
     recording
-        Recordings; one of them at least with images.
+        Recordings; or a dataset, and recordings that a model predicted on.
     save_to
         Write an .rrd file with its layout, for `rerun F.rrd`.
     screenshot_to
         Write a PNG picture. Needs no screen.
     serve_web
-        Show it in a browser of this computer.
+        Show it in a browser.
     time_s
         Take the picture of the image nearest to this time, seconds from the start.
+    rank
+        Take the picture of this row of a dataset; 1 is the worst.
     """
     if save_to is not None:
         count = save(recording, save_to, settings)
         print(f"{save_to}: {count} images")
     elif screenshot_to is not None:
-        shown_s = screenshot(recording, screenshot_to, settings, time_s=time_s)
-        print(f"{screenshot_to}: at {shown_s:.3f} s")
+        shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
+        print(f"{screenshot_to}: {shown}")
     elif serve_web:
-        serve(recording, settings)
+        serve(recording, settings, web)
     else:
         view(recording, settings)

@@ -1,0 +1,289 @@
+"""Layout ``dataset``: the rows of a dataset, those first where a model is most wrong.
+
+A model's detections come from recordings that ``dmrl predict`` wrote. A row is found in one by
+the recording it was made from, its robot and its log time.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from dmrl.colours import RGB
+from dmrl.dataset import layout, open_dataset
+from dmrl.errors import DatasetError, SettingError
+from dmrl.geometry import STRIDE_PX
+from dmrl.viewer import entities, layouts, plots
+from dmrl.viewer.entities import Scale
+from dmrl.viewer.entity import Entity, image_frame
+from dmrl.viewer.found import Found, Key, errors_of_rows, find
+from dmrl.viewer.layouts import Eye, Plot
+from dmrl.viewer.legend import colour_bars, legend
+from dmrl.viewer.selection import Settings
+from dmrl.viewer.show import Logged, Show
+
+TIMELINE = "rank"
+ROBOT = "row"
+FACTS, ERROR_PX, ERROR_M = "/row/facts", "/row/error_px", "/row/error_m"
+ROWS_AT_ONCE = 32
+
+CHANNELS = {"confidence": layout.CONFIDENCE, "depth_m": layout.DEPTH}
+"""Channels of maps, and the columns with the maps that a network should give."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ranked:
+    """Rows of a dataset in the order they are shown.
+
+    Parameters
+    ----------
+    rows
+        All columns.
+    of
+        How many there would have been.
+    error_px, error_m
+        (N,) of the worst label of each row; NaN where there is nothing to judge.
+    found
+        What a model found in them; None without one.
+    """
+
+    rows: pa.Table
+    of: int
+    error_px: NDArray[np.float64]
+    error_m: NDArray[np.float64]
+    found: Found | None
+
+
+def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Show:
+    """A dataset, row by row.
+
+    Parameters
+    ----------
+    paths
+        The folder, and recordings with a model's detections, if any.
+    settings
+        How many rows, of which split, with which errors.
+    rank
+        Only this one, from 1. None: all.
+
+    Raises
+    ------
+    DatasetError
+        If the folder is not a dataset.
+    RecordingError
+        If a recording has no detections, or of other images.
+    SettingError
+        If no row is left, or another layout was asked for.
+    """
+    folder, recordings = _sorted_out(paths, settings)
+    ranked = _ranked(folder, recordings, settings)
+    if rank is not None and not 1 <= rank <= len(ranked.rows):
+        raise SettingError(f"{folder} shows {len(ranked.rows)} rows. Give --rank 1 to that")
+    scales = entities.scales(settings.depth_max_m)
+    rows, cols = _grid_shape(ranked.rows)
+    eye = Eye(
+        ROBOT,
+        folder.name,
+        cols * STRIDE_PX,
+        rows * STRIDE_PX,
+        "/row/image",
+        "/row/labels",
+        "/row/detections",
+        "/row/grid",
+        tuple(scales),
+    )
+    plot = None
+    if ranked.found is not None:
+        plot = Plot("error by rank, px", (ERROR_PX,))
+    return Show(
+        folder.name,
+        layouts.dataset(eye, scales, plot, FACTS, timeline=TIMELINE, overlay=settings.overlay),
+        partial(_logged, ranked, eye, scales, settings, rank),
+        len(ranked.rows) if rank is None else 1,
+        (TIMELINE, rank or 1),
+        f"row {rank or 1} of {len(ranked.rows)}",
+    )
+
+
+def _sorted_out(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[Path]]:
+    folders = [path for path in dict.fromkeys(paths) if path.is_dir()]
+    if settings.layout not in ("auto", "dataset"):
+        raise SettingError(f"{folders[0]} is a dataset: leave --layout {settings.layout} out")
+    if len(folders) > 1:
+        raise SettingError(f"{folders[0]}, {folders[1]}: one dataset at a time. Leave one out")
+    return folders[0], [path for path in dict.fromkeys(paths) if not path.is_dir()]
+
+
+def _ranked(folder: Path, recordings: Sequence[Path], settings: Settings) -> Ranked:
+    dataset = open_dataset(folder)
+    splits = dataset.splits if settings.split is None else (settings.split,)
+    tables = [dataset.split(name).table for name in splits]
+    rows = pa.concat_tables([table for table in tables if len(table)] or tables[:1])
+    if settings.robot is not None:
+        rows = rows.filter(pa.compute.equal(rows["robot"], settings.robot))
+    if not len(rows):
+        raise DatasetError(f"{folder} has no such rows. Leave --split or --robot out")
+    if not recordings:
+        if settings.error_from_px is not None or settings.error_to_px is not None:
+            raise SettingError(
+                "errors are those of a model: name its recording as well. "
+                "Try: dmrl predict MODEL IN.mcap OUT.mcap"
+            )
+        chosen = np.arange(len(rows))[:: settings.every][: settings.most]
+        unknown = np.full(len(chosen), np.nan)
+        return Ranked(rows.take(chosen), len(rows), unknown, unknown, None)
+    found = find(recordings, folder, keys(rows))
+    error_px, error_m = errors_of_rows(rows, found, _image_size(rows))
+    low = -1.0 if settings.error_from_px is None else settings.error_from_px
+    high = np.inf if settings.error_to_px is None else settings.error_to_px
+    filtered = settings.error_from_px is not None or settings.error_to_px is not None
+    # Images that show nobody have no error; unless errors are asked for, they come last.
+    kept = (error_px >= low) & (error_px <= high) | (np.isnan(error_px) & (not filtered))
+    order = np.argsort(np.nan_to_num(-error_px, nan=np.inf), kind="stable")
+    order = order[kept[order]]
+    if not len(order):
+        raise SettingError(
+            f"no row of {folder} has such an error: they go from {np.nanmin(error_px):.2f} to "
+            f"{np.nanmax(error_px):.2f} px. Change --error-from-px or --error-to-px"
+        )
+    chosen = order[:: settings.every][: settings.most]
+    return Ranked(
+        rows.take(chosen), len(order), error_px[chosen], error_m[chosen], found.of(chosen)
+    )
+
+
+def keys(rows: pa.Table) -> list[Key]:
+    """What each row was made from: recording, robot, log time."""
+    names = ("source", "robot", "log_time")
+    return list(zip(*(rows[name].to_pylist() for name in names), strict=True))
+
+
+def _grid_shape(rows: pa.Table) -> tuple[int, int]:
+    kind = rows.schema.field(layout.CONFIDENCE).type
+    return kind.list_size, kind.value_type.list_size
+
+
+def _image_size(rows: pa.Table) -> tuple[int, int]:
+    """Width and height, pixels."""
+    high, wide = _grid_shape(rows)
+    return wide * STRIDE_PX, high * STRIDE_PX
+
+
+def _logged(
+    ranked: Ranked, eye: Eye, scales: Mapping[str, Scale], settings: Settings, rank: int | None
+) -> Iterator[Logged]:
+    every = np.arange(len(ranked.rows))
+    if ranked.found is not None:
+        known = every[np.isfinite(ranked.error_px)]
+        yield (
+            _ranks(known),
+            plots.line(ERROR_PX, ranked.error_px[known], "worst label", RGB["detection"]),
+        )
+    named = {} if ranked.found is None else {"detection": RGB["detection"]}
+    shown = {name: scales[name] for name in eye.channels}
+    for entity in colour_bars(ROBOT, shown, eye.width_px, eye.height_px):
+        yield None, entity
+    sources: set[str] = set()
+    chosen = every if rank is None else every[[rank - 1]]
+    for start in range(0, len(chosen), ROWS_AT_ONCE):
+        part = chosen[start : start + ROWS_AT_ONCE]
+        for entity in _drawn(ranked, part, eye, shown, sources, smooth=settings.overlay):
+            yield _ranks(part), entity
+    colours = {name: RGB.get(name, RGB["other"]) for name in sorted(sources)} | named
+    yield None, legend(ROBOT, colours, eye.width_px, eye.height_px)
+
+
+def _ranks(rows: NDArray[np.int64]) -> rr.TimeColumn:
+    return rr.TimeColumn(TIMELINE, sequence=rows + 1)
+
+
+def _drawn(
+    ranked: Ranked,
+    part: NDArray[np.int64],
+    eye: Eye,
+    scales: Mapping[str, Scale],
+    sources: set[str],
+    *,
+    smooth: bool,
+) -> Iterator[Entity]:
+    rows = ranked.rows.take(part).combine_chunks()
+    frame = image_frame(ROBOT)
+    (batch,) = rows.to_batches()
+    yield _pictures(eye, batch)
+    yield from entities.labels(eye.labels, frame, batch.select(["peers"]), sources)
+    maps = None
+    if ranked.found is not None:
+        mine = ranked.found.of(part)
+        yield from entities.detections(eye.detections, frame, mine.detections())
+        maps = mine.maps()
+    yield from entities.grids(
+        eye.grid, frame, _true_maps(batch) if maps is None else maps, scales, smooth=smooth
+    )
+    words = [_facts(ranked, int(k)) for k in part]
+    columns = rr.TextDocument.columns(text=words, media_type=["text/markdown"] * len(words))
+    yield Entity(FACTS, columns)
+
+
+def _pictures(eye: Eye, batch: pa.RecordBatch) -> Entity:
+    frame = image_frame(ROBOT)
+    if layout.PIXELS not in batch.schema.names:
+        blobs = batch[layout.IMAGE].field("bytes").to_pylist()
+        columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
+        return Entity(eye.picture, columns, frame=frame)
+    form = rr.components.ImageFormat(
+        width=eye.width_px, height=eye.height_px, color_model="RGB", channel_datatype="U8"
+    )
+    pixels = batch[layout.PIXELS].to_pylist()
+    return Entity(
+        eye.picture, rr.Image.columns(buffer=pixels, format=[form] * len(pixels)), frame=frame
+    )
+
+
+def _true_maps(batch: pa.RecordBatch) -> pa.RecordBatch:
+    """The maps that a network should give, as columns of GridMap."""
+    flat = [
+        np.asarray(batch[column].flatten().flatten(), "<f4").reshape(batch.num_rows, -1)
+        for column in CHANNELS.values()
+    ]
+    high, wide = _grid_shape(pa.Table.from_batches([batch]))
+    data = [row.tobytes() for row in np.concatenate(flat, axis=1)]
+    count = batch.num_rows
+    columns: dict[str, Any] = {
+        "rows": [high] * count,
+        "cols": [wide] * count,
+        "channels": [list(CHANNELS)] * count,
+        "data": data,
+        "stride_px": [STRIDE_PX] * count,
+    }
+    return pa.RecordBatch.from_pydict(columns)
+
+
+def _facts(ranked: Ranked, row: int) -> str:
+    """What a row is, in Markdown."""
+    one = {
+        name: ranked.rows[name][row].as_py() for name in ("source", "robot", "log_time", "split")
+    }
+    lines = [f"# {row + 1} of {len(ranked.rows)}"]
+    if ranked.found is None:
+        lines.append("Maps: what a network should give.")
+    elif np.isnan(ranked.error_px[row]):
+        lines.append("Shows nobody: no error.")
+    else:
+        lines += [
+            f"**{ranked.error_px[row]:.1f} px** off",
+            f"**{ranked.error_m[row]:.2f} m** in depth",
+        ]
+    lines += [
+        f"recording {one['source']}",
+        f"robot {one['robot']}",
+        f"log time {one['log_time'] / 1e9:.3f} s",
+        f"split {one['split']}",
+        f"{ranked.of} rows in all",
+    ]
+    return "\n\n".join(lines)

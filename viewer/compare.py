@@ -1,0 +1,152 @@
+"""Layout ``compare``: what two models found in the same images, and how far off they were."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from dmrl import evaluation, topics
+from dmrl.colours import RGB, SECOND_DETECTION
+from dmrl.dataset.rows import label_source
+from dmrl.errors import DmrlError, RecordingError, SettingError
+from dmrl.geometry import Array
+from dmrl.learn.matching import errors
+from dmrl.progress import say
+from dmrl.viewer import entities, layouts, plots
+from dmrl.viewer.entities import Colour
+from dmrl.viewer.entity import Entity
+from dmrl.viewer.layouts import Plot
+from dmrl.viewer.motion import Times
+from dmrl.viewer.scene import Scene, Still, bars, eye_of, model_draws, picture_draws
+from dmrl.viewer.selection import Selection, Settings
+
+COLOURS = (RGB["detection"], SECOND_DETECTION)
+TABLE = "/models/table"
+ROWS = (
+    ("median error, px", "px", lambda v: f"{np.median(v):.2f}"),
+    ("within 8 px", "px", lambda v: f"{np.mean(v <= 8):.1%}"),
+    ("within 20 px", "px", lambda v: f"{np.mean(v <= 20):.1%}"),
+    ("median depth error, m", "m", lambda v: f"{np.nanmedian(abs(v)):.3f}"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Errors of one model: (N,) log times of labels, sorted, and how far off it was."""
+
+    source: str
+    time_ns: Times
+    error_px: Array
+    error_m: Array
+
+
+def compare_scene(selection: Selection, settings: Settings) -> Scene:
+    """Two models in the images of one robot.
+
+    Raises
+    ------
+    RecordingError
+        If there are not two recordings with detections of one robot.
+    """
+    robot, models = _models(selection, settings.robot)
+    scales = entities.scales(settings.depth_max_m)
+    eyes = [eye_of(selection, robot, scales, model=path) for path in models]
+    judged = {path: found for path in models if (found := _judged(path, robot, selection))}
+    scene = Scene(
+        layouts.compare(eyes, scales, _plots(models, judged), TABLE, overlay=settings.overlay),
+        picture_draws(eyes[0], set()),
+        [*bars(eyes[0], scales), *_stills(models, judged)],
+        eyes[:1],
+    )
+    sources = scene.sources.setdefault(robot, set())
+    scene.draws = picture_draws(eyes[0], sources)
+    for eye, path, colour in zip(eyes, models, COLOURS, strict=True):
+        scene.draws += model_draws(eye, scales, colour, smooth=settings.overlay, recording=path)
+        scene.named[path.stem] = colour
+    return scene
+
+
+def _models(selection: Selection, wanted: str | None) -> tuple[str, list[Path]]:
+    robot = wanted or min(selection.image_ns, default="")
+    topic = topics.detections(robot)
+    models = [path for path, kept in selection.recordings.items() if topic in kept.topics]
+    names = ", ".join(str(path) for path in selection.recordings)
+    if len(models) != 2:
+        raise RecordingError(
+            f"{len(models)} of {names} have detections of {robot}; compare takes two. "
+            "Try: dmrl predict MODEL IN.mcap OUT.mcap"
+        )
+    if models[0].stem == models[1].stem:
+        raise SettingError(f"{names} have the same name, which tells models apart. Rename one")
+    return robot, models
+
+
+def _judged(path: Path, robot: str, selection: Selection) -> Judged | None:
+    """How far off a model was; None, and a line, if nothing can judge it."""
+    try:
+        source = label_source(path, "best")
+        pairs = evaluation.join(path, source)
+    except DmrlError as e:
+        say(f"no errors of {path.stem}: {e}")
+        return None
+    found = errors(pairs.labels, pairs.detections)
+    whose = np.array([name for name, _ in pairs.at], object)[pairs.labels.image]
+    time_ns = np.array([time for _, time in pairs.at], np.int64)[pairs.labels.image]
+    first_ns, end_ns = selection.shown_ns
+    own = (whose == robot) & (time_ns >= first_ns) & (time_ns < end_ns)
+    return Judged(source, time_ns[own], found.norm_px[own], found.depth_m[own])
+
+
+def _prefix(path: Path) -> str:
+    return f"/models/{path.stem}"
+
+
+def _plots(models: Sequence[Path], judged: dict[Path, Judged]) -> list[Plot]:
+    if not judged:
+        return []
+    source = next(iter(judged.values())).source
+    return [
+        Plot(title, tuple(f"{_prefix(path)}/{name}" for path in models if path in judged))
+        for title, name in (
+            (f"pixel error against {source}, px", "error_px"),
+            (f"depth error against {source}, m", "error_m"),
+        )
+    ]
+
+
+def _stills(models: Sequence[Path], judged: dict[Path, Judged]) -> Iterator[Still]:
+    for path, colour in zip(models, COLOURS, strict=True):
+        if path in judged and len(judged[path].time_ns):
+            for entity in _lines(path, judged[path], colour):
+                yield np.unique(judged[path].time_ns), entity
+    if judged:
+        yield (
+            None,
+            Entity(TABLE, style=(rr.TextDocument(_table(judged), media_type="text/markdown"),)),
+        )
+
+
+def _lines(path: Path, judged: Judged, colour: Colour) -> Iterator[Entity]:
+    """The worst label of each image."""
+    _, row = np.unique(judged.time_ns, return_inverse=True)
+    for name, values in (("error_px", judged.error_px), ("error_m", abs(judged.error_m))):
+        worst = np.full(row.max() + 1, -np.inf)
+        np.maximum.at(worst, row, np.nan_to_num(values, nan=np.inf))
+        worst[~np.isfinite(worst)] = np.nan
+        yield plots.line(f"{_prefix(path)}/{name}", worst, path.stem, colour, plots.THIN_UI)
+
+
+def _table(judged: dict[Path, Judged]) -> str:
+    names = [path.stem for path in judged]
+    source = next(iter(judged.values())).source
+    lines = [f"| against {source} | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    lines.append(f"| labels | {' | '.join(str(len(j.time_ns)) for j in judged.values())} |")
+    for words, unit, form in ROWS:
+        cells = [
+            form(j.error_px if unit == "px" else j.error_m) if len(j.time_ns) else "-"
+            for j in judged.values()
+        ]
+        lines.append(f"| {words} | {' | '.join(cells)} |")
+    return "\n".join(lines)

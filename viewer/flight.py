@@ -1,0 +1,239 @@
+"""Layout ``flight``: space, images, and plots of every pair of robots."""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.colours import RGB
+from dmrl.progress import say
+from dmrl.viewer import layouts, plots, space
+from dmrl.viewer.entity import (
+    WORLD,
+    camera_frame,
+    horizontal_frame,
+    optical_frame,
+)
+from dmrl.viewer.layouts import Eye, Plot, Space
+from dmrl.viewer.motion import Motion, Names, read_motion
+from dmrl.viewer.scene import Draw, Scene, Still, eye_of, first_of, model_draws, picture_draws
+from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
+
+CAMERAS_MAX = 4
+
+
+def flight_scene(selection: Selection, settings: Settings) -> Scene:
+    """What a flight shows, as far as the recordings have it."""
+    pairs = _pairs(selection, settings.robot)
+    motion = read_motion(selection.recordings, pairs, *selection.shown_ns)
+    robots = _robots(selection, pairs, settings.robot)
+    eyes = [eye_of(selection, robot, {}) for robot in sorted(selection.image_ns)[:CAMERAS_MAX]]
+    sources: dict[str, set[str]] = {eye.robot: set() for eye in eyes}
+    named = {}
+    draws: list[Draw] = []
+    for eye in eyes:
+        draws += picture_draws(eye, sources[eye.robot])
+        if topics.detections(eye.robot) in _topics(selection):
+            draws += model_draws(eye, {}, smooth=False)
+            named["detection"] = RGB["detection"]
+    for robot in robots:
+        draws += _robot_draws(selection, motion, robot, own=robot == robots[0])
+    for pair in pairs:
+        draws += _range_draws(pair, motion)
+    stills = [
+        *_frames(selection, motion, robots),
+        *(still for pair in pairs for still in _pair_stills(pair, motion)),
+    ]
+    spaces = _spaces(selection, motion, pairs, robots, eyes)
+    panels = {f"{a} sees {b}": _panels(selection, motion, (a, b)) for a, b in pairs}
+    if not pairs:
+        panels = {robots[0]: _own_panels(selection, robots)} if robots else {}
+    return Scene(layouts.flight(spaces, eyes, panels), draws, stills, eyes, sources, named)
+
+
+def _topics(selection: Selection) -> set[str]:
+    return {
+        topic
+        for kept in selection.recordings.values()
+        for topic, info in kept.topics.items()
+        if info.count
+    }
+
+
+def _pairs(selection: Selection, robot: str | None) -> list[Names]:
+    pairs = selection.pairs(robot)
+    if robot is not None or len(pairs) <= MANY_PAIRS:
+        return pairs
+    first = min(selection.image_ns, default=pairs[0][0])
+    say(f"{len(pairs)} pairs of robots: {first} is shown. Name another with --robot")
+    return selection.pairs(first)
+
+
+def _robots(selection: Selection, pairs: Sequence[Names], only: str | None) -> list[str]:
+    """Robots that are drawn: those of the pairs, and those that measure themselves."""
+    own = {n["robot"] for p in (topics.ATTITUDE, topics.HEIGHT) for n in selection.found(p)}
+    own |= {n["robot"] for n in selection.found(topics.TRACKS)} | set(selection.image_ns)
+    if only is not None or pairs:
+        own &= {name for pair in pairs for name in pair} | {only or pairs[0][0]}
+    return sorted(own | {name for pair in pairs for name in pair})
+
+
+def _robot_draws(selection: Selection, motion: Motion, robot: str, *, own: bool) -> list[Draw]:
+    attitude, height = topics.attitude(robot), topics.height(robot)
+    draws = [
+        Draw(attitude, partial(plots.attitude, attitude, robot=robot, own=own)),
+        Draw(height, partial(plots.height, height, robot, own=own)),
+        Draw(topics.tracks(robot), partial(space.tracks, topics.tracks(robot), robot)),
+    ]
+    if camera_frame(robot) not in motion.poses:
+        draws.append(Draw(attitude, partial(space.attitude, robot)))
+    return draws
+
+
+def _range_draws(pair: Names, motion: Motion) -> list[Draw]:
+    topic = topics.uwb_range(*pair)
+    towards = motion.estimates.get(pair) or motion.truths.get(pair)
+    return [
+        Draw(topic, partial(plots.ranges, topic)),
+        Draw(topic, partial(space.ranges, topic, pair[0], towards=towards)),
+    ]
+
+
+def _frames(selection: Selection, motion: Motion, robots: Sequence[str]) -> Iterator[Still]:
+    """Every frame that /tf has, those that hang on it, and what stands in them."""
+    for frame, poses in motion.poses.items():
+        drawn = space.transform(frame, poses)
+        yield (None if poses.fixed else poses.time_ns), drawn
+    present = _topics(selection)
+    for robot in robots:
+        if camera_frame(robot) not in motion.poses and topics.attitude(robot) not in present:
+            yield None, space.still_frame(camera_frame(robot), horizontal_frame(robot))
+        if optical_frame(robot) not in motion.poses:
+            yield (
+                None,
+                space.still_frame(optical_frame(robot), camera_frame(robot), space.OPTICAL_XYZW),
+            )
+        for entity in space.body(robot):
+            yield None, entity
+        topic = topics.calibration(robot)
+        calibration = first_of(selection, topic)
+        if calibration is not None and len(calibration["K"]) == 9 and any(calibration["K"]):
+            yield None, space.frustum(robot, topic, calibration)
+
+
+def _pair_stills(pair: Names, motion: Motion) -> Iterator[Still]:
+    estimate, truth = motion.estimates.get(pair), motion.truths.get(pair)
+    for positions, path, source in (
+        (truth, topics.truth(*pair), "truth"),
+        (estimate, topics.position(*pair), "estimate"),
+    ):
+        if positions is None:
+            continue
+        drawn = [*space.seen(path, pair, positions, source)]
+        there = motion.in_space(pair[0], positions.xyz, positions.time_ns)
+        drawn.append(space.trail(f"{path}/trail", motion.space(pair[0]), there, source))
+        drawn.append(plots.distance(path, positions, source))
+        if positions is estimate:
+            drawn += plots.status(path, positions)
+            drawn += [] if truth is None else plots.errors(path, positions, truth)
+        yield from ((positions.time_ns, entity) for entity in drawn)
+
+
+def _spaces(
+    selection: Selection,
+    motion: Motion,
+    pairs: Sequence[Names],
+    robots: Sequence[str],
+    eyes: Sequence[Eye],
+) -> list[Space]:
+    """The world; or what every robot sees around it, where there is no world."""
+    groups: dict[str, list[str]] = {}
+    for robot in robots:
+        groups.setdefault(motion.space(robot), []).append(robot)
+    lookers = {pair[0] for pair in pairs} | {eye.robot for eye in eyes}
+    return [
+        _space(motion, frame, [p for p in pairs if p[0] in members], members, eyes)
+        for frame, members in groups.items()
+        if frame == WORLD or lookers & set(members) or len(groups) == 1
+    ]
+
+
+def _space(
+    motion: Motion, frame: str, pairs: Sequence[Names], robots: Sequence[str], eyes: Sequence[Eye]
+) -> Space:
+    contents, trails = [], []
+    for robot in robots:
+        contents += [f"/{robot}/body", f"/{robot}/name", topics.calibration(robot)]
+        contents += [topics.tracks(robot), *_below(topics.tracks(robot), "velocity", "covariance")]
+    contents += [eye.picture for eye in eyes if eye.robot in robots]
+    for pair in pairs:
+        contents += _below(topics.uwb_range(*pair), "line", "sphere")
+        for path in (topics.position(*pair), topics.truth(*pair)):
+            contents += [path, *_below(path, "covariance", "trail")]
+            trails.append(f"{path}/trail")
+    low, high = _extent(motion, frame, pairs, robots)
+    middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.5)
+    eye = middle + size * np.array([-0.65, -0.65, 0.55])
+    return Space(frame, tuple(contents), tuple(trails), _three(eye), _three(middle))
+
+
+def _below(path: str, *names: str) -> list[str]:
+    return [f"{path}/{name}" for name in names]
+
+
+def _three(point: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def _extent(
+    motion: Motion, frame: str, pairs: Sequence[Names], robots: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box that holds nearly all positions, metres."""
+    if frame == WORLD:
+        own = (horizontal_frame(robot) for robot in robots)
+        found = [motion.poses[name].xyz for name in own if name in motion.poses]
+    else:
+        every = (motion.truths.get(pair) or motion.estimates.get(pair) for pair in pairs)
+        found = [np.zeros((1, 3)), *(p.xyz for p in every if p is not None)]
+    points = np.concatenate(found)
+    return np.percentile(points, 2, axis=0), np.percentile(points, 98, axis=0)
+
+
+def _panels(selection: Selection, motion: Motion, pair: Names) -> list[Plot]:
+    """Plots of what one robot knows of another, those that have something to show."""
+    robot, peer = pair
+    estimate, truth, measured = topics.position(*pair), topics.truth(*pair), topics.uwb_range(*pair)
+    judged = pair in motion.estimates and pair in motion.truths
+    far = [measured] if measured in _topics(selection) else []
+    far += [
+        f"{path}/distance"
+        for path, has in ((truth, motion.truths), (estimate, motion.estimates))
+        if pair in has
+    ]
+    panels = [Plot(f"distance of {peer}, m", tuple(far))] if far else []
+    if judged:
+        panels += [
+            Plot(f"error along {axis}, m", (f"{estimate}/bound/{axis}", f"{estimate}/error/{axis}"))
+            for axis in "xy"
+        ]
+        panels.append(
+            Plot("NEES of x and y, 2 dof", (f"{estimate}/nees", f"{estimate}/nees/limit"), (0, 15))
+        )
+    if pair in motion.estimates:
+        panels.append(Plot(f"status of {peer}'s position", (f"{estimate}/status",), band=True))
+    return [*panels, *_own_panels(selection, pair)]
+
+
+def _own_panels(selection: Selection, robots: Sequence[str]) -> list[Plot]:
+    present = _topics(selection)
+    heights = tuple(t for r in robots if (t := topics.height(r)) in present)
+    tilted = [t for r in robots if (t := topics.attitude(r)) in present]
+    panels = [Plot("height, m", heights)] if heights else []
+    if tilted:
+        own = tilted[0]
+        name = f"attitude of {(topics.names(topics.ATTITUDE, own) or {})['robot']}, degrees"
+        panels.append(Plot(name, (f"{own}/roll", f"{own}/pitch")))
+        panels.append(Plot("yaw, degrees", tuple(f"{topic}/yaw" for topic in tilted), (-180, 180)))
+    return panels

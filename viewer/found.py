@@ -1,0 +1,161 @@
+"""What a model found in the rows of a dataset, from the recordings that hold it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.errors import RecordingError
+from dmrl.geometry import Array, inside
+from dmrl.learn.matching import Points, errors
+from dmrl.recording import Provenance, stretches, summary
+
+Key = tuple[str, str, int]
+"""Recording that a row was made from, robot, log time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Messages of a model, a row for each row of a dataset.
+
+    Parameters
+    ----------
+    messages
+        All Detections.
+    place
+        (N,) which of them belongs to each row; -1: none.
+    where
+        (N,) recording, robot and log time to look for more; None: none.
+    """
+
+    messages: pa.Table
+    place: NDArray[np.int64]
+    where: tuple[tuple[Path, str, int] | None, ...]
+
+    def of(self, rows: NDArray[np.int64]) -> "Found":
+        """The same for some of the rows."""
+        return Found(self.messages, self.place[rows], tuple(self.where[k] for k in rows))
+
+    def detections(self) -> pa.RecordBatch:
+        """Columns of Detections, empty where there are none."""
+        empty = self.messages.slice(0, 1).to_pylist()[0] | {"detections": []}
+        blank = pa.Table.from_pylist([empty], self.messages.schema)
+        every = pa.concat_tables([self.messages, blank])
+        (batch,) = every.take(self.place % len(every)).combine_chunks().to_batches()
+        return batch
+
+    def maps(self) -> pa.RecordBatch | None:
+        """Columns of GridMap; None unless every row has one."""
+        if any(where is None for where in self.where):
+            return None
+        held = {}
+        for path, robot in dict.fromkeys((w[0], w[1]) for w in self.where if w):
+            times = sorted(w[2] for w in self.where if w and w[:2] == (path, robot))
+            topic = topics.grid(robot)
+            span = {"start_ns": times[0], "end_ns": times[-1] + 1}
+            for stretch in stretches(path, {topic: None}, **span):
+                batch = stretch[topic]
+                own = np.isin(batch["log_time"].to_numpy(), times)
+                for row in np.flatnonzero(own).tolist():
+                    time_ns = batch["log_time"][row].as_py()
+                    held[path, robot, time_ns] = batch.slice(row, 1)
+        if not all(where in held for where in self.where):
+            return None
+        rows = pa.Table.from_batches([held[where] for where in self.where if where])
+        (batch,) = rows.combine_chunks().to_batches()
+        return batch
+
+
+def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Found:
+    """Detections of the images that a dataset was made from.
+
+    Parameters
+    ----------
+    recordings
+        With detections.
+    folder
+        The dataset.
+    wanted
+        Key of each of its rows.
+
+    Raises
+    ------
+    RecordingError
+        If a recording has no detections, or none of these images.
+    """
+    parts, keys, where = [], [], []
+    for path in recordings:
+        kept = summary(path)
+        robots = topics.robots(list(kept.topics), topics.DETECTIONS)
+        if not robots:
+            raise RecordingError(
+                f"{path} has no detections. Try: dmrl predict MODEL {path} OUT.mcap"
+            )
+        names = {path.name, *_ancestors(kept.provenance)} & {source for source, _, _ in wanted}
+        if not names:
+            raise RecordingError(
+                f"{folder} was not made from {path}, nor from what it was predicted on. "
+                "Predict on the dataset's own recordings"
+            )
+        own = {topics.detections(robot): robot for robot in robots}
+        for stretch in stretches(path, dict.fromkeys(own)):
+            for topic, batch in stretch.items():
+                parts.append(batch)
+                times = batch["log_time"].to_pylist()
+                keys += [(names, own[topic], time_ns) for time_ns in times]
+                where += [(path, own[topic], time_ns) for time_ns in times]
+    at = {(name, robot, t): k for k, (names, robot, t) in enumerate(keys) for name in names}
+    place = np.array([at.get(key, -1) for key in wanted], np.int64)
+    if not (place >= 0).any():
+        raise RecordingError(f"no image of {folder} is in {recordings[0]}. Predict on its images")
+    found = tuple(where[k] if k >= 0 else None for k in place.tolist())
+    return Found(pa.Table.from_batches(parts), place, found)
+
+
+def _ancestors(made: Provenance | None) -> set[str]:
+    """Names of all files that a recording was made from."""
+    if made is None:
+        return set()
+    return {i.name for i in made.inputs} | {
+        n for i in made.inputs for n in _ancestors(i.provenance)
+    }
+
+
+def errors_of_rows(rows: pa.Table, found: Found, size_px: tuple[int, int]) -> tuple[Array, Array]:
+    """Pixel and depth error of the worst label of each row; NaN where there is none to judge."""
+    peers = rows["peers"].combine_chunks()
+    labels = _points(peers, np.arange(len(peers)))
+    uv = np.stack([labels.u_px, labels.v_px], axis=1)
+    labels = labels.select(inside(uv, *size_px) & (labels.depth_m > 0))
+    messages = found.messages["detections"].combine_chunks()
+    (known,) = np.nonzero(found.place >= 0)
+    detections = _points(messages.take(pa.array(found.place[known])), known)
+    judged = np.isin(labels.image, known)
+    off = errors(labels.select(judged), detections)
+    image = labels.image[judged]
+    return (
+        _worst(len(peers), image, off.norm_px),
+        _worst(len(peers), image, abs(off.depth_m)),
+    )
+
+
+def _worst(count: int, image: NDArray[np.int64], values: Array) -> Array:
+    out = np.full(count, -1.0)
+    np.maximum.at(out, image, np.nan_to_num(values, nan=np.inf))
+    return np.where(out < 0, np.nan, out)
+
+
+def _points(column: pa.ListArray, numbers: NDArray[np.int64]) -> Points:
+    """The entries of a list column; ``numbers`` names its rows."""
+    flat = column.flatten()
+    image = np.repeat(numbers, column.value_lengths().to_numpy())
+    values = [flat.field(name).to_numpy() for name in ("u_px", "v_px", "depth_m")]
+    names = {flat.type.field(k).name for k in range(flat.type.num_fields)}
+    known = "confidence" in names
+    confidence = flat.field("confidence").to_numpy() if known else np.ones(len(flat))
+    order = np.lexsort((-confidence, image))
+    return Points(image[order], *(value[order] for value in values), confidence[order])

@@ -1,0 +1,105 @@
+"""What is plotted over time, every line with its unit in the name of its panel."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+
+from dmrl.colours import OWN, PEER, RGB, STATUS_RGB
+from dmrl.geometry import Array
+from dmrl.messages import descriptor
+from dmrl.viewer.entities import Colour
+from dmrl.viewer.entity import Entity
+from dmrl.viewer.motion import Positions
+
+BOUND_SIGMAS = 3.0
+NEES_95 = 5.991
+"""95 % of a chi-square with two degrees of freedom lie below."""
+
+WIDTH_UI, THIN_UI, MARKER_UI = 1.5, 0.8, 1.2
+
+
+def line(path: str, values: Array, name: str, colour: Colour, width: float = WIDTH_UI) -> Entity:
+    """One line: (N,) values; where they are NaN, it has a gap."""
+    style = rr.SeriesLines(colors=[colour], names=[name], widths=[width])
+    return Entity(path, rr.Scalars.columns(scalars=values), (style,))
+
+
+def dots(path: str, values: Array, name: str, colour: Colour) -> Entity:
+    """(N,) values that scatter too much for a line."""
+    style = rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[MARKER_UI])
+    return Entity(path, rr.Scalars.columns(scalars=values), (style,))
+
+
+def height(path: str, robot: str, batch: pa.RecordBatch, *, own: bool) -> Iterator[Entity]:
+    """A robot's height."""
+    yield line(path, batch["height_m"].to_numpy(), robot, OWN if own else PEER)
+
+
+def attitude(path: str, batch: pa.RecordBatch, robot: str, *, own: bool) -> Iterator[Entity]:
+    """Roll, pitch and yaw, degrees."""
+    colours = {"roll": OWN, "pitch": PEER, "yaw": OWN if own else PEER}
+    for name, colour in colours.items():
+        degrees = np.degrees(batch[f"{name}_rad"].to_numpy())
+        if name == "yaw":
+            # The jump from 180 to -180 is none.
+            degrees = (degrees + 180) % 360 - 180
+            degrees[1:][abs(np.diff(degrees)) > 180] = np.nan
+        yield line(f"{path}/{name}", degrees, robot if name == "yaw" else name, colour)
+
+
+def ranges(path: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+    """Measured distances."""
+    yield dots(path, batch["range_m"].to_numpy(), "UWB", RGB["range"])
+
+
+def distance(path: str, positions: Positions, source: str) -> Entity:
+    """How far away a peer is thought to be."""
+    values = np.linalg.norm(positions.xyz, axis=1)
+    return line(f"{path}/distance", values, source, RGB[source])
+
+
+def errors(path: str, positions: Positions, truth: Positions) -> Iterator[Entity]:
+    """Estimate minus truth with three standard deviations, along x and y; NEES of both."""
+    error = (positions.xyz - truth.at(positions.time_ns))[:, :2]
+    covariance = positions.covariance[:, :2, :2]
+    bound = BOUND_SIGMAS * np.sqrt(np.einsum("nii->ni", covariance))
+    dim = tuple(value // 2 for value in RGB["estimate"])
+    for k, axis in enumerate("xy"):
+        both = np.stack([bound[:, k], -bound[:, k]], axis=1)
+        style = rr.SeriesLines(
+            colors=[dim, dim], names=["+3 sigma", "-3 sigma"], widths=[THIN_UI, THIN_UI]
+        )
+        yield Entity(f"{path}/bound/{axis}", rr.Scalars.columns(scalars=both), (style,))
+        yield line(f"{path}/error/{axis}", error[:, k], "estimate", RGB["estimate"])
+    yield line(f"{path}/nees", _nees(error, covariance), "estimate", RGB["estimate"])
+    limit = np.full(len(error), NEES_95)
+    yield line(f"{path}/nees/limit", limit, "95 % are below", PEER, THIN_UI)
+
+
+def _nees(error: Array, covariance: Array) -> Array:
+    """(N,) squared errors in units of their covariance; NaN where it is unknown or zero."""
+    known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    known &= np.linalg.det(np.where(known[:, None, None], covariance, 0.0)) > 0
+    out = np.full(len(error), np.nan)
+    solved = np.linalg.solve(covariance[known], error[known][:, :, None])[:, :, 0]
+    out[known] = np.einsum("ni,ni->n", error[known], solved)
+    return out
+
+
+def status(path: str, positions: Positions) -> Iterator[Entity]:
+    """How far the estimates can be trusted, as a band."""
+    kind = descriptor("PeerPosition").fields_by_name["status"].enum_type
+    names = {} if kind is None else {n: v.name for n, v in kind.values_by_number.items()}
+    states = [names.get(number, str(number)) for number in positions.status.tolist()]
+    style = rr.StateConfiguration(
+        values=list(STATUS_RGB),
+        labels=list(STATUS_RGB),
+        colors=[_rgba(colour) for colour in STATUS_RGB.values()],
+    )
+    yield Entity(f"{path}/status", rr.StateChange.columns(state=states), (style,))
+
+
+def _rgba(colour: Sequence[int]) -> int:
+    return int.from_bytes(bytes([*colour, 255]))

@@ -1,0 +1,85 @@
+"""What is to be logged, and how a stream logs it."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from dmrl.viewer.entity import Entity, escaped
+from dmrl.viewer.motion import Times
+
+Logged = tuple[rr.TimeColumn | None, Entity]
+
+
+@dataclass(frozen=True, slots=True)
+class Show:
+    """Everything that a viewer is given.
+
+    Parameters
+    ----------
+    title
+        Name of the recording.
+    blueprint
+        Its layout.
+    logged
+        Rows with their times, in the order in which they are to be seen; None: never changes.
+    images
+        Number of images.
+    cursor
+        Timeline and place in it that a picture shows.
+    moment
+        The same in words.
+    """
+
+    title: str
+    blueprint: rrb.Blueprint
+    logged: Callable[[], Iterator[Logged]]
+    images: int
+    cursor: tuple[str, np.generic | int]
+    moment: str
+
+
+@dataclass(slots=True)
+class Logger:
+    """Logs entities to a stream, the style of each once."""
+
+    stream: rr.RecordingStream
+    styled: set[str] = field(default_factory=set)
+
+    def log(self, times: rr.TimeColumn | None, entity: Entity) -> None:
+        """Send some rows, or what never changes."""
+        path = escaped(entity.path)
+        if times is None or entity.path not in self.styled:
+            self.styled.add(entity.path)
+            for part in entity.style:
+                self.stream.log(path, part, static=True)
+            if entity.frame is not None:
+                self.stream.log(path, rr.CoordinateFrame(entity.frame), static=True)
+        if times is not None:
+            self.stream.send_columns(path, [times], entity.columns)
+
+
+def stream_of() -> rr.RecordingStream:
+    """A stream without a sink yet. Misuse of rerun is an error from here on."""
+    # It would log a warning and go on.
+    rr.set_strict_mode(True)
+    stream = rr.RecordingStream("dmrl")
+    # rerun's own log_time is the time of the call.
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
+
+
+def time_column(timeline: str, time_ns: Times, *, on_wall_clock: bool) -> rr.TimeColumn:
+    """Log times as dates, or as seconds from the start of a simulation."""
+    if on_wall_clock:
+        return rr.TimeColumn(timeline, timestamp=time_ns.astype("datetime64[ns]"))
+    return rr.TimeColumn(timeline, duration=time_ns.astype("timedelta64[ns]"))
+
+
+def cursor_at(timeline: str, time_ns: int, *, on_wall_clock: bool) -> tuple[str, np.generic]:
+    """A log time as `Show` wants it."""
+    kind = np.datetime64 if on_wall_clock else np.timedelta64
+    return timeline, kind(time_ns, "ns")

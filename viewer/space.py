@@ -1,0 +1,248 @@
+"""What stands in space: robots, where they see each other, and how sure they are.
+
+Positions of peers are in the ``<robot>/horizontal`` frame; where the recording has /tf, that
+frame moves in ``world``.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from dmrl.colours import OWN, RGB, STATUS_RGB
+from dmrl.geometry import Array
+from dmrl.rendering import crazyflie
+from dmrl.viewer.entity import (
+    ELLIPSE_SIGMAS,
+    LINE_UI,
+    POINT_UI,
+    Entity,
+    camera_frame,
+    horizontal_frame,
+    image_frame,
+    optical_frame,
+)
+from dmrl.viewer.motion import Names, Poses, Positions, covariances, vectors
+
+FRUSTUM_M, AXES_M, NAME_ABOVE_M = 0.35, 0.12, 0.08
+TRAIL_UI, RANGE_UI = -1.0, -0.75
+BODY_COLOUR = (190, 190, 190)
+OPTICAL_XYZW = [-0.5, 0.5, -0.5, 0.5]
+"""The rotation camera_from_optical, as in the /tf of a flight."""
+
+
+def transform(frame: str, poses: Poses) -> Entity:
+    """Where a frame is in its parent; its log times are those of the poses."""
+    path, count = f"/tf/{frame}", len(poses.time_ns)
+    if poses.fixed:
+        return Entity(path, style=(fixed(frame, poses.parent, poses.xyzw[0], poses.xyz[0]),))
+    columns = rr.Transform3D.columns(
+        translation=poses.xyz,
+        quaternion=poses.xyzw,
+        child_frame=[frame] * count,
+        parent_frame=[poses.parent] * count,
+    )
+    return Entity(path, columns)
+
+
+def fixed(
+    frame: str, parent: str, xyzw: Sequence[float], xyz: Sequence[float] = (0, 0, 0)
+) -> rr.Transform3D:
+    """A frame that stays where it is in its parent."""
+    turn = rr.Quaternion(xyzw=xyzw)
+    return rr.Transform3D(translation=xyz, quaternion=turn, child_frame=frame, parent_frame=parent)
+
+
+def still_frame(frame: str, parent: str, xyzw: Sequence[float] = (0, 0, 0, 1)) -> Entity:
+    """A frame that stays where it is."""
+    return Entity(f"/tf/{frame}", style=(fixed(frame, parent, xyzw),))
+
+
+def attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+    """How a robot's body is tilted against its horizontal frame."""
+    roll, pitch = (batch[f"{name}_rad"].to_numpy() / 2 for name in ("roll", "pitch"))
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    columns = rr.Transform3D.columns(
+        quaternion=np.stack([cp * sr, sp * cr, -sp * sr, cp * cr], axis=1),
+        child_frame=[camera_frame(robot)] * batch.num_rows,
+        parent_frame=[horizontal_frame(robot)] * batch.num_rows,
+    )
+    yield Entity(f"/tf/{camera_frame(robot)}", columns)
+
+
+def body(robot: str) -> Iterator[Entity]:
+    """A robot's shape, axes and name."""
+    mesh = crazyflie.mesh()
+    shape = rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        albedo_factor=BODY_COLOUR,
+    )
+    yield Entity(
+        f"/{robot}/body", style=(shape, rr.TransformAxes3D(AXES_M)), frame=camera_frame(robot)
+    )
+    name = rr.Points3D(
+        [[0, 0, NAME_ABOVE_M]], radii=[LINE_UI / 10], colors=[OWN], labels=[robot], show_labels=True
+    )
+    yield Entity(f"/{robot}/name", style=(name,), frame=horizontal_frame(robot))
+
+
+def frustum(robot: str, path: str, calibration: Mapping[str, object]) -> Entity:
+    """A robot's field of view, with its image in it.
+
+    Parameters
+    ----------
+    robot
+        Its name.
+    path
+        Where the calibration stands.
+    calibration
+        Fields of foxglove.CameraCalibration.
+    """
+    pinhole = rr.Pinhole(
+        image_from_camera=np.reshape(calibration["K"], (3, 3)),
+        resolution=[calibration["width"], calibration["height"]],
+        image_plane_distance=FRUSTUM_M,
+        color=OWN,
+        line_width=LINE_UI,
+        parent_frame=optical_frame(robot),
+        child_frame=image_frame(robot),
+    )
+    return Entity(path, style=(pinhole,))
+
+
+def seen(path: str, pair: Names, positions: Positions, source: str) -> Iterator[Entity]:
+    """Where a robot sees a peer, with the covariance; its log times are those of the positions.
+
+    An estimate that is not OK is drawn in the colour of its status.
+    """
+    frame = horizontal_frame(pair[0])
+    colours = np.array([RGB[source], STATUS_RGB["UNCONVERGED"], STATUS_RGB["AMBIGUOUS"]], np.uint8)
+    own = colours[np.clip(positions.status, 0, 2)]
+    points = rr.Points3D.columns(positions=positions.xyz, colors=own)
+    style = rr.Points3D.from_fields(radii=[POINT_UI])
+    yield Entity(path, points, (style,), frame)
+    yield from _ellipsoids(f"{path}/covariance", frame, positions.xyz, positions.covariance, own)
+
+
+def _ellipsoids(
+    path: str,
+    frame: str,
+    xyz: Array,
+    covariance: Array,
+    colours: NDArray[np.uint8],
+    lengths: NDArray[np.intp] | None = None,
+) -> Iterator[Entity]:
+    """One for each known covariance that is not zero; ``lengths``: how many to a row."""
+    known = np.isfinite(covariance).all(axis=(1, 2)) & covariance.any(axis=(1, 2))
+    if not known.any():
+        return
+    half_sizes, xyzw = _axes(covariance[known])
+    columns = rr.Ellipsoids3D.columns(
+        centers=xyz[known], half_sizes=half_sizes, quaternions=xyzw, colors=colours[known]
+    )
+    lengths = np.ones(len(xyz), np.intp) if lengths is None else lengths
+    row_of = np.repeat(np.arange(len(lengths)), lengths)
+    columns = columns.partition(np.bincount(row_of[known], minlength=len(lengths)))
+    style = rr.Ellipsoids3D.from_fields(
+        fill_mode=rr.components.FillMode.MajorWireframe, line_radii=[LINE_UI / 2]
+    )
+    yield Entity(path, columns, (style,), frame)
+
+
+def _axes(covariance: Array) -> tuple[Array, Array]:
+    """Half axes (N, 3), metres, and directions (N, 4), quaternions, of ellipsoids."""
+    variance, axes = np.linalg.eigh(covariance)
+    # A rotation, not a reflection.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    return ELLIPSE_SIGMAS * np.sqrt(np.maximum(variance, 0)), _quaternions(axes)
+
+
+def _quaternions(matrices: Array) -> Array:
+    """(N, 4) xyzw of (N, 3, 3) rotations, from the largest of the four."""
+    m = matrices
+    diagonal = np.einsum("nii->ni", m)
+    trace = diagonal.sum(axis=1, keepdims=True)
+    # Rows of 4 q q^T, in the order x, y, z, w.
+    outer = np.empty((len(m), 4, 4))
+    outer[:, :3, :3] = m + m.transpose(0, 2, 1)
+    for k in range(3):
+        outer[:, k, k] = 1 + 2 * diagonal[:, k] - trace[:, 0]
+    turn = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1)
+    outer[:, :3, 3] = outer[:, 3, :3] = turn
+    outer[:, 3, 3] = 1 + trace[:, 0]
+    row = outer[np.arange(len(m)), np.einsum("nii->ni", outer).argmax(axis=1)]
+    return np.asarray(row / np.linalg.norm(row, axis=1, keepdims=True))
+
+
+def trail(path: str, frame: str, xyz: Array, source: str) -> Entity:
+    """The way from each position to the next; a view shows the last seconds of it."""
+    steps = np.stack([np.roll(xyz, 1, axis=0), xyz], axis=1)
+    steps[0] = xyz[:1]
+    columns = rr.LineStrips3D.columns(strips=list(steps))
+    style = rr.LineStrips3D.from_fields(colors=[RGB[source]], radii=[TRAIL_UI])
+    return Entity(path, columns, (style,), frame)
+
+
+def ranges(
+    path: str, robot: str, batch: pa.RecordBatch, towards: Positions | None
+) -> Iterator[Entity]:
+    """Measured distances: lines to where the peer is thought to be, or spheres where nobody knows.
+
+    Parameters
+    ----------
+    path, robot
+        Where the ranges stand, and who measured them.
+    batch
+        Columns of UwbRange.
+    towards
+        Where the peer is thought to be.
+    """
+    range_m = batch["range_m"].to_numpy()
+    frame = horizontal_frame(robot)
+    if towards is None:
+        sphere = rr.Ellipsoids3D.columns(
+            centers=np.zeros((len(range_m), 3)), half_sizes=np.repeat(range_m[:, None], 3, axis=1)
+        )
+        style = rr.Ellipsoids3D.from_fields(
+            colors=[RGB["range"]],
+            line_radii=[RANGE_UI / 2],
+            fill_mode=rr.components.FillMode.MajorWireframe,
+        )
+        yield Entity(f"{path}/sphere", sphere, (style,), frame)
+        return
+    there = towards.at(batch["log_time"].to_numpy())
+    length = np.linalg.norm(there, axis=1, keepdims=True)
+    known = np.isfinite(length[:, 0]) & (length[:, 0] > 0)
+    ends = there[known] / length[known] * range_m[known, None]
+    lines = rr.LineStrips3D.columns(strips=list(np.stack([np.zeros_like(ends), ends], axis=1)))
+    style = rr.LineStrips3D.from_fields(colors=[RGB["range"]], radii=[RANGE_UI])
+    yield Entity(f"{path}/line", lines.partition(known.astype(int)), (style,), frame)
+
+
+def tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+    """Peers followed over time: position, name, velocity and covariance."""
+    column, frame = batch["tracks"], horizontal_frame(robot)
+    lengths = column.value_lengths().to_numpy()
+    found = column.flatten()
+    xyz = vectors(found, "xyz")
+    velocity = np.stack([found.field(f"v{axis}_mps").to_numpy() for axis in "xyz"], axis=1)
+    names = [
+        f"{peer or 'track'} {number}"
+        for peer, number in zip(
+            found.field("peer").to_pylist(), found.field("id").to_pylist(), strict=True
+        )
+    ]
+    colour = RGB["track"]
+    points = rr.Points3D.columns(positions=xyz, labels=names).partition(lengths)
+    dot = rr.Points3D.from_fields(colors=[colour], radii=[POINT_UI], show_labels=True)
+    yield Entity(path, points, (dot,), frame)
+    # As far as it goes in one second.
+    arrows = rr.Arrows3D.columns(origins=xyz, vectors=velocity).partition(lengths)
+    thin = rr.Arrows3D.from_fields(colors=[colour], radii=[LINE_UI])
+    yield Entity(f"{path}/velocity", arrows, (thin,), frame)
+    colours = np.full((len(xyz), 3), colour, np.uint8)
+    covariance = covariances(found.field("covariance"))
+    yield from _ellipsoids(f"{path}/covariance", frame, xyz, covariance, colours, lengths)
