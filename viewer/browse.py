@@ -216,7 +216,9 @@ def _drawn(
     frame = image_frame(ROBOT)
     (batch,) = rows.to_batches()
     yield _pictures(eye, batch)
-    yield from entities.labels(eye.labels, frame, batch.select(["peers"]), sources)
+    yield from entities.labels(
+        eye.labels, frame, batch.select(["peers"]), sources, (eye.width_px, eye.height_px)
+    )
     maps = None
     if ranked.found is not None:
         mine = ranked.found.of(part)

@@ -19,7 +19,7 @@ from dmrl.viewer.entities import Colour
 from dmrl.viewer.entity import Entity
 from dmrl.viewer.layouts import Plot
 from dmrl.viewer.motion import Times
-from dmrl.viewer.scene import Scene, Still, bars, eye_of, model_draws, picture_draws
+from dmrl.viewer.scene import Scene, Still, bars, eyes_of, model_draws, picture_draws
 from dmrl.viewer.selection import Selection, Settings
 
 COLOURS = (RGB["detection"], SECOND_DETECTION)
@@ -52,7 +52,7 @@ def compare_scene(selection: Selection, settings: Settings) -> Scene:
     """
     robot, models = _models(selection, settings.robot)
     scales = entities.scales(settings.depth_max_m)
-    eyes = [eye_of(selection, robot, scales, model=path) for path in models]
+    eyes = [eye for path in models for eye in eyes_of(selection, [robot], scales, model=path)]
     judged = {path: found for path in models if (found := _judged(path, robot, selection))}
     scene = Scene(
         layouts.compare(eyes, scales, _plots(models, judged), TABLE, overlay=settings.overlay),

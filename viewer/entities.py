@@ -14,6 +14,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
+from dmrl.geometry import inside
 from dmrl.viewer.entity import (
     ELLIPSE_SIGMAS,
     FAINT_POINT_UI,
@@ -31,7 +32,7 @@ STRIDE_PX = 8
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 CELL_COLOUR = (255, 255, 255)
 # rerun writes below a point; at the zoom that a layout opens with, this is a line's height.
-TEXT_PX = 14
+TEXT_PX = 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,13 @@ def images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     yield Entity(path, columns, frame=frame)
 
 
-def labels(path: str, frame: str, batch: pa.RecordBatch, sources: set[str]) -> Iterator[Entity]:
+def labels(
+    path: str,
+    frame: str,
+    batch: pa.RecordBatch,
+    sources: set[str],
+    size_px: tuple[int, int],
+) -> Iterator[Entity]:
     """Points, boxes and ellipses of every source of labels.
 
     Parameters
@@ -91,31 +98,39 @@ def labels(path: str, frame: str, batch: pa.RecordBatch, sources: set[str]) -> I
     sources
         Sources met so far, grown here: a row without a source's labels must still be sent,
         or the last ones would stay on the screen.
+    size_px
+        Width and height of the images: ellipses around points outside are left out, which
+        would cover all that is around the image.
     """
     column = batch["peers"]
     row_of = _row_of(column)
     peers = column.flatten()
     source_of = np.array(peers.field("source").to_pylist(), dtype=object)
     sources.update(source_of)
-    for source in sorted(sources):
+    for place, source in enumerate(sorted(sources, key=_order)):
         (at,) = np.nonzero(source_of == source)
-        mine = _Labels(peers.take(at), row_of[at], batch.num_rows)
+        mine = _Labels(peers.take(at), row_of[at], batch.num_rows, size_px, place)
         for entity in mine.entities(f"{path}/{source}", source):
             yield replace(entity, frame=frame)
 
 
 @dataclass(frozen=True, slots=True)
 class _Labels:
-    """The labels of one source, one after another; ``row_of`` says in which image."""
+    """The labels of one source, one after another.
+
+    ``row_of`` says in which image, ``place`` how many lines of text other sources have above.
+    """
 
     peers: pa.StructArray
     row_of: NDArray[np.intp]
     rows: int
+    size_px: tuple[int, int]
+    place: int
 
     def entities(self, path: str, source: str) -> Iterator[Entity]:
         colour = RGB.get(source, RGB["other"])
         # Where two sources agree, the one named first in the table is seen.
-        order = 30.0 - list(RGB).index(source if source in RGB else "other")
+        order = 30.0 - _order(source)[0]
         edges = self.peers.field("box_px")
         boxed = edges.value_lengths().to_numpy() == 4
         corners = edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
@@ -133,16 +148,24 @@ class _Labels:
         outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
         yield Entity(f"{path}/points", self._rows(points), (dot,))
         yield Entity(f"{path}/boxes", self._rows(boxes, boxed), (outline,))
-        yield Entity(f"{path}/texts", self._rows(_label_texts(self.peers, top_px)), (dust,))
+        yield Entity(f"{path}/texts", self._rows(self._texts(top_px)), (dust,))
         sigmas_px = _columns(self.peers, ("sigma_u_px", "sigma_v_px"))
-        if (unsure := (sigmas_px > 0).all(axis=1)).any():
-            ellipses = rr.Ellipses2D.columns(
-                centers=uv_px[unsure], half_sizes=ELLIPSE_SIGMAS * sigmas_px[unsure]
-            )
-            style = rr.Ellipses2D.from_fields(
-                colors=[colour], line_radii=[LINE_UI], draw_order=order - 10.0
-            )
-            yield Entity(f"{path}/sigmas", self._rows(ellipses, unsure), (style,))
+        unsure = (sigmas_px > 0).all(axis=1) & inside(uv_px, *self.size_px)
+        ellipses = rr.Ellipses2D.columns(
+            centers=uv_px[unsure], half_sizes=ELLIPSE_SIGMAS * sigmas_px[unsure]
+        )
+        curve = rr.Ellipses2D.from_fields(
+            colors=[colour], line_radii=[LINE_UI], draw_order=order - 10.0
+        )
+        yield Entity(f"{path}/sigmas", self._rows(ellipses, unsure), (curve,))
+
+    def _texts(self, top_px: NDArray[np.float64]) -> rr.ComponentColumnList:
+        # Above the peer: below it stands what the network found.
+        above_px = top_px[:, 1] - TEXT_PX * (self.place + 1)
+        places = np.column_stack([top_px[:, 0], np.maximum(above_px, TEXT_PX * self.place)])
+        names, depths_m = (self.peers.field(key).to_pylist() for key in ("peer", "depth_m"))
+        texts = [f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)]
+        return rr.Points2D.columns(positions=places, labels=texts)
 
     def _rows(
         self, columns: rr.ComponentColumnList, kept: NDArray[np.bool_] | None = None
@@ -151,12 +174,9 @@ class _Labels:
         return columns.partition(np.bincount(row_of, minlength=self.rows))
 
 
-def _label_texts(peers: pa.StructArray, top_px: NDArray[np.float64]) -> rr.ComponentColumnList:
-    # Above the peer: below it stands what the network found.
-    above_px = np.column_stack([top_px[:, 0], np.maximum(top_px[:, 1] - TEXT_PX, 0)])
-    names, depths_m = (peers.field(key).to_pylist() for key in ("peer", "depth_m"))
-    texts = [f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)]
-    return rr.Points2D.columns(positions=above_px, labels=texts)
+def _order(source: str) -> tuple[int, str]:
+    """Place of a source in the table of colours; those it does not know come last."""
+    return list(RGB).index(source if source in RGB else "other"), source
 
 
 def detections(

@@ -17,7 +17,7 @@ from dmrl.viewer.entity import (
 )
 from dmrl.viewer.layouts import Eye, Plot, Space
 from dmrl.viewer.motion import Motion, Names, read_motion
-from dmrl.viewer.scene import Draw, Scene, Still, eye_of, first_of, model_draws, picture_draws
+from dmrl.viewer.scene import Draw, Scene, Still, eyes_of, firsts, model_draws, picture_draws
 from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
 
 CAMERAS_MAX = 4
@@ -28,7 +28,7 @@ def flight_scene(selection: Selection, settings: Settings) -> Scene:
     pairs = _pairs(selection, settings.robot)
     motion = read_motion(selection.recordings, pairs, *selection.shown_ns)
     robots = _robots(selection, pairs, settings.robot)
-    eyes = [eye_of(selection, robot, {}) for robot in sorted(selection.image_ns)[:CAMERAS_MAX]]
+    eyes = eyes_of(selection, sorted(selection.image_ns)[:CAMERAS_MAX], {})
     sources: dict[str, set[str]] = {eye.robot: set() for eye in eyes}
     named = {}
     draws: list[Draw] = []
@@ -106,6 +106,7 @@ def _frames(selection: Selection, motion: Motion, robots: Sequence[str]) -> Iter
         drawn = space.transform(frame, poses)
         yield (None if poses.fixed else poses.time_ns), drawn
     present = _topics(selection)
+    calibrations = firsts(selection, map(topics.calibration, robots))
     for robot in robots:
         if camera_frame(robot) not in motion.poses and topics.attitude(robot) not in present:
             yield None, space.still_frame(camera_frame(robot), horizontal_frame(robot))
@@ -117,9 +118,9 @@ def _frames(selection: Selection, motion: Motion, robots: Sequence[str]) -> Iter
         for entity in space.body(robot):
             yield None, entity
         topic = topics.calibration(robot)
-        calibration = first_of(selection, topic)
-        if calibration is not None and len(calibration["K"]) == 9 and any(calibration["K"]):
-            yield None, space.frustum(robot, topic, calibration)
+        # Zeros: not calibrated.
+        if topic in calibrations and any(calibrations[topic]["K"]):
+            yield None, space.frustum(robot, topic, calibrations[topic])
 
 
 def _pair_stills(pair: Names, motion: Motion) -> Iterator[Still]:
@@ -173,8 +174,8 @@ def _space(
             contents += [path, *_below(path, "covariance", "trail")]
             trails.append(f"{path}/trail")
     low, high = _extent(motion, frame, pairs, robots)
-    middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.5)
-    eye = middle + size * np.array([-0.65, -0.65, 0.55])
+    middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.2)
+    eye = middle + size * np.array([-0.45, -0.5, 0.45])
     return Space(frame, tuple(contents), tuple(trails), _three(eye), _three(middle))
 
 
@@ -203,7 +204,7 @@ def _extent(
 
 def _panels(selection: Selection, motion: Motion, pair: Names) -> list[Plot]:
     """Plots of what one robot knows of another, those that have something to show."""
-    robot, peer = pair
+    peer = pair[1]
     estimate, truth, measured = topics.position(*pair), topics.truth(*pair), topics.uwb_range(*pair)
     judged = pair in motion.estimates and pair in motion.truths
     far = [measured] if measured in _topics(selection) else []
@@ -215,14 +216,19 @@ def _panels(selection: Selection, motion: Motion, pair: Names) -> list[Plot]:
     panels = [Plot(f"distance of {peer}, m", tuple(far))] if far else []
     if judged:
         panels += [
-            Plot(f"error along {axis}, m", (f"{estimate}/bound/{axis}", f"{estimate}/error/{axis}"))
+            Plot(
+                f"error along {axis}, m",
+                (f"{estimate}/bound/{axis}", f"{estimate}/error/{axis}"),
+                (-1.2, 1.2),
+            )
             for axis in "xy"
         ]
         panels.append(
             Plot("NEES of x and y, 2 dof", (f"{estimate}/nees", f"{estimate}/nees/limit"), (0, 15))
         )
     if pair in motion.estimates:
-        panels.append(Plot(f"status of {peer}'s position", (f"{estimate}/status",), band=True))
+        bands = tuple(f"{topics.position(*other)}/status" for other in motion.estimates)
+        panels.append(Plot("status of positions", bands, band=True))
     return [*panels, *_own_panels(selection, pair)]
 
 

@@ -110,6 +110,9 @@ def image(eyes: Sequence[Eye], scales: Mapping[str, Scale], *, overlay: bool) ->
     """
     if len(eyes) == 1:
         views = eye_views(eyes[0], scales, both=not overlay, overlay=overlay)
+        if len(views) == 3:
+            beside = rrb.Vertical(*views[1:])
+            return window(rrb.Horizontal(views[0], beside, column_shares=[1.4, 1]))
         return window(rrb.Grid(*views, grid_columns=min(len(views), 2)))
     return window(_rows(eyes, scales, overlay=overlay))
 
@@ -223,7 +226,8 @@ def eye_views(
     over = list(heat) if overlay else ["confidence"] if both and "confidence" in heat else []
     for channel in over:
         contents = [picture, *heat[channel], *(marks if overlay else [])]
-        name = f"{scales[channel].title} over image"
+        what, comma, unit = scales[channel].title.partition(",")
+        name = f"{what} over image{comma}{unit}"
         views.append(_view(eye, name, contents, texts=False, opacity=BELOW_MAP_OPACITY))
     if not overlay:
         for channel, paths in heat.items():

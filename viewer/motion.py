@@ -3,7 +3,7 @@
 Positions of a whole flight are held, 200 bytes each: 15 MB an hour for a pair.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -46,12 +46,21 @@ class Poses:
         return bool((self.xyz == self.xyz[0]).all() and (self.xyzw == self.xyzw[0]).all())
 
     def applied(self, points: Array, time_ns: Times) -> Array:
-        """(M, 3) points at (M,) times, in the parent; the pose next in time is taken."""
-        row = _nearest(self.time_ns, time_ns)
+        """(M, 3) points at (M,) times, in the parent; between two poses on the way of both."""
+        after = np.searchsorted(self.time_ns, time_ns).clip(0, len(self.time_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        span = np.maximum(self.time_ns[after] - self.time_ns[before], 1)
+        share = np.clip((time_ns - self.time_ns[before]) / span, 0.0, 1.0)[:, None]
+        ends = self.xyzw[before], self.xyzw[after]
+        # A quaternion and its negative are the same turn.
+        near = np.sign((ends[0] * ends[1]).sum(axis=1, keepdims=True))
+        turn = (1 - share) * ends[0] + share * near * ends[1]
+        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
         # Rotation by a unit quaternion: p + 2 v x (v x p + w p).
-        axis, w = self.xyzw[row, :3], self.xyzw[row, 3:]
+        axis, w = turn[:, :3], turn[:, 3:]
         turned = points + 2 * np.cross(axis, np.cross(axis, points) + w * points)
-        return np.asarray(turned + self.xyz[row])
+        place = (1 - share) * self.xyz[before] + share * self.xyz[after]
+        return np.asarray(turned + place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +119,13 @@ def read_motion(
     recordings: Mapping[Path, Summary], pairs: Iterable[Names], start_ns: int, end_ns: int
 ) -> Motion:
     """What the recordings say of the pairs in [start_ns, end_ns), and their /tf."""
+    pairs = list(pairs)
     kinds = {topics.position(*pair): ("estimates", pair) for pair in pairs}
-    kinds |= {topics.truth(*pair): ("truths", pair) for _, pair in list(kinds.values())}
-    wanted = {topics.TRANSFORMS: ("transforms",), **dict.fromkeys(kinds)}
+    kinds |= {topics.truth(*pair): ("truths", pair) for pair in pairs}
+    fields: dict[str, Sequence[str] | None] = {**dict.fromkeys(kinds)}
+    fields[topics.TRANSFORMS] = ("transforms",)
     found: dict[str, list[pa.RecordBatch]] = {}
     for path in recordings:
-        fields = {**dict.fromkeys(wanted), topics.TRANSFORMS: ("transforms",)}
         for stretch in stretches(path, fields, start_ns=start_ns, end_ns=end_ns):
             for topic, batch in stretch.items():
                 found.setdefault(topic, []).append(batch)
@@ -162,10 +172,3 @@ def covariances(column: pa.ListArray) -> Array:
 def vectors(column: pa.StructArray, axes: str) -> Array:
     """(N, k) of a column of structs with these fields."""
     return np.stack([column.field(axis).to_numpy() for axis in axes], axis=1)
-
-
-def _nearest(sorted_ns: Times, time_ns: Times) -> NDArray[np.intp]:
-    after = np.searchsorted(sorted_ns, time_ns).clip(0, len(sorted_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = abs(sorted_ns[before] - time_ns) < abs(sorted_ns[after] - time_ns)
-    return np.asarray(np.where(closer, before, after))

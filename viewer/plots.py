@@ -17,7 +17,7 @@ BOUND_SIGMAS = 3.0
 NEES_95 = 5.991
 """95 % of a chi-square with two degrees of freedom lie below."""
 
-WIDTH_UI, THIN_UI, MARKER_UI = 1.5, 0.8, 1.2
+WIDTH_UI, THIN_UI, MARKER_UI = 1.5, 0.8, 0.8
 
 
 def line(path: str, values: Array, name: str, colour: Colour, width: float = WIDTH_UI) -> Entity:
@@ -69,7 +69,7 @@ def errors(path: str, positions: Positions, truth: Positions) -> Iterator[Entity
     for k, axis in enumerate("xy"):
         both = np.stack([bound[:, k], -bound[:, k]], axis=1)
         style = rr.SeriesLines(
-            colors=[dim, dim], names=["+3 sigma", "-3 sigma"], widths=[THIN_UI, THIN_UI]
+            colors=[dim, dim], names=["3 sigma", "3 sigma"], widths=[THIN_UI, THIN_UI]
         )
         yield Entity(f"{path}/bound/{axis}", rr.Scalars.columns(scalars=both), (style,))
         yield line(f"{path}/error/{axis}", error[:, k], "estimate", RGB["estimate"])
@@ -96,7 +96,7 @@ def status(path: str, positions: Positions) -> Iterator[Entity]:
     style = rr.StateConfiguration(
         values=list(STATUS_RGB),
         labels=list(STATUS_RGB),
-        colors=[_rgba(colour) for colour in STATUS_RGB.values()],
+        colors=np.array([_rgba(colour) for colour in STATUS_RGB.values()], np.uint32),
     )
     yield Entity(f"{path}/status", rr.StateChange.columns(state=states), (style,))
 

@@ -1,6 +1,6 @@
 """What of a selection is drawn, and how: read in one pass, stretch by stretch."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 from dmrl import images, topics
 from dmrl.colours import RGB
 from dmrl.progress import track
-from dmrl.recording import columns, stretches
+from dmrl.recording import stretches
 from dmrl.viewer import entities
 from dmrl.viewer.entities import Colour, Scale
 from dmrl.viewer.entity import Entity, image_frame
@@ -88,7 +88,7 @@ def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
                     yield from _drawn(selection, draw, stretch[draw.topic])
             for robot, eye in {eye.robot: eye for eye in scene.eyes}.items():
                 sources = scene.sources.get(robot, set())
-                if shown.get(robot) != sources:
+                if shown.get(robot) != sources and (sources or scene.named):
                     shown[robot] = set(sources)
                     yield None, _legend(eye, sources, scene.named)
 
@@ -130,44 +130,63 @@ def _legend(eye: Eye, sources: set[str], named: Mapping[str, Colour]) -> Entity:
     return legend(eye.robot, colours, eye.width_px, eye.height_px)
 
 
-def eye_of(
-    selection: Selection, robot: str, scales: Mapping[str, Scale], *, model: Path | None = None
-) -> Eye:
-    """A robot's camera, with what one recording's model found, or any.
+def firsts(
+    selection: Selection, wanted: Iterable[str], only: Path | None = None
+) -> dict[str, dict[str, Any]]:
+    """Fields of the first message of each of these topics, where there is one."""
+    wanted, found = list(wanted), dict[str, dict[str, Any]]()
+    for path, kept in selection.recordings.items():
+        if only not in (None, path):
+            continue
+        missing = {t: None for t in wanted if t in kept.topics and t not in found}
+        missing = {t: None for t in missing if kept.topics[t].count}
+        for stretch in stretches(path, missing):
+            for topic in set(stretch) & set(missing):
+                found[topic] = stretch[topic].slice(0, 1).to_pylist()[0]
+                del missing[topic]
+            if not missing:
+                break
+    return found
+
+
+def eyes_of(
+    selection: Selection,
+    robots: Sequence[str],
+    scales: Mapping[str, Scale],
+    *,
+    model: Path | None = None,
+) -> list[Eye]:
+    """Cameras of robots, with what one recording's model found, or any.
 
     Raises
     ------
     SourceError
-        If its first image is none.
+        If a first image is none.
     """
-    picture, grid = topics.camera_image(robot), topics.grid(robot)
-    data = first_of(selection, picture, ("data",))
-    assert data is not None
-    width_px, height_px, _ = images.size(data["data"], f"the first image of {picture}")
-    said = first_of(selection, grid, ("channels",), model)
+    first = firsts(selection, map(topics.camera_image, robots))
+    grids = firsts(selection, map(topics.grid, robots), model) if scales else {}
     prefix = "" if model is None else f"/{model.stem}"
-    return Eye(
-        robot,
-        robot if model is None else model.stem,
-        width_px,
-        height_px,
-        picture,
-        topics.labels(robot),
-        prefix + topics.detections(robot),
-        prefix + grid,
-        tuple(name for name in (said or {"channels": ()})["channels"] if name in scales),
-    )
-
-
-def first_of(
-    selection: Selection, topic: str, fields: Sequence[str] | None = None, only: Path | None = None
-) -> dict[str, Any] | None:
-    """Fields of the first message of a topic; None if there is none."""
-    for path, kept in selection.recordings.items():
-        if topic in kept.topics and only in (None, path):
-            for batch in columns(path, topic, fields=fields):
-                return dict(batch.slice(0, 1).to_pylist()[0])
-    return None
+    eyes = []
+    for robot in robots:
+        picture, grid = topics.camera_image(robot), topics.grid(robot)
+        width_px, height_px, _ = images.size(
+            first[picture]["data"], f"the first image of {picture}"
+        )
+        channels = grids[grid]["channels"] if grid in grids else ()
+        eyes.append(
+            Eye(
+                robot,
+                robot if model is None else model.stem,
+                width_px,
+                height_px,
+                picture,
+                topics.labels(robot),
+                prefix + topics.detections(robot),
+                prefix + grid,
+                tuple(name for name in channels if name in scales),
+            )
+        )
+    return eyes
 
 
 def picture_draws(eye: Eye, sources: set[str]) -> list[Draw]:
@@ -177,7 +196,13 @@ def picture_draws(eye: Eye, sources: set[str]) -> list[Draw]:
         Draw(eye.picture, partial(entities.images, eye.picture, frame), eye.robot),
         Draw(
             eye.labels,
-            partial(entities.labels, eye.labels, frame, sources=sources),
+            partial(
+                entities.labels,
+                eye.labels,
+                frame,
+                sources=sources,
+                size_px=(eye.width_px, eye.height_px),
+            ),
             eye.robot,
         ),
     ]

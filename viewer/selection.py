@@ -22,6 +22,9 @@ PAIRWISE = (topics.RANGE, topics.POSITION, topics.TRUTH)
 FLIGHT = (*PAIRWISE, topics.TRACKS, topics.ATTITUDE, topics.HEIGHT)
 """Topics that the layout ``flight`` is for."""
 
+WHOLE = ("flight", "compare")
+"""Layouts with plots: a picture shows all of them."""
+
 MANY_PAIRS = 6
 
 Layout = Literal["auto", "image", "flight", "compare", "dataset"]
@@ -175,7 +178,8 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
 
 def _fitting(every: Sequence[str]) -> Layout:
     measured = _of(every, (topics.RANGE, topics.POSITION, topics.TRACKS))
-    blind = not topics.robots(list(every))
+    # Labels and detections are nothing without their images, which somebody forgot.
+    blind = not topics.robots(list(every)) and not _of(every, MARKS)
     return "flight" if measured or (blind and _of(every, FLIGHT)) else "image"
 
 
@@ -201,7 +205,7 @@ def _say_blind(every: list[str]) -> None:
 
 
 def at_time(selection: Selection, time_s: float | None) -> Selection:
-    """One image of each robot: the one nearest to a time. A flight stays whole around it.
+    """One image of each robot: the one nearest to a time. Plots stay whole around it.
 
     Parameters
     ----------
@@ -218,7 +222,7 @@ def at_time(selection: Selection, time_s: float | None) -> Selection:
         for robot, times in selection.image_ns.items()
     }
     moment = replace(selection, image_ns=nearest, all_images=False)
-    if selection.layout == "flight":
+    if selection.layout in WHOLE:
         return moment
     first = min(int(times[0]) for times in nearest.values())
     return replace(moment, shown_ns=(first, moment.last_image_ns + 1))

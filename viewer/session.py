@@ -15,7 +15,7 @@ from dmrl.viewer.browse import browse
 from dmrl.viewer.compare import compare_scene
 from dmrl.viewer.flight import flight_scene
 from dmrl.viewer.layouts import TIMELINE
-from dmrl.viewer.scene import Scene, bars, eye_of, logged, model_draws, picture_draws
+from dmrl.viewer.scene import Scene, bars, eyes_of, logged, model_draws, picture_draws
 from dmrl.viewer.selection import Selection, Settings, at_time, moment_ns, select
 from dmrl.viewer.show import Logger, Show, cursor_at, stream_of
 
@@ -109,7 +109,7 @@ def log(show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lam
 def image_scene(selection: Selection, settings: Settings) -> Scene:
     """Images and maps of every robot."""
     scales = entities.scales(settings.depth_max_m)
-    eyes = [eye_of(selection, robot, scales) for robot in sorted(selection.image_ns)]
+    eyes = eyes_of(selection, sorted(selection.image_ns), scales)
     scene = Scene(layouts.image(eyes, scales, overlay=settings.overlay), [], [], eyes)
     for eye in eyes:
         scene.draws += picture_draws(eye, scene.sources.setdefault(eye.robot, set()))

@@ -137,7 +137,7 @@ def _ellipsoids(
 ) -> Iterator[Entity]:
     """One for each known covariance that is not zero; ``lengths``: how many to a row."""
     known = np.isfinite(covariance).all(axis=(1, 2)) & covariance.any(axis=(1, 2))
-    if not known.any():
+    if lengths is None and not known.any():
         return
     half_sizes, xyzw = _axes(covariance[known])
     columns = rr.Ellipsoids3D.columns(

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Annotated
 from urllib.parse import quote
 
@@ -26,7 +26,7 @@ from dmrl.errors import OutputError, SettingError
 from dmrl.output import partial_file
 from dmrl.progress import say
 from dmrl.viewer.selection import Settings
-from dmrl.viewer.session import log, prepare
+from dmrl.viewer.session import log, prepare, write
 from dmrl.viewer.show import Show, stream_of
 
 LOOPBACK = "127.0.0.1"
@@ -233,13 +233,15 @@ class _ViewerStopped(Exception):
 
 def _picture(show: Show) -> bytes:
     port = _free_port(LOOPBACK)
-    where = ("--headless", "--window-size", PICTURE_SIZE, "--port", str(port))
-    with _viewer(_command(LOOPBACK, *where)) as viewer:
-        if _listens(viewer, LOOPBACK, port):
-            _stream(show, viewer, port)
+    # From a file: a viewer that waits for a stream says so, across the picture.
+    with TemporaryDirectory(prefix="dmrl-view-") as folder:
+        path = Path(folder) / "view.rrd"
+        write(show, path)
+        where = ("--headless", "--window-size", PICTURE_SIZE, "--port", str(port), str(path))
+        with _viewer(_command(LOOPBACK, *where)) as viewer:
             if picture := _settled(show, viewer, port):
                 return picture
-        said = viewer.said()
+            said = viewer.said()
     if NO_VULKAN in said:
         raise _ViewerStopped("no Vulkan driver. Install one: apt-get install mesa-vulkan-drivers")
     raise _ViewerStopped(f"rerun's viewer stopped: {_last_line(said)}. Try: dmrl view --save")
@@ -249,10 +251,11 @@ def _settled(show: Show, viewer: "_Viewer", port: int) -> bytes | None:
     deadline = time.monotonic() + PATIENCE_S
     previous = b""
     while time.monotonic() < deadline and viewer.alive:
-        # Until all has arrived and is decoded, pictures differ.
+        # Until it listens, requests fail; until all is loaded and decoded, pictures differ.
         with suppress(OSError, RuntimeError):
             client = ViewerClient.connect(_url(port))
-            if client.get_state().active_recording:
+            state = client.get_state()
+            if state.active_recording and not state.loading:
                 timeline, value = show.cursor
                 client.set_time(timeline, play_state="paused", **{_kind(value): value})
                 picture = client.take_screenshot()
@@ -273,7 +276,8 @@ class _Viewer:
     """rerun's viewer as a child process."""
 
     def __init__(self, command: list[str]) -> None:
-        self._errors = TemporaryFile()
+        # Lives as long as the viewer.
+        self._errors = TemporaryFile()  # noqa: SIM115
         self.process = subprocess.Popen(command, env=_environment(), stderr=self._errors)
 
     @property
@@ -287,6 +291,7 @@ class _Viewer:
     def close(self) -> None:
         self.process.kill()
         self.process.wait()
+        self._errors.close()
 
 
 @contextmanager

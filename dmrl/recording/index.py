@@ -125,7 +125,11 @@ def _check_ends(path: Path, stream: BinaryIO) -> None:
 
 def mcap_summary(path: Path, stream: BinaryIO) -> McapSummary | None:
     """The summary section of an opened recording, or None where it has none."""
-    found = SeekingReader(stream).get_summary()
+    return _summary_of(SeekingReader(stream))
+
+
+def _summary_of(reader: SeekingReader) -> McapSummary | None:
+    found = reader.get_summary()
     if found is not None and found.statistics is None and not found.channels:
         return None
     return found
@@ -171,10 +175,11 @@ def summary(path: Path) -> Summary:
         If the file is absent, not MCAP, cut short or damaged.
     """
     with opened(path) as stream:
-        found = mcap_summary(path, stream)
+        # One reader: each reads the summary again.
+        reader = SeekingReader(stream)
+        found = _summary_of(reader)
         if found is None:
             return _scanned(path, stream)
-        reader = SeekingReader(stream)
         metadata: dict[str, list[dict[str, str]]] = {}
         for record in reader.iter_metadata():
             metadata.setdefault(record.name, []).append(dict(record.metadata))

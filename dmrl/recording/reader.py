@@ -1,7 +1,7 @@
 """Messages of a recording, one at a time or as Arrow columns, in log-time order."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from dmrl.errors import MissingTopic, RecordingError
 from dmrl.messages import descriptor, pool_of
 from dmrl.recording.block import EMPTY, Block, concatenate
 from dmrl.recording.blocks import blocks
-from dmrl.recording.index import channel_on, damaged, summary
+from dmrl.recording.index import TopicInfo, channel_on, damaged, summary
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
 from dmrl.recording.writer import Channel, RawMessage
@@ -60,14 +60,18 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
         if not hits:
             raise MissingTopic(want, topics, path)
         found |= hits
-    for topic in sorted(found):
+    _require_types(path, topics, found)
+    return frozenset(found)
+
+
+def _require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> None:
+    for topic in sorted(chosen):
         row = row_of(topic)
         if row is not None and topics[topic].schema != row.message:
             raise RecordingError(
                 f"{path}: {topic} carries {topics[topic].schema or 'no schema'}, not "
                 f"{row.message}. Convert the recording: dmrl convert --help"
             )
-    return frozenset(found)
 
 
 def read_raw(
@@ -227,7 +231,9 @@ def stretches(
     RecordingError
         If the file is not a complete recording, or a message is not of its type.
     """
-    names = matching(path, [topic for topic in fields if topic in summary(path).topics])
+    present = summary(path).topics
+    names = frozenset(topic for topic in fields if topic in present)
+    _require_types(path, present, names)
     held: Block | None = None
     channels: dict[int, Channel] = {}
     for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):

@@ -42,7 +42,7 @@ def make(tmp_path: Path) -> Make:
 
 
 def _messages(robot: str, k: int) -> dict[str, Any]:
-    rgb = np.full((HEIGHT_PX, WIDTH_PX, 3), 20 * k, np.uint8)
+    rgb = np.full((HEIGHT_PX, WIDTH_PX, 3), 20 * k % 256, np.uint8)
     picture = (encode_png(rgb), "png") if k % 2 else (encode_jpeg(rgb, 90), "jpeg")
     truth = {"peer": "cf2", "u_px": 20, "v_px": 12, "depth_m": 1.25, "source": "truth"}
     peers = [{**truth, "box_px": [16, 8, 28, 18]}, {**truth, "u_px": 30, "source": "published"}]
@@ -64,6 +64,65 @@ def _messages(robot: str, k: int) -> dict[str, Any]:
             data=cell.tobytes(),
             stride_px=8,
         ),
+    }
+
+
+@pytest.fixture
+def fly(tmp_path: Path) -> Make:
+    """Two seconds of two robots that see and measure each other, cf2 1 m ahead of cf1.
+
+    Both stand still; cf1 looks along the world's y from (1, 2, 0.5). What it estimates is 0.1 m
+    too far, one standard deviation.
+    """
+
+    def build(name: str = "flight.mcap", without: tuple[str, ...] = ()) -> Path:
+        with RecordingWriter(tmp_path / name, Provenance("test")) as sink:
+            for k in range(20):
+                for topic, sample in _flown(k).items():
+                    if not any(word in topic for word in without):
+                        sink.write(k * STEP_NS, topic, sample)
+        return tmp_path / name
+
+    return build
+
+
+def _flown(k: int) -> dict[str, Any]:
+    exact, known = [0.0] * 9, [0.01, 0, 0, 0, 0.04, 0, 0, 0, 0.0025]
+    truth = {"x": 1.0, "covariance": exact, "frame_id": "cf1/horizontal"}
+    followed = {"id": 3, "peer": "cf2", "x": 1.0, "vx_mps": 0.5, "covariance": known}
+    messages = {
+        topics.TRANSFORMS: message("FrameTransforms")(
+            transforms=[
+                _frame("world", "cf1/horizontal", (1.0, 2.0, 0.5), (0, 0, 0.5**0.5, 0.5**0.5)),
+                _frame("world", "cf2/horizontal", (1.0, 3.0 + 0.01 * k, 0.5), (0, 0, 0, 1)),
+            ]
+        ),
+        topics.truth("cf1", "cf2"): message("PeerPosition")(**truth),
+        topics.position("cf1", "cf2"): message("PeerPosition")(
+            **{**truth, "x": 1.1, "covariance": known, "status": 0 if k > 4 else 1}
+        ),
+        topics.uwb_range("cf1", "cf2"): message("UwbRange")(range_m=1.05),
+        topics.uwb_range("cf2", "cf1"): message("UwbRange")(range_m=1.0),
+        topics.tracks("cf1"): message("Tracks")(tracks=[followed] if k < 15 else []),
+        topics.calibration("cf1"): message("CameraCalibration")(
+            width=WIDTH_PX, height=HEIGHT_PX, K=[40, 0, 32, 0, 40, 24, 0, 0, 1]
+        ),
+        **_messages("cf1", k),
+    }
+    for robot in ("cf1", "cf2"):
+        messages[topics.height(robot)] = message("Height")(height_m=0.5)
+        messages[topics.attitude(robot)] = message("Attitude")(roll_rad=0.1, yaw_rad=3.1 + 0.01 * k)
+    return messages
+
+
+def _frame(
+    parent: str, child: str, xyz: tuple[float, ...], xyzw: tuple[float, ...]
+) -> dict[str, Any]:
+    return {
+        "parent_frame_id": parent,
+        "child_frame_id": child,
+        "translation": dict(zip("xyz", xyz, strict=True)),
+        "rotation": dict(zip("xyzw", xyzw, strict=True)),
     }
 
 

@@ -1,9 +1,7 @@
 """What is logged, read back from the .rrd files."""
 
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,41 +13,10 @@ from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read_table
 from dmrl.viewer import Settings, save
 
+from .rrd import column, logged, panels
+
 Make = Callable[..., Path]
 IMAGES = "/cf1/camera/image"
-
-
-def logged(path: Path) -> dict[tuple[str, str], int]:
-    """Rows by entity and archetype; what is static counts as "static"."""
-    rows: Counter[tuple[str, str]] = Counter()
-    for chunk in RrdReader(path).stream():
-        kinds = {n.partition(":")[0] for n in chunk.to_record_batch().schema.names if ":" in n}
-        for kind in kinds:
-            rows[str(chunk.entity_path), f"static {kind}" if chunk.is_static else kind] += (
-                chunk.num_rows
-            )
-    return dict(rows)
-
-
-def column(path: Path, entity: str, component: str) -> list[Any]:
-    """Values of a component, row by row."""
-    values: list[Any] = []
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        if str(chunk.entity_path) == entity and component in batch.schema.names:
-            values += batch[component].to_pylist()
-    return values
-
-
-def panels(path: Path) -> set[str]:
-    """Names of the views of the layout."""
-    reader = RrdReader(path)
-    names: set[str] = set()
-    for chunk in reader.stream(store=reader.blueprints()[0]):
-        batch = chunk.to_record_batch()
-        if "ViewBlueprint:display_name" in batch.schema.names:
-            names |= {name for (name,) in batch["ViewBlueprint:display_name"].to_pylist()}
-    return names
 
 
 @pytest.fixture
@@ -71,6 +38,9 @@ def test_every_topic_becomes_its_archetypes(make: Make, rrd: Path) -> None:
         ("/cf1/detections", "Points2D"): 10,
         ("/cf1/detections/grid/confidence", "DepthImage"): 10,
         ("/cf1/detections/grid/depth_m", "DepthImage"): 10,
+        ("/cf1/detections/grid/best", "Boxes2D"): 10,
+        ("/cf1/labels/truth/sigmas", "Ellipses2D"): 10,
+        ("/cf1/labels/published/sigmas", "Ellipses2D"): 10,
     }
     assert {path for path, kind in found if kind == "static LineStrips2D"} == {
         "/cf1/legend/sources",

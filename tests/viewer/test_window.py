@@ -1,6 +1,7 @@
 """Pictures, windows and pages, with rerun's own viewer."""
 
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,7 +16,7 @@ import pytest
 from dmrl.errors import OutputError, SettingError
 from dmrl.images import decode
 from dmrl.stages import view as stage
-from dmrl.viewer import Settings, screenshot, view, window
+from dmrl.viewer import Page, Settings, Web, screenshot, view, window
 from dmrl.viewer.layouts import BACKGROUND, IMAGE_OPACITY
 
 Make = Callable[..., Path]
@@ -32,7 +33,7 @@ def vulkan() -> None:
 def panel(picture: Path, row: int, col: int) -> tuple[int, ...]:
     """Mean colour of the middle of one of four panels."""
     rgb = decode(picture.read_bytes())
-    v, u = (250, 730)[row], (400, 1200)[col]
+    v, u = (280, 760)[row], (400, 1200)[col]
     return tuple(int(value) for value in rgb[v - 40 : v + 40, u - 40 : u + 40].mean(axis=(0, 1)))
 
 
@@ -40,7 +41,7 @@ def test_a_picture_shows_the_image_nearest_to_the_time(
     make: Make, tmp_path: Path, vulkan: None
 ) -> None:
     picture = tmp_path / "picture.png"
-    assert screenshot([make()], picture, Settings(), time_s=0.43) == pytest.approx(0.4)
+    assert screenshot([make()], picture, Settings(), time_s=0.43) == "at 0.400 s"
     assert decode(picture.read_bytes()).shape == (1000, 1600, 3)
     assert np.ptp(panel(picture, 0, 0)) <= 3
     # The fifth image is grey 80, and lies over the background as light does, not as bytes do.
@@ -83,7 +84,7 @@ def test_without_a_screen_the_window_says_what_else_there_is(make: Make) -> None
 
 
 def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
-    command, environment = window._command(), window._environment()
+    command, environment = window._command("127.0.0.1"), window._environment()
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert environment["CI"] == "1"
     assert {environment[name] for name in ("https_proxy", "HTTPS_PROXY")} == {"http://127.0.0.1:9"}
@@ -122,6 +123,29 @@ def _page(address: str) -> bytes:
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.05)
+
+
+def test_a_page_can_be_opened_and_closed_in_a_notebook(make: Make) -> None:
+    page = Page([make()], Settings())
+    try:
+        assert page._repr_html_().startswith(f'<iframe src="{page.url}"')
+        assert b"<html" in _page(page.url)
+    finally:
+        page.close()
+
+
+def test_a_port_in_use_is_named(make: Make) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(SettingError, match=rf"port {port} is in use. Choose another --port"):
+            Page([make()], Settings(), Web(port=port))
+
+
+def test_an_address_that_is_none_is_named(make: Make) -> None:
+    with pytest.raises(SettingError, match=r"Try: --bind 127\.0\.0\.1"):
+        Page([make()], Settings(), Web(bind="192.0.2.1"))
 
 
 def test_a_pipeline_writes_by_suffix(make: Make, tmp_path: Path, vulkan: None) -> None:

@@ -1,0 +1,40 @@
+"""What is in an .rrd file."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import RrdReader
+
+
+def logged(path: Path) -> dict[tuple[str, str], int]:
+    """Rows by entity and archetype; what is static counts as "static"."""
+    rows: Counter[tuple[str, str]] = Counter()
+    for chunk in RrdReader(path).stream():
+        kinds = {n.partition(":")[0] for n in chunk.to_record_batch().schema.names if ":" in n}
+        for kind in kinds:
+            rows[str(chunk.entity_path), f"static {kind}" if chunk.is_static else kind] += (
+                chunk.num_rows
+            )
+    return dict(rows)
+
+
+def column(path: Path, entity: str, component: str) -> list[Any]:
+    """Values of a component, row by row."""
+    values: list[Any] = []
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if str(chunk.entity_path) == entity and component in batch.schema.names:
+            values += batch[component].to_pylist()
+    return values
+
+
+def panels(path: Path) -> set[str]:
+    """Names of the views of the layout."""
+    reader = RrdReader(path)
+    names: set[str] = set()
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        if "ViewBlueprint:display_name" in batch.schema.names:
+            names |= {name for (name,) in batch["ViewBlueprint:display_name"].to_pylist()}
+    return names

@@ -1,0 +1,196 @@
+"""What the layout ``flight`` logs, read back from the .rrd files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.colours import RGB, STATUS_RGB
+from dmrl.errors import SettingError
+from dmrl.viewer import Settings, save
+
+from .rrd import column, logged, panels
+
+Make = Callable[..., Path]
+POSITION, TRUTH = "/cf1/peer/cf2/position", "/cf1/peer/cf2/truth"
+
+
+@pytest.fixture
+def rrd(tmp_path: Path) -> Path:
+    return tmp_path / "flight.rrd"
+
+
+def moving(path: Path) -> dict[tuple[str, str], int]:
+    """Rows of what has a time, without what lies in images."""
+    return {
+        key: n
+        for key, n in logged(path).items()
+        if not key[1].startswith("static") and not key[0].startswith(("/cf1/lab", "/cf1/det"))
+    }
+
+
+def test_every_message_of_a_flight_becomes_its_archetypes(fly: Make, rrd: Path) -> None:
+    assert save([fly()], rrd, Settings()) == 20
+    plots = ["distance", "error/x", "error/y", "bound/x", "bound/y", "nees", "nees/limit"]
+    assert moving(rrd) == {
+        ("/tf/cf2/horizontal", "Transform3D"): 20,
+        ("/tf/cf1/camera", "Transform3D"): 20,
+        ("/tf/cf2/camera", "Transform3D"): 20,
+        ("/cf1/camera/image", "EncodedImage"): 20,
+        (TRUTH, "Points3D"): 20,
+        (f"{TRUTH}/trail", "LineStrips3D"): 20,
+        (f"{TRUTH}/distance", "Scalars"): 20,
+        (POSITION, "Points3D"): 20,
+        (f"{POSITION}/covariance", "Ellipsoids3D"): 20,
+        (f"{POSITION}/trail", "LineStrips3D"): 20,
+        (f"{POSITION}/status", "StateChange"): 20,
+        **{(f"{POSITION}/{name}", "Scalars"): 20 for name in plots},
+        ("/cf1/range/cf2", "Scalars"): 20,
+        ("/cf1/range/cf2/line", "LineStrips3D"): 20,
+        ("/cf2/range/cf1", "Scalars"): 20,
+        ("/cf2/range/cf1/sphere", "Ellipsoids3D"): 20,
+        ("/cf1/tracks", "Points3D"): 20,
+        ("/cf1/tracks/velocity", "Arrows3D"): 20,
+        ("/cf1/tracks/covariance", "Ellipsoids3D"): 20,
+        **{(f"/cf{k}/height", "Scalars"): 20 for k in (1, 2)},
+        **{
+            (f"/cf{k}/attitude/{n}", "Scalars"): 20
+            for k in (1, 2)
+            for n in ("roll", "pitch", "yaw")
+        },
+    }
+    still = {key for key in logged(rrd) if key[1].startswith("static")}
+    assert {
+        ("/tf/cf1/horizontal", "static Transform3D"),
+        ("/tf/cf1/optical", "static Transform3D"),
+        ("/cf1/camera/calibration", "static Pinhole"),
+        ("/cf1/body", "static Mesh3D"),
+        ("/cf2/body", "static TransformAxes3D"),
+    } <= still
+
+
+def test_the_panels_have_units(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    assert panels(rrd) == {
+        "space, world, grid 1 m",
+        "cf1 image",
+        "distance of cf2, m",
+        "distance of cf1, m",
+        "error along x, m",
+        "error along y, m",
+        "NEES of x and y, 2 dof",
+        "status of positions",
+        "height, m",
+        "attitude of cf1, degrees",
+        "attitude of cf2, degrees",
+        "yaw, degrees",
+    }
+
+
+def test_errors_bounds_and_nees_are_right(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    values = {
+        name: np.array(column(rrd, f"{POSITION}/{name}", "Scalars:scalars"))
+        for name in ("error/x", "bound/x", "bound/y", "nees", "distance")
+    }
+    assert values["error/x"] == pytest.approx(0.1)
+    assert values["bound/x"] == pytest.approx(np.tile([0.3, -0.3], (20, 1)))
+    assert values["bound/y"] == pytest.approx(np.tile([0.6, -0.6], (20, 1)))
+    assert values["nees"] == pytest.approx(1.0)
+    assert values["distance"] == pytest.approx(1.1)
+
+
+def test_an_ellipsoid_has_two_sigmas_along_the_axes_of_the_covariance(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    (half,) = column(rrd, f"{POSITION}/covariance", "Ellipsoids3D:half_sizes")[0]
+    assert sorted(half) == pytest.approx([0.1, 0.2, 0.4])
+    (xyzw,) = column(rrd, f"{POSITION}/covariance", "Ellipsoids3D:quaternions")[0]
+    x, y, z, w = xyzw
+    # The axis with the largest half size points along y.
+    axes = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    spread = axes @ np.diag(np.array(half) ** 2) @ axes.T
+    assert spread == pytest.approx(4 * np.diag([0.01, 0.04, 0.0025]), abs=1e-6)
+
+
+def test_trails_are_in_the_world_and_positions_in_the_robots_frame(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    strips = column(rrd, f"{TRUTH}/trail", "LineStrips3D:strips")
+    # cf1 stands at (1, 2, 0.5) and looks along y: 1 m ahead of it is (1, 3, 0.5).
+    assert strips[5][0][1] == pytest.approx([1.0, 3.0, 0.5], abs=1e-6)
+    assert column(rrd, f"{TRUTH}/trail", "CoordinateFrame:frame") == [["world"]]
+    assert column(rrd, TRUTH, "CoordinateFrame:frame") == [["cf1/horizontal"]]
+    assert column(rrd, "/cf1/camera/image", "CoordinateFrame:frame") == [["cf1/image"]]
+
+
+def test_without_tf_everything_is_around_the_robot(fly: Make, rrd: Path) -> None:
+    save([fly(without=("/tf",))], rrd, Settings(robot="cf1"))
+    assert "space, cf1/horizontal, grid 1 m" in panels(rrd)
+    strips = column(rrd, f"{TRUTH}/trail", "LineStrips3D:strips")
+    assert strips[5][0][1] == pytest.approx([1.0, 0.0, 0.0])
+    assert column(rrd, f"{TRUTH}/trail", "CoordinateFrame:frame") == [["cf1/horizontal"]]
+
+
+def test_a_range_points_to_where_the_peer_is_thought_to_be(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    ((start, end),) = column(rrd, "/cf1/range/cf2/line", "LineStrips3D:strips")[0]
+    assert (start, end) == ([0, 0, 0], pytest.approx([1.05, 0, 0]))
+    assert column(rrd, "/cf2/range/cf1/sphere", "Ellipsoids3D:half_sizes")[0] == [[1, 1, 1]]
+
+
+def test_an_estimate_that_is_not_ok_has_the_colour_of_its_status(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    colours = [rgba >> 8 for (rgba,) in column(rrd, POSITION, "Points3D:colors")]
+    doubted = int.from_bytes(bytes(STATUS_RGB["UNCONVERGED"]))
+    assert colours == [doubted] * 5 + [int.from_bytes(bytes(RGB["estimate"]))] * 15
+    states = column(rrd, f"{POSITION}/status", "StateChange:state")
+    assert states == [["UNCONVERGED"]] * 5 + [["OK"]] * 15
+
+
+def test_a_track_disappears_when_it_ends(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    assert column(rrd, "/cf1/tracks", "Points3D:labels") == [["cf2 3"]] * 15 + [[]] * 5
+    assert column(rrd, "/cf1/tracks/covariance", "Ellipsoids3D:half_sizes")[19] == []
+
+
+def test_yaw_has_a_gap_where_it_turns_over(fly: Make, rrd: Path) -> None:
+    save([fly()], rrd, Settings())
+    yaw = np.array(column(rrd, "/cf1/attitude/yaw", "Scalars:scalars"))[:, 0]
+    assert np.nanmax(abs(yaw)) <= 180
+    assert np.isnan(yaw).sum() == 1
+    roll = column(rrd, "/cf1/attitude/roll", "Scalars:scalars")
+    assert roll[0][0] == pytest.approx(np.degrees(0.1))
+
+
+def test_a_flight_without_images_is_shown_all_the_same(fly: Make, rrd: Path) -> None:
+    assert save([fly(without=("camera", "labels", "detections"))], rrd, Settings()) == 0
+    assert "cf1 image" not in panels(rrd)
+    assert moving(rrd)[POSITION, "Points3D"] == 20
+
+
+def test_from_and_to_hold_for_plots_too(fly: Make, rrd: Path) -> None:
+    assert save([fly()], rrd, Settings(from_s=0.5, to_s=1.0)) == 5
+    assert set(moving(rrd).values()) == {5}
+
+
+def test_every_thins_images_and_leaves_plots_whole(fly: Make, rrd: Path) -> None:
+    assert save([fly()], rrd, Settings(every=4)) == 5
+    assert moving(rrd)["/cf1/camera/image", "EncodedImage"] == 5
+    assert moving(rrd)[f"{POSITION}/nees", "Scalars"] == 20
+
+
+def test_an_empty_stretch_of_a_flight_is_refused(fly: Make, rrd: Path) -> None:
+    recording = fly(without=("camera", "labels", "detections"))
+    with pytest.raises(SettingError, match=r"lasts from 0 to 1.900 s. Change --from-s or --to-s"):
+        save([recording], rrd, Settings(from_s=1.0, to_s=1.0))
+
+
+def test_a_robot_that_is_not_there_is_named_with_those_that_are(fly: Make, rrd: Path) -> None:
+    with pytest.raises(SettingError, match=r"no robot cf9 in .*It has: cf1, cf2"):
+        save([fly()], rrd, Settings(robot="cf9"))
