@@ -302,4 +302,6 @@ def plot_view(plot: Plot) -> rrb.View:
         axis_x=shared,
         axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
         plot_legend=rrb.PlotLegend(corner="RightTop"),
+        # A browser may have a light theme, on which bright lines cannot be seen.
+        background=rrb.archetypes.PlotBackground(color=BACKGROUND),
     )

@@ -17,6 +17,9 @@ from dmrl.recording import Summary, stretches, summary
 # Log times below this do not count from 1970 but from the start of a simulation.
 DURATION_BELOW_NS = 10 * 365 * 86400 * 10**9
 
+LEAD_NS = 1_000_000_000
+"""Measurements so long before the first image are left out."""
+
 MARKS = (topics.LABELS, topics.DETECTIONS, topics.GRID)
 PAIRWISE = (topics.RANGE, topics.POSITION, topics.TRUTH)
 FLIGHT = (*PAIRWISE, topics.TRACKS, topics.ATTITUDE, topics.HEIGHT)
@@ -172,7 +175,12 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
         # What lies before the first image and after the last belongs to none.
         lower_ns = min(int(times[0]) for times in chosen.values())
         upper_ns = max(int(times[-1]) for times in chosen.values()) + 1
-    shown_ns = max(lower_ns, start_ns), min(upper_ns, last_ns + 1)
+    lower_ns = max(lower_ns, start_ns)
+    first_image_ns = min((int(times[0]) for times in chosen.values()), default=lower_ns)
+    if first_image_ns - lower_ns <= LEAD_NS:
+        # A viewer opens at the start, where it should have something to show.
+        lower_ns = first_image_ns
+    shown_ns = lower_ns, min(upper_ns, last_ns + 1)
     return Selection(found, layout, start_ns, shown_ns, chosen, settings.every == 1)
 
 

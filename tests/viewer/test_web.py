@@ -1,0 +1,121 @@
+"""The page, in a real browser without a screen: what a user sees, and that it draws."""
+
+import base64
+import json
+import shutil
+import socket
+import subprocess
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.colours import RGB
+from dmrl.images import Rgb, decode
+from dmrl.viewer import Page, Settings
+
+Make = Callable[..., Path]
+PATIENCE_S = 120.0
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--enable-unsafe-swiftshader",  # WebGL without a graphics card
+    "--use-angle=swiftshader",
+    "--window-size=1600,1000",
+)
+
+
+class Browser:
+    """Chromium, spoken to as the WebDriver standard says."""
+
+    def __init__(self, port: int, profile: Path) -> None:
+        self.address = f"http://127.0.0.1:{port}"
+        options = {"args": [*FLAGS, f"--user-data-dir={profile}"]}
+        wanted = {"alwaysMatch": {"goog:chromeOptions": options}}
+        session = self.call("", {"capabilities": wanted})
+        self.address += f"/session/{session['sessionId']}"
+
+    def call(self, path: str, body: dict[str, Any] | None = None, method: str | None = None) -> Any:
+        where = self.address if "/session" in self.address else f"{self.address}/session"
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(where + path, data, method=method)
+        with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
+            return json.loads(answer.read())["value"]
+
+    def picture(self) -> Rgb:
+        return decode(base64.b64decode(self.call("/screenshot")))
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    """A browser with an empty profile. Skips where there is none."""
+    program = shutil.which("chromedriver")
+    if program is None:
+        pytest.skip("no browser; apt-get install chromium chromium-driver")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    driver = subprocess.Popen([program, f"--port={port}"], stdout=subprocess.DEVNULL)
+    try:
+        _wait_for(f"http://127.0.0.1:{port}/status")
+        opened = Browser(port, tmp_path / "profile")
+        try:
+            yield opened
+        finally:
+            opened.call("", method="DELETE")
+    finally:
+        driver.terminate()
+        driver.wait()
+
+
+def _wait_for(address: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            urllib.request.urlopen(address).close()
+        except urllib.error.URLError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)
+        else:
+            return
+
+
+def share(rgb: Rgb, colour: tuple[int, int, int]) -> float:
+    """Share of pixels that have nearly this colour."""
+    return float((abs(rgb.astype(int) - colour).max(axis=2) < 12).mean())
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_flight(fly: Make, browser: Browser) -> None:
+    page = Page([fly()], Settings())
+    try:
+        browser.call("/url", {"url": page.url})
+        page.fill()
+        deadline = time.monotonic() + PATIENCE_S
+        shown: dict[str, float] = {}
+        while time.monotonic() < deadline:
+            rgb = browser.picture()
+            names = ("truth", "estimate", "detection", "range")
+            shown = {name: share(rgb, RGB[name]) for name in names}
+            print(time.monotonic() - deadline, shown)
+            if min(shown.values()) > 0:
+                break
+            time.sleep(1)
+        # The distance plot has the ranges, the image the boxes, the legends every colour.
+        assert min(shown.values()) > 0, shown
+        assert np.unique(rgb.reshape(-1, 3), axis=0).shape[0] > 200
+        assert "Rerun" in browser.call("/title")
+    finally:
+        page.close()
