@@ -1,0 +1,207 @@
+"""A long flight in the viewer: CPU time, memory, and how soon there is something to see.
+
+Run as ``python benchmarks/bench_view.py [RECORDING] [--minutes 5]``. Without a recording: a flight
+of two robots with a camera each, 20 images a second, truth and estimates as labels, detections and
+maps; images are drawn once a second and repeated, which costs the viewer the same. Then, each in a
+process of its own: the .rrd by ``dmrl view``, the same recording by rerun's own importer as the peer (it shows no
+label, detection or plot), a flight of half the length, and the time until a viewer has its first
+picture.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from dmrl import topics
+from dmrl.images import decode
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, read, summary, trim
+from dmrl.stages import fly
+from dmrl.viewer import Settings, save, window
+
+RATE_HZ = 20
+ROWS, COLS = 28, 40
+
+
+def write(path: Path, minutes: float) -> int:
+    """The flight; returns the number of images."""
+    flown = path.with_name(f"flown-{path.name}")
+    settings = fly.Settings(duration_s=60 * minutes, camera=True, camera_rate_hz=1.0)
+    fly.run(flown, settings)
+    rng = np.random.default_rng(0)
+    count = 0
+    with RecordingWriter(path, Provenance("bench")) as sink:
+        for stamped in read(flown):
+            names = topics.names(topics.CAMERA_IMAGE, stamped.topic)
+            labelled = topics.names(topics.LABELS, stamped.topic)
+            if names is None and labelled is None:
+                _copy(sink, stamped)
+                continue
+            robot = (names or labelled or {})["robot"]
+            for k in range(RATE_HZ):
+                time_ns = stamped.time_ns + k * 1_000_000_000 // RATE_HZ
+                if names is not None:
+                    count += 1
+                    sink.write(time_ns, stamped.topic, stamped.message)
+                    _predict(sink, time_ns, robot, rng)
+                else:
+                    sink.write(time_ns, stamped.topic, _with_estimates(stamped.message))
+    flown.unlink()
+    return count
+
+
+def _copy(sink: RecordingWriter, stamped) -> None:  # noqa: ANN001
+    sink.write(stamped.time_ns, stamped.topic, stamped.message)
+    names = topics.names(topics.TRUTH, stamped.topic)
+    if names is not None:
+        guess = message("PeerPosition")()
+        guess.CopyFrom(stamped.message)
+        guess.covariance[:] = [0.01, 0, 0, 0, 0.02, 0, 0, 0, 0.002]
+        sink.write(stamped.time_ns, topics.position(**names), guess)
+
+
+def _with_estimates(labels):  # noqa: ANN001, ANN202
+    both = message("PeerLabels")()
+    both.CopyFrom(labels)
+    for label in labels.peers:
+        sigmas = {"sigma_u_px": 15.0, "sigma_v_px": 8.0, "sigma_depth_m": 0.1}
+        values = {"peer": label.peer, "u_px": label.u_px + 5, "v_px": label.v_px + 3}
+        both.peers.add(source="estimate", depth_m=label.depth_m, **values, **sigmas)
+    return both
+
+
+def _predict(sink: RecordingWriter, time_ns: int, robot: str, rng: np.random.Generator) -> None:
+    cells = rng.random((2, ROWS, COLS), np.float32)
+    found = [
+        {"u_px": u, "v_px": v, "depth_m": 1.0, "confidence": c}
+        for u, v, c in zip(*rng.uniform(0, [[320], [224], [1]], (3, 10)), strict=True)
+    ]
+    channels = ["confidence", "depth_m"]
+    grid = message("GridMap")(rows=ROWS, cols=COLS, channels=channels, data=cells.tobytes())
+    sink.write(time_ns, topics.detections(robot), message("Detections")(detections=found))
+    sink.write(time_ns, topics.grid(robot), grid)
+
+
+def with_dmrl(path: Path, out: Path, layout: str) -> dict[str, float]:
+    """CPU seconds and peak memory of ``dmrl view --save``."""
+    begun = time.process_time()
+    save([path], out, Settings(layout=layout))  # type: ignore[arg-type]
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"cpu_s": time.process_time() - begun, "peak_mb": peak_mb, "rrd_mb": size_mb(out)}
+
+
+def with_rerun(path: Path, out: Path) -> dict[str, float]:
+    """The same of rerun's own importer of MCAP."""
+    program = window._command(window.LOOPBACK)[0]
+    subprocess.run([program, "mcap", "convert", str(path), "-o", str(out)], check=True)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {
+        "cpu_s": used.ru_utime + used.ru_stime,
+        "peak_mb": used.ru_maxrss / 1024,
+        "rrd_mb": size_mb(out),
+    }
+
+
+def first_picture(path: Path, layout: str) -> dict[str, float]:
+    """Seconds from the call until a viewer, without a screen, shows the first image.
+
+    The clock starts with the process: imports count. What is drawn is looked for every 0.1 s.
+    """
+    show = window.prepare([path], Settings(layout=layout))  # type: ignore[arg-type]
+    port = window._free_port(window.LOOPBACK)
+    where = ("--headless", "--window-size", window.PICTURE_SIZE, "--port", str(port))
+    with window._viewer(window._command(window.LOOPBACK, *where)) as viewer:
+        assert window._listens(viewer, window.LOOPBACK, port)
+        sender = threading.Thread(target=window._stream, args=(show, viewer, port))
+        sender.start()
+        client = window.ViewerClient.connect(window._url(port))
+        child = psutil.Process(viewer.process.pid)
+        while not _seen(client):
+            time.sleep(0.1)
+        seconds = time.time() - float(sys.argv[-1])
+        used = child.cpu_times()
+        cpu_s = time.process_time(), used.user + used.system
+        sender.join()
+        all_s = time.time() - float(sys.argv[-1])
+    return {"first_s": seconds, "own_s": cpu_s[0], "viewer_s": cpu_s[1], "all_sent_s": all_s}
+
+
+def _seen(client: window.ViewerClient) -> bool:
+    """Whether there is more to see than empty panels: an image has thousands of colours."""
+    try:
+        rgb = decode(client.take_screenshot())
+    except RuntimeError:
+        return False
+    return len(np.unique(rgb[::4, ::4].reshape(-1, 3), axis=0)) > 2000
+
+
+def size_mb(path: Path) -> float:
+    """Size of a file."""
+    return path.stat().st_size / 1e6
+
+
+def apart(*arguments: object) -> dict[str, float]:
+    """One measurement, in a fresh process."""
+    command = [sys.executable, __file__, *map(str, arguments), str(time.time())]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def measure(what: str, path: Path, layout: str) -> dict[str, float]:
+    """The measurement of that name."""
+    out = path.with_suffix(f".{what}.rrd")
+    try:
+        if what == "dmrl":
+            return with_dmrl(path, out, layout)
+        return with_rerun(path, out) if what == "rerun" else first_picture(path, layout)
+    finally:
+        out.unlink(missing_ok=True)
+
+
+def main() -> None:
+    """Measure and print."""
+    if sys.argv[1:2] == ["measure"]:
+        print(json.dumps(measure(sys.argv[2], Path(sys.argv[3]), sys.argv[4])))
+        return
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recording", type=Path, nargs="?")
+    parser.add_argument("--minutes", type=float, default=5.0)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        long, half = given.recording or Path(scratch) / "long.mcap", Path(scratch) / "half.mcap"
+        if given.recording is None:
+            print(f"{write(long, given.minutes)} images", flush=True)
+        held = summary(long)
+        middle_ns = (held.start_ns + held.end_ns) // 2
+        trim(long, half, None, middle_ns)
+        print(f"{long.name}: {size_mb(long):.0f} MB, {(held.end_ns - held.start_ns) / 1e9:.0f} s")
+        peer = apart("measure", "rerun", long, "-")
+        print(f"{'':<26}{'cpu-s':>8}{'peak MB':>10}{'.rrd MB':>10}")
+        rows = {"rerun mcap convert": peer}
+        for layout in ("image", "flight"):
+            rows[f"dmrl view, {layout}"] = apart("measure", "dmrl", long, layout)
+            rows["  half the length"] = apart("measure", "dmrl", half, layout)
+            for name, row in rows.items():
+                print(f"{name:<26}{row['cpu_s']:8.1f}{row['peak_mb']:10.0f}{row['rrd_mb']:10.0f}")
+            shown = rows[f"dmrl view, {layout}"]
+            print(f"{'  ratio to the peer':<26}{shown['cpu_s'] / peer['cpu_s']:8.2f}")
+            seen = apart("measure", "first", long, layout)
+            print(
+                f"  first picture after {seen['first_s']:.1f} s; CPU until then: "
+                f"dmrl {seen['own_s']:.1f} s, viewer {seen['viewer_s']:.1f} s"
+            )
+            print(f"  all of it sent after {seen['all_sent_s']:.1f} s")
+            rows = {}
+
+
+if __name__ == "__main__":
+    main()

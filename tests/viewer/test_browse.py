@@ -1,0 +1,141 @@
+"""What the layout ``dataset`` logs: rows, worst first."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.dataset import open_dataset
+from dmrl.errors import DatasetError, RecordingError, SettingError
+from dmrl.images import encode_png
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter
+from dmrl.recording import provenance as made_by
+from dmrl.stages import dataset as dataset_stage
+from dmrl.viewer import Settings, save
+
+from .rrd import column, logged, panels
+
+Make = Callable[..., Path]
+STEP_NS = 100_000_000
+OFF_PX = (3.0, 30.0, 1.0, 10.0)
+"""How far off the model is in each image with a peer; the last image shows nobody."""
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Five labelled images; nobody is in the last."""
+    path = tmp_path / "pictures.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(5):
+            rgb = np.full((48, 64, 3), 40 * k, np.uint8)
+            image = message("CompressedImage")(data=encode_png(rgb), format="png")
+            label = {"peer": "cf2", "u_px": 20, "v_px": 12, "depth_m": 1.0, "source": "truth"}
+            sink.write(k * STEP_NS, topics.camera_image("cf1"), image)
+            peers = [label] if k < 4 else []
+            sink.write(k * STEP_NS, topics.labels("cf1"), message("PeerLabels")(peers=peers))
+    return path
+
+
+@pytest.fixture
+def folder(pictures: Path, tmp_path: Path) -> Path:
+    """The five images as a dataset."""
+    out = tmp_path / "set"
+    dataset_stage.run([pictures], out, dataset_stage.Settings(split="none"))
+    return out
+
+
+@pytest.fixture
+def found(pictures: Path, tmp_path: Path) -> Path:
+    """What a model found in them, each time that far off."""
+    path = tmp_path / "found.mcap"
+    with RecordingWriter(path, made_by("predict", Settings(), (pictures,))) as sink:
+        for k, off_px in enumerate((*OFF_PX, 0.0)):
+            seen = {"u_px": 20 + off_px, "v_px": 12, "depth_m": 1.5, "confidence": 0.9}
+            cells = np.full((2, 6, 8), 0.1 * k, "<f4")
+            grid = message("GridMap")(
+                rows=6,
+                cols=8,
+                channels=["confidence", "depth_m"],
+                data=cells.tobytes(),
+                stride_px=8,
+            )
+            detections = message("Detections")(detections=[seen], threshold=0.5)
+            sink.write(k * STEP_NS, topics.detections("cf1"), detections)
+            sink.write(k * STEP_NS, topics.grid("cf1"), grid)
+    return path
+
+
+@pytest.fixture
+def rrd(tmp_path: Path) -> Path:
+    return tmp_path / "rows.rrd"
+
+
+def greys(path: Path) -> list[int]:
+    """Grey of the pictures, in the order they are shown: it tells which they are."""
+    return [bytes(pixels)[0] for (pixels,) in column(path, "/row/image", "Image:buffer")]
+
+
+def test_the_worst_row_comes_first_and_those_without_a_peer_last(
+    folder: Path, found: Path, rrd: Path
+) -> None:
+    assert save([folder, found], rrd, Settings()) == 5
+    assert greys(rrd) == [40, 120, 0, 80, 160]
+    errors_px = column(rrd, "/row/error_px", "Scalars:scalars")
+    assert errors_px == [[30.0], [10.0], [3.0], [1.0]]
+    facts = [words for (words,) in column(rrd, "/row/facts", "TextDocument:text")]
+    assert "**30.0 px** off" in facts[0]
+    assert "**0.50 m** in depth" in facts[0]
+    assert "recording pictures.mcap" in facts[0]
+    assert "Shows nobody" in facts[4]
+    assert column(rrd, "/row/detections", "Points2D:positions")[0] == [[50.0, 12.0]]
+    maps = column(rrd, "/row/grid/confidence", "DepthImage:buffer")
+    assert np.frombuffer(bytes(maps[0][0]), "<f4")[0] == np.float32(0.1)
+
+
+def test_a_dataset_alone_is_shown_in_its_order_with_its_own_maps(folder: Path, rrd: Path) -> None:
+    assert save([folder], rrd, Settings()) == 5
+    assert greys(rrd) == [0, 40, 80, 120, 160]
+    assert "error by rank, px" not in panels(rrd)
+    truth = open_dataset(folder).split("train").confidence
+    maps = column(rrd, "/row/grid/confidence", "DepthImage:buffer")
+    assert bytes(maps[0][0]) == truth[0].astype("<f4").tobytes()
+    assert logged(rrd)["/row/labels/truth/points", "Points2D"] == 5
+
+
+def test_rows_are_filtered_by_error_and_number(folder: Path, found: Path, rrd: Path) -> None:
+    between = Settings(error_from_px=2.0, error_to_px=20.0)
+    assert save([folder, found], rrd, between) == 2
+    assert greys(rrd) == [120, 0]
+    rrd.unlink()
+    assert save([folder, found], rrd, Settings(most=1)) == 1
+    assert greys(rrd) == [40]
+
+
+def test_a_filter_that_leaves_nothing_says_what_there_is(
+    folder: Path, found: Path, rrd: Path
+) -> None:
+    with pytest.raises(SettingError, match=r"go from 1\.00 to 30\.00 px. Change --error-from-px"):
+        save([folder, found], rrd, Settings(error_from_px=100.0))
+    with pytest.raises(SettingError, match=r"name its recording as well"):
+        save([folder], rrd, Settings(error_from_px=1.0))
+    assert list(rrd.parent.glob("*.rrd*")) == []
+
+
+def test_a_recording_of_other_images_is_refused(folder: Path, make: Make, rrd: Path) -> None:
+    with pytest.raises(RecordingError, match=r"was not made from .*other\.mcap"):
+        save([folder, make("other.mcap")], rrd, Settings())
+    with pytest.raises(RecordingError, match=r"has no detections. Try: dmrl predict"):
+        save([folder, make("blind.mcap", without=("detections",))], rrd, Settings())
+
+
+def test_what_is_no_dataset_is_named(tmp_path: Path, folder: Path, rrd: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DatasetError, match=r"empty is not a dataset"):
+        save([tmp_path / "empty"], rrd, Settings())
+    with pytest.raises(SettingError, match=r"leave --layout flight out"):
+        save([folder], rrd, Settings(layout="flight"))
+    with pytest.raises(SettingError, match=r"layout dataset is for datasets"):
+        save([tmp_path / "pictures.mcap"], rrd, Settings(layout="dataset"))
