@@ -3,9 +3,9 @@
 Run as ``python benchmarks/bench_view.py [RECORDING] [--minutes 5]``. Without a recording: a flight
 of two robots with a camera each, 20 images a second, truth and estimates as labels, detections and
 maps; images are drawn once a second and repeated, which costs the viewer the same. Then, each in a
-process of its own: the .rrd by ``dmrl view``, the same recording by rerun's own importer as the peer (it shows no
-label, detection or plot), a flight of half the length, and the time until a viewer has its first
-picture.
+process of its own: the .rrd by ``dmrl view``, the same recording by rerun's own importer as the
+peer (it shows no label, detection or plot), a flight of half the length, and the time until a
+viewer has its first picture.
 """
 
 import argparse
@@ -182,7 +182,7 @@ def main() -> None:
             print(f"{write(long, given.minutes)} images", flush=True)
         held = summary(long)
         middle_ns = (held.start_ns + held.end_ns) // 2
-        trim(long, half, None, middle_ns)
+        trim(long, half, end_ns=middle_ns)
         print(f"{long.name}: {size_mb(long):.0f} MB, {(held.end_ns - held.start_ns) / 1e9:.0f} s")
         peer = apart("measure", "rerun", long, "-")
         print(f"{'':<26}{'cpu-s':>8}{'peak MB':>10}{'.rrd MB':>10}")

@@ -1,6 +1,6 @@
 """Layout ``compare``: what two models found in the same images, and how far off they were."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from dmrl.viewer.selection import Selection, Settings
 
 COLOURS = (RGB["detection"], SECOND_DETECTION)
 TABLE = "/models/table"
-ROWS = (
+ROWS: tuple[tuple[str, str, Callable[[Array], str]], ...] = (
     ("median error, px", "px", lambda v: f"{np.median(v):.2f}"),
     ("within 8 px", "px", lambda v: f"{np.mean(v <= 8):.1%}"),
     ("within 20 px", "px", lambda v: f"{np.mean(v <= 20):.1%}"),

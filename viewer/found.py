@@ -153,9 +153,9 @@ def _points(column: pa.ListArray, numbers: NDArray[np.int64]) -> Points:
     """The entries of a list column; ``numbers`` names its rows."""
     flat = column.flatten()
     image = np.repeat(numbers, column.value_lengths().to_numpy())
-    values = [flat.field(name).to_numpy() for name in ("u_px", "v_px", "depth_m")]
+    u_px, v_px, depth_m = (flat.field(name).to_numpy() for name in ("u_px", "v_px", "depth_m"))
     names = {flat.type.field(k).name for k in range(flat.type.num_fields)}
     known = "confidence" in names
     confidence = flat.field("confidence").to_numpy() if known else np.ones(len(flat))
     order = np.lexsort((-confidence, image))
-    return Points(image[order], *(value[order] for value in values), confidence[order])
+    return Points(image, u_px, v_px, depth_m, confidence).select(order)

@@ -41,11 +41,12 @@ def attitude(path: str, batch: pa.RecordBatch, robot: str, *, own: bool) -> Iter
     """Roll, pitch and yaw, degrees."""
     colours = {"roll": OWN, "pitch": PEER, "yaw": OWN if own else PEER}
     for name, colour in colours.items():
-        degrees = np.degrees(batch[f"{name}_rad"].to_numpy())
+        degrees: Array = np.degrees(batch[f"{name}_rad"].to_numpy())
         if name == "yaw":
             # The jump from 180 to -180 is none.
             degrees = (degrees + 180) % 360 - 180
-            degrees[1:][abs(np.diff(degrees)) > 180] = np.nan
+            jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180)
+            degrees[jumps + 1] = np.nan
         yield line(f"{path}/{name}", degrees, robot if name == "yaw" else name, colour)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.progress import say
-from dmrl.recording import Summary, stretches, summary
+from dmrl.recording import Summary, log_times, summary
 
 # Log times below this do not count from 1970 but from the start of a simulation.
 DURATION_BELOW_NS = 10 * 365 * 86400 * 10**9
@@ -248,13 +248,8 @@ def _image_times(
     found: Mapping[Path, Summary], robots: Sequence[str], start_ns: int, end_ns: int
 ) -> dict[str, Times]:
     of_topic = {topics.camera_image(robot): robot for robot in robots}
-    fields: dict[str, Sequence[str]] = dict.fromkeys(of_topic, ())
-    parts: dict[str, list[Times]] = {robot: [] for robot in robots}
+    parts: dict[str, list[Times]] = {robot: [np.zeros(0, np.int64)] for robot in robots}
     for path in found:
-        for stretch in stretches(path, fields, start_ns=start_ns, end_ns=end_ns):
-            for topic, batch in stretch.items():
-                parts[of_topic[topic]].append(batch["log_time"].to_numpy())
-    return {
-        robot: np.unique(np.concatenate([np.zeros(0, np.int64), *times]))
-        for robot, times in parts.items()
-    }
+        for topic, times in log_times(path, of_topic, start_ns=start_ns, end_ns=end_ns).items():
+            parts[of_topic[topic]].append(times)
+    return {robot: np.unique(np.concatenate(times)) for robot, times in parts.items()}

@@ -5,6 +5,7 @@ frame moves in ``world``.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -89,7 +90,7 @@ def body(robot: str) -> Iterator[Entity]:
     yield Entity(f"/{robot}/name", style=(name,), frame=horizontal_frame(robot))
 
 
-def frustum(robot: str, path: str, calibration: Mapping[str, object]) -> Entity:
+def frustum(robot: str, path: str, calibration: Mapping[str, Any]) -> Entity:
     """A robot's field of view, with its image in it.
 
     Parameters
@@ -206,12 +207,12 @@ def ranges(
         sphere = rr.Ellipsoids3D.columns(
             centers=np.zeros((len(range_m), 3)), half_sizes=np.repeat(range_m[:, None], 3, axis=1)
         )
-        style = rr.Ellipsoids3D.from_fields(
+        thin = rr.Ellipsoids3D.from_fields(
             colors=[RGB["range"]],
             line_radii=[RANGE_UI / 2],
             fill_mode=rr.components.FillMode.MajorWireframe,
         )
-        yield Entity(f"{path}/sphere", sphere, (style,), frame)
+        yield Entity(f"{path}/sphere", sphere, (thin,), frame)
         return
     there = towards.at(batch["log_time"].to_numpy())
     length = np.linalg.norm(there, axis=1, keepdims=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import numpy as np
@@ -253,12 +253,12 @@ def _settled(show: Show, viewer: "_Viewer", port: int) -> bytes | None:
     while time.monotonic() < deadline and viewer.alive:
         # Until it listens, requests fail; until all is loaded and decoded, pictures differ.
         with suppress(OSError, RuntimeError):
-            client = ViewerClient.connect(_url(port))
+            client: Any = ViewerClient.connect(_url(port))
             state = client.get_state()
             if state.active_recording and not state.loading:
                 timeline, value = show.cursor
                 client.set_time(timeline, play_state="paused", **{_kind(value): value})
-                picture = client.take_screenshot()
+                picture = bytes(client.take_screenshot())
                 if picture == previous:
                     return picture
                 previous = picture

@@ -9,7 +9,16 @@ from dmrl.recording.extras import copy_extras, splits
 from dmrl.recording.index import SPLIT_METADATA, Summary, TopicInfo, summary
 from dmrl.recording.inputs import input_of, provenance
 from dmrl.recording.provenance import Input, Provenance
-from dmrl.recording.reader import Stamped, columns, matching, read, read_raw, read_table, stretches
+from dmrl.recording.reader import (
+    Stamped,
+    columns,
+    log_times,
+    matching,
+    read,
+    read_raw,
+    read_table,
+    stretches,
+)
 from dmrl.recording.recover import Recovery, recover
 from dmrl.recording.resume import Interrupted, interrupted
 from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
@@ -32,6 +41,7 @@ __all__ = [
     "copy_extras",
     "input_of",
     "interrupted",
+    "log_times",
     "matching",
     "merge",
     "provenance",

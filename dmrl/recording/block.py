@@ -1,5 +1,6 @@
 """Some thousand messages as arrays of offsets into the bytes that hold them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +81,20 @@ def concatenate(first: Block | None, second: Block) -> Block:
         np.concatenate([first.publish_ns, second.publish_ns]),
         np.concatenate([first.start, second.start + shift]),
         np.concatenate([first.end, second.end + shift]),
+    )
+
+
+def joined(blocks: Sequence[Block]) -> Block:
+    """All blocks' messages over one run of bytes, none but their own."""
+    parts = [b.compact() if 2 * int((b.end - b.start).sum()) < len(b.data) else b for b in blocks]
+    shift = np.cumsum([0, *(len(part.data) for part in parts)])
+    return Block(
+        np.concatenate([part.data for part in parts]),
+        np.concatenate([part.channel for part in parts]),
+        np.concatenate([part.time_ns for part in parts]),
+        np.concatenate([part.publish_ns for part in parts]),
+        np.concatenate([part.start + k for part, k in zip(parts, shift, strict=False)]),
+        np.concatenate([part.end + k for part, k in zip(parts, shift, strict=False)]),
     )
 
 

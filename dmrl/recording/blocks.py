@@ -90,6 +90,37 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
             yield _indexed(path, stream, chunk, channels), channels
 
 
+def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
+    """Log times of topics, as they stand in the message indexes; chunks are not unpacked.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording.
+    """
+    parts: dict[str, list[Ints]] = {topic: [_NO_TIMES] for topic in topics}
+    with opened(path) as stream:
+        summary = mcap_summary(path, stream)
+        chunks = [] if summary is None else summary.chunk_indexes
+        indexed = bool(chunks) and all(chunk.message_index_offsets for chunk in chunks)
+        for chunk in chunks if indexed else ():
+            first = chunk.chunk_start_offset + chunk.chunk_length
+            stream.seek(first)
+            raw = stream.read(chunk.message_index_length)
+            for number, at in chunk.message_index_offsets.items():
+                topic = summary.channels[number].topic if summary is not None else ""
+                if topic in parts:
+                    parts[topic].append(_index_entries(path, raw, at - first, number)[:, 0])
+    if not indexed:
+        for block, channels in blocks(path, topics):
+            for number, channel in channels.items():
+                parts[channel.topic].append(block.time_ns[block.channel == number])
+    return {topic: np.concatenate(times) for topic, times in parts.items()}
+
+
+_NO_TIMES: Ints = np.empty(0, np.int64)
+
+
 def _message_count(summary: McapSummary) -> int:
     return summary.statistics.message_count if summary.statistics else 1
 

@@ -11,11 +11,12 @@ import pyarrow as pa
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
+from numpy.typing import NDArray
 
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.messages import descriptor, pool_of
-from dmrl.recording.block import EMPTY, Block, concatenate
-from dmrl.recording.blocks import blocks
+from dmrl.recording.block import EMPTY, Block, joined
+from dmrl.recording.blocks import blocks, indexed_times
 from dmrl.recording.index import TopicInfo, channel_on, damaged, summary
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
@@ -234,15 +235,50 @@ def stretches(
     present = summary(path).topics
     names = frozenset(topic for topic in fields if topic in present)
     _require_types(path, present, names)
-    held: Block | None = None
+    held: list[Block] = []
+    size = 0
     channels: dict[int, Channel] = {}
     for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):
-        held = concatenate(held, block)
-        if len(held.data) >= STRETCH_BYTES:
-            yield _by_topic(path, held, channels, fields)
-            held = None
-    if held is not None:
-        yield _by_topic(path, held, channels, fields)
+        held.append(block)
+        size += len(block.data)
+        if size >= STRETCH_BYTES:
+            yield _by_topic(path, joined(held), channels, fields)
+            held, size = [], 0
+    if held:
+        yield _by_topic(path, joined(held), channels, fields)
+
+
+def log_times(
+    path: Path, topics: Iterable[str], *, start_ns: int | None = None, end_ns: int | None = None
+) -> dict[str, NDArray[np.int64]]:
+    """Log times of topics, as the index has them: no message is read.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    topics
+        Those that the recording lacks are left out.
+    start_ns, end_ns
+        Only log times in [start_ns, end_ns), nanoseconds.
+
+    Returns
+    -------
+    dict
+        Topic to (N,) log times, sorted.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording.
+    """
+    present = summary(path).topics
+    names = frozenset(topic for topic in topics if topic in present)
+    _require_types(path, present, names)
+    low = 0 if start_ns is None else start_ns
+    high = np.iinfo(np.int64).max if end_ns is None else end_ns
+    found = {topic: np.sort(times) for topic, times in indexed_times(path, names).items()}
+    return {topic: t[(t >= low) & (t < high)] for topic, t in found.items()}
 
 
 def _by_topic(

@@ -3,6 +3,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 
@@ -12,9 +13,12 @@ from dmrl.recording import (
     Provenance,
     RecordingWriter,
     columns,
+    log_times,
     read,
     read_raw,
     read_table,
+    reader,
+    stretches,
     summary,
 )
 
@@ -240,3 +244,28 @@ def test_a_stretch_without_messages_is_a_table_without_rows(flight: Path) -> Non
     assert table.num_rows == 0
     assert table.schema == read_table(flight, "/cf1/attitude").schema
     assert read_table(flight, "/cf1/attitude", fields=["roll_rad"], end_ns=0).num_rows == 0
+
+
+def test_topics_are_read_in_one_pass_as_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "STRETCH_BYTES", 10_000)
+    path = tmp_path / "two.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(20_000):
+            sink.write(k * 10, "/cf1/height", message("Height")(height_m=k))
+            if k % 3 == 0:
+                sink.write(k * 10, "/cf1/range/cf2", message("UwbRange")(range_m=-k))
+    wanted = {"/cf1/height": None, "/cf1/range/cf2": ("range_m",), "/cf9/height": None}
+    found: dict[str, list[pa.RecordBatch]] = {}
+    for stretch in stretches(path, wanted, start_ns=100, end_ns=190_000):
+        for topic, batch in stretch.items():
+            found.setdefault(topic, []).append(batch)
+    assert sorted(found) == ["/cf1/height", "/cf1/range/cf2"]
+    for topic, batches in found.items():
+        alone = read_table(path, topic, start_ns=100, end_ns=190_000)
+        assert pa.Table.from_batches(batches).equals(alone)
+    times = log_times(path, wanted, start_ns=100, end_ns=190_000)
+    assert sorted(times) == ["/cf1/height", "/cf1/range/cf2"]
+    for topic, ns in times.items():
+        assert ns.tolist() == [t for b in found[topic] for t in b["log_time"].to_pylist()]
