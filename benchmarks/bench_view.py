@@ -26,7 +26,7 @@ from dmrl.images import decode
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read, summary, trim
 from dmrl.stages import fly
-from dmrl.viewer import Settings, save, window
+from dmrl.viewer import Settings, process, save, session, window
 
 RATE_HZ = 20
 ROWS, COLS = 28, 40
@@ -101,7 +101,7 @@ def with_dmrl(path: Path, out: Path, layout: str) -> dict[str, float]:
 
 def with_rerun(path: Path, out: Path) -> dict[str, float]:
     """The same of rerun's own importer of MCAP."""
-    program = window._command(window.LOOPBACK)[0]
+    program = process.command(process.LOOPBACK)[0]
     subprocess.run([program, "mcap", "convert", str(path), "-o", str(out)], check=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
@@ -116,14 +116,14 @@ def first_picture(path: Path, layout: str) -> dict[str, float]:
 
     The clock starts with the process: imports count. What is drawn is looked for every 0.1 s.
     """
-    show = window.prepare([path], Settings(layout=layout))  # type: ignore[arg-type]
-    port = window._free_port(window.LOOPBACK)
+    show = session.prepare([path], Settings(layout=layout))  # type: ignore[arg-type]
+    port = process.free_port(process.LOOPBACK)
     where = ("--headless", "--window-size", window.PICTURE_SIZE, "--port", str(port))
-    with window._viewer(window._command(window.LOOPBACK, *where)) as viewer:
-        assert window._listens(viewer, window.LOOPBACK, port)
-        sender = threading.Thread(target=window._stream, args=(show, viewer, port))
+    with process.running(process.command(process.LOOPBACK, *where)) as viewer:
+        assert process.listens(viewer, process.LOOPBACK, port)
+        sender = threading.Thread(target=process.stream_to, args=(show, viewer, port))
         sender.start()
-        client = window.ViewerClient.connect(window._url(port))
+        client = window.ViewerClient.connect(process.url_of(port))
         child = psutil.Process(viewer.process.pid)
         while not _seen(client):
             time.sleep(0.1)

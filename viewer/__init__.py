@@ -2,7 +2,7 @@
 
 ``entities`` (images), ``space`` (3D) and ``plots`` turn a topic's columns into archetypes,
 ``layouts`` arranges them; ``flight``, ``compare`` and ``browse`` say what a layout shows;
-``session`` logs what ``selection`` chose, ``window`` runs rerun's viewer.
+``session`` logs what ``selection`` chose; ``window`` and ``web`` run rerun's viewer.
 """
 
 from dmrl.errors import MissingExtra
@@ -10,7 +10,8 @@ from dmrl.errors import MissingExtra
 try:
     from dmrl.viewer.selection import Settings
     from dmrl.viewer.session import save
-    from dmrl.viewer.window import Page, Web, page, screenshot, serve, view
+    from dmrl.viewer.web import Page, Web, page, serve
+    from dmrl.viewer.window import screenshot, view
 except ImportError as e:
     raise MissingExtra("rerun-sdk", "view", "dmrl view") from e
 

@@ -81,8 +81,9 @@ def errors(path: str, positions: Positions, truth: Positions) -> Iterator[Entity
 
 def _nees(error: Array, covariance: Array) -> Array:
     """(N,) squared errors in units of their covariance; NaN where it is unknown or zero."""
-    known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
-    known &= np.linalg.det(np.where(known[:, None, None], covariance, 0.0)) > 0
+    given = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    spread = np.linalg.det(np.where(np.reshape(given, (-1, 1, 1)), covariance, 0.0))
+    known = np.flatnonzero(spread > 0)
     out = np.full(len(error), np.nan)
     solved = np.linalg.solve(covariance[known], error[known][:, :, None])[:, :, 0]
     out[known] = np.einsum("ni,ni->n", error[known], solved)

@@ -1,0 +1,158 @@
+"""rerun's viewer as a child process that reports to nobody.
+
+What it shows is streamed to it, so that it can be looked at while the rest is read.
+"""
+
+import errno
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.resources import files
+from tempfile import TemporaryFile
+
+from dmrl.errors import SettingError
+from dmrl.viewer.session import log
+from dmrl.viewer.show import Show, stream_of
+
+LOOPBACK = "127.0.0.1"
+PATIENCE_S = 60.0
+
+# CI=1 turns rerun's usage statistics off; its look-up of newer versions has no switch, so the
+# web is put out of its reach, at a port where nobody listens. Its warnings would be drawn over
+# a picture.
+NOWHERE = f"http://{LOOPBACK}:9"
+PROXIES = ("all_proxy", "http_proxy", "https_proxy")
+QUIET = {name: NOWHERE for lower in PROXIES for name in (lower, lower.upper())} | {
+    "CI": "1",
+    "NO_PROXY": LOOPBACK,
+    "RUST_LOG": "error",
+}
+
+
+class Viewer:
+    """rerun's viewer as a child process."""
+
+    def __init__(self, command: list[str]) -> None:
+        # Lives as long as the viewer.
+        self._errors = TemporaryFile()  # noqa: SIM115
+        self.process = subprocess.Popen(command, env=environment(), stderr=self._errors)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it has not ended."""
+        return self.process.poll() is None
+
+    def said(self) -> str:
+        """All that it has said on standard error."""
+        self._errors.seek(0)
+        return self._errors.read().decode(errors="replace")
+
+    def close(self) -> None:
+        """End it."""
+        self.process.kill()
+        self.process.wait()
+        self._errors.close()
+
+
+@contextmanager
+def running(words: list[str]) -> Iterator[Viewer]:
+    """A viewer that ends with the block."""
+    viewer = Viewer(words)
+    try:
+        yield viewer
+    finally:
+        viewer.close()
+
+
+def listens(viewer: Viewer, host: str, port: int) -> bool:
+    """Whether the viewer is there to be talked to, or has ended."""
+    deadline = time.monotonic() + PATIENCE_S
+    while viewer.alive and time.monotonic() < deadline:
+        with suppress(OSError), socket.create_connection((host, port), timeout=1):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def stream_to(show: Show, viewer: Viewer, port: int, host: str = LOOPBACK) -> None:
+    """Send everything, unless the viewer is closed meanwhile."""
+    stream = stream_of()
+    stream.connect_grpc(url_of(port, host), default_blueprint=show.blueprint)
+    try:
+        log(show, stream, wanted=lambda: viewer.alive)
+        if viewer.alive:
+            stream.flush(timeout_sec=PATIENCE_S)
+    except RuntimeError:
+        if viewer.alive:
+            raise
+    finally:
+        stream.disconnect()
+
+
+def command(bind: str, *arguments: str) -> list[str]:
+    """Words that start the viewer."""
+    program = files("rerun_cli").joinpath("rerun")
+    return [str(program), "--bind", bind, "--hide-welcome-screen", *arguments]
+
+
+def environment() -> dict[str, str]:
+    """What the viewer finds around it."""
+    return os.environ | QUIET
+
+
+def url_of(port: int, host: str = LOOPBACK) -> str:
+    """Where a viewer takes what it shows."""
+    return f"rerun+http://{host}:{port}/proxy"
+
+
+def free_port(bind: str) -> int:
+    """A port that nobody listens on.
+
+    Raises
+    ------
+    SettingError
+        If the address is not one of this computer's.
+    """
+    with _socket(bind) as probe:
+        return _bound(probe, bind, 0)
+
+
+def require_free(bind: str, port: int) -> None:
+    """Nothing, if nobody listens on a port.
+
+    Raises
+    ------
+    SettingError
+        If somebody does, or the address is not one of this computer's.
+    """
+    with _socket(bind) as probe:
+        _bound(probe, bind, port)
+
+
+def _socket(bind: str) -> socket.socket:
+    return socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET)
+
+
+def _bound(probe: socket.socket, bind: str, port: int) -> int:
+    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        probe.bind((bind, port))
+    except socket.gaierror:
+        raise SettingError(f"{bind} is no address. Try: --bind {LOOPBACK}") from None
+    except OSError as e:
+        if e.errno == errno.EADDRINUSE:
+            raise SettingError(
+                f"port {port} is in use. Choose another --port, or leave it out"
+            ) from None
+        raise SettingError(
+            f"cannot listen on {bind}, port {port}: {e.strerror}. Try: --bind {LOOPBACK}"
+        ) from None
+    return int(probe.getsockname()[1])
+
+
+def last_line(said: str) -> str:
+    """The last that a viewer said."""
+    return said.strip().rpartition("\n")[2] or "it said nothing"
