@@ -84,7 +84,9 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
     folder, recordings = _sorted_out(paths, settings)
     ranked = _ranked(folder, recordings, settings)
     if rank is not None and not 1 <= rank <= len(ranked.rows):
-        raise SettingError(f"{folder} shows {len(ranked.rows)} rows. Give --rank 1 to that")
+        raise SettingError(
+            f"{folder} shows {len(ranked.rows)} rows. Give --rank 1 to {len(ranked.rows)}"
+        )
     scales = entities.scales(settings.depth_max_m)
     rows, cols = _grid_shape(ranked.rows)
     eye = Eye(
