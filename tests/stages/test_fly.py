@@ -162,7 +162,7 @@ def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
 
 
 def test_blender_renders_what_is_labelled_in_one_place(blender: Path, tmp_path: Path) -> None:
-    drawn = Settings(2, 3.0, noise="ideal", seed=1, camera=True, camera_rate_hz=1.0)
+    drawn = Settings(2, 3.0, seed=0, camera=True, camera_rate_hz=1.0)
     rendered = replace(drawn, camera_renderer="blender", cameras_max=1)
     paths = [tmp_path / f"{name}.mcap" for name in ("drawn", "rendered", "again")]
     for path, settings in zip(paths, (drawn, rendered, rendered), strict=True):
