@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.estimation.estimate import OK, Estimate, estimate_ekf, estimate_pairs
+from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+from dmrl.estimation.gate import OK
 from dmrl.estimation.pair import Pair, Track, resample, usable_ranges
 from dmrl.estimation.score import Figures, Judged, figures, overall
 from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
