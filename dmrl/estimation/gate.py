@@ -15,7 +15,7 @@ OK, UNCONVERGED, AMBIGUOUS = range(3)
 
 GATE_M = 0.3
 """A position that is off by more than this is a bad one."""
-EXPECTED_SHARE = 0.03
+EXPECTED_SHARE = 0.035
 """Share of a flight's OK positions that may be expected to be bad. The 95 % ellipses of
 realistic flights in view hold nearly 97 %: it comes out at 1 %."""
 WORST_SHARE = 0.15
