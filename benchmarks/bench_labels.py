@@ -106,7 +106,7 @@ def cost(robots: int, duration_s: float, flights: int) -> float:
 
 def costs(stem: Path | None) -> None:
     """Print, and draw, the cost against length and robots."""
-    lengths = [(s, cost(2, s, 10)) for s in (25.0, 50.0, 100.0, 200.0, 400.0)]
+    lengths = [(s, cost(2, s, 3)) for s in (25.0, 50.0, 100.0, 200.0, 400.0)]
     swarms = [(n * (n - 1), cost(n, 100.0, 1)) for n in (2, 3, 5, 7, 10)]
     for what, rows in (("seconds of flight, 2 pairs", lengths), ("pairs, 100 s", swarms)):
         print(f"\n{what:>28}   cpu-s")
