@@ -126,17 +126,8 @@ def costs(stem: Path | None) -> None:
         figure.savefig(stem.with_suffix(".png"), dpi=150)
 
 
-def main() -> None:
-    """Print every table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--flights", type=int, default=50)
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--only", choices=list(TRAJECTORIES))
-    parser.add_argument("--noise", choices=[n for n in NOISE if n != "ideal"])
-    parser.add_argument("--no-published", action="store_true", help="the batch solve alone")
-    parser.add_argument("--no-costs", action="store_true")
-    parser.add_argument("--plot", type=Path)
-    given = parser.parse_args()
+def tables(given: argparse.Namespace) -> None:
+    """Print the figures of every noise preset and trajectory asked for, and of all together."""
     print(f"{given.flights} flights of 100 s each; RMSE, 95 % and coverage after {SETTLE_S:g} s")
     print("kept: status OK; good: kept samples within 0.3 m; the second coverage: of kept samples")
     print(HEAD)
@@ -150,6 +141,22 @@ def main() -> None:
                 kept.setdefault(method, []).extend(found)
     for method, found in kept.items():
         print(line("all", "all", method, found, float("nan")))
+
+
+def main() -> None:
+    """Print every table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--flights", type=int, default=50)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--only", choices=list(TRAJECTORIES))
+    parser.add_argument("--noise", choices=[n for n in NOISE if n != "ideal"])
+    parser.add_argument("--no-published", action="store_true", help="the batch solve alone")
+    parser.add_argument("--no-costs", action="store_true")
+    parser.add_argument("--costs-only", action="store_true")
+    parser.add_argument("--plot", type=Path)
+    given = parser.parse_args()
+    if not given.costs_only:
+        tables(given)
     if not given.no_costs:
         costs(given.plot)
 

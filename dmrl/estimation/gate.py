@@ -16,8 +16,8 @@ OK, UNCONVERGED, AMBIGUOUS = range(3)
 GATE_M = 0.3
 """A position that is off by more than this is a bad one."""
 EXPECTED_SHARE = 0.035
-"""Share of a flight's OK positions that may be expected to be bad. The 95 % ellipses of
-realistic flights in view hold nearly 97 %: it comes out at 1 %."""
+"""Share of a flight's OK positions that may be expected to be bad. Covariances are cautious, and
+few flights spend all of it: some 1 % are bad in the end."""
 WORST_SHARE = 0.15
 """Probability of being bad that no OK position exceeds."""
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25

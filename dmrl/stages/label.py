@@ -58,8 +58,8 @@ class Settings:
     preset
         ekf: its noise, as published for simulation or in the firmware.
     gate_m
-        A position that is off by more than this is bad, metres: OK are as many as come with
-        some one in a hundred bad ones.
+        A position that is off by more than this is a bad one, metres. About one in a hundred of
+        those that are OK is bad.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
     range_offset_m
