@@ -20,7 +20,7 @@ KEY_HZ = 10.0
 """Keyframes per second."""
 INFLATION = 0.96
 """Sigmas of the batch solve are multiplied by this, and where biases are larger than the
-default's by some more: the 95 % ellipse then holds 92 to 97 % in view."""
+default's by some more: the 95 % ellipse then holds 92 to 98 % in view."""
 SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
