@@ -16,16 +16,25 @@ folder is the camera that took the pictures as they are stored (keys: see ``Came
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 from dmrl import images
 from dmrl.errors import SettingError, SourceError
+from dmrl.formats.camera_toml import read_camera
 from dmrl.formats.crop import Crop
 from dmrl.formats.label_table import LabelRow, read_labels
-from dmrl.formats.sample import Content, Sample, calibration, image, intervals, labels
-from dmrl.geometry import Camera
+from dmrl.formats.sample import (
+    Content,
+    Format,
+    Options,
+    Sample,
+    calibration,
+    image,
+    intervals,
+    labels,
+)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
 LABELS = "labels.csv"
@@ -33,31 +42,6 @@ CALIBRATION = "calibration.toml"
 TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
 NS_PER_S = 1_000_000_000
 TIME_MAX_NS = 2**63 - 1
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How a folder of pictures becomes samples.
-
-    Parameters
-    ----------
-    robot
-        Robot that carries the camera.
-    rate_hz
-        Pictures per second where their names are not times.
-    labels
-        CSV file; None: labels.csv in the folder, if there.
-    camera
-        Camera that took the pictures as they are stored; None: not known.
-    size_px
-        Width and height to crop and scale to; None: pictures stay as they are.
-    """
-
-    robot: str = "cf1"
-    rate_hz: float = 10.0
-    labels: Path | None = None
-    camera: Camera | None = None
-    size_px: tuple[int, int] | None = None
 
 
 def recognises(source: Path) -> bool:
@@ -77,7 +61,7 @@ def content(source: Path, options: Options) -> Content:
     source
         The folder.
     options
-        See ``Options``.
+        All but ``peers`` count.
 
     Raises
     ------
@@ -87,6 +71,9 @@ def content(source: Path, options: Options) -> Content:
     SettingError
         If the camera is not of the pictures' size.
     """
+    own = source / CALIBRATION
+    if options.camera is None and own.is_file():
+        options = replace(options, camera=read_camera(own))
     pictures = list_pictures(source, options.rate_hz)
     path = options.labels or source / LABELS
     known = {picture.name for _, picture in pictures}
@@ -162,3 +149,6 @@ def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
             f"{camera.height_px}. Give the calibration of the pictures as they are stored"
         )
     return Crop(width_px, height_px, *(options.size_px or (width_px, height_px)))
+
+
+FORMAT = Format("images", "a folder of pictures", recognises, content)

@@ -17,7 +17,7 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats import flight_sample
 from dmrl.formats.flight_sample import from_poses, in_order, nanoseconds
-from dmrl.formats.sample import Content, Sample
+from dmrl.formats.sample import Content, Format, Options, Sample
 from dmrl.geometry import Array
 
 RATE_HZ = 10.0
@@ -34,7 +34,7 @@ def recognises(source: Path) -> bool:
     return any(map(POSE.fullmatch, names)) and any(map(RANGE.fullmatch, names))
 
 
-def content(source: Path) -> Content:
+def content(source: Path, _options: Options | None = None) -> Content:
     """Samples of the file, robots named turtle1, turtle3, ...
 
     Parameters
@@ -99,3 +99,6 @@ def _ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
     return flight_sample.ranges(
         f"turtle{int(one)}", f"turtle{int(other)}", time_ns[kept], range_m[kept]
     )
+
+
+FORMAT = Format("uwb-tiers", "ranges with motion capture", recognises, content)

@@ -4,14 +4,15 @@ from pathlib import Path
 import pytest
 
 from dmrl.formats.image_folder import SUFFIXES
+from dmrl.formats.known import FORMATS
 from dmrl.formats.label_table import COLUMNS
 from dmrl.geometry import Camera
-from dmrl.stages.convert import CAMERAS, KINDS
+from dmrl.stages.convert import CAMERAS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "sources.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FORMATS)
 def test_every_kind_is_documented(kind: str) -> None:
     assert f"## `{kind}`" in TEXT
 

@@ -7,8 +7,7 @@ import pytest
 
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import image_folder
-from dmrl.formats.image_folder import Options
-from dmrl.formats.sample import Sample
+from dmrl.formats.sample import Options, Sample
 from dmrl.geometry import AIDECK, project
 from dmrl.images import decode, encode_jpeg, encode_png
 
