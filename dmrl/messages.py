@@ -76,7 +76,7 @@ class LogType:
     name
         Of the event or block.
     variables
-        Names and types, the latter in the letters of ``struct``: ``b B h H i I e f d``.
+        Names and types, the latter in the letters of ``struct``: ``b B h H i I q e f d``.
     """
 
     name: str
@@ -98,7 +98,7 @@ class LogType:
 LOG_PACKAGE = "dmrl.log"
 _F = FieldDescriptorProto
 _OF_CODE = dict.fromkeys("BHI", _F.TYPE_UINT32) | dict.fromkeys("bhi", _F.TYPE_SINT32)
-_OF_CODE |= {"e": _F.TYPE_FLOAT, "f": _F.TYPE_FLOAT, "d": _F.TYPE_DOUBLE}
+_OF_CODE |= {"q": _F.TYPE_SINT64, "e": _F.TYPE_FLOAT, "f": _F.TYPE_FLOAT, "d": _F.TYPE_DOUBLE}
 
 
 def _identifier(text: str) -> str:

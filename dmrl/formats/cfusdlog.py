@@ -251,7 +251,7 @@ def content(source: Path, options: Options) -> Content:
     source
         The file or folder.
     options
-        ``robot`` names the robot of a single file; ``peers`` the robots ranged to.
+        ``robot`` names the robot of a single file; ``names`` the robots ranged to.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def _streams(robot: str, path: Path, options: Options) -> list[crazyflie_log.Str
         say(warning)
     if not log.blocks:
         raise SourceError(f"{path} has a header, but no whole record. Name another log")
-    return crazyflie_log.streams(robot, log.blocks, options.peers, path)
+    return crazyflie_log.streams(robot, log.blocks, options.names, path)
 
 
 FORMAT = Format(

@@ -43,7 +43,7 @@ Stream = Iterator[Sample]
 
 
 def streams(
-    robot: str, blocks: Sequence[Block], peers: Mapping[int, str], where: object = "the log"
+    robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object = "the log"
 ) -> list[Stream]:
     """Samples of a robot's log: each stream in time order.
 
@@ -53,7 +53,7 @@ def streams(
         Its name.
     blocks
         What it logged.
-    peers
+    names
         Names of the robots that it ranges to, by their number; others are ``cf<number>``.
     where
         The source, for warnings.
@@ -64,7 +64,7 @@ def streams(
     if attitude is not None:
         found.append(_attitude(robot, attitude, yaw_rate_of(blocks, attitude)))
     found += _motion(robot, blocks, attitude, where)
-    found += ranges_of(robot, blocks, peers, where)
+    found += ranges_of(robot, blocks, names, where)
     found += _poses(robot, blocks)
     return found
 
@@ -194,11 +194,11 @@ def _flown_over(blocks: Sequence[Block], attitude: Series | None) -> Series | No
 
 
 def ranges_of(
-    robot: str, blocks: Sequence[Block], peers: Mapping[int, str], where: object
+    robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object
 ) -> Iterator[Stream]:
     """UWB distances. A logged value that did not change is the same measurement still."""
     for number, time_ns, range_m in _distances(blocks):
-        peer = peers.get(number, f"cf{number}")
+        peer = names.get(str(number), f"cf{number}")
         usable = np.isfinite(range_m) & (range_m > 0) & (range_m < RANGE_MAX_M)
         if refused := int((np.isfinite(range_m) & (range_m != 0) & ~usable).sum()):
             say(f"{where}: {refused} ranges to {peer} left out: not over 0 and under 60 m")

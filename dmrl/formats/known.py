@@ -8,10 +8,15 @@ from pathlib import Path
 
 from dmrl.errors import SourceError
 from dmrl.formats import (
+    aideck_stream,
+    cfclient_csv,
     cfusdlog,
     flight_csv,
+    hyperflash,
     image_folder,
     locanet,
+    nanocockpit,
+    ros,
     uwb_tiers,
 )
 from dmrl.formats.sample import Format
@@ -23,7 +28,12 @@ FORMATS = {
         locanet.FORMAT,
         flight_csv.FORMAT,
         uwb_tiers.FORMAT,
+        ros.FORMAT,
+        nanocockpit.FORMAT,
+        cfclient_csv.FORMAT,
         cfusdlog.FORMAT,
+        aideck_stream.FORMAT,
+        hyperflash.FORMAT,
         image_folder.FORMAT,
     )
 }

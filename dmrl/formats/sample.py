@@ -65,8 +65,8 @@ class Options:
     ----------
     robot
         Robot that carries the camera, or whose log it is.
-    peers
-        Names of other robots by the numbers that logs have for them.
+    names
+        Names of robots by those, or the numbers, that the source has for them.
     rate_hz
         Pictures per second where the source has no times.
     labels
@@ -75,14 +75,17 @@ class Options:
         Camera that took the pictures as they are stored; None: the source's own.
     size_px
         Width and height to crop and scale pictures to; None: they stay as they are.
+    raw
+        Grey pictures are as a colour sensor gave them (RGGB).
     """
 
     robot: str = "cf1"
-    peers: Mapping[int, str] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
     rate_hz: float = 10.0
     labels: Path | None = None
     camera: Camera | None = None
     size_px: tuple[int, int] | None = None
+    raw: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,8 +39,9 @@ class Settings:
         What SOURCE is, as docs/sources.md names it. Guessed where it can be.
     robot
         Robot that carries the camera, or whose log it is.
-    peers
-        Names of other robots by their numbers in logs: 0=cf2,1=cf3. Others are cf0, cf1, ...
+    names
+        Names of robots by those that the source has for them: 0=cf2,turtle_cap=turtle1. The
+        numbers in logs are else cf0, cf1, ...
     rate_hz
         Pictures per second, where the source has no times.
     labels
@@ -52,16 +53,19 @@ class Settings:
         images: crop to the middle and scale to this width. Needs the height too.
     height_px
         images: crop to the middle and scale to this height. Needs the width too.
+    raw
+        images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
     """
 
     source_kind: Annotated[str | None, Parameter(name="--from")] = None
     robot: str = "cf1"
-    peers: str | None = None
+    names: str | None = None
     rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 10.0
     labels: Path | None = None
     camera: Path | None = None
     width_px: Positive | None = None
     height_px: Positive | None = None
+    raw: Annotated[bool, Parameter(negative=())] = False
 
 
 def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
@@ -119,21 +123,22 @@ def _options(settings: Settings) -> Options:
         raise SettingError("--width-px and --height-px go together. Give both, or neither")
     return Options(
         robot=settings.robot,
-        peers=_peers(settings.peers),
+        names=_names(settings.names),
         rate_hz=settings.rate_hz,
         labels=settings.labels,
         camera=_camera(settings.camera),
         size_px=None if width_px is None or height_px is None else (width_px, height_px),
+        raw=settings.raw,
     )
 
 
-def _peers(text: str | None) -> dict[int, str]:
+def _names(text: str | None) -> dict[str, str]:
     found = {}
     for part in text.split(",") if text else []:
-        number, _, name = part.strip().partition("=")
-        if not (number.isdecimal() and ROBOT.fullmatch(name)):
-            raise SettingError(f"--peers {part.strip()!r} is not NUMBER=ROBOT. Try: 0=cf2,1=cf3")
-        found[int(number)] = name
+        old, _, new = part.strip().partition("=")
+        if not (old and ROBOT.fullmatch(new)):
+            raise SettingError(f"--names {part.strip()!r} is not OLD=NEW. Try: 0=cf2,1=cf3")
+        found[old] = new
     return found
 
 
