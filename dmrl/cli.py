@@ -22,7 +22,7 @@ COMMANDS = {
     "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
-    "convert": "Convert SOURCE, a foreign file or folder, into a recording.",
+    "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
     "card": "Write a dataset's card and figures again.",

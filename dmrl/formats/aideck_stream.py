@@ -96,9 +96,7 @@ def _pictures(source: Path, time_ns: Sequence[int], options: Options) -> Iterato
 
 def _states(states: Sequence[State], options: Options, source: Path) -> list[crazyflie_log.Stream]:
     """What the robot told its camera, each state once."""
-    fresh = [
-        s for k, s in enumerate(states) if k == 0 or s.received_us != states[k - 1].received_us
-    ]
+    fresh = list({state.received_us: state for state in states}.values())
     if not fresh:
         return []
     columns = {

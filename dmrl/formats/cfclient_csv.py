@@ -6,7 +6,6 @@ folder of such files. In a folder of folders, each of them is a robot, named aft
 
 import csv
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +35,9 @@ def _robots(source: Path, robot: str) -> dict[str, list[Path]]:
         return {robot: [source]} if _is_log(source) else {}
     if own := sorted(path for path in source.glob("*.csv") if _is_log(path)):
         return {robot: own}
-    below = {
-        folder.name: sorted(filter(_is_log, folder.glob("*.csv"))) for folder in _folders(source)
-    }
+    folders = [path for path in sorted(source.iterdir()) if path.is_dir()]
+    below = {folder.name: sorted(filter(_is_log, folder.glob("*.csv"))) for folder in folders}
     return {name: paths for name, paths in below.items() if paths}
-
-
-def _folders(source: Path) -> Iterator[Path]:
-    return (path for path in sorted(source.iterdir()) if path.is_dir())
 
 
 def _is_log(path: Path) -> bool:

@@ -63,11 +63,14 @@ def content(source: Path, options: Options) -> Content:
     lost = int((np.diff(unwrap(table[NUMBER], 8)) - 1).clip(0).sum())
     if lost:
         say(f"{source}: {lost} pictures were lost on the way, by their numbers")
-    state_ns = (
-        time_ns + ((table[STATE_TIME] - table[TIME] + (1 << 31)) % (1 << 32) - (1 << 31)) * 1000
-    )
+    state_ns = time_ns + _nearest(table[STATE_TIME] - table[TIME]) * 1000
     streams = [_pictures(paths, np.maximum.accumulate(time_ns), options)]
     return Content(in_order(streams + _state(table, state_ns, options, source)))
+
+
+def _nearest(ticks: Times) -> Times:
+    """Differences of two 32-bit counts, without the wrap that may lie between them."""
+    return np.asarray((ticks + (1 << 31)) % (1 << 32) - (1 << 31))
 
 
 def _read(path: Path) -> tuple[list[str], dict[str, Times]]:

@@ -8,11 +8,13 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
 from dmrl.errors import SettingError
+from dmrl.export.ros2 import write_bag
+from dmrl.export.tables import write_tables
 from dmrl.formats.camera_toml import read_camera
 from dmrl.formats.known import format_of
 from dmrl.formats.sample import Content, Options
@@ -55,6 +57,9 @@ class Settings:
         images: crop to the middle and scale to this height. Needs the width too.
     raw
         images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
+    to
+        The other way: SOURCE is a recording, OUT a folder of tables (csv, parquet) or a ROS 2
+        bag (ros2).
     """
 
     source_kind: Annotated[str | None, Parameter(name="--from")] = None
@@ -66,17 +71,18 @@ class Settings:
     width_px: Positive | None = None
     height_px: Positive | None = None
     raw: Annotated[bool, Parameter(negative=())] = False
+    to: Literal["csv", "parquet", "ros2"] | None = None
 
 
 def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
-    """Messages per topic of the recording written to ``out``.
+    """Messages per topic of the recording, or rows of the tables, written to ``out``.
 
     Parameters
     ----------
     source
-        A foreign file or folder.
+        A foreign file or folder; with ``settings.to``, a recording.
     out
-        Recording to write. Must not exist.
+        Recording, or folder, to write. Must not exist.
     settings
         See `Settings`.
 
@@ -90,6 +96,10 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
         If ``out`` exists or cannot be written.
     """
     refuse_existing(out)
+    if settings.to == "ros2":
+        return write_bag(source, out)
+    if settings.to is not None:
+        return write_tables(source, out, settings.to)
     options = _options(settings)
     content = format_of(source, settings.source_kind).content(source, options)
     read = [path for path in (settings.labels, settings.camera) if path and path.is_file()]
@@ -157,14 +167,14 @@ def command(
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Convert SOURCE, a foreign file or folder, into a recording.
+    """Convert a foreign file or folder into a recording, or a recording into files.
 
     Parameters
     ----------
     source
         A foreign file or folder: pictures, flight logs, dumps of a camera deck, ROS bags.
     out
-        Recording to write. Must not exist.
+        Recording to write; with --to, a folder. Must not exist.
     as_json
         Print one JSON document in place of the table.
     """
@@ -172,4 +182,4 @@ def command(
     if as_json:
         print_json({"recording": str(out), "messages": counts})
         return
-    print_table(str(out), ("topic", "messages"), list(counts.items()))
+    print_table(str(out), ("topic", "rows" if settings.to else "messages"), list(counts.items()))

@@ -8,7 +8,9 @@ Variables = Sequence[tuple[str, str]]
 Record = tuple[int, int, tuple[float, ...]]
 
 
-def encode(events: dict[int, tuple[str, Variables]], records: Sequence[Record], version: int = 2):
+def encode(
+    events: dict[int, tuple[str, Variables]], records: Sequence[Record], version: int = 2
+) -> bytes:
     """A log: events by id, records of (id, ticks, values)."""
     out = bytearray(struct.pack("<BHH", 0xBC, version, len(events)))
     for number, (name, variables) in events.items():
