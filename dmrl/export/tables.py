@@ -9,11 +9,13 @@ In CSV, lists are JSON and other bytes base64; in Parquet both stay what they ar
 
 import base64
 import json
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from dmrl.errors import MissingExtra
 from dmrl.output import partial_folder
@@ -39,16 +41,14 @@ def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
     Raises
     ------
     MissingExtra
-        If pandas is not installed.
+        If pandas, which writes CSV, is not installed.
     RecordingError
         If the recording cannot be read, or a topic is not protobuf.
     OutputError
         If ``out`` exists or cannot be written.
     """
-    try:
-        import pandas  # noqa: F401, PLC0415
-    except ModuleNotFoundError as e:
-        raise MissingExtra("pandas", "table", f"convert --to {kind}") from e
+    if kind == "csv" and find_spec("pandas") is None:
+        raise MissingExtra("pandas", "table", "convert --to csv")
     found = summary(recording)
     counts = {}
     with partial_folder(out) as folder:
@@ -112,10 +112,10 @@ def _rows(table: pa.Table, name: str) -> pa.Table:
 
 
 def _write(table: pa.Table, path: Path, kind: Kind) -> None:
-    frame = table.to_pandas(types_mapper=_nullable)
     if kind == "parquet":
-        frame.to_parquet(path, index=False)
+        pq.write_table(table, path)
         return
+    frame = table.to_pandas(types_mapper=_nullable)
     for field in table.schema:
         if pa.types.is_list(field.type):
             frame[field.name] = [_json(v) for v in table[field.name].to_pylist()]

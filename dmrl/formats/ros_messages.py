@@ -79,8 +79,8 @@ def _compressed(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
 
 
 def _camera_info(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
-    k = np.asarray(message.k if hasattr(message, "k") else message.K, float)
-    p = np.asarray(message.p if hasattr(message, "p") else message.P, float)
+    k = np.array(message.k if hasattr(message, "k") else message.K, float)
+    p = np.array(message.p if hasattr(message, "p") else message.P, float)
     d = message.d if hasattr(message, "d") else message.D
     k[[2, 5]] += HALF_PX
     p[[2, 6]] += HALF_PX

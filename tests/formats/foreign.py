@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -68,7 +67,9 @@ def stream() -> bytes:
     """A CPX stream of nanocockpit's and of Bitcraze's kind, one behind the other."""
     state = State(1000, 990_000, (1.0, 2.0, 0.5), (0.1, 0.0, 0.0))
     made = b"".join(
-        pack_image(Image(32, 24, "raw", raw.tobytes(), 1_000_000 + 50_000 * k, k, state), "streamer")
+        pack_image(
+            Image(32, 24, "raw", raw.tobytes(), 1_000_000 + 50_000 * k, k, state), "streamer"
+        )
         for k, raw in enumerate(pictures(3))
     )
     return made + pack_image(Image(32, 24, "raw", pictures(1)[0].tobytes()))

@@ -156,7 +156,7 @@ def run(which: str, count: int, folder: Path) -> None:
             signal.alarm(0)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
     assert grown < MEMORY_BYTES, f"{grown / 1e6:.0f} MB"
-    print(f"{which}: {failed} of {count} refused, {grown / 1e6:.0f} MB")
+    sys.stdout.write(f"{which}: {failed} of {count} refused, {grown / 1e6:.0f} MB\n")
 
 
 def _in_a_process(which: str, count: int, folder: Path) -> str:
