@@ -23,6 +23,7 @@ COMMANDS = {
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
     "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
+    "align": "Set the clocks of robots by each other, from the ranges that both of a pair logged.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
     "card": "Write a dataset's card and figures again.",

@@ -171,6 +171,10 @@ def _header(types: Any, time_ns: int, frame: str) -> Any:
     return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
 
 
+def _stamp_ns(message: Any) -> int:
+    return int(message.timestamp.seconds * 1_000_000_000 + message.timestamp.nanos)
+
+
 def _vector(types: Any, name: str, value: Any) -> Any:
     return types[f"geometry_msgs/msg/{name}"](x=value.x, y=value.y, z=value.z)
 
@@ -221,7 +225,7 @@ def _pose(types: Any, message: Any, time_ns: int) -> Any:
 def _transforms(types: Any, message: Any, time_ns: int) -> Any:
     frames = [
         types["geometry_msgs/msg/TransformStamped"](
-            header=_header(types, time_ns, frame.parent_frame_id),
+            header=_header(types, _stamp_ns(frame) or time_ns, frame.parent_frame_id),
             child_frame_id=frame.child_frame_id,
             transform=types["geometry_msgs/msg/Transform"](
                 translation=_vector(types, "Vector3", frame.translation),
