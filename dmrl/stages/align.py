@@ -210,11 +210,11 @@ def command(
     rows = [
         (
             robot,
-            c.offset_s * 1e3,
-            c.drift * 1e6,
-            c.sigma_s * 1e3,
-            c.sigma_drift * 1e6,
-            c.correlation,
+            f"{c.offset_s * 1e3:.3f}",
+            f"{c.drift * 1e6:.3f}",
+            f"{c.sigma_s * 1e3:.3f}",
+            f"{c.sigma_drift * 1e6:.3f}",
+            f"{c.correlation:.3f}",
         )
         for robot, c in sorted(clocks.items())
     ]

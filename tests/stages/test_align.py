@@ -62,9 +62,7 @@ def test_a_robot_that_would_begin_before_zero_takes_all_with_it(
 
 
 def test_what_cannot_be_aligned_is_one_line(recording: Path, tmp_path: Path) -> None:
-    with pytest.raises(
-        SettingError, match="--reference cf9: no such robot with ranges. Known: cf1"
-    ):
+    with pytest.raises(SettingError, match=r"--reference cf9: no such robot .* Known: cf1"):
         run(recording, tmp_path / "out.mcap", Settings(reference="cf9"))
     alone = tmp_path / "alone.mcap"
     with RecordingWriter(alone, provenance("test")) as sink:
