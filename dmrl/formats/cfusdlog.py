@@ -30,6 +30,7 @@ VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}
 CODES = "bBhHiIef"
 TYPES_MAX = 250
 CRC_BYTES = 4
+PIECE_BYTES = 1 << 17
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -112,9 +113,9 @@ def decode(data: bytes, what: object = "the log") -> Log:
     if not data:
         raise SourceError(f"{what} is empty: the card was full, or removed. Name another log")
     version, events, body = _header(data, what)
-    sealed = len(data) - body >= CRC_BYTES and zlib.crc32(data[:-CRC_BYTES]) == int.from_bytes(
-        data[-CRC_BYTES:], "little"
-    )
+    sealed = len(data) - body >= CRC_BYTES and zlib.crc32(
+        memoryview(data)[:-CRC_BYTES]
+    ) == int.from_bytes(data[-CRC_BYTES:], "little")
     records = np.frombuffer(data, np.uint8)[: len(data) - CRC_BYTES * sealed]
     found, end = _records(records, body, events)
     warnings = [] if sealed else [f"{what}: no valid CRC at its end; cut short, or damaged"]
@@ -180,29 +181,41 @@ def _records(data: Bytes, body: int, events: list[Event]) -> tuple[list[Ints], i
     listed; but for chance they are the records, so that following the chain means to jump
     from one chance hit to the next.
     """
-    sizes = np.zeros(1 << 16, np.int64)
+    at = _ids(data, body, events)
+    # One byte of the ids tells the events apart as a rule, so that a small table will do.
+    wide = len({event.number & 0xFF for event in events}) < len(events)
+    key = data[at] | data[at + 1].astype(np.uint16) << 8 if wide else data[at]
+    mask = 0xFFFF if wide else 0xFF
+    sizes, kinds = np.zeros(mask + 1, np.int64), np.zeros(mask + 1, np.uint8)
+    for k, event in enumerate(events):
+        sizes[event.number & mask], kinds[event.number & mask] = event.dtype.itemsize, k
+    keep, end = _chain(at, at + sizes[key], body, len(data))
+    kind = kinds[key]
+    if not keep.all():
+        at, kind = at[keep], kind[keep]
+    return [at[np.flatnonzero(kind == k)] for k in range(len(events))], end
+
+
+def _ids(data: Bytes, body: int, events: list[Event]) -> Ints:
+    """Where the id of an event stands, piece by piece: small arrays stay in the cache."""
+    by_top: dict[int, list[int]] = {}
     for event in events:
-        sizes[event.number] = event.dtype.itemsize
-    at = np.flatnonzero(_ids(data, body, events)) + body
-    number = data[at] | data[at + 1].astype(np.uint16) << 8
-    target = at + sizes[number]
-    keep, end = _chain(at, target, body, len(data))
-    at, number = at[keep], number[keep]
-    return [at[number == event.number] for event in events], end
-
-
-def _ids(data: Bytes, body: int, events: list[Event]) -> NDArray[np.bool_]:
-    """Whether the id of an event stands at each byte of the body."""
-    low, high = data[body:-1], data[body + 1 :]
-    found = np.zeros(max(len(data) - body - 1, 0), bool)
-    for top in sorted({event.number >> 8 for event in events}):
-        hit = np.zeros(len(found), bool)
-        for event in events:
-            if event.number >> 8 == top:
-                hit |= low == event.number & 0xFF
-        hit &= high == top
-        found |= hit
-    return found
+        by_top.setdefault(event.number >> 8, []).append(event.number & 0xFF)
+    one, same, found = (np.empty(PIECE_BYTES, bool) for _ in range(3))
+    parts = [np.empty(0, np.int64)]
+    for start in range(body, len(data) - 1, PIECE_BYTES):
+        low = data[start : min(start + PIECE_BYTES, len(data) - 1)]
+        high = data[start + 1 : start + 1 + len(low)]
+        piece = slice(len(low))
+        for k, (top, bottoms) in enumerate(by_top.items()):
+            hit = np.equal(low, bottoms[0], out=(same if k else found)[piece])
+            for bottom in bottoms[1:]:
+                hit |= np.equal(low, bottom, out=one[piece])
+            hit &= np.equal(high, top, out=one[piece])
+            if k:
+                found[piece] |= hit
+        parts.append(np.flatnonzero(found[piece]) + start)
+    return np.concatenate(parts)
 
 
 def _chain(at: Ints, target: Ints, start: int, end: int) -> tuple[NDArray[np.bool_], int]:
@@ -210,7 +223,7 @@ def _chain(at: Ints, target: Ints, start: int, end: int) -> tuple[NDArray[np.boo
     keep = np.zeros(len(at), bool)
     if not len(at) or at[0] != start:
         return keep, start
-    stops = np.flatnonzero(np.append(target[:-1] != at[1:], True))
+    stops = np.append(np.flatnonzero(target[:-1] != at[1:]), len(at) - 1)
     goals = target[stops]
     onward = np.searchsorted(at, goals)
     reached = at[np.minimum(onward, len(at) - 1)] == goals
