@@ -1,5 +1,7 @@
 """Raw pictures of colour sensors made into RGB. The only home of OpenCV."""
 
+import numpy as np
+
 from dmrl.errors import MissingExtra
 from dmrl.images import Grey, Rgb
 
@@ -29,8 +31,7 @@ def rgb_of(raw: Grey) -> Rgb:
         import cv2  # noqa: PLC0415
     except ModuleNotFoundError as e:
         raise MissingExtra("opencv-python-headless", "bayer", "a raw picture") from e
-    rgb: Rgb = cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB)
-    return rgb
+    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB), np.uint8)
 
 
 def mosaic(rgb: Rgb) -> Grey:

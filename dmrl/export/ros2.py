@@ -127,7 +127,7 @@ class _Types:
         return name
 
     def _type(self, field: FieldDescriptor) -> str:
-        if field.type == F.TYPE_MESSAGE:
+        if field.message_type is not None:
             own = self._name(field.message_type).replace("/msg/", "/")
         else:
             own = SCALARS[field.type]

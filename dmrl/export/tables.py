@@ -98,7 +98,7 @@ def _flat(table: pa.Table) -> pa.Table:
 
 
 def _holds_structs(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) and pa.types.is_struct(kind.value_type)
+    return bool(pa.types.is_list(kind) and pa.types.is_struct(kind.value_type))
 
 
 def _rows(table: pa.Table, name: str) -> pa.Table:

@@ -5,6 +5,7 @@ camera sends its time with the pictures, that is their time; bare streams get no
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,7 @@ def _times_ns(times_us: Sequence[int | None], rate_hz: float) -> list[int]:
     """The camera's times, or nominal ones where it does not tell every picture's."""
     if any(time is None for time in times_us):
         return [round(k * 1e9 / rate_hz) for k in range(len(times_us))]
-    return np.maximum.accumulate([1000 * (time or 0) for time in times_us]).tolist()
+    return list(accumulate((1000 * (time or 0) for time in times_us), max))
 
 
 def _pictures(source: Path, time_ns: Sequence[int], options: Options) -> Iterator[Sample]:

@@ -82,7 +82,7 @@ def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:
     line = np.floor(y[left] + slope * (x - x[left]) + 1e-6)
     if count is None and (y - line).max() > slope:
         return arrival.copy()
-    return arrival[0] + line.astype(np.int64)
+    return np.asarray(arrival[0] + line.astype(np.int64))
 
 
 def _numbered(arrival: Ints) -> Ints:

@@ -14,7 +14,8 @@ besides, on dmrl's own topics:
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -83,7 +84,9 @@ def as_logged(robot: str, block: Block) -> Stream:
     codes = {name: values.dtype.char.replace("l", "i") for name, values in block.columns.items()}
     kind = LogType(block.name, tuple(codes.items()))
     topic = topics.log(robot, re.sub(r"[^A-Za-z0-9_-]", "_", block.name))
-    rows = zip(*(values.tolist() for values in block.columns.values()), strict=True)
+    rows: Iterable[tuple[Any, ...]] = zip(
+        *(values.tolist() for values in block.columns.values()), strict=True
+    )
     if not block.columns:
         rows = ((),) * len(block.time_ns)
     for moment, row in zip(block.time_ns.tolist(), rows, strict=True):
@@ -139,7 +142,8 @@ def yaw_rate_of(blocks: Sequence[Block], attitude: Series) -> Array:
         if alone is not None:
             return np.asarray(alone.at(attitude.time_ns)[:, 0] * unit)
     time_s = (attitude.time_ns - attitude.time_ns[0]) * 1e-9
-    return np.gradient(yaw, time_s) if len(yaw) > 1 and (np.diff(time_s) > 0).all() else 0 * yaw
+    usable = len(yaw) > 1 and (np.diff(time_s) > 0).all()
+    return np.asarray(np.gradient(yaw, time_s) if usable else 0 * yaw)
 
 
 def _attitude(robot: str, attitude: Series, yaw_rate: Array) -> Stream:

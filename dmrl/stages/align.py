@@ -12,7 +12,8 @@ from cyclopts import Parameter
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
-from dmrl.estimation.clocks import Array, Clock, connected, estimate_from_exchanges
+from dmrl.estimation.clocks import Array, Clock, connected
+from dmrl.estimation.exchanges import estimate_from_exchanges
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track

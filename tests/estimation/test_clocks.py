@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.clocks import Clock, connected, estimate_clock, estimate_from_exchanges
+from dmrl.estimation.clocks import Clock, connected, estimate_clock
+from dmrl.estimation.exchanges import estimate_from_exchanges
 
 Array = np.ndarray
 OFFSET_S, DRIFT = 0.080, 20e-6
