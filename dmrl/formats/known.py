@@ -57,6 +57,8 @@ def format_of(source: Path, name: str | None = None) -> Format:
     known = ", ".join(FORMATS)
     if not source.exists():
         raise SourceError(f"no file or folder {source}. Name one to convert")
+    if not (source.is_file() or source.is_dir()):
+        raise SourceError(f"{source} is neither a file nor a folder. Save it to a file first")
     if name is not None and name not in FORMATS:
         near = get_close_matches(name, FORMATS, n=1)
         hint = f"Did you mean {near[0]}? " if near else ""
@@ -68,4 +70,6 @@ def format_of(source: Path, name: str | None = None) -> Format:
     for candidate in FORMATS.values():
         if candidate.recognises(source):
             return candidate
+    if source.suffix == ".mcap":
+        raise SourceError(f"{source} is a recording already. Say --to: csv, parquet, ros2")
     raise SourceError(f"{source} looks like no kind that is known. Say --from: {known}")

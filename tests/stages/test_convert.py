@@ -145,6 +145,8 @@ def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
         run(tmp_path, tmp_path / "out.mcap", Settings())
     with pytest.raises(SourceError, match="no file or folder"):
         run(tmp_path / "none", tmp_path / "out.mcap", Settings())
+    with pytest.raises(SourceError, match="neither a file nor a folder"):
+        run(Path("/dev/null"), tmp_path / "out.mcap", Settings())
 
 
 def test_recordings_are_never_overwritten(pictures: Path, tmp_path: Path) -> None:
@@ -237,3 +239,9 @@ def _as_logged(flight: Path, robot: str, peer: int) -> bytes:
         )
     ]
     return plain_usd.encode(events, sorted(records, key=lambda r: r[1]))
+
+
+def test_a_recording_is_not_a_source(pictures: Path, tmp_path: Path) -> None:
+    run(pictures, tmp_path / "a.mcap", Settings())
+    with pytest.raises(SourceError, match=r"is a recording already\. Say --to: csv, parquet, ros2"):
+        run(tmp_path / "a.mcap", tmp_path / "b.mcap", Settings())
