@@ -1,7 +1,6 @@
 """``dmrl align``: robots that logged on clocks of their own, on one clock."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -14,6 +13,7 @@ from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.estimation.clocks import Array, Clock, connected
 from dmrl.estimation.exchanges import estimate_from_exchanges
+from dmrl.formats.counters import dejitter
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
@@ -42,9 +42,12 @@ class Settings:
     ----------
     reference
         The robot whose times stay. Without it, the first by name.
+    steady_cameras
+        Pictures that were stamped when they arrived get the even times of a steady camera.
     """
 
     reference: str | None = None
+    steady_cameras: Annotated[bool, Parameter(negative=())] = False
 
 
 def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
@@ -77,7 +80,19 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
     held = summary(recording)
     if splits(held):
         raise SettingError(f"{recording} has a split by time already. Align before that")
-    links = {(n["robot"], n["peer"]) for t in held.topics if (n := topics.names(topics.RANGE, t))}
+    steady = _steady(recording, held) if settings.steady_cameras else {}
+    clocks = {} if steady and not _links(held) else _clocks(recording, held, settings)
+    _write(recording, held, out, clocks, steady, settings)
+    return clocks
+
+
+def _links(held: Summary) -> set[tuple[str, str]]:
+    return {(n["robot"], n["peer"]) for t in held.topics if (n := topics.names(topics.RANGE, t))}
+
+
+def _clocks(recording: Path, held: Summary, settings: Settings) -> dict[str, Clock]:
+    """Of every robot that ranges tie to the reference."""
+    links = _links(held)
     robots = sorted({name for link in links for name in link})
     reference = settings.reference or (robots[0] if robots else "")
     if reference not in robots:
@@ -98,8 +113,23 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
     for robot in robots:
         if robot not in clocks:
             say(f"{recording}: nothing ties the clock of {robot} to that of {reference}; it stays")
-    _write(recording, held, out, clocks, settings)
     return clocks
+
+
+def _steady(recording: Path, held: Summary) -> dict[str, dict[int, int]]:
+    """New times by old ones of every topic of pictures that were stamped when they arrived."""
+    found = {}
+    for topic in held.topics:
+        parts = topics.names(topics.CAMERA_IMAGE, topic)
+        if parts is None:
+            continue
+        if topics.labels(parts["robot"]) in held.topics:
+            raise SettingError(f"{recording}: {topic} has labels already. Align before that")
+        table = read_table(recording, topic, fields=[])
+        arrival = table["log_time"].to_numpy()
+        if (arrival == table["publish_time"].to_numpy()).all():
+            found[topic] = dict(zip(arrival.tolist(), dejitter(arrival).tolist(), strict=True))
+    return found
 
 
 def _clock(recording: Path, held: Summary, one: str, other: str) -> Clock | None:
@@ -117,19 +147,29 @@ def _ranges(recording: Path, held: Summary, topic: str) -> tuple[Array, Array]:
 
 
 def _write(
-    recording: Path, held: Summary, out: Path, clocks: dict[str, Clock], settings: Settings
+    recording: Path,
+    held: Summary,
+    out: Path,
+    clocks: dict[str, Clock],
+    steady: dict[str, dict[int, int]],
+    settings: Settings,
 ) -> None:
     made = provenance("align", settings, [recording], libraries=("numpy",))
     # Robots that were switched on earlier would begin before 0: all times move together.
-    starts = [held.start_ns] + [_moved(held.start_ns, c, held.start_ns) for c in clocks.values()]
+    starts = [held.start_ns] + [
+        held.start_ns + _shift_ns(held.start_ns, c, held.start_ns) for c in clocks.values()
+    ]
     later_ns = max(0, -min(starts))
     copied = track(read_raw(recording), "Writing", held.count)
     with RecordingWriter(out, made) as sink:
         copy_extras(held, sink)
         told = {robot: json.dumps(_told(c, held.start_ns)) for robot, c in clocks.items()}
         sink.add_metadata(METADATA, told)
-        for raw in _shifted(copied, clocks, held.start_ns, later_ns):
-            sink.write_raw(raw)
+        for raw in copied:
+            even_ns = steady.get(raw.topic, {}).get(raw.time_ns, raw.time_ns)
+            clock = clocks.get(_robot(raw))
+            shift_ns = later_ns + (_shift_ns(even_ns, clock, held.start_ns) if clock else 0)
+            sink.write_raw(_at(raw, even_ns + shift_ns, max(raw.publish_ns + shift_ns, 0)))
 
 
 def _told(clock: Clock, start_ns: int) -> dict[str, float]:
@@ -143,22 +183,15 @@ def _told(clock: Clock, start_ns: int) -> dict[str, float]:
     }
 
 
-def _shifted(
-    messages: Iterator[RawMessage], clocks: dict[str, Clock], start_ns: int, later_ns: int
-) -> Iterator[RawMessage]:
-    for raw in messages:
-        clock = clocks.get(_robot(raw))
-        time_ns = raw.time_ns if clock is None else _moved(raw.time_ns, clock, start_ns)
-        time_ns += later_ns
-        published_ns = max(raw.publish_ns + time_ns - raw.time_ns, 0)
-        data = raw.data if time_ns == raw.time_ns else _stamped(raw, time_ns)
-        yield replace(raw, time_ns=time_ns, publish_ns=published_ns, data=data)
+def _at(raw: RawMessage, time_ns: int, publish_ns: int) -> RawMessage:
+    data = raw.data if time_ns == raw.time_ns else _stamped(raw, time_ns)
+    return replace(raw, time_ns=time_ns, publish_ns=publish_ns, data=data)
 
 
-def _moved(time_ns: int, clock: Clock, start_ns: int) -> int:
-    """A time on the reference's clock. The correction alone is a float: times are too long."""
+def _shift_ns(time_ns: int, clock: Clock, start_ns: int) -> int:
+    """What a time lacks on the reference's clock. As a float it is exact enough: times are not."""
     elapsed_s = (time_ns - start_ns) * 1e-9
-    return time_ns + round((clock.offset_s + clock.drift * (elapsed_s - clock.at_s)) * 1e9)
+    return round((clock.offset_s + clock.drift * (elapsed_s - clock.at_s)) * 1e9)
 
 
 def _robot(raw: RawMessage) -> str:

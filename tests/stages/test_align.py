@@ -71,3 +71,25 @@ def test_what_cannot_be_aligned_is_one_line(recording: Path, tmp_path: Path) -> 
     with pytest.raises(RecordingError, match="no robot saw what cf1 saw"):
         run(alone, tmp_path / "out.mcap", Settings())
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_pictures_stamped_on_arrival_get_even_times(tmp_path: Path) -> None:
+    path, out, rng = tmp_path / "in.mcap", tmp_path / "out.mcap", np.random.default_rng(1)
+    sent = 10**10 + np.arange(400) * 50_000_000
+    arrival = sent + rng.exponential(2e6, 400).astype(int)
+    with RecordingWriter(path, provenance("test")) as sink:
+        for moment in arrival.tolist():
+            sink.write(moment, "/cf1/camera/image", message("CompressedImage")(data=b"x"))
+    assert run(path, out, Settings(steady_cameras=True)) == {}
+    table = read_table(out, "/cf1/camera/image", fields=[])
+    assert np.abs(table["log_time"].to_numpy() - sent).max() < 100_000
+    assert table["publish_time"].to_pylist() == arrival.tolist()
+
+
+def test_labelled_pictures_keep_their_times(tmp_path: Path) -> None:
+    path = tmp_path / "in.mcap"
+    with RecordingWriter(path, provenance("test")) as sink:
+        sink.write(1, "/cf1/camera/image", message("CompressedImage")(data=b"x"))
+        sink.write(1, "/cf1/labels", message("PeerLabels")())
+    with pytest.raises(SettingError, match=r"has labels already\. Align before that"):
+        run(path, tmp_path / "out.mcap", Settings(steady_cameras=True))
