@@ -21,6 +21,9 @@ GAP_S = 1.0
 OVERLAP_S = 20.0
 ITERATIONS = 30
 HUBER = 1.5
+TOGETHER = 2 * np.sqrt(np.pi) * SMOOTH_S / STEP_S
+DRIFT_STD = 30e-6
+"""Standard deviation of the drift of two quartz clocks, before anything is seen."""
 CONVINCING = 0.5
 """Least correlation of the two series that is taken for the same thing seen twice."""
 
@@ -192,19 +195,22 @@ def _refined(one: _Series, other: _Series, lag_s: float) -> Clock | None:
         spread = 1.4826 * np.median(np.abs(residual)) + 1e-12
         weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-12))
         full = jacobian * (scale_bias[0], scale_bias[0], 1.0, 1.0)
+        # Smoothing ties neighbours together: so many of them count as one.
+        variance = float((weight * residual**2).mean()) * TOGETHER
         normal = full.T @ (weight[:, None] * full)
+        gradient = full.T @ (weight * residual)
+        normal[1, 1] += variance / DRIFT_STD**2
+        gradient[1] -= variance / DRIFT_STD**2 * drift
         if np.linalg.cond(normal) > 1e15:
             return None
-        step = np.linalg.solve(normal, full.T @ (weight * residual))
+        step = np.linalg.solve(normal, gradient)
         offset_s, drift = offset_s + step[0], drift + step[1]
         if abs(step[0]) < 1e-7 and abs(step[1]) < 1e-10:
             break
     correlation = float(np.corrcoef(seen[known], wanted[known])[0, 1])
     if not correlation >= CONVINCING:
         return None
-    # Smoothing ties neighbours together: so many of them count as one.
-    together = 2 * np.sqrt(np.pi) * SMOOTH_S / STEP_S
-    covariance = np.linalg.inv(normal) * (weight * residual**2).mean() * together
+    covariance = np.linalg.inv(normal) * variance
     return Clock(
         float(offset_s),
         float(drift),
