@@ -23,6 +23,8 @@ COMMANDS = {
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
     "convert": "Convert SOURCE, a foreign file or folder, into a recording.",
+    "record": "Record the logs and cameras of Crazyflies in flight, until Ctrl-C.",
+    "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
     "card": "Write a dataset's card and figures again.",
@@ -57,7 +59,8 @@ app = App(
     error_formatter=bad_command_line,
 )
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
-    app.command(f"dmrl.stages.{_name}:command", name=_name, help=_help, sort_key=_order)
+    _module = _name.replace("-", "_")
+    app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help, sort_key=_order)
 
 
 def main() -> NoReturn:
