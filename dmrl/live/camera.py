@@ -13,7 +13,7 @@ from dmrl.formats.sample import image as image_sample
 from dmrl.geometry import AIDECK, Camera
 from dmrl.live.clocks import HostTime, SenderClock, SteadySender
 from dmrl.live.feed import Feed, Health, Received
-from dmrl.live.pictures import SENSOR_PX, Colours, encoded
+from dmrl.live.pictures import SENSOR_PX, Colours, Stored, encoded
 
 US = 1_000
 CONNECT_S = 3.0
@@ -80,6 +80,8 @@ class CameraClient(threading.Thread):
         This computer's time.
     colours
         Whether raw images have colour filters before their pixels.
+    stored
+        See `encoded`.
     camera
         Its calibration; None: the AI-deck's, where the size fits.
     robot_time
@@ -95,13 +97,15 @@ class CameraClient(threading.Thread):
         now: HostTime,
         *,
         colours: Colours = "colour",
+        stored: Stored = "png",
         camera: Camera | None = None,
         robot_time: RobotTime = lambda _: None,
     ) -> None:
         super().__init__(name=f"camera {robot}", daemon=True)
         self.health = Health(f"{robot} camera")
         self.robot, self._where = robot, (host, port)
-        self._feed, self._now, self._colours = feed, now, colours
+        self._feed, self._now = feed, now
+        self._form = colours, stored
         self._camera, self._robot_time = camera, robot_time
         self._stop_wanted = threading.Event()
         self._size_px: tuple[int, int] | None = None
@@ -164,22 +168,21 @@ class CameraClient(threading.Thread):
         return "stopped"
 
     def _count(self, image: Image, before: int | None) -> int | None:
-        self.health.received += 1
         if image.frame_id is not None and before is not None:
             self.health.lost += image.frame_id - before - 1
         return image.frame_id
 
     def _hand_on(self, image: Image, time_ns: int, arrival_ns: int) -> None:
         try:
-            data, kind = encoded(image, self._colours)
+            data, kind = encoded(image, *self._form)
         except SourceError as e:
-            self.health.received -= 1
             self.health.broken += 1
             self._warn(f"{self.robot}: {e}")
             return
         self._calibrate((image.width_px, image.height_px), time_ns, arrival_ns)
         self.health.last_arrival_ns = arrival_ns
         self._feed.put(Received(image_sample(time_ns, self.robot, data, kind), arrival_ns))
+        self.health.received += 1
 
     def _calibrate(self, sent_px: tuple[int, int], time_ns: int, arrival_ns: int) -> None:
         """Hand on the calibration before the first image, if there is one of its size."""

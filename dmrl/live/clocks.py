@@ -44,7 +44,8 @@ class SenderClock:
         self._settle_ns = round(settle_s * SECOND_NS)
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._offset_ns = 0.0
+        # Whole: a float64 holds nanoseconds since 1970 to a quarter of a microsecond only.
+        self._offset_ns = 0
         # (second of the sender's clock, least difference in it)
         self._least: deque[tuple[int, int]] = deque(maxlen=self.WINDOW_S)
 
@@ -63,7 +64,7 @@ class SenderClock:
         self._note(sender_ns // SECOND_NS, arrival_ns - sender_ns)
         wanted = min(least for _, least in self._least)
         if self.settled:
-            reach = self.SLEW * max(sender_ns - self._last_ns, 0)
+            reach = round(self.SLEW * max(sender_ns - self._last_ns, 0))
             change = wanted - self._offset_ns
             if abs(change) < self.OTHER_PACE_NS:
                 self._offset_ns += min(max(change, -reach), reach)
@@ -74,7 +75,7 @@ class SenderClock:
 
     def host_ns(self, sender_ns: int) -> int:
         """A time of the sender's clock on this computer's time; something was heard before."""
-        return sender_ns + round(self._offset_ns)
+        return sender_ns + self._offset_ns
 
     def _note(self, second: int, difference_ns: int) -> None:
         if self._least and self._least[-1][0] == second:

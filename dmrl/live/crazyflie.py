@@ -21,8 +21,8 @@ MS = 1_000_000
 TIMESTAMP_BITS = 24
 SILENT_S = 2.0
 """Without a log packet for so long, a link is taken to be dead."""
-SETUP_SILENT_S = 5.0
-"""Without any packet for so long, setting up is given up; all of it may take much longer."""
+FIRST_ANSWER_S, NEXT_ANSWER_S = 2.0, 5.0
+"""Without an answer for so long, setting up is given up; all of it may take much longer."""
 RETRY_S = 1.0
 
 
@@ -189,7 +189,7 @@ class Link(threading.Thread):
         finally:
             session.close()
             self._let_go()
-        if self._stop_wanted.is_set():
+        if self._stop_wanted.is_set() and self.health.connections:
             self.health.state = "stopped"
             return
         if self.health.state != why:
@@ -202,7 +202,7 @@ class Link(threading.Thread):
         while not session.ready.wait(0.1):
             if session.lost or self._stop_wanted.is_set():
                 return "nobody answers" if not session.last_packet_s else "lost while connecting"
-            if time.monotonic() - max(session.last_packet_s, session.opened_s) > SETUP_SILENT_S:
+            if session.silent_s() > (NEXT_ANSWER_S if session.last_packet_s else FIRST_ANSWER_S):
                 return "nobody answers" if not session.last_packet_s else "stopped answering"
         wanted = plan(session.toc(), self._peers, self._period_ms, robot=self.robot)
         self._report_missing(wanted)
@@ -269,8 +269,9 @@ class _Session:
         self.ready = threading.Event()
         self.lost = ""
         self.refused = ""
-        self.last_packet_s = self.opened_s = 0.0
+        self.last_packet_s = self._opened_s = 0.0
         self._drone = crazyflie
+        self._configs: list[Any] = []
         # Closing a link would send a set-point of zero, which drops a drone that flies by
         # itself.
         crazyflie.commander.send_setpoint = lambda *_: None
@@ -280,8 +281,12 @@ class _Session:
         crazyflie.packet_received.add_callback(self._heard)
 
     def open(self, uri: str) -> None:
-        self.opened_s = time.monotonic()
         self._drone.open_link(uri)
+        self._opened_s = time.monotonic()
+
+    def silent_s(self) -> float:
+        """For how long nothing came."""
+        return time.monotonic() - max(self.last_packet_s, self._opened_s)
 
     def toc(self) -> dict[str, str]:
         """Type of each log variable."""
@@ -309,6 +314,7 @@ class _Session:
             except (KeyError, AttributeError) as e:
                 raise SettingError(f"cflib takes no block {number}: {e}. Log less") from e
             config.start()
+            self._configs.append(config)
 
     def _config(self, number: int, block: Block) -> Any:
         from cflib.crazyflie.log import LogConfig  # noqa: PLC0415 - an extra
@@ -320,6 +326,8 @@ class _Session:
         return config
 
     def close(self) -> None:
+        for config in self._configs:
+            config.stop()
         self._drone.close_link()
 
     def _gone(self, _uri: str, why: str) -> None:

@@ -92,6 +92,11 @@ class FakeCamera(threading.Thread):
         """Ask it to end; `join` waits for that."""
         self._stop_wanted.set()
 
+    def close(self) -> None:
+        """Give the port back, if it was never started."""
+        if self.ident is None:
+            self._listener.close()
+
     def run(self) -> None:
         """Wait for a client and send it images, and again."""
         while not self._stop_wanted.is_set():

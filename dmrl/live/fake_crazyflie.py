@@ -101,9 +101,8 @@ class FakeCrazyflie(threading.Thread):
         except OSError as e:
             self._socket.close()
             host, port = address
-            raise SettingError(
-                f"udp://{host}:{port}: {e.strerror or e}. Name another --uri"
-            ) from None
+            why = e.strerror or e
+            raise SettingError(f"udp://{host}:{port}: {why}. Name another --uri") from None
 
     @property
     def port(self) -> int:
@@ -113,6 +112,11 @@ class FakeCrazyflie(threading.Thread):
     def stop(self) -> None:
         """Ask it to end; `join` waits for that."""
         self._stop_wanted.set()
+
+    def close(self) -> None:
+        """Give the port back, if it was never started."""
+        if self.ident is None:
+            self._socket.close()
 
     def run(self) -> None:
         """Answer and log."""
@@ -141,7 +145,7 @@ class FakeCrazyflie(threading.Thread):
         now_s = self._clock.now_s()
         shown_ms = self._faults.clock_ms(now_s)
         for number, block in list(self._blocks.items()):
-            while block.period_ms and block.due_ms <= shown_ms:
+            while block.period_ms and block.due_ms <= shown_ms and now_s < self._clock.end_s:
                 self._log(number, block, self._faults.reached_s(block.due_ms, now_s))
                 block.due_ms += block.period_ms
 

@@ -15,13 +15,15 @@ LEFT_PX, TOP_PX = 2, 10
 """What is cut off on the left and at the top: the calibration is of the rest."""
 
 Colours = Literal["colour", "grey"]
+Stored = Literal["png", "jpeg"]
+JPEG_QUALITY = 95
 
 
-def encoded(image: Image, colours: Colours) -> tuple[bytes, str]:
+def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[bytes, str]:
     """The picture, and "png" or "jpeg".
 
-    Images of the whole sensor are cut to the 320 x 224 px that the calibration is of. Raw ones
-    become PNG, so that nothing is lost; a JPEG that need not be cut keeps its bytes.
+    Images of the whole sensor are cut to the 320 x 224 px that the calibration is of. A JPEG
+    that need not be cut keeps its bytes.
 
     Parameters
     ----------
@@ -29,6 +31,8 @@ def encoded(image: Image, colours: Colours) -> tuple[bytes, str]:
         As it came.
     colours
         Whether there are colour filters before the pixels of a raw image.
+    stored
+        What becomes of the rest: PNG, so that nothing is lost, or JPEG, a fifth of that.
 
     Raises
     ------
@@ -45,11 +49,17 @@ def encoded(image: Image, colours: Colours) -> tuple[bytes, str]:
             )
         if not whole:
             return image.data, "jpeg"
-        return images.encode_png(_cut(images.decode(image.data, "the camera's JPEG"))), "png"
+        return _stored(_cut(images.decode(image.data, "the camera's JPEG")), stored), stored
     pixels = np.frombuffer(image.data, np.uint8).reshape(image.height_px, image.width_px)
     if whole:
         pixels = _cut(pixels)
-    return images.encode_png(images.demosaic(pixels) if colours == "colour" else pixels), "png"
+    return _stored(images.demosaic(pixels) if colours == "colour" else pixels, stored), stored
+
+
+def _stored(pixels: images.Rgb, stored: Stored) -> bytes:
+    if stored == "png":
+        return images.encode_png(pixels)
+    return images.encode_jpeg(pixels, JPEG_QUALITY)
 
 
 def _cut(pixels: images.Rgb) -> images.Rgb:

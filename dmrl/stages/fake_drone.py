@@ -126,6 +126,7 @@ def fleet(
         for thread in threads:
             thread.stop()
         for thread in threads:
+            thread.close()
             if thread.is_alive():
                 thread.join(timeout=5.0)
 
@@ -139,6 +140,8 @@ def _robots(flight: Path, uris: Sequence[str], cameras: Sequence[int]) -> list[s
             f"{len(uris)} --uri and {len(cameras)} --camera for {len(known)} robots "
             f"({', '.join(known)}). Give a --uri for each that shall fly, then their cameras"
         )
+    if wrong := [port for port in cameras if not 0 <= port < 65536]:
+        raise SettingError(f"--camera {wrong[0]}: ports go from 1 to 65535. Name another")
     pictured = topics.robots(tuple(summary(flight).topics))
     if blind := [robot for robot in known[: len(cameras)] if robot not in pictured]:
         raise RecordingError(f"{flight} has no pictures of {blind[0]}. Try: dmrl fly --camera")

@@ -21,7 +21,7 @@ from dmrl.live.clocks import HostTime
 from dmrl.live.crazyflie import Link, check_uri, load_cflib
 from dmrl.live.feed import Feed, Health, Received
 from dmrl.live.log_plan import number_of
-from dmrl.live.pictures import Colours
+from dmrl.live.pictures import Colours, Stored
 from dmrl.live.table import LiveTable
 from dmrl.messages import message
 from dmrl.output import partial_of, refuse_existing
@@ -69,6 +69,9 @@ class Settings:
         Log packets per second and block; the firmware has 10 ms steps.
     pixels
         Whether raw images are behind colour filters: colour, or grey for the grey AI-deck.
+    images
+        How images are stored that are not JPEG already: png, nothing lost, or jpeg, a fifth
+        of that.
     peer
         Whose distance ranging.distance<N> is, as N=NAME; repeat for more. Without it, robot
         cf<N>'s.
@@ -77,6 +80,7 @@ class Settings:
     duration_s: Annotated[float | None, Parameter(validator=validators.Number(gt=0))] = None
     rate_hz: Annotated[float, Parameter(validator=validators.Number(gte=1, lte=100))] = 100.0
     pixels: Colours = "colour"
+    images: Stored = "png"
     peer: Annotated[tuple[str, ...], Parameter(negative=())] = field(default=())
 
 
@@ -117,6 +121,7 @@ def run(
     robots: Sequence[Robot],
     settings: Settings,
     *,
+    ended: threading.Event | None = None,
     show: Callable[[Received], None] | None = None,
 ) -> Result:
     """Record until the time is over, or Ctrl-C.
@@ -129,6 +134,8 @@ def run(
         Who is recorded.
     settings
         See `Settings`.
+    ended
+        Ends it as well when it is set.
     show
         Is given every sample as it comes.
 
@@ -159,7 +166,8 @@ def run(
     began_s, used_s = time.monotonic(), time.process_time()
     # What was received stays even if this process fails: flights are not repeated.
     with RecordingWriter(out, made, keep_on_error=True) as sink:
-        counts = _record(sink, feed, table, threads, settings.duration_s, show)
+        ended = threading.Event() if ended is None else ended
+        counts = _record(sink, feed, table, threads, (settings.duration_s, ended), show)
     if not counts:
         out.unlink()
         raise RecordingError(_nothing(out, [*links.values()]))
@@ -194,6 +202,7 @@ def _as_settings(robots: Sequence[Robot], settings: Settings) -> "_Recorded":
         tuple("" if r.camera is None else f"{r.camera[0]}:{r.camera[1]}" for r in robots),
         settings.rate_hz,
         settings.pixels,
+        settings.images,
         settings.peer,
     )
 
@@ -207,6 +216,7 @@ class _Recorded:
     cameras: tuple[str, ...]
     rate_hz: float
     pixels: str
+    images: str
     peer: tuple[str, ...]
 
 
@@ -262,6 +272,7 @@ def _client(
         feed,
         now,
         colours=settings.pixels,
+        stored=settings.images,
         camera=camera,
         robot_time=link.robot_time,
     )
@@ -272,10 +283,11 @@ def _record(
     feed: Feed,
     table: LiveTable,
     threads: Sequence[Link | CameraClient],
-    duration_s: float | None,
+    until: tuple[float | None, threading.Event],
     show: Callable[[Received], None] | None,
 ) -> dict[str, int]:
     """Write what comes until the end; messages by topic."""
+    duration_s, ended = until
     counts: Counter[str] = Counter()
 
     def take(timeout_s: float) -> bool:
@@ -301,7 +313,7 @@ def _record(
         running.callback(_end, threads)
         for thread in threads:
             thread.start()
-        ended = running.enter_context(_ended_by_signal())
+        running.enter_context(_ended_by_signal(ended))
         _until(duration_s, ended, take, lambda: _every_second(sink, table, counts))
     while take(0.0):
         pass
@@ -309,15 +321,14 @@ def _record(
 
 
 @contextmanager
-def _ended_by_signal() -> Iterator[threading.Event]:
+def _ended_by_signal(ended: threading.Event) -> Iterator[None]:
     """Set when the user wants an end: an exception amid a write would spoil the file."""
-    ended = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield ended
+        yield
         return
     before = {number: signal.signal(number, lambda *_: ended.set()) for number in ENDING}
     try:
-        yield ended
+        yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
