@@ -122,11 +122,14 @@ class Unwrapped:
         >>> [unwrapped(value) for value in (254, 255, 1, 0)]
         [254, 255, 257, 256]
         """
-        if self._last is not None:
-            ahead = (value - self._last + self._back) % self._period - self._back
-            value = self._last + ahead
-        self._last = value
-        return value
+        self._last = self.near(value)
+        return self._last
+
+    def near(self, value: int) -> int:
+        """The same, but the value is not remembered, and may have bits more than the counter."""
+        if self._last is None:
+            return value
+        return self._last + (value - self._last + self._back) % self._period - self._back
 
 
 class PacketReader:

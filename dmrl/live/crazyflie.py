@@ -4,6 +4,8 @@ cflib is GPL and so an extra: it is loaded when a link is opened, not before.
 """
 
 import logging
+import math
+import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -19,11 +21,13 @@ from dmrl.live.log_plan import SLOW_PERIOD_MS, Block, Plan, Reading, plan
 
 MS = 1_000_000
 TIMESTAMP_BITS = 24
-SILENT_S = 2.0
+SILENT_S = 5.0
 """Without a log packet for so long, a link is taken to be dead."""
 FIRST_ANSWER_S, NEXT_ANSWER_S = 2.0, 5.0
 """Without an answer for so long, setting up is given up; all of it may take much longer."""
 RETRY_S = 1.0
+UDP_BUFFER_BYTES = 1 << 22
+"""Asked for, so that a busy computer loses nothing; the system gives what it allows."""
 
 
 def load_cflib() -> None:
@@ -160,11 +164,19 @@ class Link(threading.Thread):
         self._stop_wanted.set()
 
     def robot_time(self, robot_ms: float) -> int | None:
-        """A time of the drone's clock on this computer's; None while that is not known."""
+        """A time of the drone's clock on this computer's; None while that is not known.
+
+        Parameters
+        ----------
+        robot_ms
+            With all bits, or with those of the log's time stamps only.
+        """
         flight = self._flight
         if flight is None or not flight.clock.settled:
             return None
-        return flight.clock.host_ns(round(robot_ms * MS))
+        whole_ms = math.floor(robot_ms)
+        near_ms = flight.unwrapped.near(whole_ms) + (robot_ms - whole_ms)
+        return flight.clock.host_ns(round(near_ms * MS))
 
     def run(self) -> None:
         """Connect, hand on samples, and again."""
@@ -283,6 +295,9 @@ class _Session:
     def open(self, uri: str) -> None:
         self._drone.open_link(uri)
         self._opened_s = time.monotonic()
+        link = getattr(self._drone.link, "socket", None)
+        if isinstance(link, socket.socket):
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER_BYTES)
 
     def silent_s(self) -> float:
         """For how long nothing came."""

@@ -131,6 +131,14 @@ def test_counters_unwrap_forward_or_to_the_nearest() -> None:
     ]
 
 
+def test_a_counter_is_asked_for_values_of_more_bits_without_being_changed() -> None:
+    times = Unwrapped(24)
+    times(5)
+    assert times.near((7 << 24) + 8) == 8
+    assert times.near((1 << 24) - 2) == -2
+    assert times(6) == 6
+
+
 def test_quaternions_come_back_to_a_quarter_of_a_degree() -> None:
     for xyzw in RNG.normal(size=(50, 4)):
         xyzw /= np.linalg.norm(xyzw)
