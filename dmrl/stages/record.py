@@ -392,7 +392,14 @@ def command(
         Print one JSON document in place of the tables.
     """
     robots = [robot_of(text) for text in robot]
-    result = run(out, robots, settings)
+    with ExitStack() as window:
+        show = None
+        if view:
+            from dmrl.viewer.live import LiveWindow  # noqa: PLC0415 - an extra
+
+            cameras = [r.name for r in robots if r.camera]
+            show = window.enter_context(LiveWindow([r.name for r in robots], cameras)).show
+        result = run(out, robots, settings, show=show)
     rows = [(h.source, h.received, h.lost, h.broken, h.connections) for h in result.healths]
     if as_json:
         links = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
