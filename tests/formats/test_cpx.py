@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 
 from dmrl.formats import cpx
-from dmrl.formats.cpx import Image, ImageReader, Packet, PacketReader, Unwrapped
-from dmrl.formats.cpx_pack import pack_image, pack_packet
+from dmrl.formats.cpx import Image, ImageReader
+from dmrl.formats.cpx_pack import pack_image
+from dmrl.formats.cpx_packets import (
+    APP,
+    GAP8,
+    HOST,
+    Packet,
+    PacketReader,
+    Unwrapped,
+    pack_packet,
+)
 from dmrl.formats.cpx_state import State, compressed, quaternion
 
 RNG = np.random.default_rng(8)
@@ -106,8 +115,8 @@ def test_a_packet_lost_amid_an_image_breaks_that_image_only() -> None:
 
 def test_a_header_of_a_wrong_size_is_a_broken_image() -> None:
     header = cpx.HEADER.pack(cpx.MAGIC, 324, 244, 1, 0, 1000)
-    data = pack_packet(Packet(cpx.GAP8, cpx.HOST, cpx.APP, header)) + pack_packet(
-        Packet(cpx.GAP8, cpx.HOST, cpx.APP, bytes(1000))
+    data = pack_packet(Packet(GAP8, HOST, APP, header)) + pack_packet(
+        Packet(GAP8, HOST, APP, bytes(1000))
     )
     got, reader = read(data)
     assert (got, reader.broken) == ([], 1)
@@ -115,7 +124,7 @@ def test_a_header_of_a_wrong_size_is_a_broken_image() -> None:
 
 def test_console_text_and_other_functions_are_passed_over() -> None:
     image = raw(20, 20)
-    text = pack_packet(Packet(cpx.GAP8, cpx.HOST, 2, b"Starting camera task"))
+    text = pack_packet(Packet(GAP8, HOST, 2, b"Starting camera task"))
     got, reader = read(text + pack_image(image) + text)
     assert (got, reader.broken, reader.skipped_bytes) == ([image], 0, 0)
 

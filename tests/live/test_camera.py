@@ -8,8 +8,9 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.formats import cpx
-from dmrl.formats.cpx import Image, Packet
-from dmrl.formats.cpx_pack import pack_image, pack_packet
+from dmrl.formats.cpx import Image
+from dmrl.formats.cpx_pack import pack_image
+from dmrl.formats.cpx_packets import APP, GAP8, HOST, Packet, pack_packet
 from dmrl.live.camera import GARBAGE_BYTES, CameraClient, address
 from dmrl.live.clocks import HostTime
 from dmrl.live.feed import Feed, Received
@@ -96,7 +97,7 @@ def test_garbage_ends_the_connection_and_gives_no_image(client: Start) -> None:
 
 def test_images_that_are_not_what_they_say_are_counted_and_left_out(client: Start) -> None:
     header = cpx.HEADER.pack(cpx.MAGIC, 320, 224, 1, 0, 100)
-    wrong = [Packet(cpx.GAP8, cpx.HOST, cpx.APP, data) for data in (header, bytes(100))]
+    wrong = [Packet(GAP8, HOST, APP, data) for data in (header, bytes(100))]
     no_jpeg = Image(320, 224, "jpeg", b"\xff\xd8" + bytes(500))
     deck = Deck(b"".join(map(pack_packet, wrong)) + pack_image(no_jpeg) + pack_image(RAW))
     camera, feed = client(deck.port)

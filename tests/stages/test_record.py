@@ -14,10 +14,11 @@ import pytest
 from dmrl.errors import MissingExtra, OutputError, RecordingError, SettingError
 from dmrl.images import decode
 from dmrl.live import crazyflie
+from dmrl.live.robots import Robot, robot_of
 from dmrl.recording import read, read_table, recover
 from dmrl.stages import fake_drone, fly, record
 from dmrl.stages.fake_drone import Fleet
-from dmrl.stages.record import Result, Robot, robot_of
+from dmrl.stages.record import Result
 
 pytest.importorskip("cflib", reason="cflib (extra record) is not installed")
 
