@@ -22,6 +22,9 @@ from dmrl.stages.record import Result
 
 pytest.importorskip("cflib", reason="cflib (extra record) is not installed")
 
+# cflib's own threads may meet a link that another of them has just closed.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+
 PATIENCE_S = 40.0
 PICTURES_HZ, FIRST_PICTURE_S = 2.0, 0.25
 ANY = ("udp://127.0.0.1:0", "udp://127.0.0.1:0")
@@ -181,7 +184,7 @@ def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
 def test_nobody_there_leaves_no_recording(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     nobody = [Robot("cf1", "udp://127.0.0.1:9")]
-    with pytest.raises(RecordingError, match=re.escape("udp://127.0.0.1:9: nobody answers")):
+    with pytest.raises(RecordingError, match=r"nothing came for .* \(cf1 at udp://127.0.0.1:9"):
         record.run(out, nobody, record.Settings(duration_s=0.5))
     assert list(tmp_path.iterdir()) == []
 
