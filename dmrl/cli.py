@@ -23,6 +23,8 @@ COMMANDS = {
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
     "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
+    "record": "Record the logs and cameras of Crazyflies in flight, until Ctrl-C.",
+    "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
     "calibrate": "Calibrate a camera: intrinsics from a chessboard, mount and delay from a flight.",
     "align": "Set the clocks of robots by each other, from the ranges that both of a pair logged.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
@@ -60,7 +62,8 @@ app = App(
     error_formatter=bad_command_line,
 )
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
-    app.command(f"dmrl.stages.{_name}:command", name=_name, help=_help, sort_key=_order)
+    _module = _name.replace("-", "_")
+    app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help, sort_key=_order)
 
 
 def main() -> NoReturn:

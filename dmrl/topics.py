@@ -68,9 +68,16 @@ TOPICS = (
         "image",
         "png or jpeg",
         "camera",
-        "convert, render, fly",
+        "convert, record, render, fly",
     ),
-    Topic(CALIBRATION, "foxglove.CameraCalibration", "image", "px", "once", "convert, render, fly"),
+    Topic(
+        CALIBRATION,
+        "foxglove.CameraCalibration",
+        "image",
+        "px",
+        "once",
+        "convert, record, render, fly",
+    ),
     Topic(
         LABELS, "dmrl.v1.PeerLabels", "image", "px, m", "per image", "convert, render, fly, label"
     ),
@@ -85,11 +92,13 @@ TOPICS = (
         "<robot>/horizontal",
         "rad, rad/s",
         "100 Hz",
-        "convert, render, fly",
+        "convert, record, render, fly",
     ),
-    Topic(VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert, fly"),
-    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert, fly"),
-    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert, fly"),
+    Topic(
+        VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert, record, fly"
+    ),
+    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert, record, fly"),
+    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert, record, fly"),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
     Topic(
         TRUTH,

@@ -62,7 +62,7 @@ def test_help_lists_every_command_in_the_order_of_the_work(
 
 def test_every_stage_is_in_the_table() -> None:
     with_command = {
-        path.stem
+        path.stem.replace("_", "-")
         for path in STAGES.glob("*.py")
         if "\ndef command(" in path.read_text(encoding="utf-8")
     }
@@ -71,7 +71,7 @@ def test_every_stage_is_in_the_table() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_s_table_line_is_the_first_line_of_its_docstring(name: str) -> None:
-    command = importlib.import_module(f"dmrl.stages.{name}").command
+    command = importlib.import_module(f"dmrl.stages.{name.replace('-', '_')}").command
     assert inspect.getdoc(command).splitlines()[0] == COMMANDS[name]
 
 

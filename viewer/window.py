@@ -122,6 +122,24 @@ def screenshot(
     return (moment.last_ns - moment.start_ns) / 1e9
 
 
+def open_window(*, headless: bool = False) -> tuple[subprocess.Popen[bytes], str]:
+    """An empty viewer, and the address where it listens.
+
+    Parameters
+    ----------
+    headless
+        Without a window.
+    """
+    port = _free_port()
+    extra = ("--headless", "--window-size", PICTURE_SIZE) if headless else ()
+    command = _command(*extra, "--port", str(port))
+    # Its own session: Ctrl-C ends the recording, not the window.
+    process = subprocess.Popen(
+        command, env=_environment(), stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    return process, _url(port)
+
+
 class _ViewerStopped(Exception):
     """Why the viewer ended or hangs, and the way out."""
 

@@ -3,27 +3,12 @@
 from collections.abc import Iterator
 
 from dmrl.formats import cpx
-from dmrl.formats.cpx import Image, Layout, Packet
+from dmrl.formats.cpx import Image, Layout
+from dmrl.formats.cpx_packets import APP, GAP8, HOST, STREAMER, Packet, pack_packet
 from dmrl.formats.cpx_state import pack_state
 
 UINT32 = 1 << 32
 NO_STATE = (0,) * 14
-
-
-def pack_packet(packet: Packet) -> bytes:
-    """The bytes of a packet over TCP.
-
-    Raises
-    ------
-    ValueError
-        If its data is longer than a packet can be.
-    """
-    counted = 0 if packet.function == cpx.STREAMER else 2
-    length = len(packet.data) + counted
-    if length > cpx.PACKET_MAX_BYTES:
-        raise ValueError(f"a packet of {length} bytes; {cpx.PACKET_MAX_BYTES} at most")
-    route = packet.destination | packet.source << 3 | packet.last << 6
-    return cpx.ROUTE.pack(length, route, packet.function) + packet.data
 
 
 def pack_image(image: Image, layout: Layout = "plain") -> bytes:
@@ -38,10 +23,10 @@ def pack_image(image: Image, layout: Layout = "plain") -> bytes:
         See ``cpx``.
     """
     if layout == "streamer":
-        chunks, function = _streamer_chunks(image), cpx.STREAMER
+        chunks, function = _streamer_chunks(image), STREAMER
     else:
-        chunks, function = _app_chunks(image, layout), cpx.APP
-    packets = (Packet(cpx.GAP8, cpx.HOST, function, chunk) for chunk in chunks)
+        chunks, function = _app_chunks(image, layout), APP
+    packets = (Packet(GAP8, HOST, function, chunk) for chunk in chunks)
     return b"".join(pack_packet(packet) for packet in packets)
 
 
