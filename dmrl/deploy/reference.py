@@ -1,0 +1,160 @@
+"""What an int8 network computes, bit for bit: the specification of every other backend.
+
+NumPy only. Sums of products are taken in float64, which holds every integer below 2^53: they
+are exact, and BLAS makes them fast.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.integer import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
+
+Quantised = NDArray[np.int16]
+"""Values of uint8 or int8 tensors; int16 holds both."""
+
+
+def run(network: IntegerNetwork, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
+    """Every head's grid, (rows, cols) int8, of one image.
+
+    Parameters
+    ----------
+    network
+        The network.
+    image
+        (height, width, channels) uint8: RGB, or one channel of grey.
+    """
+    tensors = list(tensors_of(network, image))
+    return {
+        name: tensors[head.tensor][head.channel].astype(np.int8)
+        for name, head in network.heads.items()
+    }
+
+
+def tensors_of(network: IntegerNetwork, image: NDArray[np.uint8]) -> Iterator[Quantised]:
+    """The image and the output of every layer, in order, each (channels, rows, cols)."""
+    assert image.shape == (network.height_px, network.width_px, network.channels)
+    tensors = [image.transpose(2, 0, 1).astype(np.int16)]
+    yield tensors[0]
+    for layer in network.layers:
+        tensors.append(compute(layer, *(tensors[k] for k in layer.sources)))
+        yield tensors[-1]
+
+
+def compute(layer: AnyLayer, *inputs: Quantised) -> Quantised:
+    """Output of a layer, (channels, rows, cols)."""
+    if isinstance(layer, Conv):
+        return convolve(layer, inputs[0])
+    if isinstance(layer, Add):
+        a, b = (x.astype(np.int64) * m for x, m in zip(inputs, layer.multipliers, strict=True))
+        return clamp((a + b + (1 << (layer.shift - 1))) >> layer.shift, signed=layer.signed)
+    channels, rows, cols = inputs[0].shape
+    whole = inputs[0][:, : rows - rows % 2, : cols - cols % 2]
+    blocks = whole.reshape(channels, rows // 2, 2, cols // 2, 2)
+    return blocks.max(axis=(2, 4))
+
+
+def convolve(layer: Conv, x: Quantised) -> Quantised:
+    """Output of a convolution, requantised: ``clamp((acc * m + 2^(s - 1)) >> s)``."""
+    acc = accumulate(layer, x)
+    shift = layer.shift.astype(np.int64)[:, None, None]
+    product = acc * layer.multiplier.astype(np.int64)[:, None, None]
+    return clamp((product + (1 << (shift - 1))) >> shift, signed=layer.signed)
+
+
+def accumulate(layer: Conv, x: Quantised) -> NDArray[np.int64]:
+    """Sums of products and bias, (out, rows, cols), before requantising."""
+    outs, rows, cols = layer.shape((x.shape,))  # type: ignore[arg-type]
+    pad = layer.padding
+    padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad)), constant_values=layer.pad_value)
+    taps = np.stack(
+        [
+            padded[
+                :,
+                top : top + layer.stride * (rows - 1) + 1 : layer.stride,
+                left : left + layer.stride * (cols - 1) + 1 : layer.stride,
+            ]
+            for top in range(0, layer.dilation * layer.kernel, layer.dilation)
+            for left in range(0, layer.dilation * layer.kernel, layer.dilation)
+        ],
+        axis=1,
+    ).astype(np.float64)  # (in, k * k, rows, cols)
+    weight = layer.weight.reshape(outs, -1).astype(np.float64)
+    if layer.depthwise:
+        sums = np.einsum("ct,ctrs->crs", weight, taps)
+    else:
+        sums = (weight @ taps.reshape(weight.shape[1], rows * cols)).reshape(outs, rows, cols)
+    return sums.astype(np.int64) + layer.bias[:, None, None]
+
+
+def clamp(values: NDArray[np.int64], *, signed: bool) -> Quantised:
+    """Values within int8, or within uint8."""
+    low, high = (-128, 127) if signed else (0, 255)
+    return np.clip(values, low, high).astype(np.int16)
+
+
+def real(head: Head, q: NDArray[np.int8]) -> NDArray[np.float64]:
+    """Real values (log depth, logit, offset) of a head's grid."""
+    return head.scale * (q.astype(np.float64) - head.zero_point)
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """A robot, in integers.
+
+    Parameters
+    ----------
+    u_q4, v_q4
+        Pixel-edge coordinates, 1/16 px.
+    depth_mm
+        Along the optical axis, 0 to 65535.
+    confidence
+        0 to 65535 for 0 to 1.
+    """
+
+    u_q4: int
+    v_q4: int
+    depth_mm: int
+    confidence: int
+
+
+def decode(
+    network: IntegerNetwork, grids: dict[str, NDArray[np.int8]], most: int = 20
+) -> list[Detection]:
+    """Detections in the grids of ``run``, best first.
+
+    A detection is a cell whose confidence q reaches ``network.threshold_q``, exceeds that of its
+    neighbours before it in raster order, and is not exceeded by the neighbours after it (3x3).
+    They go in falling q, in raster order where equal; the first ``most`` stay.
+    """
+    q = grids["confidence"].astype(np.int64)
+    rows, cols = q.shape
+    around = np.pad(q, 1, constant_values=-129)
+    peak = q >= network.threshold_q
+    for row in range(3):
+        for col in range(3):
+            neighbour = around[row : row + rows, col : col + cols]
+            if (row, col) < (1, 1):
+                peak &= q > neighbour
+            elif (row, col) > (1, 1):
+                peak &= q >= neighbour
+    cells = np.flatnonzero(peak)
+    best = cells[np.argsort(-q.ravel()[cells], kind="stable")][:most]
+    return [_detection(network, grids, int(cell)) for cell in best]
+
+
+def _detection(network: IntegerNetwork, grids: dict[str, NDArray[np.int8]], cell: int) -> Detection:
+    row, col = divmod(cell, network.grid_shape[1])
+    step = network.stride_px * SUBPIXEL
+    value = {
+        name: int(head.table[int(grids[name][row, col]) + 128])
+        for name, head in network.heads.items()
+    }
+    return Detection(
+        u_q4=col * step + value.get("offset_u", step // 2),
+        v_q4=row * step + value.get("offset_v", step // 2),
+        depth_mm=value["depth"],
+        confidence=value["confidence"],
+    )
