@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.integer import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
+from dmrl.deploy.windows import largest_of_blocks, taps_of
 
 Quantised = NDArray[np.int16]
 """Values of uint8 or int8 tensors; int16 holds both."""
@@ -50,10 +51,7 @@ def compute(layer: AnyLayer, *inputs: Quantised) -> Quantised:
     if isinstance(layer, Add):
         a, b = (x.astype(np.int64) * m for x, m in zip(inputs, layer.multipliers, strict=True))
         return clamp((a + b + (1 << (layer.shift - 1))) >> layer.shift, signed=layer.signed)
-    channels, rows, cols = inputs[0].shape
-    whole = inputs[0][:, : rows - rows % 2, : cols - cols % 2]
-    blocks = whole.reshape(channels, rows // 2, 2, cols // 2, 2)
-    return blocks.max(axis=(2, 4))
+    return largest_of_blocks(inputs[0])
 
 
 def convolve(layer: Conv, x: Quantised) -> Quantised:
@@ -66,21 +64,10 @@ def convolve(layer: Conv, x: Quantised) -> Quantised:
 
 def accumulate(layer: Conv, x: Quantised) -> NDArray[np.int64]:
     """Sums of products and bias, (out, rows, cols), before requantising."""
-    outs, rows, cols = layer.shape((x.shape,))  # type: ignore[arg-type]
     pad = layer.padding
     padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad)), constant_values=layer.pad_value)
-    taps = np.stack(
-        [
-            padded[
-                :,
-                top : top + layer.stride * (rows - 1) + 1 : layer.stride,
-                left : left + layer.stride * (cols - 1) + 1 : layer.stride,
-            ]
-            for top in range(0, layer.dilation * layer.kernel, layer.dilation)
-            for left in range(0, layer.dilation * layer.kernel, layer.dilation)
-        ],
-        axis=1,
-    ).astype(np.float64)  # (in, k * k, rows, cols)
+    taps = taps_of(padded, layer.kernel, layer.stride, layer.dilation).astype(np.float64)
+    outs, (rows, cols) = len(layer.weight), taps.shape[2:]
     weight = layer.weight.reshape(outs, -1).astype(np.float64)
     if layer.depthwise:
         sums = np.einsum("ct,ctrs->crs", weight, taps)

@@ -1,0 +1,307 @@
+"""A float network to int8, after training: ranges from calibration images, then rounding.
+
+Weights per output channel, activations per tensor with zero point 0, each head with a scale of
+its own; ranges are the largest values seen. (Clipping at a percentile costs accuracy: the few
+large values are the robots.)
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.graph import (
+    FloatAdd,
+    FloatConv,
+    FloatPool,
+    Graph,
+    grey_of,
+    outputs_of,
+    tensors_of,
+    to_input,
+)
+from dmrl.deploy.integer import (
+    CONFIDENCE_ONE,
+    PIXEL_ZERO,
+    SUBPIXEL,
+    Add,
+    AnyLayer,
+    Conv,
+    Head,
+    Int32,
+    IntegerNetwork,
+    MaxPool,
+)
+from dmrl.errors import SettingError
+
+Array = NDArray[np.float64]
+
+HEADS = ("depth", "confidence", "offset_u", "offset_v")
+"""The channels of a network's output, in order; the last two are optional."""
+LEVELS = np.arange(-128, 128)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges:
+    """What calibration images gave.
+
+    Parameters
+    ----------
+    low, high
+        (tensors,) least and largest value of every tensor.
+    output_low, output_high
+        (channels,) of every channel of the output.
+    images
+        How many there were.
+    height_px, width_px
+        Of the images.
+    """
+
+    low: Array
+    high: Array
+    output_low: Array
+    output_high: Array
+    images: int
+    height_px: int
+    width_px: int
+
+    def with_more(self, other: "Ranges") -> "Ranges":
+        """The ranges over both sets of images, which are of one size."""
+        return Ranges(
+            np.minimum(self.low, other.low),
+            np.maximum(self.high, other.high),
+            np.minimum(self.output_low, other.output_low),
+            np.maximum(self.output_high, other.output_high),
+            self.images + other.images,
+            self.height_px,
+            self.width_px,
+        )
+
+
+def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
+    """Ranges of every tensor over calibration images.
+
+    Parameters
+    ----------
+    graph
+        The network.
+    batches
+        (n, height, width, 3) RGB images, all of one size; a network of grey images sees them
+        in grey.
+
+    Raises
+    ------
+    SettingError
+        If there are no images, every one of them is of a single colour, or a layer is zero
+        for all of them.
+    """
+    ranges: Ranges | None = None
+    varied = False
+    for batch in batches:
+        varied = varied or bool((np.ptp(batch, axis=(1, 2)) > 0).any())
+        more = _ranges(graph, batch)
+        ranges = more if ranges is None else ranges.with_more(more)
+    if ranges is None:
+        raise SettingError("no images to calibrate on. Give a dataset with images")
+    if not varied:
+        raise SettingError(
+            f"each of the {ranges.images} calibration images is of a single colour, so nothing "
+            "can be learned of the ranges. Give images as the camera takes them"
+        )
+    for layer, high, low in zip(graph.layers, ranges.high[1:], ranges.low[1:], strict=True):
+        if high == 0 == low:
+            raise SettingError(
+                f"layer {layer.name} is zero for all of the {ranges.images} calibration images. "
+                "Give more of them, or train the network"
+            )
+    return ranges
+
+
+def _ranges(graph: Graph, images: NDArray[np.uint8]) -> Ranges:
+    seen = grey_of(images) if graph.channels == 1 else images
+    tensors = tensors_of(graph, to_input(seen))
+    output = outputs_of(graph, tensors)
+    return Ranges(
+        np.array([tensor.min() for tensor in tensors], np.float64),
+        np.array([tensor.max() for tensor in tensors], np.float64),
+        output.min(axis=(0, 2, 3)).astype(np.float64),
+        output.max(axis=(0, 2, 3)).astype(np.float64),
+        len(images),
+        images.shape[1],
+        images.shape[2],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What an integer network says of itself; see ``IntegerNetwork``."""
+
+    name: str
+    architecture: str
+    stride_px: int
+    threshold: float
+
+
+def quantise(graph: Graph, ranges: Ranges, about: About) -> IntegerNetwork:
+    """The int8 network of a float one.
+
+    Raises
+    ------
+    SettingError
+        If the output has neither two nor four channels.
+    """
+    if len(graph.outputs) not in (2, 4):
+        raise SettingError(
+            f"{about.name} gives {len(graph.outputs)} channels. "
+            "Give log depth and confidence, and the two offsets of a cell if there are any"
+        )
+    heads = [_head(graph, ranges, k, about.stride_px) for k in range(len(graph.outputs))]
+    layers: list[AnyLayer] = []
+    scales = [1 / PIXEL_ZERO]
+    signed = [False]
+    for index, layer in enumerate(graph.layers):
+        tensor = index + 1
+        own = [head for head in heads if head.tensor == tensor]
+        made: AnyLayer
+        if isinstance(layer, FloatConv):
+            made = _conv(layer, scales, ranges, tensor, own)
+        elif isinstance(layer, FloatAdd):
+            made = _add(layer, scales, ranges, tensor)
+        else:
+            made = _pool(layer, scales, signed)
+        layers.append(made)
+        scales.append(made.scale)
+        signed.append(made.signed)
+    return IntegerNetwork(
+        about.name,
+        about.architecture,
+        graph.channels,
+        ranges.height_px,
+        ranges.width_px,
+        about.stride_px,
+        tuple(layers),
+        threshold=about.threshold,
+        **dict(zip(HEADS, heads, strict=False)),
+    )
+
+
+def _head(graph: Graph, ranges: Ranges, output: int, stride_px: int) -> Head:
+    """Scale and zero point of a head: its range, and 0, on the 256 levels."""
+    low = min(ranges.output_low[output], 0.0)
+    high = max(ranges.output_high[output], 0.0)
+    scale = float(high - low) / 255 or 1.0
+    zero_point = int(np.clip(np.rint(-128 - low / scale), -128, 127))
+    tensor, channel = graph.outputs[output]
+    meaning = MEANINGS[HEADS[output]](scale * (LEVELS - zero_point), stride_px)
+    return Head(tensor, channel, scale, zero_point, np.rint(meaning).astype(np.int32))
+
+
+def _confidence_of(logit: Array, _stride_px: int) -> Array:
+    confidence: Array = CONFIDENCE_ONE / (1 + np.exp(-logit))
+    return confidence
+
+
+def _millimetres_of(log_depth: Array, _stride_px: int) -> Array:
+    return np.minimum(1000 * np.exp(np.minimum(log_depth, 20)), 65535)
+
+
+def _place_of(offset: Array, stride_px: int) -> Array:
+    """Place in a cell, 1/16 px, of an offset from its centre in cells."""
+    return np.clip((offset + 0.5) * stride_px * SUBPIXEL, -32768, 32767)
+
+
+MEANINGS: dict[str, Callable[[Array, int], Array]] = {
+    "confidence": _confidence_of,
+    "depth": _millimetres_of,
+    "offset_u": _place_of,
+    "offset_v": _place_of,
+}
+
+
+def _activation_scale(ranges: Ranges, tensor: int, *, signed: bool) -> float:
+    if signed:
+        return float(max(-ranges.low[tensor], ranges.high[tensor])) / 127
+    return float(ranges.high[tensor]) / 255
+
+
+def _conv(
+    layer: FloatConv, scales: list[float], ranges: Ranges, tensor: int, heads: list[Head]
+) -> Conv:
+    outs = len(layer.bias)
+    scale = 1.0 if heads else _activation_scale(ranges, tensor, signed=not layer.relu)
+    out_scale, zero_point = np.full(outs, scale), np.zeros(outs)
+    for head in heads:
+        out_scale[head.channel], zero_point[head.channel] = head.scale, head.zero_point
+    weight, bias, factor = _integers(layer, scales[layer.sources[0]], out_scale, zero_point)
+    if layer.sources[0] == 0:
+        bias -= PIXEL_ZERO * weight.sum(axis=(1, 2, 3))
+    multiplier, shift = _fixed_point(factor)
+    return Conv(
+        layer.name,
+        layer.sources[0],
+        weight.astype(np.int8),
+        bias.astype(np.int32),
+        multiplier,
+        shift,
+        layer.stride,
+        layer.dilation,
+        layer.padding,
+        layer.groups,
+        signed=not layer.relu,
+        pad_value=PIXEL_ZERO if layer.sources[0] == 0 else 0,
+        scale=scale,
+    )
+
+
+def _integers(
+    layer: FloatConv, in_scale: float, out_scale: Array, zero_point: Array
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Weights, bias and the real factor from sum to output, per output channel.
+
+    The scale of a channel's weights is set by its largest weight; by its bias, where that would
+    not fit beside the sum; or by the smallest factor that a shift of 62 can express.
+    """
+    largest = np.abs(layer.weight).max(axis=(1, 2, 3))
+    room = 2**31 - 1 - 128 * 255 * layer.weight[0].size
+    bias = layer.bias + zero_point * out_scale
+    least = 2.0**-31 * out_scale / in_scale
+    weight_scale = np.maximum.reduce([largest / 127, np.abs(bias) / (in_scale * room), least])
+    weight = np.rint(layer.weight / weight_scale[:, None, None, None]).astype(np.int64)
+    sum_scale = in_scale * weight_scale
+    return weight, np.rint(bias / sum_scale).astype(np.int64), sum_scale / out_scale
+
+
+def _fixed_point(factor: Array) -> tuple[Int32, Int32]:
+    """Multipliers of 31 bits and shifts: ``factor = multiplier / 2^shift``."""
+    mantissa, exponent = np.frexp(factor)
+    multiplier = np.rint(mantissa * 2**31).astype(np.int64)
+    carried = multiplier == 2**31
+    multiplier = np.where(carried, 2**30, multiplier)
+    return multiplier.astype(np.int32), (31 - exponent - carried).astype(np.int32)
+
+
+def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> Add:
+    signed = not layer.relu and bool(ranges.low[tensor] < 0)
+    a, b = (scales[source] for source in layer.sources)
+    # A sum that cancels may be small; a shift below 1 cannot be.
+    scale = max(_activation_scale(ranges, tensor, signed=signed), max(a, b) * 2.0**-19)
+    _, exponent = np.frexp(max(a, b) / scale)
+    shift = 21 - int(exponent)
+    multipliers = [round(part / scale * 2**shift) for part in (a, b)]
+    if max(multipliers) == 2**21:
+        shift -= 1
+        multipliers = [round(part / scale * 2**shift) for part in (a, b)]
+    return Add(
+        layer.name,
+        layer.sources,
+        (multipliers[0], multipliers[1]),
+        shift,
+        signed=signed,
+        scale=scale,
+    )
+
+
+def _pool(layer: FloatPool, scales: list[float], signed: list[bool]) -> MaxPool:
+    source = layer.sources[0]
+    return MaxPool(layer.name, source, signed=signed[source], scale=scales[source])
