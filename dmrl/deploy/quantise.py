@@ -37,8 +37,15 @@ from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]
 
-HEADS = ("depth", "confidence", "offset_u", "offset_v")
-"""The channels of a network's output, in order; the last two are optional."""
+HEAD_OF = {
+    "log_depth": "depth",
+    "confidence": "confidence",
+    "offset_u": "offset_u",
+    "offset_v": "offset_v",
+}
+"""The head that each channel of a network's output becomes; other channels are left behind."""
+HEAD_ROOM = 0.05
+"""Share of its range that a head keeps free at either end, for images not seen before."""
 LEVELS = np.arange(-128, 128)
 
 
@@ -135,11 +142,20 @@ def _ranges(graph: Graph, images: NDArray[np.uint8]) -> Ranges:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What an integer network says of itself; see ``IntegerNetwork``."""
+    """What an integer network says of itself.
+
+    Parameters
+    ----------
+    name, architecture, stride_px, threshold
+        See ``IntegerNetwork``.
+    channels
+        What the channels of the output are, as the network's class names them.
+    """
 
     name: str
     architecture: str
     stride_px: int
+    channels: tuple[str, ...]
     threshold: float
 
 
@@ -149,20 +165,21 @@ def quantise(graph: Graph, ranges: Ranges, about: About) -> IntegerNetwork:
     Raises
     ------
     SettingError
-        If the output has neither two nor four channels.
+        If the network gives no confidence or no depth.
     """
-    if len(graph.outputs) not in (2, 4):
-        raise SettingError(
-            f"{about.name} gives {len(graph.outputs)} channels. "
-            "Give log depth and confidence, and the two offsets of a cell if there are any"
-        )
-    heads = [_head(graph, ranges, k, about.stride_px) for k in range(len(graph.outputs))]
+    heads = {
+        HEAD_OF[channel]: _head(graph, ranges, k, HEAD_OF[channel], about.stride_px)
+        for k, channel in enumerate(about.channels)
+        if channel in HEAD_OF
+    }
+    if absent := sorted({"confidence", "depth"} - heads.keys()):
+        raise SettingError(f"{about.name} gives no {absent[0]}, which detections are made of")
     layers: list[AnyLayer] = []
     scales = [1 / PIXEL_ZERO]
     signed = [False]
     for index, layer in enumerate(graph.layers):
         tensor = index + 1
-        own = [head for head in heads if head.tensor == tensor]
+        own = [head for head in heads.values() if head.tensor == tensor]
         made: AnyLayer
         if isinstance(layer, FloatConv):
             made = _conv(layer, scales, ranges, tensor, own)
@@ -182,18 +199,19 @@ def quantise(graph: Graph, ranges: Ranges, about: About) -> IntegerNetwork:
         about.stride_px,
         tuple(layers),
         threshold=about.threshold,
-        **dict(zip(HEADS, heads, strict=False)),
+        **heads,
     )
 
 
-def _head(graph: Graph, ranges: Ranges, output: int, stride_px: int) -> Head:
-    """Scale and zero point of a head: its range, and 0, on the 256 levels."""
-    low = min(ranges.output_low[output], 0.0)
-    high = max(ranges.output_high[output], 0.0)
+def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) -> Head:
+    """Scale and zero point of a head: its range, some room, and 0, on the 256 levels."""
+    room = HEAD_ROOM * (ranges.output_high[output] - ranges.output_low[output])
+    low = min(ranges.output_low[output] - room, 0.0)
+    high = max(ranges.output_high[output] + room, 0.0)
     scale = float(high - low) / 255 or 1.0
     zero_point = int(np.clip(np.rint(-128 - low / scale), -128, 127))
     tensor, channel = graph.outputs[output]
-    meaning = MEANINGS[HEADS[output]](scale * (LEVELS - zero_point), stride_px)
+    meaning = MEANINGS[name](scale * (LEVELS - zero_point), stride_px)
     return Head(tensor, channel, scale, zero_point, np.rint(meaning).astype(np.int32))
 
 
