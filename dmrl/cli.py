@@ -29,6 +29,8 @@ COMMANDS = {
     "train": "Train a network on a dataset.",
     "predict": "Run a network on every image of a recording.",
     "evaluate": "Judge detections against labels, or estimated positions against the truth.",
+    "quantize": "Quantise a network to int8, and say what that costs.",
+    "export": "Write a network as ONNX and as C.",
     "view": "Show recordings in rerun, or save what it would show.",
     "info": "Show what a recording holds and where it comes from.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",

@@ -69,7 +69,9 @@ def load(path: Path) -> IntegerNetwork:
             arrays = {name: archive[name] for name in archive.files}
         said = json.loads(arrays.pop("description").tobytes())
         if said["format"] != FORMAT:
-            raise ModelError(f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Update dmrl")
+            raise ModelError(
+                f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Update dmrl"
+            )
         return _network(said, arrays)
     except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as e:
         raise ModelError(f"{file} is damaged: {e}. Quantise the model again") from None
