@@ -172,16 +172,15 @@ def _seen(pictures: list[Rgb], model: Model, settings: Settings) -> list[_Seen]:
     """What the network finds in each picture."""
     out = []
     for _, same_size in groupby(pictures, key=np.shape):
-        confidence, depth_m = model.grids(np.stack(list(same_size)))
+        grids = model.grids(np.stack(list(same_size)))
         found = find(
-            confidence,
-            depth_m,
+            *grids,
             stride_px=model.network.stride_px,
             most=settings.most,
             min_confidence=settings.min_confidence,
         )
-        for k in range(len(confidence)):
-            grid = _grid(confidence[k], depth_m[k], model.network.stride_px)
+        for k in range(len(found.count)):
+            grid = _grid(grids.confidence[k], grids.depth_m[k], model.network.stride_px)
             out.append(_Seen(_detections(found, k, model.threshold), grid))
     return out
 

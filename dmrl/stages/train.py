@@ -1,16 +1,19 @@
 """``dmrl train``: an Arrow dataset to a run folder with a trained network."""
 
+import fnmatch
 import shutil
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import pyarrow.compute as pc
 from cyclopts import Parameter
+from numpy.typing import NDArray
 
 from dmrl import recipe as recipes
-from dmrl.dataset import Split, open_dataset
+from dmrl.dataset import Dataset, Split, open_dataset
 from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
 from dmrl.output import partial_folder, partial_of, refuse_existing
 from dmrl.progress import track
@@ -18,11 +21,20 @@ from dmrl.recording import provenance
 from dmrl.tables import print_json, print_table
 
 try:
-    from dmrl.learn.batches import Examples
+    from dmrl.learn.batches import FIELDS, Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
-    from dmrl.learn.fit import FitSettings, Step, Training, new_network
-    from dmrl.learn.model import Model, load_model, save_model, set_weights, weights_of
+    from dmrl.learn.fit import Step, Training, new_network
+    from dmrl.learn.model import (
+        PUBLISHED_THRESHOLD,
+        Model,
+        load_model,
+        save_model,
+        set_weights,
+        weights_of,
+    )
     from dmrl.learn.network import Network
+    from dmrl.learn.settings import FitSettings
+    from dmrl.learn.validate import best_threshold, scores
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "train", "dmrl train") from e
 
@@ -50,7 +62,8 @@ def run(
 ) -> Result:
     """Train on the train split of ``dataset`` and write the run folder ``out``.
 
-    A split named val is watched, where there is one, and used for nothing else.
+    The threshold is chosen on images held out: the split named val or, where there is none, a
+    share of the train split.
 
     Parameters
     ----------
@@ -81,8 +94,7 @@ def run(
     _clear_the_way(partial_of(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
-    examples = _examples(train)
-    watched = _examples(data.split("val")) if "val" in data.splits else None
+    examples, held_out, shares = _material(data, settings)
     network = _first_network(settings, examples, init)
     inputs = (dataset,) if init is None else (dataset, init)
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
@@ -93,13 +105,16 @@ def run(
             examples,
             settings,
             folder,
-            validation=watched,
+            validation=held_out,
+            shares=shares,
             identity=identity,
             resume=resume and has_checkpoint(folder),
         )
         made.write(folder)
         result = _train(training, settings, len(examples))
-        save_model(_model(network, settings, train, training.history), folder)
+        threshold = _threshold(training.network, held_out, settings)
+        model = _model(training, settings, train, len(examples), threshold)
+        save_model(model, folder)
         remove_checkpoint(folder)
     return result
 
@@ -116,8 +131,73 @@ def _clear_the_way(partial: Path, *, resume: bool) -> None:
     shutil.rmtree(partial)
 
 
+def _material(
+    data: Dataset, settings: Settings
+) -> tuple[Examples, Examples | None, NDArray[np.float64] | None]:
+    """Images to learn from, images held out, and the shares of the former."""
+    train = data.split("train")
+    every, sources = _examples(train), np.array(train.table.column("source").to_pylist())
+    held = np.zeros(len(every), bool)
+    watched = _examples(data.split("val")) if "val" in data.splits else None
+    if watched is None and settings.validation_share:
+        held = _last_of_each(sources, settings.validation_share)
+        watched = every.select(held) if held.any() else None
+    learnt = every.select(~held) if held.any() else every
+    return learnt, watched, _shares(sources[~held], settings)
+
+
+def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
+    """The last share of the images of each recording."""
+    held = np.zeros(len(sources), bool)
+    for source in np.unique(sources):
+        mine = np.flatnonzero(sources == source)
+        held[mine[len(mine) - int(share * len(mine)) :]] = True
+    return held
+
+
+def _shares(sources: NDArray[np.str_], settings: Settings) -> NDArray[np.float64] | None:
+    """How often each image shall come in an epoch, by the shares of the recordings.
+
+    Raises
+    ------
+    SettingError
+        If a pattern fits no recording, or a recording fits none.
+    """
+    if not settings.shares:
+        return None
+    out = np.full(len(sources), np.nan)
+    names = sorted(set(sources.tolist()))
+    for pattern, share in settings.shares.items():
+        mine = np.isin(sources, fnmatch.filter(names, pattern)) & np.isnan(out)
+        if not mine.any():
+            raise SettingError(
+                f"shares: no images left for {pattern}. The recordings are {', '.join(names)}"
+            )
+        out[mine] = share / mine.sum()
+    if np.isnan(out).any():
+        forgotten = sources[np.isnan(out)][0]
+        raise SettingError(f'shares: none for {forgotten}. Name it, or add "*"')
+    if not out.sum():
+        raise SettingError("shares: all are 0. Give one that is not")
+    return out / out.mean()
+
+
 def _examples(split: Split) -> Examples:
-    return Examples(split.pixels, split.confidence, split.depth)
+    """Images and robots of a split."""
+    peers = split.table.column("peers").to_pylist()
+    robots = np.full((len(peers), max(map(len, peers), default=0) or 1, len(FIELDS)), np.nan)
+    for row, found in zip(robots, peers, strict=True):
+        for place, peer in zip(row, found, strict=False):
+            place[:6] = [peer[name] for name in FIELDS[:6]]
+            place[6:] = peer["box_px"] if len(peer["box_px"]) == 4 else np.nan
+    return Examples(split.pixels, robots.astype(np.float32))
+
+
+def _threshold(network: Network, held_out: Examples | None, settings: Settings) -> float:
+    if settings.threshold is not None:
+        return settings.threshold
+    best = best_threshold(scores(network, held_out)) if held_out is not None else None
+    return PUBLISHED_THRESHOLD if best is None else best
 
 
 def _first_network(settings: Settings, examples: Examples, init: Path | None) -> Network:
@@ -140,19 +220,19 @@ def _train(training: Training, settings: Settings, images: int) -> Result:
 
 
 def _model(
-    network: Network, settings: Settings, train: Split, history: list[dict[str, float]]
+    training: Training, settings: Settings, train: Split, images: int, threshold: float
 ) -> Model:
     height_px, width_px = train.image_shape
     peers = pc.list_flatten(train.table.column("peers"))
     sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
     return Model(
-        network,
+        training.network,
         settings.architecture,
         width_px=width_px,
         height_px=height_px,
-        threshold=settings.threshold,
+        threshold=threshold,
         label_source=", ".join(sorted(sources)),
-        training={"images": len(train), "settings": asdict(settings), "history": history},
+        training={"images": images, "settings": asdict(settings), "history": training.history},
     )
 
 
@@ -203,7 +283,7 @@ def command(
     out: Annotated[Path, Parameter(name="OUT_DIR")],
     /,
     *,
-    recipe: str = "locanet",
+    recipe: str = "dmrl_nano",
     init: Path | None = None,
     resume: bool = False,
     flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
