@@ -1,11 +1,11 @@
-"""A float network to int8, after training: ranges from calibration images, then rounding.
+"""A float network to int8, after training: ranges of calibration images, then rounding.
 
 Weights per output channel, activations per tensor with zero point 0, each head with a scale of
 its own; ranges are the largest values seen. (Clipping at a percentile costs accuracy: the few
 large values are the robots.)
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +16,6 @@ from dmrl.deploy.graph import (
     FloatConv,
     FloatPool,
     Graph,
-    grey_of,
-    outputs_of,
-    tensors_of,
-    to_input,
 )
 from dmrl.deploy.integer import (
     CONFIDENCE_ONE,
@@ -33,6 +29,7 @@ from dmrl.deploy.integer import (
     IntegerNetwork,
     MaxPool,
 )
+from dmrl.deploy.ranges import Ranges
 from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]
@@ -47,97 +44,6 @@ HEAD_OF = {
 HEAD_ROOM = 0.05
 """Share of its range that a head keeps free at either end, for images not seen before."""
 LEVELS = np.arange(-128, 128)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Ranges:
-    """What calibration images gave.
-
-    Parameters
-    ----------
-    low, high
-        (tensors,) least and largest value of every tensor.
-    output_low, output_high
-        (channels,) of every channel of the output.
-    images
-        How many there were.
-    height_px, width_px
-        Of the images.
-    """
-
-    low: Array
-    high: Array
-    output_low: Array
-    output_high: Array
-    images: int
-    height_px: int
-    width_px: int
-
-    def with_more(self, other: "Ranges") -> "Ranges":
-        """The ranges over both sets of images, which are of one size."""
-        return Ranges(
-            np.minimum(self.low, other.low),
-            np.maximum(self.high, other.high),
-            np.minimum(self.output_low, other.output_low),
-            np.maximum(self.output_high, other.output_high),
-            self.images + other.images,
-            self.height_px,
-            self.width_px,
-        )
-
-
-def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
-    """Ranges of every tensor over calibration images.
-
-    Parameters
-    ----------
-    graph
-        The network.
-    batches
-        (n, height, width, 3) RGB images, all of one size; a network of grey images sees them
-        in grey.
-
-    Raises
-    ------
-    SettingError
-        If there are no images, every one of them is of a single colour, or a layer is zero
-        for all of them.
-    """
-    ranges: Ranges | None = None
-    varied = False
-    for batch in batches:
-        varied = varied or bool((np.ptp(batch, axis=(1, 2)) > 0).any())
-        more = _ranges(graph, batch)
-        ranges = more if ranges is None else ranges.with_more(more)
-    if ranges is None:
-        raise SettingError("no images to calibrate on. Give a dataset with images")
-    if not varied:
-        raise SettingError(
-            f"each of the {ranges.images} calibration images is of a single colour, so nothing "
-            "can be learned of the ranges. Give images as the camera takes them"
-        )
-    for layer, high, low in zip(graph.layers, ranges.high[1:], ranges.low[1:], strict=True):
-        if high == 0 == low:
-            raise SettingError(
-                f"layer {layer.name} is zero for all of the {ranges.images} calibration images. "
-                "Give more of them, or train the network"
-            )
-    return ranges
-
-
-def _ranges(graph: Graph, images: NDArray[np.uint8]) -> Ranges:
-    seen = grey_of(images) if graph.channels == 1 else images
-    tensors = tensors_of(graph, to_input(seen))
-    output = outputs_of(graph, tensors)
-    return Ranges(
-        np.array([tensor.min() for tensor in tensors], np.float64),
-        np.array([tensor.max() for tensor in tensors], np.float64),
-        output.min(axis=(0, 2, 3)).astype(np.float64),
-        output.max(axis=(0, 2, 3)).astype(np.float64),
-        len(images),
-        images.shape[1],
-        images.shape[2],
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +111,12 @@ def quantise(graph: Graph, ranges: Ranges, about: About) -> IntegerNetwork:
 
 def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) -> Head:
     """Scale and zero point of a head: its range, some room, and 0, on the 256 levels."""
-    room = HEAD_ROOM * (ranges.output_high[output] - ranges.output_low[output])
-    low = min(ranges.output_low[output] - room, 0.0)
-    high = max(ranges.output_high[output] + room, 0.0)
+    tensor, channel = graph.outputs[output]
+    least, most = ranges.low[tensor][channel], ranges.high[tensor][channel]
+    room = HEAD_ROOM * (most - least)
+    low, high = min(least - room, 0.0), max(most + room, 0.0)
     scale = float(high - low) / 255 or 1.0
     zero_point = int(np.clip(np.rint(-128 - low / scale), -128, 127))
-    tensor, channel = graph.outputs[output]
     meaning = MEANINGS[name](scale * (LEVELS - zero_point), stride_px)
     return Head(tensor, channel, scale, zero_point, np.rint(meaning).astype(np.int32))
 
@@ -238,9 +144,8 @@ MEANINGS: dict[str, Callable[[Array, int], Array]] = {
 
 
 def _activation_scale(ranges: Ranges, tensor: int, *, signed: bool) -> float:
-    if signed:
-        return float(max(-ranges.low[tensor], ranges.high[tensor])) / 127
-    return float(ranges.high[tensor]) / 255
+    low, high = float(ranges.low[tensor].min()), float(ranges.high[tensor].max())
+    return max(-low, high) / 127 if signed else high / 255
 
 
 def _conv(
@@ -300,7 +205,7 @@ def _fixed_point(factor: Array) -> tuple[Int32, Int32]:
 
 
 def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> Add:
-    signed = not layer.relu and bool(ranges.low[tensor] < 0)
+    signed = not layer.relu and bool((ranges.low[tensor] < 0).any())
     a, b = (scales[source] for source in layer.sources)
     # A sum that cancels may be small; a shift below 1 cannot be.
     scale = max(_activation_scale(ranges, tensor, signed=signed), max(a, b) * 2.0**-19)

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from dmrl.dataset import Dataset, Split, open_dataset
 from dmrl.deploy.accuracy import argmax_kept, figures_of, maps_of, points_of
 from dmrl.deploy.backends import Backend, Float, Integer, Outputs
+from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import Graph, graph_of
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.layers import LayerFigures, layer_figures
-from dmrl.deploy.quantise import About, calibrate, quantise
+from dmrl.deploy.quantise import About, quantise
+from dmrl.deploy.ranges import calibrate
 from dmrl.deploy.samples import SAMPLES, save_samples
 from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.errors import MissingExtra, SettingError
@@ -139,6 +141,7 @@ def run(model: Path, dataset: Path, out: Path, settings: Settings) -> Result:
     rows = _spread(len(seen), settings.images)
     calibration = track(_images(seen, rows), "Calibrating", len(rows))
     ranges = calibrate(graph, (image[None] for image in calibration))
+    graph, ranges = equalise(graph, ranges)
     network = quantise(graph, ranges, _about(trained))
     made = provenance("quantize", settings, (model, dataset), libraries=("torch", "numpy"))
     with partial_folder(out) as folder:
