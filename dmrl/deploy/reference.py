@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.integer import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
 from dmrl.deploy.windows import largest_of_blocks, taps_of
+from dmrl.learn.decode import SAME_PX
 
 Quantised = NDArray[np.int16]
 """Values of uint8 or int8 tensors; int16 holds both."""
@@ -114,7 +115,11 @@ def decode(
 
     A detection is a cell whose confidence q reaches ``network.threshold_q``, exceeds that of its
     neighbours before it in raster order, and is not exceeded by the neighbours after it (3x3).
-    They go in falling q, in raster order where equal; the first ``most`` stay.
+    They go in falling q, in raster order where equal; the first ``most`` are taken.
+
+    Where the network has offsets, the positions are clipped to the image, 0 and its sides
+    included, and, in that order, a detection less than ``SAME_PX`` from one that stays is
+    dropped: ``du^2 + dv^2 < (16 SAME_PX)^2`` in 1/16 px.
     """
     q = grids["confidence"].astype(np.int64)
     rows, cols = q.shape
@@ -129,19 +134,32 @@ def decode(
                 peak &= q >= neighbour
     cells = np.flatnonzero(peak)
     best = cells[np.argsort(-q.ravel()[cells], kind="stable")][:most]
-    return [_detection(network, grids, int(cell)) for cell in best]
+    found = [_detection(network, grids, int(cell)) for cell in best]
+    return found if network.offset_u is None else _without_doubles(found)
 
 
 def _detection(network: IntegerNetwork, grids: dict[str, NDArray[np.int8]], cell: int) -> Detection:
-    row, col = divmod(cell, network.grid_shape[1])
+    rows, cols = network.grid_shape
+    row, col = divmod(cell, cols)
     step = network.stride_px * SUBPIXEL
     value = {
         name: int(head.table[int(grids[name][row, col]) + 128])
         for name, head in network.heads.items()
     }
     return Detection(
-        u_q4=col * step + value.get("offset_u", step // 2),
-        v_q4=row * step + value.get("offset_v", step // 2),
+        u_q4=min(max(col * step + value.get("offset_u", step // 2), 0), cols * step),
+        v_q4=min(max(row * step + value.get("offset_v", step // 2), 0), rows * step),
         depth_mm=value["depth"],
         confidence=value["confidence"],
     )
+
+
+def _without_doubles(found: list[Detection]) -> list[Detection]:
+    """The same without detections that lie by a more confident one."""
+    near = int(SAME_PX * SUBPIXEL) ** 2
+    kept: list[Detection] = []
+    for one in found:
+        away = [(one.u_q4 - other.u_q4) ** 2 + (one.v_q4 - other.v_q4) ** 2 for other in kept]
+        if not away or min(away) >= near:
+            kept.append(one)
+    return kept
