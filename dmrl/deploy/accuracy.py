@@ -1,25 +1,16 @@
-"""Outputs of a backend to maps and detections, and how good they are against labels."""
+"""Detections of a backend, and how good they are against labels."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dmrl.deploy.backends import Outputs
+from dmrl.deploy.backends import Outputs, grids_of
 from dmrl.learn.decode import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import by_band, score
 
-Array = NDArray[np.float64]
-
-
-def maps_of(outputs: Outputs) -> tuple[Array, Array]:
-    """Confidence (0 to 1) and depth (m), each (N, rows, cols)."""
-    logit = outputs["confidence"].astype(np.float64)
-    return 1 / (1 + np.exp(-logit)), np.exp(outputs["log_depth"].astype(np.float64))
-
 
 def points_of(outputs: Outputs, stride_px: int) -> Points:
     """Detections in N images."""
-    found = decode(*maps_of(outputs), stride_px=stride_px)
+    found = decode(*grids_of(outputs), stride_px=stride_px)
     kept = np.arange(found.u_px.shape[1]) < found.count[:, None]
     return Points(
         np.nonzero(kept)[0],

@@ -1,5 +1,6 @@
 """The ways to compute a network's output without torch; each is asked the same question."""
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -9,6 +10,7 @@ from dmrl.deploy import reference
 from dmrl.deploy.graph import Float32, Graph, grey_of, outputs_of, tensors_of, to_input
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.quantise import HEAD_OF
+from dmrl.learn.decode import Grids
 
 Outputs = dict[str, Float32]
 """(N, rows, cols) by the names that the network's class gives its ``channels``."""
@@ -21,6 +23,17 @@ class Backend(Protocol):
 
     def outputs(self, images: NDArray[np.uint8]) -> Outputs:
         """Output for (N, height, width, 3) RGB images of the network's size."""
+
+
+def grids_of(outputs: Outputs) -> Grids:
+    """What an output says of N images."""
+    logit = outputs["confidence"].astype(np.float64)
+    offset = None
+    if "offset_u" in outputs and "offset_v" in outputs:
+        offset = np.stack([outputs["offset_u"], outputs["offset_v"]], axis=1)
+    return Grids(
+        (1 / (1 + np.exp(-logit))).astype(np.float32), np.exp(outputs["log_depth"]), offset
+    )
 
 
 class Float:
@@ -45,24 +58,30 @@ class Float:
         return dict(zip(self.channels, output.swapaxes(0, 1), strict=True))
 
 
-class Integer:
-    """The int8 network in NumPy: the reference.
+class OnLevels:
+    """An int8 network, computed image by image.
 
     Parameters
     ----------
     network
-        What it computes.
+        What is computed.
+    run
+        From a (height, width, channels) image, as the network takes it, to its heads' grids.
     """
 
-    def __init__(self, network: IntegerNetwork) -> None:
+    def __init__(self, network: IntegerNetwork, run: Callable[[NDArray[np.uint8]], Levels]) -> None:
         self.network = network
+        self.run = run
 
     def outputs(self, images: NDArray[np.uint8]) -> Outputs:
         """Output for (N, height, width, 3) RGB images: real values of the heads."""
-        network = self.network
-        return real_outputs(
-            network, [reference.run(network, seen_by(network, image)) for image in images]
-        )
+        seen = [seen_by(self.network, image) for image in images]
+        return real_outputs(self.network, [self.run(image) for image in seen])
+
+
+def integer(network: IntegerNetwork) -> OnLevels:
+    """The int8 network in NumPy: the reference."""
+    return OnLevels(network, lambda image: reference.run(network, image))
 
 
 def seen_by(network: IntegerNetwork, image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ and of detections closer than ``SAME_PX`` only the most confident stays.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,25 @@ Array = NDArray[np.float64]
 
 SAME_PX = 8.0
 """Detections closer than this are of one robot."""
+
+
+class Grids(NamedTuple):
+    """What a network says of N images.
+
+    Parameters
+    ----------
+    confidence
+        (N, rows, cols), 0 to 1.
+    depth_m
+        (N, rows, cols), metres.
+    offset
+        (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells; None
+        for a network that has no such channels.
+    """
+
+    confidence: NDArray[np.floating]
+    depth_m: NDArray[np.floating]
+    offset: NDArray[np.floating] | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ A run folder holds ``model.safetensors`` and ``model.json``. Nothing is ever unp
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from dmrl.errors import ModelError, SettingError
+from dmrl.learn.decode import Grids
 from dmrl.learn.keras import read_h5
 from dmrl.learn.network import ARCHITECTURES, SUB_CELL, Network, build, parameter_count, to_input
 
@@ -25,25 +26,6 @@ PUBLISHED_THRESHOLD = 0.33
 """Confidence threshold of the published evaluation."""
 
 Grid = NDArray[np.float32]
-
-
-class Grids(NamedTuple):
-    """What a network says of N images.
-
-    Parameters
-    ----------
-    confidence
-        (N, rows, cols), 0 to 1.
-    depth_m
-        (N, rows, cols), metres.
-    offset
-        (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells; None
-        for a network that has no such channels.
-    """
-
-    confidence: Grid
-    depth_m: Grid
-    offset: Grid | None
 
 
 def grids_of(network: Network, images: Tensor) -> Grids:

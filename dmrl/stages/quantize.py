@@ -12,8 +12,8 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl.dataset import Dataset, Split, open_dataset
-from dmrl.deploy.accuracy import argmax_kept, figures_of, maps_of, points_of
-from dmrl.deploy.backends import Backend, Float, Integer, Outputs
+from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
+from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
 from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import Graph, graph_of
 from dmrl.deploy.integer import IntegerNetwork
@@ -204,7 +204,7 @@ def _judge(
 ) -> Result:
     """Float and int8 on the same images; a few of them are drawn into the folder."""
     rows = _spread(len(split), settings.most)
-    backends = {"float": Float(graph, model.network.channels), "int8": Integer(network)}
+    backends = {"float": Float(graph, model.network.channels), "int8": integer(network)}
     outputs = _outputs(backends, split, rows)
     labels = labels_of_split(split, rows)
     few = [rows[k] for k in _spread(len(rows), LAYER_IMAGES)]
@@ -241,12 +241,12 @@ def _outputs(backends: Mapping[str, Backend], split: Split, rows: list[int]) -> 
 def _draw(split: Split, rows: list[int], outputs: dict[str, Outputs], folder: Path) -> None:
     assert plots is not None
     shown = _spread(len(rows), DRAWN_IMAGES + 2)[1:-1] or [0]
-    maps = {name: maps_of(each) for name, each in outputs.items()}
+    grids = {name: grids_of(each) for name, each in outputs.items()}
     pictures = [
         plots.MapPair(
             f"image {rows[k]} of {split.name}",
             image,
-            {name: (confidence[k], depth_m[k]) for name, (confidence, depth_m) in maps.items()},
+            {name: (each.confidence[k], each.depth_m[k]) for name, each in grids.items()},
         )
         for k, image in zip(shown, _images(split, [rows[k] for k in shown]), strict=True)
     ]
