@@ -31,6 +31,7 @@ COMMANDS = {
     "evaluate": "Judge detections against labels, or estimated positions against the truth.",
     "quantize": "Quantise a network to int8, and say what that costs.",
     "export": "Write a network as ONNX and as C.",
+    "verify": "Prove that the C of an export computes the int8 network, bit for bit.",
     "view": "Show recordings in rerun, or save what it would show.",
     "info": "Show what a recording holds and where it comes from.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",

@@ -208,10 +208,10 @@ def _identifier(name: str, taken: list[str]) -> str:
 
 RESERVED = """
 image image_pad zeros raw raw_rows done compute advance ready scaled clamp add pool convolve
-depthwise largest smallest fill copy demosaic detection is_peak confidence_at next_row
-row_is_there layers net row in auto break case char const continue default do double else enum
-extern float for goto if inline int long register restrict return short signed sizeof static
-struct switch typedef union unsigned void volatile while
+depthwise largest smallest fill copy demosaic put detect_cell is_peak confidence_at next_row
+row_is_there within same_robot without_doubles layers net row in auto break case char const
+continue default do double else enum extern float for goto if inline int long register restrict
+return short signed sizeof static struct switch typedef union unsigned void volatile while
 """
 """Words of C, and names that the C has for other things."""
 

@@ -15,6 +15,7 @@ from dmrl.deploy.c.layers import (
 from dmrl.deploy.c.plan import Buffer, Plan, plan
 from dmrl.deploy.c.text import array, fill
 from dmrl.deploy.integer import SUBPIXEL, Head, IntegerNetwork
+from dmrl.learn.decode import SAME_PX
 
 STACK_BYTES = 512
 """Stack that the C may use on a 32-bit core, optimised; `dmrl verify` measures it."""
@@ -183,13 +184,20 @@ def _decode(planned: Plan, names: dict[str, str]) -> str:
         f"    case {_head_name(names, name)}: return {_cell(planned, head)};\n"
         for name, head in heads.items()
     )
-    u, v = (
-        f"{name}_table[{names['prefix']}_output(net, {_head_name(names, name)}, row, col) + 128]"
-        if name in heads
-        else str(network.stride_px * SUBPIXEL // 2)
-        for name in ("offset_u", "offset_v")
-    )
-    return fill("decode.c", **names, cases=cases, u=u, v=v)
+    step, sub_cell = network.stride_px * SUBPIXEL, "offset_u" in heads
+    places = {}
+    for axis, side in (("u", "col"), ("v", "row")):
+        value = f"{names['prefix']}_output(net, {_head_name(names, f'offset_{axis}')}, row, col)"
+        offset = (
+            f"offset_{axis}_table[{value} + 128]" if f"offset_{axis}" in heads else str(step // 2)
+        )
+        places[axis] = f"{side} * {step} + {offset}"
+        if sub_cell:
+            places[axis] = f"within({places[axis]}, {names['PREFIX']}_{side.upper()}S * {step})"
+    near = int(SAME_PX * SUBPIXEL)
+    doubles = fill("doubles.c", **names, near=near) if sub_cell else ""
+    count = "without_doubles(found, count)" if sub_cell else "count"
+    return fill("decode.c", **names, **places, cases=cases, doubles=doubles, count=count)
 
 
 def _head_name(names: dict[str, str], head: str) -> str:

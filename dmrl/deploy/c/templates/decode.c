@@ -25,17 +25,25 @@ static int is_peak(const ${prefix}_t *net, int row, int col, int confidence)
     return 1;
 }
 
-static ${prefix}_detection_t detection(const ${prefix}_t *net, int row, int col)
+/* Field by field: compilers may call memcpy for a whole structure. */
+static void put(${prefix}_detection_t *to, const ${prefix}_detection_t *from)
+{
+    to->u_q4 = from->u_q4;
+    to->v_q4 = from->v_q4;
+    to->depth_mm = from->depth_mm;
+    to->confidence = from->confidence;
+    to->confidence_step = from->confidence_step;
+}
+
+${doubles}static void detect_cell(const ${prefix}_t *net, int row, int col, ${prefix}_detection_t *found)
 {
     const int8_t confidence = ${prefix}_output(net, ${PREFIX}_CONFIDENCE, row, col);
     const int8_t depth = ${prefix}_output(net, ${PREFIX}_DEPTH, row, col);
-    ${prefix}_detection_t found;
-    found.u_q4 = col * ${PREFIX}_STRIDE * 16 + $u;
-    found.v_q4 = row * ${PREFIX}_STRIDE * 16 + $v;
-    found.depth_mm = depth_table[depth + 128];
-    found.confidence = confidence_table[confidence + 128];
-    found.confidence_step = confidence;
-    return found;
+    found->u_q4 = $u;
+    found->v_q4 = $v;
+    found->depth_mm = depth_table[depth + 128];
+    found->confidence = confidence_table[confidence + 128];
+    found->confidence_step = confidence;
 }
 
 int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int most)
@@ -50,16 +58,17 @@ int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int m
                 count++;
             else if (most < 1 || found[most - 1].confidence_step >= confidence)
                 continue;
-            found[count - 1] = detection(net, row, col);
+            detect_cell(net, row, col, &found[count - 1]);
             /* Up, past all that are less confident. */
             for (int k = count - 1; k > 0 && found[k - 1].confidence_step < confidence; k--) {
-                const ${prefix}_detection_t weaker = found[k - 1];
-                found[k - 1] = found[k];
-                found[k] = weaker;
+                ${prefix}_detection_t weaker;
+                put(&weaker, &found[k - 1]);
+                put(&found[k - 1], &found[k]);
+                put(&found[k], &weaker);
             }
         }
     }
-    return count;
+    return $count;
 }
 
 int ${prefix}_run(${prefix}_t *net, const uint8_t *image, ${prefix}_detection_t *found, int most)

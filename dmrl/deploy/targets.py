@@ -1,0 +1,114 @@
+"""Where the C of an export is proved: compilers, their settings, and how each result is run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dmrl.deploy.c import NAME
+from dmrl.deploy.c.harness import harness
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.toolchain import EMULATOR, RISCV, missing, run
+
+RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding")
+SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+LEVELS = ("-O0", "-O1", "-O2", "-O3")
+
+
+@dataclass(frozen=True, slots=True)
+class Build:
+    """One way to compile the C.
+
+    Parameters
+    ----------
+    label
+        For people: the settings.
+    compiler
+        Program.
+    flags
+        Its flags.
+    bayer
+        Whether it takes raw mosaics.
+    emulated
+        Whether the program runs in the emulator.
+    """
+
+    label: str
+    compiler: str
+    flags: tuple[str, ...]
+    bayer: bool = False
+    emulated: bool = False
+
+    def program(self, network: IntegerNetwork, folder: Path, build: Path) -> list[str | Path]:
+        """Compile the C of an export folder; how to call what comes of it.
+
+        Parameters
+        ----------
+        network
+            What the C computes.
+        folder
+            The export folder.
+        build
+            Folder for what is compiled.
+
+        Raises
+        ------
+        ToolError
+            If it does not compile.
+        """
+        harness_c, program = build / "harness.c", build / "program"
+        harness_c.write_text(harness(network), encoding="utf-8")
+        flags = (*self.flags, f"-D{NAME.upper()}_BAYER={int(self.bayer)}", "-I", folder)
+        sources = (harness_c, folder / f"{NAME}.c")
+        last = ("-lgcc",) if self.emulated else ()
+        what = f"{self.compiler} {self.label}"
+        run((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)
+        return [EMULATOR, program] if self.emulated else [program]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A compiler or checker, with all its builds."""
+
+    name: str
+    builds: tuple[Build, ...]
+
+    @property
+    def skipped(self) -> str:
+        """Why it cannot be tried on this machine; empty: it can."""
+        needed = [self.builds[0].compiler]
+        return missing(*needed, *([EMULATOR] if self.builds[0].emulated else []))
+
+
+def targets(channels: int) -> tuple[Target, ...]:
+    """Every target.
+
+    Parameters
+    ----------
+    channels
+        Of the network's images.
+    """
+    bayer = ("-O3", "-O3 Bayer") if channels == 3 else ("-O3", "-O3 Bayer, grey")
+    hosts = tuple(
+        Target(name, (*(Build(level, name, (level,)) for level in LEVELS),
+                      Build(bayer[1], name, (bayer[0],), bayer=True)))
+        for name in ("gcc", "clang")
+    )  # fmt: skip
+    checked = missing("clang") == "" or missing("gcc") != ""
+    checker = "clang" if checked else "gcc"
+    return (
+        *hosts,
+        Target(
+            "sanitizers",
+            (
+                Build(f"{checker} address, undefined", checker, SANITIZERS),
+                Build(f"{checker} address, undefined, Bayer", checker, SANITIZERS, bayer=True),
+            ),
+        ),
+        Target(
+            "riscv32",
+            (
+                Build("-O3", RISCV, ("-O3", *RISCV_FLAGS), emulated=True),
+                Build("-Os", RISCV, ("-Os", *RISCV_FLAGS), emulated=True),
+                Build("-O3 Bayer", RISCV, ("-O3", *RISCV_FLAGS), bayer=True, emulated=True),
+            ),
+        ),
+    )
