@@ -27,13 +27,13 @@ class Backend(Protocol):
 
 def grids_of(outputs: Outputs) -> Grids:
     """What an output says of N images."""
-    logit = outputs["confidence"].astype(np.float64)
+    # Clipped far beyond what means anything, so that exp does not overflow.
+    logit = np.clip(outputs["confidence"].astype(np.float64), -60, 60)
+    depth_m = np.exp(np.minimum(outputs["log_depth"], 60))
     offset = None
     if "offset_u" in outputs and "offset_v" in outputs:
         offset = np.stack([outputs["offset_u"], outputs["offset_v"]], axis=1)
-    return Grids(
-        (1 / (1 + np.exp(-logit))).astype(np.float32), np.exp(outputs["log_depth"]), offset
-    )
+    return Grids((1 / (1 + np.exp(-logit))).astype(np.float32), depth_m, offset)
 
 
 class Float:

@@ -26,20 +26,19 @@ def equalise(graph: Graph, ranges: Ranges) -> tuple[Graph, Ranges]:
     Channels of a tensor are scaled where a convolution gives it and convolutions alone, or
     max-pools on the way to them, read it; a sum needs its two tensors as they are.
     """
-    layers = list(graph.layers)
+    convs = {k: layer for k, layer in enumerate(graph.layers) if isinstance(layer, FloatConv)}
     low, high = list(ranges.low), list(ranges.high)
-    for index, layer in enumerate(graph.layers):
-        if not isinstance(layer, FloatConv):
-            continue
+    for index in convs:
         passed, readers = _followed(graph, index + 1)
         if not readers:
             continue
-        factor = _factor(high[index + 1] - low[index + 1], [layers[k] for k in readers])
-        layers[index] = _output_divided(layers[index], factor)
+        factor = _factor(high[index + 1] - low[index + 1], [convs[k] for k in readers])
+        convs[index] = _output_divided(convs[index], factor)
         for k in readers:
-            layers[k] = _input_multiplied(layers[k], factor)
+            convs[k] = _input_multiplied(convs[k], factor)
         for tensor in passed:
             low[tensor], high[tensor] = low[tensor] / factor, high[tensor] / factor
+    layers = [convs.get(k, layer) for k, layer in enumerate(graph.layers)]
     return replace(graph, layers=tuple(layers)), replace(ranges, low=tuple(low), high=tuple(high))
 
 

@@ -14,10 +14,10 @@ def float_graph(model: Model, *, grey: bool) -> Graph:
 
 def float_onnx_of(model: Model, *, grey: bool) -> bytes:
     """The ONNX file of a model, for images of the size it was trained on."""
+    cell_px = model.network.stride_px
     return float_onnx(
         float_graph(model, grey=grey),
         model.network.channels,
-        height_px=model.height_px,
-        width_px=model.width_px,
-        stride_px=model.network.stride_px,
+        size_px=(model.height_px, model.width_px),
+        grid_shape=(model.height_px // cell_px, model.width_px // cell_px),
     )

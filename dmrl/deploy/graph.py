@@ -261,7 +261,8 @@ class _Builder:
 def to_input(images: NDArray[np.uint8]) -> Float32:
     """(N, C, H, W) input, ``x / 128 - 1``, of (N, H, W, C) images."""
     planes = images.transpose(0, 3, 1, 2).astype(np.float32)
-    return planes / PIXEL_ZERO - 1
+    scaled: Float32 = planes / np.float32(PIXEL_ZERO) - np.float32(1)
+    return scaled
 
 
 def grey_of(images: NDArray[np.uint8]) -> NDArray[np.uint8]:

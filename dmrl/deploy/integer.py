@@ -117,7 +117,7 @@ class Conv:
     @property
     def kernel(self) -> int:
         """Side of the kernel."""
-        return self.weight.shape[2]
+        return int(self.weight.shape[2])
 
     @property
     def depthwise(self) -> bool:

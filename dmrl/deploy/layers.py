@@ -12,8 +12,6 @@ from dmrl.deploy.graph import Float32, Graph, grey_of
 from dmrl.deploy.integer import Conv, IntegerNetwork
 from dmrl.deploy.reference import Quantised
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True)
 class LayerFigures:
@@ -53,7 +51,9 @@ class _Sums:
     saturated: int = 0
     count: int = 0
 
-    def take(self, wanted: Float32, got: Array, levels: NDArray[np.integer], signed: bool) -> None:
+    def take(
+        self, wanted: Float32, got: NDArray[np.floating], levels: NDArray[np.integer], signed: bool
+    ) -> None:
         self.signal += float((wanted.astype(np.float64) ** 2).sum())
         self.error += float(((wanted - got) ** 2).sum())
         last = (levels == 127) | (levels == -128) if signed else levels == 255

@@ -72,7 +72,7 @@ class _Writer:
 
 
 def float_onnx(
-    graph: Graph, channels: Sequence[str], *, height_px: int, width_px: int, stride_px: int
+    graph: Graph, channels: Sequence[str], *, size_px: tuple[int, int], grid_shape: tuple[int, int]
 ) -> bytes:
     """An ONNX file of a float network.
 
@@ -82,8 +82,10 @@ def float_onnx(
         The network.
     channels
         What the channels of its output are.
-    height_px, width_px, stride_px
-        Of the images, and of a grid cell.
+    size_px
+        Height and width of the images.
+    grid_shape
+        Rows and columns of the output.
     """
     out = _Writer()
     planes = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
@@ -109,9 +111,8 @@ def float_onnx(
         if channel in OUTPUT_OF:
             at = out.constant(f"channel{place}", np.array(place, np.int64))
             names[channel] = out.node("Gather", [tensors[tensor], at], OUTPUT_OF[channel], axis=1)
-    grid = (height_px // stride_px, width_px // stride_px)
-    image = (height_px, width_px, graph.channels)
-    return out.model("float", image, dict.fromkeys(names.values(), grid))
+    image = (*size_px, graph.channels)
+    return out.model("float", image, dict.fromkeys(names.values(), grid_shape))
 
 
 def _conv_settings(layer: FloatConv | Conv) -> dict[str, Any]:

@@ -43,7 +43,7 @@ HEAD_OF = {
 """The head that each channel of a network's output becomes; other channels are left behind."""
 HEAD_ROOM = 0.05
 """Share of its range that a head keeps free at either end, for images not seen before."""
-LEVELS = np.arange(-128, 128)
+LEVELS = np.arange(-128.0, 128.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,12 +122,13 @@ def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) 
 
 
 def _confidence_of(logit: Array, _stride_px: int) -> Array:
-    confidence: Array = CONFIDENCE_ONE / (1 + np.exp(-logit))
+    confidence: Array = CONFIDENCE_ONE / (1 + np.exp(-np.clip(logit, -60, 60)))
     return confidence
 
 
 def _millimetres_of(log_depth: Array, _stride_px: int) -> Array:
-    return np.minimum(1000 * np.exp(np.minimum(log_depth, 20)), 65535)
+    depth: Array = np.minimum(1000 * np.exp(np.minimum(log_depth, 20)), 65535)
+    return depth
 
 
 def _place_of(offset: Array, stride_px: int) -> Array:

@@ -74,7 +74,8 @@ def accumulate(layer: Conv, x: Quantised) -> NDArray[np.int64]:
         sums = np.einsum("ct,ctrs->crs", weight, taps)
     else:
         sums = (weight @ taps.reshape(weight.shape[1], rows * cols)).reshape(outs, rows, cols)
-    return sums.astype(np.int64) + layer.bias[:, None, None]
+    acc: NDArray[np.int64] = sums.astype(np.int64) + layer.bias[:, None, None]
+    return acc
 
 
 def clamp(values: NDArray[np.int64], *, signed: bool) -> Quantised:

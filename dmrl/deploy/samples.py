@@ -27,7 +27,7 @@ def load_samples(folder: Path) -> NDArray[np.uint8]:
     """
     file = folder / SAMPLES_NAME
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             images = np.asarray(archive["images"])
     except FileNotFoundError:
         raise ModelError(f"no {file}. Quantise the model again") from None

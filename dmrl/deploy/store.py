@@ -65,7 +65,7 @@ def load(path: Path) -> IntegerNetwork:
     if not file.is_file():
         raise ModelError(f"no {file.name} in {file.parent}. Make one with: dmrl quantize")
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         said = json.loads(arrays.pop("description").tobytes())
         if said["format"] != FORMAT:
@@ -87,7 +87,8 @@ def _network(said: dict[str, Any], arrays: Arrays) -> IntegerNetwork:
         for name, head in said["heads"].items()
         if name in HEADS
     }
-    return IntegerNetwork(**{name: said[name] for name in PLAIN}, layers=layers, **heads)
+    fields: dict[str, Any] = {name: said[name] for name in PLAIN} | heads
+    return IntegerNetwork(layers=layers, **fields)
 
 
 def _unpacked(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, Any]:

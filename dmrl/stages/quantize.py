@@ -204,7 +204,10 @@ def _judge(
 ) -> Result:
     """Float and int8 on the same images; a few of them are drawn into the folder."""
     rows = _spread(len(split), settings.most)
-    backends = {"float": Float(graph, model.network.channels), "int8": integer(network)}
+    backends: dict[str, Backend] = {
+        "float": Float(graph, model.network.channels),
+        "int8": integer(network),
+    }
     outputs = _outputs(backends, split, rows)
     labels = labels_of_split(split, rows)
     few = [rows[k] for k in _spread(len(rows), LAYER_IMAGES)]
