@@ -51,15 +51,15 @@ class Compiled:
         run((host_compiler(), *flags, *sources, "-o", library), f"compiling {folder / NAME}.c")
         self._run = ctypes.CDLL(str(library)).harness_run
 
-    def answer(self, image: NDArray[np.uint8]) -> Answer:
+    def answer(self, image: NDArray[np.uint8], most: int = MOST) -> Answer:
         """Grids and detections of a (height, width, channels) image as the network takes it."""
         network = self.network
         assert image.shape == (network.height_px, network.width_px, network.channels)
         pixels = np.ascontiguousarray(image, np.uint8)
         grids = np.empty((len(network.heads), *network.grid_shape), np.int8)
-        found = np.zeros(MOST, DETECTION)
+        found = np.zeros(most, DETECTION)
         pointers = (ctypes.c_void_p(a.ctypes.data) for a in (pixels, grids, found))
-        count = self._run(*pointers, MOST)
+        count = self._run(*pointers, most)
         named = dict(zip(network.heads, grids, strict=True))
         return Answer(named, detections_of(found[:count]), 0)
 

@@ -21,7 +21,7 @@ from dmrl.deploy.toolchain import (
     run,
     run_both,
 )
-from dmrl.errors import ToolError
+from dmrl.errors import ModelError, ToolError
 
 CLUSTER_HZ = 175e6
 """Clock of the GAP8's cluster of eight cores."""
@@ -63,6 +63,21 @@ def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cos
         if not missing(EMULATOR):
             counted = _instructions(network, folder, Path(place), image)
     return Cost(code, constants, counted)
+
+
+def state_bytes(folder: Path) -> int:
+    """Bytes of RAM that the header of an export folder states; compilers hold it to that.
+
+    Raises
+    ------
+    ModelError
+        If it states none.
+    """
+    text = (folder / f"{NAME}.h").read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"_STATE_BYTES \((\d+)", text)
+    if not found:
+        raise ModelError(f"{folder / NAME}.h is damaged. Export the model again: dmrl export")
+    return int(found[1])
 
 
 def _sizes(folder: Path, build: Path) -> tuple[int, int]:

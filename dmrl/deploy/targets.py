@@ -8,7 +8,9 @@ from dmrl.deploy.c.harness import harness
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.toolchain import EMULATOR, RISCV, missing, run
 
-RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding")
+RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding",
+               "-Wl,--no-relax")  # fmt: skip
+"""For rv32imc without any library. No start-up code sets the register that relaxed code needs."""
 SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.bayer import demosaic, mosaic
 from dmrl.deploy.c.harness import MOST, Answer, answers
+from dmrl.deploy.c.source import STACK_BYTES
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.reference import decode
 from dmrl.deploy.reference import run as reference_run
@@ -147,8 +148,14 @@ def _try(network: IntegerNetwork, folder: Path, build: Build, wanted: Expected) 
             f"{build.compiler} {build.label}: answered {len(found)} of {len(images)} images. "
             "Export the model again"
         )
+    stack_bytes = max(a.stack_bytes for a in found)
+    if stack_bytes > STACK_BYTES:
+        raise ToolError(
+            f"{build.compiler} {build.label}: uses {stack_bytes} bytes of stack, the header states "
+            f"{STACK_BYTES}. Give its task more, and report it"
+        )
     wrong = sum(not same(a, b) for a, b in zip(found, right, strict=True))
-    return BuildResult(build.label, len(images), wrong, max(a.stack_bytes for a in found))
+    return BuildResult(build.label, len(images), wrong, stack_bytes)
 
 
 def same(a: Answer, b: Answer) -> bool:

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from dmrl.dataset import open_dataset
 from dmrl.deploy.backends import seen_by
-from dmrl.deploy.c.source import source
-from dmrl.deploy.c.text import names_of
 from dmrl.deploy.compiled import require_c
 from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.measure import Cost, cost, rates
+from dmrl.deploy.measure import Cost, cost, rates, state_bytes
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import load
 from dmrl.deploy.targets import targets
@@ -126,8 +124,9 @@ def run(folder: Path, settings: Settings) -> Result:
         len(pictures),
         len(noise),
         tried,
-        cost(network, folder, images[0]),
-        source(network, names_of(network), bayer=False).state_bytes,
+        # C that a target could not compile or run is not worth measuring.
+        None if any(t.error for t in tried) else cost(network, folder, images[0]),
+        state_bytes(folder),
     )
 
 
@@ -226,7 +225,7 @@ def _cost_rows(result: Result) -> list[tuple[object, ...]]:
         ("RAM, bytes", f"{result.state_bytes:,}", "state, RGB or grey")
     ]
     if (stack := stack_bytes(result.targets)) is not None:
-        rows.append(("stack, bytes", f"{stack:,}", "painted, rv32imc, most of its builds"))
+        rows.append(("stack, bytes", f"{stack:,}", "the most of rv32imc's builds, measured"))
     if found := result.cost:
         rows.append(("code, bytes", f"{found.code_bytes:,}", "rv32imc, gcc -O3"))
         rows.append(("constants, bytes", f"{found.constant_bytes:,}", "rv32imc, gcc -O3"))
