@@ -1,6 +1,7 @@
 """The C of a network as a shared library: what ``predict --backend c`` computes with."""
 
 import ctypes
+import platform
 import shutil
 import tempfile
 import weakref
@@ -15,7 +16,9 @@ from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.toolchain import host_compiler, run
 from dmrl.errors import ModelError
 
-FLAGS = ("-O3", "-march=native", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
+FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
+# Rows are short: vectors of 512 bits would spend their time on what is left over.
+PC_FLAGS = ("-march=native", "-mprefer-vector-width=256")
 
 
 class Compiled:
@@ -27,6 +30,8 @@ class Compiled:
         What the C computes.
     folder
         An export folder, whose C is used. None: the C is written anew.
+    compiler
+        Program that compiles it. None: the first that is found.
 
     Raises
     ------
@@ -36,7 +41,9 @@ class Compiled:
         If the folder has no C, or the C cannot carry the network.
     """
 
-    def __init__(self, network: IntegerNetwork, folder: Path | None = None) -> None:
+    def __init__(
+        self, network: IntegerNetwork, folder: Path | None = None, compiler: str | None = None
+    ) -> None:
         self.network = network
         build = Path(tempfile.mkdtemp(prefix="dmrl-c-"))
         self._remove = weakref.finalize(self, shutil.rmtree, build, ignore_errors=True)
@@ -47,8 +54,12 @@ class Compiled:
         (build / "harness.c").write_text(harness(network), encoding="utf-8")
         library = build / "network.so"
         sources = (build / "harness.c", folder / f"{NAME}.c")
-        flags = (*FLAGS, f"-D{NAME.upper()}_BAYER=0", "-I", folder)
-        run((host_compiler(), *flags, *sources, "-o", library), f"compiling {folder / NAME}.c")
+        own = PC_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()
+        flags = (*FLAGS, *own, f"-D{NAME.upper()}_BAYER=0", "-I", folder)
+        run(
+            (compiler or host_compiler(), *flags, *sources, "-o", library),
+            f"compiling {folder / NAME}.c",
+        )
         self._run = ctypes.CDLL(str(library)).harness_run
 
     def answer(self, image: NDArray[np.uint8], most: int = MOST) -> Answer:
