@@ -80,29 +80,28 @@ class Target:
         return missing(*needed, *([EMULATOR] if self.builds[0].emulated else []))
 
 
-def targets(channels: int) -> tuple[Target, ...]:
-    """Every target.
-
-    Parameters
-    ----------
-    channels
-        Of the network's images.
-    """
-    bayer = ("-O3", "-O3 Bayer") if channels == 3 else ("-O3", "-O3 Bayer, grey")
+def targets() -> tuple[Target, ...]:
+    """Every target."""
     hosts = tuple(
-        Target(name, (*(Build(level, name, (level,)) for level in LEVELS),
-                      Build(bayer[1], name, (bayer[0],), bayer=True)))
+        Target(
+            name,
+            (
+                *(Build(level, name, (level,)) for level in LEVELS),
+                Build("-O3 Bayer", name, ("-O3",), bayer=True),
+            ),
+        )
         for name in ("gcc", "clang")
-    )  # fmt: skip
-    checked = missing("clang") == "" or missing("gcc") != ""
-    checker = "clang" if checked else "gcc"
+    )
+    # gcc brings its sanitizers along; clang's are a package of their own.
+    checker = "clang" if missing("gcc") and not missing("clang") else "gcc"
+    label = f"{checker} address, undefined"
     return (
         *hosts,
         Target(
             "sanitizers",
             (
-                Build(f"{checker} address, undefined", checker, SANITIZERS),
-                Build(f"{checker} address, undefined, Bayer", checker, SANITIZERS, bayer=True),
+                Build(label, checker, SANITIZERS),
+                Build(f"{label}, Bayer", checker, SANITIZERS, bayer=True),
             ),
         ),
         Target(

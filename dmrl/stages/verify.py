@@ -117,7 +117,7 @@ def run(folder: Path, settings: Settings) -> Result:
     if not images:
         raise SettingError("no images to try the C on. Give --images or --noise above 0")
     wanted = expected(network, list(track(images, "Computing the reference")))
-    chosen = [t for t in targets(network.channels) if t.name in settings.targets]
+    chosen = [t for t in targets() if t.name in settings.targets]
     tried = [prove(network, folder, t, wanted) for t in track(chosen, "Proving the C")]
     return Result(
         network,
