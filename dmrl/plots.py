@@ -384,7 +384,8 @@ def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
     names = list(shown[0].maps)
     words = ("confidence", "depth, m")
     with mpl.rc_context(STYLE):
-        figure = Figure((13.0, 2.0 * len(shown) + 0.9), layout="constrained")
+        figure = Figure((13.0, 2.1 * len(shown) + 1.1), layout="constrained")
+        figure.get_layout_engine().set(h_pad=0.12)  # type: ignore[call-arg, union-attr]
         grid = figure.subplots(len(shown), 5, squeeze=False)
         for channel, (name, colours) in enumerate(zip(words, ("inferno", "turbo"), strict=True)):
             columns = slice(1 + 2 * channel, 3 + 2 * channel)
