@@ -3,6 +3,7 @@
 import fnmatch
 import shutil
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -24,6 +25,7 @@ try:
     from dmrl.learn.batches import FIELDS, Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.fit import Step, Training, new_network
+    from dmrl.learn.group import Group, join_group, leave_group
     from dmrl.learn.model import (
         PUBLISHED_THRESHOLD,
         Model,
@@ -90,8 +92,19 @@ def run(
     SettingError
         If the network cannot take the images, or the loss is no longer a number.
     """
+    group = join_group()
+    try:
+        return _run(dataset, out, settings, init, group, resume=resume)
+    finally:
+        leave_group()
+
+
+def _run(
+    dataset: Path, out: Path, settings: Settings, init: Path | None, group: Group, *, resume: bool
+) -> Result:
     refuse_existing(out)
-    _clear_the_way(partial_of(out), resume=resume)
+    if group.leads:
+        _clear_the_way(partial_of(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
     examples, held_out, shares = _material(data, settings)
@@ -99,7 +112,8 @@ def run(
     inputs = (dataset,) if init is None else (dataset, init)
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
     identity = " ".join(source.sha256 for source in made.inputs)
-    with partial_folder(out, keep_on_error=True) as folder:
+    where = partial_folder(out, keep_on_error=True) if group.leads else nullcontext(partial_of(out))
+    with where as folder:
         training = Training(
             network,
             examples,
@@ -108,13 +122,15 @@ def run(
             validation=held_out,
             shares=shares,
             identity=identity,
+            group=group,
             resume=resume and has_checkpoint(folder),
         )
+        if not group.leads:
+            return _train(training, settings, len(examples))
         made.write(folder)
         result = _train(training, settings, len(examples))
         threshold = _threshold(training.network, held_out, settings)
-        model = _model(training, settings, train, len(examples), threshold)
-        save_model(model, folder)
+        save_model(_model(training, settings, train, len(examples), threshold), folder)
         remove_checkpoint(folder)
     return result
 
