@@ -19,7 +19,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dmrl.learn.batches import BOX, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, Batch, Examples, Robots, U, V
+from dmrl.learn.batches import (
+    BOX,
+    DEPTH,
+    SIGMA_DEPTH,
+    SIGMA_U,
+    SIGMA_V,
+    Batch,
+    Examples,
+    Robots,
+    U,
+    V,
+)
 
 MAX_ROBOTS = 12
 """Robots of one canvas that are labelled, at most."""
@@ -211,9 +222,7 @@ class Augmenter:
         most = math.radians(self._settings.rotation_deg)
         angle = rng.uniform(-most, most)
         mirror = -1.0 if rng.random() < self._settings.flip_share else 1.0
-        turn = np.array(
-            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-        )
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         matrix = turn @ np.diag([mirror, 1.0]) / zoom
         return Window(matrix, centre - matrix @ (np.asarray(size) / 2), zoom)
 

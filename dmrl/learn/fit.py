@@ -212,7 +212,9 @@ class Training:
             if self._augmenter is None:
                 yield gathered(self._examples, chosen)
             else:
-                yield self._augmenter.batch(chosen, epoch=epoch, index=index * self._group.size + self._group.rank)
+                yield self._augmenter.batch(
+                    chosen, epoch=epoch, index=index * self._group.size + self._group.rank
+                )
 
     def _epoch(self, epoch: int, board: Board) -> Generator[Step, None, dict[str, float]]:
         """Train one epoch; returns its mean losses."""

@@ -25,7 +25,7 @@ class Group:
         return self.rank == 0
 
     def part(self, items: Sequence[int]) -> Sequence[int]:
-        """This process' part of a batch; empty where there are more processes than items."""
+        """The items of this process; none where there are more processes than items."""
         return items[self.rank :: self.size]
 
     def average(self, network: Network, losses: Tensor, share: float) -> Tensor:

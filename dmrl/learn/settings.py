@@ -146,10 +146,10 @@ class FitSettings:
 
 
 SHARES = (
-    ("validation_share", "threshold", "flip_share", "mosaic_share") 
-    + ("blur_share", "colour", "noise")
+    *("validation_share", "threshold", "flip_share", "mosaic_share"),
+    *("blur_share", "colour", "noise"),
 )
 NOT_NEGATIVE = (
-    ("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus")
-    + ("confidence_weight", "depth_weight", "offset_weight", "rotation_deg", "paste", "seed")
+    *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus"),
+    *("confidence_weight", "depth_weight", "offset_weight", "rotation_deg", "paste", "seed"),
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from cyclopts import Parameter
 from numpy.typing import NDArray
@@ -152,9 +153,9 @@ def _material(
 ) -> tuple[Examples, Examples | None, NDArray[np.float64] | None]:
     """Images to learn from, images held out, and the shares of the former."""
     train = data.split("train")
-    every, sources = _examples(train), np.array(train.table.column("source").to_pylist())
+    every, sources = examples_of(train), np.array(train.table.column("source").to_pylist())
     held = np.zeros(len(every), bool)
-    watched = _examples(data.split("val")) if "val" in data.splits else None
+    watched = examples_of(data.split("val")) if "val" in data.splits else None
     if watched is None and settings.validation_share:
         held = _last_of_each(sources, settings.validation_share)
         watched = every.select(held) if held.any() else None
@@ -198,14 +199,22 @@ def _shares(sources: NDArray[np.str_], settings: Settings) -> NDArray[np.float64
     return out / out.mean()
 
 
-def _examples(split: Split) -> Examples:
-    """Images and robots of a split."""
-    peers = split.table.column("peers").to_pylist()
-    robots = np.full((len(peers), max(map(len, peers), default=0) or 1, len(FIELDS)), np.nan)
-    for row, found in zip(robots, peers, strict=True):
-        for place, peer in zip(row, found, strict=False):
-            place[:6] = [peer[name] for name in FIELDS[:6]]
-            place[6:] = peer["box_px"] if len(peer["box_px"]) == 4 else np.nan
+def examples_of(split: Split) -> Examples:
+    """Images of a split with the robots in them."""
+    column = split.table.column("peers").combine_chunks()
+    counts = pc.list_value_length(column).to_numpy(zero_copy_only=False).astype(np.int64)
+    peers = column.flatten()
+    flat = np.full((len(peers), len(FIELDS)), np.nan, np.float32)
+    for index, name in enumerate(FIELDS[:6]):
+        flat[:, index] = pc.struct_field(peers, name).to_numpy(zero_copy_only=False)
+    boxes = pc.struct_field(peers, "box_px")
+    boxed = pc.list_value_length(boxes).to_numpy(zero_copy_only=False) == 4
+    corners = boxes.filter(pa.array(boxed)).flatten().to_numpy(zero_copy_only=False)
+    flat[boxed, 6:] = corners.reshape(-1, 4)
+    robots = np.full((len(counts), max(int(counts.max(initial=0)), 1), len(FIELDS)), np.nan)
+    image = np.repeat(np.arange(len(counts)), counts)
+    place = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
+    robots[image, place] = flat
     return Examples(split.pixels, robots.astype(np.float32))
 
 

@@ -104,7 +104,9 @@ def test_a_batch_depends_on_seed_epoch_and_place_alone() -> None:
 
 
 def test_images_without_robots_or_boxes_can_be_varied_too() -> None:
-    empty = Examples([np.zeros((2, 112, 160, 3), np.uint8)], np.full((2, 1, 10), np.nan, np.float32))
+    empty = Examples(
+        [np.zeros((2, 112, 160, 3), np.uint8)], np.full((2, 1, 10), np.nan, np.float32)
+    )
     batch = Augmenter(empty, GEOMETRY, seed=0).batch([0, 1], epoch=0, index=0)
     assert not torch.isfinite(batch.robots[..., 0]).any()
     assert batch.images.shape == (2, 3, 112, 160)

@@ -27,9 +27,7 @@ def test_without_width_they_are_the_grid_labels_of_the_paper() -> None:
         confidence, depth_m = grid_label(found[:, :2], found[:, 2])
         np.testing.assert_array_equal(got.confidence[0], confidence)
         np.testing.assert_array_equal(got.weight[0], confidence)
-        np.testing.assert_allclose(
-            got.depth_m[0].numpy() * confidence, depth_m, rtol=1e-6
-        )
+        np.testing.assert_allclose(got.depth_m[0].numpy() * confidence, depth_m, rtol=1e-6)
 
 
 def test_with_width_the_offset_leads_from_every_near_cell_to_the_centre() -> None:
