@@ -19,12 +19,12 @@ import numpy as np
 import torch
 
 from dmrl.dataset import Split, open_dataset
+from dmrl.examples import examples_of
 from dmrl.images import encode_jpeg
 from dmrl.learn.batches import gathered, order
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
-from dmrl.stages.train import examples_of
 from dmrl.tables import print_table
 from dmrl.topics import camera_image, labels
 

@@ -34,7 +34,7 @@ class Depthwise(nn.Conv2d):
         weight = self.weight
         if torch.is_autocast_enabled("cpu"):
             x, weight = (t.to(torch.get_autocast_dtype("cpu")) for t in (x, weight))
-        out: Tensor = _Depthwise.apply(x, weight, stride, dilation)
+        out: Tensor = _Depthwise.apply(x, weight, stride, dilation)  # type: ignore[no-untyped-call]
         return out
 
 
@@ -46,7 +46,7 @@ class _Depthwise(torch.autograd.Function):
         return conv2d(x, weight, None, stride, dilation, dilation, len(weight))
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         x, weight = ctx.saved_tensors
         stride, dilation = ctx.stride, ctx.dilation
         grad = grad.contiguous(memory_format=torch.channels_last)

@@ -244,7 +244,7 @@ class Training:
     def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:
         """(3,) losses of a batch of ``whole`` images, of which this process has a part."""
         group = self._group
-        share = len(group.part(range(whole))) / whole
+        share = len(group.part(np.arange(whole))) / whole
         return train_step(
             self._learning, self._optimizer, batch, self._settings, rate, group, share
         )

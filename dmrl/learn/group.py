@@ -5,9 +5,10 @@ the normalisations are then averaged, so that all hold the same network after ev
 """
 
 import os
-from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, distributed
 
 from dmrl.learn.network import Network
@@ -24,7 +25,7 @@ class Group:
         """Whether this is the process that writes."""
         return self.rank == 0
 
-    def part(self, items: Sequence[int]) -> Sequence[int]:
+    def part(self, items: NDArray[np.int64]) -> NDArray[np.int64]:
         """The items of this process; none where there are more processes than items."""
         return items[self.rank :: self.size]
 
@@ -46,7 +47,8 @@ class Group:
         tensors += [b for b in network.buffers() if b.is_floating_point()]
         flat = torch.cat([t.flatten() for t in tensors]).mul_(share)
         distributed.all_reduce(flat)
-        for tensor, mean in zip(tensors, flat.split([t.numel() for t in tensors]), strict=True):
+        means = torch.split(flat, [tensor.numel() for tensor in tensors])
+        for tensor, mean in zip(tensors, means, strict=True):
             tensor.copy_(mean.view_as(tensor))
         return losses
 

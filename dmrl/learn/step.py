@@ -40,7 +40,8 @@ def losses(network: Network, batch: Batch, settings: FitSettings) -> Tensor:
     if network.channels == SUB_CELL:
         offset = offset_loss(out[:, 2:4], wanted.offset, wanted.offset_weight)
     weights = (settings.confidence_weight, settings.depth_weight, settings.offset_weight)
-    return torch.stack((confidence, depth, offset)) * out.new_tensor(weights)
+    parts: Tensor = torch.stack((confidence, depth, offset)) * out.new_tensor(weights)
+    return parts
 
 
 def new_optimizer(network: Network, settings: FitSettings) -> torch.optim.Optimizer:

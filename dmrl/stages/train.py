@@ -1,6 +1,5 @@
 """``dmrl train``: an Arrow dataset to a run folder with a trained network."""
 
-import fnmatch
 import shutil
 import time
 from contextlib import nullcontext
@@ -8,14 +7,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 from cyclopts import Parameter
-from numpy.typing import NDArray
 
 from dmrl import recipe as recipes
-from dmrl.dataset import Dataset, Split, open_dataset
+from dmrl.dataset import Split, open_dataset
 from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
 from dmrl.output import partial_folder, partial_of, refuse_existing
 from dmrl.progress import track
@@ -23,7 +19,8 @@ from dmrl.recording import provenance
 from dmrl.tables import print_json, print_table
 
 try:
-    from dmrl.learn.batches import FIELDS, Examples
+    from dmrl.examples import material
+    from dmrl.learn.batches import Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.fit import Step, Training, new_network
     from dmrl.learn.group import Group, join_group, leave_group
@@ -108,7 +105,7 @@ def _run(
         _clear_the_way(partial_of(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
-    examples, held_out, shares = _material(data, settings)
+    examples, held_out, shares = material(data, settings)
     network = _first_network(settings, examples, init)
     inputs = (dataset,) if init is None else (dataset, init)
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
@@ -146,76 +143,6 @@ def _clear_the_way(partial: Path, *, resume: bool) -> None:
             f"{partial} holds an interrupted training. Go on with --resume, or remove it"
         )
     shutil.rmtree(partial)
-
-
-def _material(
-    data: Dataset, settings: Settings
-) -> tuple[Examples, Examples | None, NDArray[np.float64] | None]:
-    """Images to learn from, images held out, and the shares of the former."""
-    train = data.split("train")
-    every, sources = examples_of(train), np.array(train.table.column("source").to_pylist())
-    held = np.zeros(len(every), bool)
-    watched = examples_of(data.split("val")) if "val" in data.splits else None
-    if watched is None and settings.validation_share:
-        held = _last_of_each(sources, settings.validation_share)
-        watched = every.select(held) if held.any() else None
-    learnt = every.select(~held) if held.any() else every
-    return learnt, watched, _shares(sources[~held], settings)
-
-
-def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
-    """The last share of the images of each recording."""
-    held = np.zeros(len(sources), bool)
-    for source in np.unique(sources):
-        mine = np.flatnonzero(sources == source)
-        held[mine[len(mine) - int(share * len(mine)) :]] = True
-    return held
-
-
-def _shares(sources: NDArray[np.str_], settings: Settings) -> NDArray[np.float64] | None:
-    """How often each image shall come in an epoch, by the shares of the recordings.
-
-    Raises
-    ------
-    SettingError
-        If a pattern fits no recording, or a recording fits none.
-    """
-    if not settings.shares:
-        return None
-    out = np.full(len(sources), np.nan)
-    names = sorted(set(sources.tolist()))
-    for pattern, share in settings.shares.items():
-        mine = np.isin(sources, fnmatch.filter(names, pattern)) & np.isnan(out)
-        if not mine.any():
-            raise SettingError(
-                f"shares: no images left for {pattern}. The recordings are {', '.join(names)}"
-            )
-        out[mine] = share / mine.sum()
-    if np.isnan(out).any():
-        forgotten = sources[np.isnan(out)][0]
-        raise SettingError(f'shares: none for {forgotten}. Name it, or add "*"')
-    if not out.sum():
-        raise SettingError("shares: all are 0. Give one that is not")
-    return out / out.mean()
-
-
-def examples_of(split: Split) -> Examples:
-    """Images of a split with the robots in them."""
-    column = split.table.column("peers").combine_chunks()
-    counts = pc.list_value_length(column).to_numpy(zero_copy_only=False).astype(np.int64)
-    peers = column.flatten()
-    flat = np.full((len(peers), len(FIELDS)), np.nan, np.float32)
-    for index, name in enumerate(FIELDS[:6]):
-        flat[:, index] = pc.struct_field(peers, name).to_numpy(zero_copy_only=False)
-    boxes = pc.struct_field(peers, "box_px")
-    boxed = pc.list_value_length(boxes).to_numpy(zero_copy_only=False) == 4
-    corners = boxes.filter(pa.array(boxed)).flatten().to_numpy(zero_copy_only=False)
-    flat[boxed, 6:] = corners.reshape(-1, 4)
-    robots = np.full((len(counts), max(int(counts.max(initial=0)), 1), len(FIELDS)), np.nan)
-    image = np.repeat(np.arange(len(counts)), counts)
-    place = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
-    robots[image, place] = flat
-    return Examples(split.pixels, robots.astype(np.float32))
 
 
 def _threshold(network: Network, held_out: Examples | None, settings: Settings) -> float:

@@ -14,6 +14,7 @@ from dmrl import card, recipe
 from dmrl.cli import app
 from dmrl.dataset import open_dataset
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
+from dmrl.examples import examples_of, material
 from dmrl.learn.batches import FIELDS
 from dmrl.learn.model import load_model
 from dmrl.stages import dataset as dataset_stage
@@ -150,7 +151,7 @@ def test_the_threshold_is_chosen_on_images_held_out(dataset: Path, tmp_path: Pat
 
 def test_examples_carry_every_peer_with_its_box(dataset: Path) -> None:
     split = open_dataset(dataset).split("train")
-    examples = train.examples_of(split)
+    examples = examples_of(split)
     for robots, peers in zip(examples.robots, split.table.column("peers").to_pylist(), strict=True):
         found = robots[np.isfinite(robots[:, 0])]
         assert len(found) == len(peers)
@@ -158,6 +159,17 @@ def test_examples_carry_every_peer_with_its_box(dataset: Path) -> None:
             np.testing.assert_allclose(robot[:6], [peer[n] for n in FIELDS[:6]], rtol=1e-6)
             if peer["box_px"]:
                 np.testing.assert_allclose(robot[6:], peer["box_px"], rtol=1e-6)
+
+
+def test_the_last_images_of_a_recording_are_held_out(dataset: Path) -> None:
+    every = examples_of(open_dataset(dataset).split("train"))
+    found = material(open_dataset(dataset), Settings(validation_share=0.25))
+    assert (len(found.examples), found.shares) == (15, None)
+    assert found.held_out is not None
+    joined = np.concatenate([found.examples.robots, found.held_out.robots])
+    np.testing.assert_array_equal(joined, every.robots)
+    np.testing.assert_array_equal(found.held_out.image(0), every.image(15))
+    assert material(open_dataset(dataset), Settings(validation_share=0.0)).held_out is None
 
 
 def test_shares_are_of_recordings_by_name(dataset: Path, tmp_path: Path) -> None:
