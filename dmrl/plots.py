@@ -162,46 +162,46 @@ def _violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float)
     axes.grid(axis="y", alpha=0.3)
 
 
-def position_error(
+def error_trace(
+    title: str,
     time_s: NDArray[np.float64],
-    error_m: NDArray[np.float64],
     sigma_m: NDArray[np.float64],
-    kept: NDArray[np.bool_],
-    pair: str,
+    errors_m: Mapping[str, NDArray[np.float64]],
     stem: Path,
 ) -> None:
-    """Errors of an estimated position over time, x above y, with their 3-sigma bands.
+    """Errors of positions over time, one axis above the other, with their 3-sigma bands.
 
     Parameters
     ----------
+    title
+        Words above it.
     time_s
         (N,) seconds.
-    error_m, sigma_m
-        (N, 2) estimate minus truth, and its standard deviation as the estimator has it.
-    kept
-        (N,) whether the estimator believes it.
-    pair
-        Words for the title.
+    sigma_m
+        (N, A) standard deviations, as the estimator has them.
+    errors_m
+        (N, A) errors by what made them, NaN where there are none; the last in black, on top.
     stem
         Path without suffix.
     """
+    colours = ["tab:red", "black"][-len(errors_m) :]
     with mpl.rc_context(STYLE):
-        figure = Figure((SIZE_INCHES[0], 4.4), layout="constrained")
-        for k, axes in enumerate(figure.subplots(2, 1, sharex=True, sharey=True)):
+        figure = Figure((SIZE_INCHES[0], 2.2 * sigma_m.shape[1]), layout="constrained")
+        rows: Any = figure.subplots(sigma_m.shape[1], 1, sharex=True, sharey=True)
+        for k, axes in enumerate(rows):
             band = 3 * sigma_m[:, k]
             axes.fill_between(time_s, -band, band, alpha=0.25, linewidth=0, label="3 sigma")
-            for mask, colour, word in ((kept, "black", "kept"), (~kept, "tab:red", "left out")):
-                axes.plot(
-                    time_s[mask], error_m[mask, k], ".", color=colour, markersize=2, label=word
-                )
+            for (word, error_m), colour in zip(errors_m.items(), colours, strict=True):
+                axes.plot(time_s, error_m[:, k], ".", color=colour, markersize=2, label=word)
             axes.axhline(0, color="grey", linewidth=0.8)
             axes.grid(alpha=0.3)
-            axes.set_ylabel(f"error in {'xy'[k]}, m")
-            # Far errors and wide bands at the start would flatten the rest.
-            limit = max(0.3, float(np.percentile(np.abs(error_m), 99)))
-            axes.set_ylim(-1.2 * limit, 1.2 * limit)
+            axes.set_ylabel(f"error in {'xyz'[k]}, m")
+        # Far errors and wide bands at the start would flatten the rest.
+        sizes = np.abs(np.concatenate([error.ravel() for error in errors_m.values()]))
+        limit = np.percentile(sizes[np.isfinite(sizes)], 99) if np.isfinite(sizes).any() else 0.0
+        axes.set_ylim(-1.2 * max(0.3, float(limit)), 1.2 * max(0.3, float(limit)))
         axes.set_xlabel("time, s")
-        figure.axes[0].set_title(f"{pair}: estimate minus truth")
+        figure.axes[0].set_title(title)
         figure.axes[0].legend(loc="upper right", fontsize=8, markerscale=4)
     save(figure, stem)
 

@@ -149,6 +149,11 @@ def grid(robot: str) -> str:
     return GRID.format(robot=robot)
 
 
+def tracks(robot: str) -> str:
+    """Topic of the peers that a robot's detections are followed as."""
+    return TRACKS.format(robot=robot)
+
+
 def position(robot: str, peer: str) -> str:
     """Topic of where a robot estimates a peer to be."""
     return POSITION.format(robot=robot, peer=peer)

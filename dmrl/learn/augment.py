@@ -11,34 +11,35 @@ zoom by z divides the depth by z. A turn about the optical axis keeps it.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
-from dmrl.learn.batches import BOX, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, Batch, Examples, Robots, U, V
+from dmrl.learn.batches import BOX, DEPTH, Batch, Examples, Robots, U, V
+from dmrl.learn.layers import (
+    Rect,
+    Rng,
+    Window,
+    feather,
+    inside,
+    moved,
+    parts,
+    present,
+    sample,
+)
 
 MAX_ROBOTS = 12
 """Robots of one canvas that are labelled, at most."""
 PATCH_MARGIN = 1.25
 """Side of a pasted patch over that of the robot's box."""
-FEATHER_PX = 3.0
-"""Width of a pasted patch's soft border."""
 DISTRACTOR_SHARE = 0.4
 """Share of patches that show any place of any image."""
 FOCUS_SHARE = 0.8
 """Share of mosaic windows that hold a robot of their image; the rest fall where they may."""
 DEPTH_SLACK = 1.1
 """How far beyond the nearest and the farthest label zooming may bring a robot."""
-
-LEFT_RIGHT, TOP_BOTTOM = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
-
-Rng = np.random.Generator
-Rect = tuple[int, int, int, int]
-"""Left, top, right, bottom on the canvas, whole pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,14 +80,6 @@ class Augmentation:
     def is_nothing(self) -> bool:
         """Whether images stay as they are."""
         return self == Augmentation()
-
-
-class Window(NamedTuple):
-    """Where a canvas rectangle looks: source = matrix @ (canvas - corner) + origin, pixels."""
-
-    matrix: NDArray[np.float64]
-    origin: NDArray[np.float64]
-    zoom: float
 
 
 class Augmenter:
@@ -145,9 +138,9 @@ class Augmenter:
         robots = np.empty((0, 10), np.float32)
         whole = (0, 0, self._width, self._height)
         mosaic = rng.random() < self._settings.mosaic_share
-        parts = _parts(whole, rng) if mosaic else [whole]
-        others = rng.integers(len(self._examples), size=len(parts) - 1)
-        for rect, source in zip(parts, (number, *others.tolist()), strict=True):
+        rects = parts(whole, rng) if mosaic else [whole]
+        others = rng.integers(len(self._examples), size=len(rects) - 1)
+        for rect, source in zip(rects, (number, *others.tolist()), strict=True):
             robots = self._layer(canvas, rect, source, robots, rng)
         for _ in range(int(rng.poisson(self._settings.paste))):
             robots = self._patch(canvas, robots, rng)
@@ -157,7 +150,7 @@ class Augmenter:
     def _layer(self, canvas: Tensor, rect: Rect, source: int, robots: Robots, rng: Rng) -> Robots:
         """Show a window of a source in a rectangle; the robots of the canvas after it."""
         width, height = rect[2] - rect[0], rect[3] - rect[1]
-        mine = _present(self._examples.robots[source])
+        mine = present(self._examples.robots[source])
         focus = mine[rng.integers(len(mine))] if len(mine) else None
         zoom = self._zoom(focus, rng)
         zoom = max(zoom, width / self._width, height / self._height)  # no look past the source
@@ -192,8 +185,8 @@ class Augmenter:
             source = int(rng.integers(len(self._examples)))
             centre = rng.uniform((0, 0), (self._width, self._height))
         window = self._window(centre, size, zoom, rng)
-        mine = _present(self._examples.robots[source])
-        return self._show(canvas, rect, source, window, mine, robots, rng, feather=True)
+        mine = present(self._examples.robots[source])
+        return self._show(canvas, rect, source, window, mine, robots, rng, soft=True)
 
     def _zoom(self, robot: Robots | None, rng: Rng) -> float:
         """A magnification, log-uniform; the robot's depth stays in the range of the labels."""
@@ -211,9 +204,7 @@ class Augmenter:
         most = math.radians(self._settings.rotation_deg)
         angle = rng.uniform(-most, most)
         mirror = -1.0 if rng.random() < self._settings.flip_share else 1.0
-        turn = np.array(
-            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-        )
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         matrix = turn @ np.diag([mirror, 1.0]) / zoom
         return Window(matrix, centre - matrix @ (np.asarray(size) / 2), zoom)
 
@@ -227,47 +218,22 @@ class Augmenter:
         robots: Robots,
         rng: Rng,
         *,
-        feather: bool = False,
+        soft: bool = False,
     ) -> Robots:
         left, top, right, bottom = rect
-        pixels = self._sample(source, window, (bottom - top, right - left))
+        pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
         self._tint(pixels, rng)
         place = canvas[top:bottom, left:right]
-        if feather:
-            place.lerp_(pixels, _feather(bottom - top, right - left))
+        if soft:
+            place.lerp_(pixels, feather(bottom - top, right - left))
         else:
             place.copy_(pixels)
-        seen = _moved(mine, window, rect)
-        kept = robots[~_inside(robots, rect)]
-        return np.concatenate([kept, seen[_inside(seen, rect) & self._in_source(mine)]])
+        seen = moved(mine, window, rect)
+        kept = robots[~inside(robots, rect)]
+        return np.concatenate([kept, seen[inside(seen, rect) & self._in_source(mine)]])
 
     def _in_source(self, robots: Robots) -> NDArray[np.bool_]:
-        return _inside(robots, (0, 0, self._width, self._height))
-
-    def _sample(self, source: int, window: Window, shape: tuple[int, int]) -> Tensor:
-        """(h, w, 3) float32 pixels of a window."""
-        raw = self._examples.image(source)
-        if shape == raw.shape[:2] and window.zoom == 1 and (window.matrix == np.eye(2)).all():
-            return torch.from_numpy(raw.astype(np.float32))
-        # Only what the window looks at is made float.
-        corners = window.matrix @ (shape[1] * LEFT_RIGHT, shape[0] * TOP_BOTTOM)
-        seen = corners + window.origin[:, None]
-        size = np.array([self._width, self._height])
-        low = np.clip(np.floor(seen.min(axis=1)).astype(int) - 1, 0, size - 2)
-        high = np.clip(np.ceil(seen.max(axis=1)).astype(int) + 1, low + 2, size)
-        part = raw[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-        image = torch.from_numpy(part).permute(2, 0, 1)[None]
-        # grid_sample counts from -1 to 1 over the image's edges.
-        scale = 2 / (high - low)
-        step = (window.matrix * scale[:, None]).astype(np.float32)
-        start = ((window.origin - low) * scale - 1).astype(np.float32)
-        down, across = (torch.arange(n, dtype=torch.float32) + 0.5 for n in shape)
-        grid = torch.empty(1, *shape, 2)
-        for axis in range(2):
-            rows = down * float(step[axis, 1]) + float(start[axis])
-            torch.add(rows[:, None], across * float(step[axis, 0]), out=grid[0, ..., axis])
-        out = grid_sample(image, grid, padding_mode="border", align_corners=False)
-        return out[0].permute(1, 2, 0)
+        return inside(robots, (0, 0, self._width, self._height))
 
     def _tint(self, pixels: Tensor, rng: Rng) -> None:
         """Other contrast, brightness and white balance, in place; 0 to 255."""
@@ -288,48 +254,3 @@ class Augmenter:
             at = int(rng.integers(len(self._grain) - canvas.numel()))
             grain = self._grain[at : at + canvas.numel()].view(canvas.shape)
             canvas.add_(grain, alpha=255 * self._settings.noise * rng.random())
-
-
-def _parts(whole: Rect, rng: Rng) -> list[Rect]:
-    """A rectangle in two or four, cut between a third and two thirds of its sides."""
-    left, top, right, bottom = whole
-    x = round(left + (right - left) * rng.uniform(1 / 3, 2 / 3))
-    y = round(top + (bottom - top) * rng.uniform(1 / 3, 2 / 3))
-    kind = rng.integers(3)
-    if kind == 0:
-        return [(left, top, x, bottom), (x, top, right, bottom)]
-    if kind == 1:
-        return [(left, top, right, y), (left, y, right, bottom)]
-    return [(left, top, x, y), (x, top, right, y), (left, y, x, bottom), (x, y, right, bottom)]
-
-
-def _present(robots: Robots) -> Robots:
-    return robots[np.isfinite(robots[:, U])]
-
-
-def _inside(robots: Robots, rect: Rect) -> NDArray[np.bool_]:
-    u, v = robots[:, U], robots[:, V]
-    inside: NDArray[np.bool_] = (rect[0] <= u) & (u < rect[2]) & (rect[1] <= v) & (v < rect[3])
-    return inside
-
-
-def _moved(robots: Robots, window: Window, rect: Rect) -> Robots:
-    """Robots of a source where a window puts them on the canvas."""
-    back = np.linalg.inv(window.matrix)
-    out = robots.copy()
-    out[:, BOX] = np.nan  # not carried along: nothing asks for it
-    corner = np.array(rect[:2])
-    out[:, [U, V]] = (robots[:, [U, V]] - window.origin) @ back.T + corner
-    out[:, DEPTH] = robots[:, DEPTH] / window.zoom
-    out[:, SIGMA_DEPTH] = robots[:, SIGMA_DEPTH] / window.zoom
-    out[:, [SIGMA_U, SIGMA_V]] = robots[:, [SIGMA_U, SIGMA_V]] * window.zoom
-    return out
-
-
-def _feather(height: int, width: int) -> Tensor:
-    """(h, w, 1) opacity: 1 within, falling to 0 over the border."""
-    down, across = (
-        ((torch.minimum(r, n - 1 - r) + 1) / (FEATHER_PX + 1)).clamp(max=1)
-        for n, r in ((n, torch.arange(n, dtype=torch.float32)) for n in (height, width))
-    )
-    return (down[:, None] * across)[..., None]

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -20,8 +21,10 @@ from torch import Tensor
 Robots = NDArray[np.float32]
 """(..., 10): ``FIELDS`` of each robot; a row whose u is NaN is no robot."""
 
-FIELDS = ("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m")
-FIELDS = (*FIELDS, "left_px", "top_px", "right_px", "bottom_px")
+FIELDS = (
+    *("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m"),
+    *("left_px", "top_px", "right_px", "bottom_px"),
+)
 U, V, DEPTH, SIGMA_U, SIGMA_V, SIGMA_DEPTH = range(6)
 BOX = slice(6, 10)
 
@@ -63,7 +66,7 @@ class Examples:
 
     @cached_property
     def _ends(self) -> list[int]:
-        return np.cumsum([len(chunk) for chunk in self.pixels]).tolist()
+        return list(accumulate(len(chunk) for chunk in self.pixels))
 
     def __len__(self) -> int:
         return len(self.robots)

@@ -110,9 +110,9 @@ def decode(
         uv += np.stack([np.take_along_axis(flat[:, axis], best, axis=1) for axis in range(2)])
         uv = np.clip(uv, 0, np.array([cols, rows])[:, None, None])
     uv *= stride_px
-    depth_m = np.take_along_axis(depth_m.reshape(images, -1), best, axis=1).astype(np.float64)
+    depth = np.take_along_axis(depth_m.reshape(images, -1), best, axis=1).astype(np.float64)
     count = np.maximum((kept >= max(min_confidence, 0.0)).sum(axis=1), 1)
-    found = Found(uv[0], uv[1], depth_m, kept.astype(np.float64), count)
+    found = Found(uv[0], uv[1], depth, kept.astype(np.float64), count)
     return found if offset is None else _without_doubles(found)
 
 
@@ -129,4 +129,5 @@ def _without_doubles(found: Found) -> Found:
     # Those that stay first, in their order.
     first = np.argsort(~stays, axis=1, kind="stable")
     columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
-    return Found(*(np.take_along_axis(c, first, axis=1) for c in columns), stays.sum(axis=1))
+    u_px, v_px, depth_m, confidence = (np.take_along_axis(c, first, axis=1) for c in columns)
+    return Found(u_px, v_px, depth_m, confidence, stays.sum(axis=1))

@@ -1,7 +1,8 @@
 """Training: seeded, resumable, watched in TensorBoard."""
 
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
@@ -16,12 +17,17 @@ from dmrl.errors import SettingError
 from dmrl.learn.augment import Augmenter
 from dmrl.learn.batches import Batch, Examples, ahead, batch_count, gathered, order
 from dmrl.learn.checkpoint import State, load_checkpoint, save_checkpoint
+from dmrl.learn.group import Group
 from dmrl.learn.network import Network, build
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.step import LOSSES, Average, new_optimizer, train_step
+from dmrl.learn.step import ALONE, LOSSES, Average, new_optimizer, train_step
 from dmrl.learn.validate import validation_figures
 
 WATCH_STEPS = 10  # reading a loss makes an accelerator wait, so not at every step
+
+
+Board = Callable[[str, float, int], None]
+"""Takes a curve's name, its value and the step."""
 
 
 class Step(NamedTuple):
@@ -97,6 +103,8 @@ class Training:
         (N,) how often each image shall come in an epoch. None: once.
     identity
         Names the data, so that a training is resumed on the same.
+    group
+        The processes that train this network together; only the first writes to ``folder``.
     resume
         Go on from the checkpoint in ``folder``.
 
@@ -118,8 +126,10 @@ class Training:
         validation: Examples | None = None,
         shares: NDArray[np.float64] | None = None,
         identity: str = "",
+        group: Group = ALONE,
         resume: bool = False,
     ) -> None:
+        self._group = group
         self._learning = network.to(device_of(settings.device))
         self._examples, self._validation, self._shares = examples, validation, shares
         self._settings, self._folder = settings, folder
@@ -165,19 +175,28 @@ class Training:
             If the loss is no longer a number.
         """
         first = self._state.epochs_done
-        log = self._folder / "tensorboard"
-        with SummaryWriter(log, purge_step=first * self._steps_per_epoch + 1) as board:
+        with self._board(first * self._steps_per_epoch + 1) as board:
             for epoch in range(first, self._settings.epochs):
                 self._learning.train()
                 said = yield from self._epoch(epoch, board)
                 self._learning.eval()
-                if self._validation is not None:
+                if self._validation is not None and self._group.leads:
                     said |= validation_figures(self.network, self._validation, self._settings)
-                    for name in said.keys() - {"loss", *LOSSES}:
-                        at = (epoch + 1) * self._steps_per_epoch
-                        board.add_scalar(name.replace("_", "/", 1), said[name], at)
+                    at = (epoch + 1) * self._steps_per_epoch
+                    for name in sorted(said.keys() - {"loss", *LOSSES}):
+                        board(name.replace("_", "/", 1), said[name], at)
                 self._state = State(self._state.run, epoch + 1, [*self.history, said])
-                save_checkpoint(self._folder, self._networks(), self._optimizer, self._state)
+                if self._group.leads:
+                    save_checkpoint(self._folder, self._networks(), self._optimizer, self._state)
+
+    @contextmanager
+    def _board(self, first_step: int) -> Iterator[Board]:
+        """TensorBoard's log; nothing in processes that do not lead."""
+        if not self._group.leads:
+            yield lambda name, value, step: None
+            return
+        with SummaryWriter(self._folder / "tensorboard", purge_step=first_step) as writer:
+            yield writer.add_scalar
 
     def _networks(self) -> dict[str, Network]:
         averaged = {"average": self._average.network} if self._average else {}
@@ -187,13 +206,17 @@ class Training:
         size, seed = self._settings.batch_size, self._settings.seed
         indices = order(len(self._examples), seed=seed, epoch=epoch, shares=self._shares)
         for index, start in enumerate(range(0, len(indices), size)):
-            chosen = indices[start : start + size]
+            whole = indices[start : start + size]
+            # Where there are more processes than images some compute one that does not count.
+            chosen = self._group.part(whole) if len(whole) >= self._group.size else whole[:1]
             if self._augmenter is None:
                 yield gathered(self._examples, chosen)
             else:
-                yield self._augmenter.batch(chosen, epoch=epoch, index=index)
+                yield self._augmenter.batch(
+                    chosen, epoch=epoch, index=index * self._group.size + self._group.rank
+                )
 
-    def _epoch(self, epoch: int, board: SummaryWriter) -> Generator[Step, None, dict[str, float]]:
+    def _epoch(self, epoch: int, board: Board) -> Generator[Step, None, dict[str, float]]:
         """Train one epoch; returns its mean losses."""
         size = self._settings.batch_size
         seen: list[Tensor] = []
@@ -201,21 +224,30 @@ class Training:
         for index, batch in enumerate(ahead(self._batches(epoch)), start=1):
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
-            parts = train_step(self._learning, self._optimizer, batch, self._settings, rate)
+            whole = min(size, len(self._examples) - (index - 1) * size)
+            parts = self._step(batch, rate, whole)
             if self._average:
                 self._average.update(step)
-            seen.append(parts * len(batch.images))
+            seen.append(parts * whole)
             if index % WATCH_STEPS == 0 or index == self._steps_per_epoch:
                 recent = torch.stack(seen).cpu()
-                loss = float(recent.sum()) / ((len(seen) - 1) * size + len(batch.images))
+                loss = float(recent.sum()) / ((len(seen) - 1) * size + whole)
                 _require_finite(loss, epoch + 1, index)
-                board.add_scalar("loss/train", loss, step)
-                board.add_scalar("learning_rate", rate, step)
+                board("loss/train", loss, step)
+                board("learning_rate", rate, step)
                 total += recent.sum(dim=0)
                 seen.clear()
             yield Step(epoch + 1, loss)
         means = (total / len(self._examples)).tolist()
         return {"loss": sum(means), **dict(zip(LOSSES, means, strict=True))}
+
+    def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:
+        """(3,) losses of a batch of ``whole`` images, of which this process has a part."""
+        group = self._group
+        share = len(group.part(np.arange(whole))) / whole
+        return train_step(
+            self._learning, self._optimizer, batch, self._settings, rate, group, share
+        )
 
 
 def _require_finite(loss: float, epoch: int, step: int) -> None:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from dmrl.errors import SettingError
+from dmrl.learn.depthwise import Depthwise
 
 CHANNELS = 3
 CHANNEL_MEANINGS = {
@@ -99,17 +100,16 @@ class ConvNorm(nn.Sequential):
         *,
         stride: int = 1,
         dilation: int = 1,
-        groups: int = 1,
+        depthwise: bool = False,
         relu: bool = True,
     ) -> None:
-        padding = dilation * (kernel // 2)
-        conv = nn.Conv2d(
-            ins, outs, kernel, stride, padding, dilation=dilation, groups=groups, bias=False
-        )
-        nn.init.kaiming_normal_(conv.weight, mode="fan_out", nonlinearity="relu")
-        if groups > 1:  # fan-out counts every group's outputs
-            nn.init.normal_(conv.weight, std=(2 / kernel**2) ** 0.5)
-        last = (nn.ReLU(),) if relu else ()
+        if depthwise:
+            conv: nn.Conv2d = Depthwise(ins, stride=stride, dilation=dilation)
+        else:
+            conv = nn.Conv2d(ins, outs, kernel, stride, kernel // 2, bias=False)
+        fan_out = kernel**2 * (1 if depthwise else outs)
+        nn.init.normal_(conv.weight, std=(2 / fan_out) ** 0.5)  # He et al. 2015
+        last = (nn.ReLU(inplace=True),) if relu else ()
         super().__init__(conv, nn.BatchNorm2d(outs), *last)
 
 
@@ -118,7 +118,7 @@ class Residual(nn.Module):
 
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
-        self.depthwise = ConvNorm(width, width, dilation=dilation, groups=width)
+        self.depthwise = ConvNorm(width, width, dilation=dilation, depthwise=True)
         self.pointwise = ConvNorm(width, width, 1, relu=False)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ class DmrlNano(Network):
             ConvNorm(CHANNELS, stem, stride=2),
             ConvNorm(stem, fine, stride=2),
             *(Residual(fine, dilation) for dilation in self.dilations[0]),
-            ConvNorm(fine, fine, stride=2, groups=fine),
+            ConvNorm(fine, fine, stride=2, depthwise=True),
             ConvNorm(fine, coarse, 1),
             *(Residual(coarse, dilation) for dilation in self.dilations[1]),
         )
@@ -158,7 +158,9 @@ class DmrlNano(Network):
 
     def forward(self, images: Tensor) -> Tensor:
         """(N, 4, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
-        out: Tensor = self.head(self.body(images))
+        features = self.body(images)
+        with torch.autocast(features.device.type, enabled=False):
+            out: Tensor = self.head(features.float())
         return out
 
 

@@ -6,12 +6,14 @@ import torch
 from torch import Tensor
 
 from dmrl.learn.batches import Batch
+from dmrl.learn.group import Group
 from dmrl.learn.losses import confidence_loss, depth_loss, offset_loss
 from dmrl.learn.network import SUB_CELL, Network, to_input
 from dmrl.learn.settings import FitSettings
 from dmrl.learn.targets import targets
 
 ADAM_EPSILON = 1e-7  # Keras' default, with which the paper trained
+ALONE = Group()
 LOSSES = ("confidence_loss", "depth_loss", "offset_loss")
 
 
@@ -19,7 +21,10 @@ def losses(network: Network, batch: Batch, settings: FitSettings) -> Tensor:
     """(3,) weighted confidence, depth and offset loss of a batch."""
     device = next(network.parameters()).device
     images, robots = (t.to(device, non_blocking=True) for t in batch)
-    out = network(to_input(images))
+    half = settings.precision == "bfloat16"
+    with torch.autocast(device.type, torch.bfloat16, enabled=half):
+        out = network(to_input(images))
+    out = out.float()
     wanted = targets(
         robots,
         (out.shape[2], out.shape[3]),
@@ -35,7 +40,8 @@ def losses(network: Network, batch: Batch, settings: FitSettings) -> Tensor:
     if network.channels == SUB_CELL:
         offset = offset_loss(out[:, 2:4], wanted.offset, wanted.offset_weight)
     weights = (settings.confidence_weight, settings.depth_weight, settings.offset_weight)
-    return torch.stack((confidence, depth, offset)) * out.new_tensor(weights)
+    parts: Tensor = torch.stack((confidence, depth, offset)) * out.new_tensor(weights)
+    return parts
 
 
 def new_optimizer(network: Network, settings: FitSettings) -> torch.optim.Optimizer:
@@ -57,15 +63,34 @@ def train_step(
     batch: Batch,
     settings: FitSettings,
     learning_rate: float,
+    group: Group = ALONE,
+    share: float = 1.0,
 ) -> Tensor:
-    """(3,) losses of a batch, after one step of the optimizer on their sum."""
-    for group in optimizer.param_groups:
-        group["lr"] = learning_rate
+    """(3,) losses of a batch, after one step of the optimizer on their sum.
+
+    Parameters
+    ----------
+    network, optimizer
+        Changed in place.
+    batch
+        Images and robots; this process' part of the batch.
+    settings
+        The recipe.
+    learning_rate
+        Of this step.
+    group
+        The processes that train together.
+    share
+        Share of the whole batch that ``batch`` is. 0: of ``batch`` nothing is learnt.
+    """
+    for parameters in optimizer.param_groups:
+        parameters["lr"] = learning_rate
     parts = losses(network, batch, settings)
     optimizer.zero_grad(set_to_none=True)
     parts.sum().backward()  # type: ignore[no-untyped-call]
+    parts = group.average(network, parts.detach(), share)
     optimizer.step()
-    return parts.detach()
+    return parts
 
 
 class Average:

@@ -1,19 +1,17 @@
 """``dmrl train``: an Arrow dataset to a run folder with a trained network."""
 
-import fnmatch
 import shutil
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import pyarrow.compute as pc
 from cyclopts import Parameter
-from numpy.typing import NDArray
 
 from dmrl import recipe as recipes
-from dmrl.dataset import Dataset, Split, open_dataset
+from dmrl.dataset import Split, open_dataset
 from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
 from dmrl.output import partial_folder, partial_of, refuse_existing
 from dmrl.progress import track
@@ -21,9 +19,11 @@ from dmrl.recording import provenance
 from dmrl.tables import print_json, print_table
 
 try:
-    from dmrl.learn.batches import FIELDS, Examples
+    from dmrl.examples import material
+    from dmrl.learn.batches import Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.fit import Step, Training, new_network
+    from dmrl.learn.group import Group, join_group, leave_group
     from dmrl.learn.model import (
         PUBLISHED_THRESHOLD,
         Model,
@@ -90,16 +90,28 @@ def run(
     SettingError
         If the network cannot take the images, or the loss is no longer a number.
     """
+    group = join_group()
+    try:
+        return _run(dataset, out, settings, init, group, resume=resume)
+    finally:
+        leave_group()
+
+
+def _run(
+    dataset: Path, out: Path, settings: Settings, init: Path | None, group: Group, *, resume: bool
+) -> Result:
     refuse_existing(out)
-    _clear_the_way(partial_of(out), resume=resume)
+    if group.leads:
+        _clear_the_way(partial_of(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
-    examples, held_out, shares = _material(data, settings)
+    examples, held_out, shares = material(data, settings)
     network = _first_network(settings, examples, init)
     inputs = (dataset,) if init is None else (dataset, init)
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
     identity = " ".join(source.sha256 for source in made.inputs)
-    with partial_folder(out, keep_on_error=True) as folder:
+    where = partial_folder(out, keep_on_error=True) if group.leads else nullcontext(partial_of(out))
+    with where as folder:
         training = Training(
             network,
             examples,
@@ -108,13 +120,15 @@ def run(
             validation=held_out,
             shares=shares,
             identity=identity,
+            group=group,
             resume=resume and has_checkpoint(folder),
         )
+        if not group.leads:
+            return _train(training, settings, len(examples))
         made.write(folder)
         result = _train(training, settings, len(examples))
         threshold = _threshold(training.network, held_out, settings)
-        model = _model(training, settings, train, len(examples), threshold)
-        save_model(model, folder)
+        save_model(_model(training, settings, train, len(examples), threshold), folder)
         remove_checkpoint(folder)
     return result
 
@@ -129,68 +143,6 @@ def _clear_the_way(partial: Path, *, resume: bool) -> None:
             f"{partial} holds an interrupted training. Go on with --resume, or remove it"
         )
     shutil.rmtree(partial)
-
-
-def _material(
-    data: Dataset, settings: Settings
-) -> tuple[Examples, Examples | None, NDArray[np.float64] | None]:
-    """Images to learn from, images held out, and the shares of the former."""
-    train = data.split("train")
-    every, sources = _examples(train), np.array(train.table.column("source").to_pylist())
-    held = np.zeros(len(every), bool)
-    watched = _examples(data.split("val")) if "val" in data.splits else None
-    if watched is None and settings.validation_share:
-        held = _last_of_each(sources, settings.validation_share)
-        watched = every.select(held) if held.any() else None
-    learnt = every.select(~held) if held.any() else every
-    return learnt, watched, _shares(sources[~held], settings)
-
-
-def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
-    """The last share of the images of each recording."""
-    held = np.zeros(len(sources), bool)
-    for source in np.unique(sources):
-        mine = np.flatnonzero(sources == source)
-        held[mine[len(mine) - int(share * len(mine)) :]] = True
-    return held
-
-
-def _shares(sources: NDArray[np.str_], settings: Settings) -> NDArray[np.float64] | None:
-    """How often each image shall come in an epoch, by the shares of the recordings.
-
-    Raises
-    ------
-    SettingError
-        If a pattern fits no recording, or a recording fits none.
-    """
-    if not settings.shares:
-        return None
-    out = np.full(len(sources), np.nan)
-    names = sorted(set(sources.tolist()))
-    for pattern, share in settings.shares.items():
-        mine = np.isin(sources, fnmatch.filter(names, pattern)) & np.isnan(out)
-        if not mine.any():
-            raise SettingError(
-                f"shares: no images left for {pattern}. The recordings are {', '.join(names)}"
-            )
-        out[mine] = share / mine.sum()
-    if np.isnan(out).any():
-        forgotten = sources[np.isnan(out)][0]
-        raise SettingError(f'shares: none for {forgotten}. Name it, or add "*"')
-    if not out.sum():
-        raise SettingError("shares: all are 0. Give one that is not")
-    return out / out.mean()
-
-
-def _examples(split: Split) -> Examples:
-    """Images and robots of a split."""
-    peers = split.table.column("peers").to_pylist()
-    robots = np.full((len(peers), max(map(len, peers), default=0) or 1, len(FIELDS)), np.nan)
-    for row, found in zip(robots, peers, strict=True):
-        for place, peer in zip(row, found, strict=False):
-            place[:6] = [peer[name] for name in FIELDS[:6]]
-            place[6:] = peer["box_px"] if len(peer["box_px"]) == 4 else np.nan
-    return Examples(split.pixels, robots.astype(np.float32))
 
 
 def _threshold(network: Network, held_out: Examples | None, settings: Settings) -> float:
