@@ -17,7 +17,7 @@ def mosaic(image: Image, *, red_row: int = 0, red_col: int = 0) -> Image:
         0 or 1: the rows and columns, modulo 2, of the red pixels. Both 0: RGGB.
     """
     red, green, blue = np.broadcast_to(image, (*image.shape[:2], 3)).transpose(2, 0, 1)
-    raw = green.copy()
+    raw: Image = green.copy()
     raw[red_row::2, red_col::2] = red[red_row::2, red_col::2]
     raw[1 - red_row :: 2, 1 - red_col :: 2] = blue[1 - red_row :: 2, 1 - red_col :: 2]
     return raw
@@ -52,6 +52,7 @@ def demosaic(raw: Image, *, channels: int = 3, red_row: int = 0, red_col: int = 
                    np.where(in_red_row, raw, corners))  # fmt: skip
     blue = np.where(measured_green, np.where(in_red_row, down, across),
                     np.where(in_red_row, corners, raw))  # fmt: skip
-    if channels == 1:
-        return ((77 * red + 150 * green + 29 * blue + 128) >> 8).astype(np.uint8)[..., None]
-    return np.stack((red, green, blue), axis=2).astype(np.uint8)
+    grey = (77 * red + 150 * green + 29 * blue + 128) >> 8
+    planes = (red, green, blue) if channels == 3 else (grey,)
+    out: Image = np.stack(planes, axis=2).astype(np.uint8)
+    return out

@@ -60,7 +60,7 @@ class Build:
         harness_c.write_text(harness(network), encoding="utf-8")
         flags = (*self.flags, f"-D{NAME.upper()}_BAYER={int(self.bayer)}", "-I", folder)
         sources = (harness_c, folder / f"{NAME}.c")
-        last = ("-lgcc",) if self.emulated else ()
+        last: tuple[str, ...] = ("-lgcc",) if self.emulated else ()
         what = f"{self.compiler} {self.label}"
         run((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)
         return [EMULATOR, program] if self.emulated else [program]
