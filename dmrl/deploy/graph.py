@@ -232,7 +232,7 @@ class _Builder:
         plain = set(op.settings) == {"kernel", "stride"}
         if source == 0:
             raise Cannot(op.name, "a max-pool of the image", "a convolution first")
-        if not plain or any(side not in (2, (2, 2), [2, 2]) for side in op.settings.values()):
+        if not plain or any(side != 2 for side in op.settings.values()):
             raise Cannot(op.name, f"a max-pool with {op.settings}", "2x2 max-pools with stride 2")
         self._put(op, FloatPool(op.name, (source,)))
 

@@ -93,7 +93,7 @@ class Odd(Network):
         (lambda x: torch.cat([x, x], 1), r"layer cat is a concatenation inside the network"),
         (lambda x: x * x, r"layer mul is a mul, .* Use a convolution"),
         (lambda x: x + 1, r"layer add is an add of a number"),
-        (lambda x: x if x.sum() > 0 else -x, r"Odd.forward decides by the values it sees"),
+        (lambda x: x if x.sum() > 0 else -x, r"layer sum is a sum, .* Use convolutions"),
     ],
 )
 def test_what_cannot_be_carried_is_named_with_what_to_use_instead(
