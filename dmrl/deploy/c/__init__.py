@@ -13,6 +13,9 @@ from dmrl.deploy.integer import IntegerNetwork
 
 __all__ = ["NAME", "write_c"]
 
+L1_FOR_STATE = 48 * 1024
+"""Bytes of the GAP8's 64 kB of L1 that a state may take: the cores' stacks lie there too."""
+
 
 def write_c(
     network: IntegerNetwork,
@@ -62,6 +65,7 @@ def write_c(
             stack_bytes=made.stack_bytes,
             input="raw Bayer images" if bayer else "RGB" if network.channels == 3 else "grey",
             macs=f"{network.macs / 1e6:.1f}",
+            memory="L1" if made.state_bytes <= L1_FOR_STATE else "L2",
         ),
     }
     for name, text in files.items():

@@ -9,8 +9,9 @@ INLINE void convolve_$suffix(const uint8_t *const *in, uint8_t *out, const int8_
             int32_t sum[8];
             dot_2x4_$suffix(sum, in, weights + o * filter, taps, run, x * step, step);
             for (int k = 0; k < 4; k++) {
-                out[x * outs + o + k] = clamp(scaled(sum[k], &scales[o + k], wide), low, high);
-                out[(x + 1) * outs + o + k] = clamp(scaled(sum[k + 4], &scales[o + k], wide), low, high);
+                const scale_t *scale = &scales[o + k];
+                out[x * outs + o + k] = clamp(scaled(sum[k], scale, wide), low, high);
+                out[(x + 1) * outs + o + k] = clamp(scaled(sum[k + 4], scale, wide), low, high);
             }
         }
     }
