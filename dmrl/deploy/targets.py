@@ -58,7 +58,8 @@ class Build:
         """
         harness_c, program = build / "harness.c", build / "program"
         harness_c.write_text(harness(network), encoding="utf-8")
-        flags = (*self.flags, f"-D{NAME.upper()}_BAYER={int(self.bayer)}", "-I", folder)
+        mode = f"-D{NAME.upper()}_BAYER={int(self.bayer)}"
+        flags: tuple[str | Path, ...] = (*self.flags, mode, "-I", folder)
         sources = (harness_c, folder / f"{NAME}.c")
         last: tuple[str, ...] = ("-lgcc",) if self.emulated else ()
         what = f"{self.compiler} {self.label}"
