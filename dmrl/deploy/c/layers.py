@@ -67,7 +67,9 @@ def row_function(plan: Plan, index: int, prefix: str) -> str:
         body = _pool_body(inputs[0], out)
     comment = f"/* {describe(plan, index)}. */\n"
     unused = "" if "row" in re.findall(r"\w+", body) else "    (void)row;\n"
-    return f"{comment}static void {step.name}({prefix}_t *net, int row)\n{{\n{unused}{body}}}\n\n"
+    return (
+        f"{comment}static void make_{step.name}({prefix}_t *net, int row)\n{{\n{unused}{body}}}\n\n"
+    )
 
 
 def describe(plan: Plan, index: int) -> str:

@@ -122,10 +122,6 @@ class Plan:
             for name in dict.fromkeys(b.home for b in self.buffers)
         }
 
-    def head_buffers(self) -> list[int]:
-        """Buffers that hold results, whole."""
-        return sorted({self.tensors[h.tensor] for h in self.network.heads.values()})
-
 
 def plan(network: IntegerNetwork) -> Plan:
     """How the C of a network works.
@@ -164,7 +160,7 @@ def _homes(passing: list[int], together: set[tuple[int, int]]) -> dict[int, str]
                 break
         else:
             shared.append([k])
-    return {k: f"passing_{index}" for index, home in enumerate(shared) for k in home}
+    return {k: f"{SHARED}{index}" for index, home in enumerate(shared) for k in home}
 
 
 def _steps(network: IntegerNetwork) -> tuple[list[Step], list[int]]:
@@ -199,7 +195,7 @@ def _pools_to_fuse(network: IntegerNetwork) -> set[int]:
 def _identifier(name: str, taken: list[str]) -> str:
     """A C identifier like ``name`` that is not taken."""
     plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "layer"
-    plain = plain if plain[0].isalpha() else f"layer_{plain}"
+    plain = f"layer_{plain}" if plain.startswith(SHARED) or not plain[0].isalpha() else plain
     reserved = {*taken, *RESERVED.split()}
     if plain not in reserved:
         return plain
@@ -207,13 +203,13 @@ def _identifier(name: str, taken: list[str]) -> str:
 
 
 RESERVED = """
-image image_pad zeros raw raw_rows done compute advance ready scaled clamp add pool convolve
-depthwise largest smallest fill copy demosaic put detect_cell is_peak confidence_at next_row
-row_is_there within same_robot without_doubles layers net row in auto break case char const
-continue default do double else enum extern float for goto if inline int long register restrict
-return short signed sizeof static struct switch typedef union unsigned void volatile while
+image image_pad done raw raw_rows auto break case char const continue default do double else enum
+extern float for goto if inline int long register restrict return short signed sizeof static
+struct switch typedef union unsigned void volatile while
 """
-"""Words of C, and names that the C has for other things."""
+"""Words of C, and other members of the state."""
+SHARED = "passing_"
+"""How members begin that several buffers share."""
 
 
 @dataclass(frozen=True, slots=True)

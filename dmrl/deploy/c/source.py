@@ -151,7 +151,7 @@ def _schedule(planned: Plan, names: dict[str, str]) -> str:
             planned.buffers[k + 1].rows,
         )
         table += f"    {{{', '.join(map(str, numbers))}}}, /* {step.name} */\n"
-        cases += f"    case {k}: {step.name}(net, row); break;\n"
+        cases += f"    case {k}: make_{step.name}(net, row); break;\n"
     image, pads = planned.buffers[0], ""
     if image.pad_value and image.gap:
         pads = f"    fill(net->image, {image.pad_value}, sizeof net->image);\n"
@@ -236,7 +236,8 @@ def _members(planned: Plan) -> str:
     lines += ["#if @_BAYER", "    int16_t raw_rows;", "    uint8_t raw[3][@_WIDTH];", "#endif"]
     for name, size in planned.homes.items():
         held = [b for b in planned.buffers if b.home == name]
-        text = _columns(held[0]) if len(held) == 1 else ", ".join(b.name for b in held)
+        shared = f"rows of {len(held)} layers, each read at once by the next"
+        text = _columns(held[0]) if len(held) == 1 else shared
         lines.append(f"    uint8_t {name}[{size}]; /* {text} */")
     if _has_pad(planned.buffers[0]):
         lines.append(f"    uint8_t image_pad[{_pad_bytes(planned)}];")
