@@ -109,8 +109,8 @@ def run(folder: Path, settings: Settings) -> Result:
     DatasetError, SettingError
         If there are no images to try it on.
     """
-    network = load(folder)
     require_c(folder)
+    network = load(folder)
     pictures = _pictures(network, folder, settings)
     noise = _noise(network, settings)
     images = [*pictures, *noise]
