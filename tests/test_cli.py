@@ -23,6 +23,7 @@ HEAVY = {
 OPTIONAL = (
     *("torch", "safetensors", "tensorboard", "h5py", "rerun", "rerun_cli", "matplotlib", "pandas"),
     *("filterpy", "datasets", "foxglove_schemas_protobuf", "grpc_tools", "mcap_protobuf"),
+    *("onnx", "onnxruntime"),
 )
 STAGES = Path(cli.__file__).parent / "stages"
 
