@@ -19,8 +19,9 @@ import numpy as np
 import torch
 
 from dmrl.dataset import Split, open_dataset
+from dmrl.examples import examples_of
 from dmrl.images import encode_jpeg
-from dmrl.learn.batches import Examples, shuffled
+from dmrl.learn.batches import gathered, order
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
@@ -52,10 +53,11 @@ def order_of(count: int) -> Iterator[np.ndarray]:
 
 
 def from_dmrl(split: Split) -> Iterator[torch.Tensor]:
-    """The loader that `dmrl train` uses; it gathers the grid labels as well."""
-    examples = Examples(split.pixels, split.confidence, split.depth)
-    for batch in shuffled(examples, BATCH, seed=1, epoch=0):
-        yield batch.images
+    """The loader that `dmrl train` uses; it gathers the robots as well."""
+    examples = examples_of(split)
+    chosen = order(len(examples), seed=1, epoch=0)
+    for start in range(0, len(chosen), BATCH):
+        yield gathered(examples, chosen[start : start + BATCH]).images
 
 
 def from_datasets_bytes(split: datasets.Dataset) -> Iterator[torch.Tensor]:

@@ -22,13 +22,21 @@ COMMANDS = {
     "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
-    "convert": "Convert SOURCE, a foreign file or folder, into a recording.",
+    "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
+    "record": "Record the logs and cameras of Crazyflies in flight, until Ctrl-C.",
+    "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
+    "calibrate": "Calibrate a camera: intrinsics from a chessboard, mount and delay from a flight.",
+    "align": "Set the clocks of robots by each other, from the ranges that both of a pair logged.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
     "card": "Write a dataset's card and figures again.",
     "train": "Train a network on a dataset.",
     "predict": "Run a network on every image of a recording.",
-    "evaluate": "Judge detections against labels, or estimated positions against the truth.",
+    "track": "Follow detected peers over time: 3D tracks with covariance.",
+    "evaluate": "Judge detections against labels; tracks and positions against the truth.",
+    "quantize": "Quantise a network to int8, and say what that costs.",
+    "export": "Write a network as ONNX and as C.",
+    "verify": "Prove that the C of an export computes the int8 network, bit for bit.",
     "view": "Show recordings in rerun, or save what it would show.",
     "info": "Show what a recording holds and where it comes from.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",
@@ -57,7 +65,8 @@ app = App(
     error_formatter=bad_command_line,
 )
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
-    app.command(f"dmrl.stages.{_name}:command", name=_name, help=_help, sort_key=_order)
+    _module = _name.replace("-", "_")
+    app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help, sort_key=_order)
 
 
 def main() -> NoReturn:

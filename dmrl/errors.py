@@ -10,6 +10,7 @@
   - RecipeError       the TOML does not describe a run
   - SettingError      a setting cannot be met by this input
   - BlenderError      Blender cannot be set up, does not start, or cannot use a model
+  - ToolError         a compiler or an emulator is missing, or fails
   - MissingExtra      a package that an optional room needs is not installed
 """
 
@@ -70,6 +71,10 @@ class SettingError(DmrlError):
 
 class BlenderError(DmrlError):
     """Blender cannot be set up, does not start, or cannot use a model."""
+
+
+class ToolError(DmrlError):
+    """A compiler or an emulator is not installed, or cannot do its work."""
 
 
 class MissingExtra(DmrlError):

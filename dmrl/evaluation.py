@@ -5,7 +5,7 @@ for, all of them OK, or with labels that name no peer at all. See ``dmrl.dataset
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.dataset import Split
 from dmrl.errors import RecordingError, SettingError
 from dmrl.images import size
 from dmrl.learn.matching import Points
@@ -92,6 +93,20 @@ def join(recording: Path, against: str, split: str | None = None) -> Pairs:
     return pairs
 
 
+def labels_of_split(split: Split, rows: Sequence[int]) -> Points:
+    """Labels inside the images of some rows of a dataset's split, numbered by their place."""
+    height_px, width_px = split.image_shape
+    entries = _column(split.table, "peers")
+    labels = _points(entries, None, np.array(rows, np.int64), len(split))
+    return labels.select(_inside(labels, width_px, height_px))
+
+
+def _inside(labels: Points, width_px: int, height_px: int) -> Mask:
+    inside: Mask = (labels.u_px >= 0) & (labels.u_px < width_px)
+    inside &= (labels.v_px >= 0) & (labels.v_px < height_px) & (labels.depth_m > 0)
+    return inside
+
+
 def _spans(
     recording: Path, own: dict[str, list[tuple[int, int]]], split: str | None
 ) -> list[tuple[int, int]] | None:
@@ -129,8 +144,7 @@ def _join_robot(
     judged, in_usable, in_detections = np.intersect1d(times[usable], seen_at, return_indices=True)
     labels = _points(peers, mine, np.flatnonzero(usable)[in_usable], len(labelled))
     width_px, height_px = _image_size(recording, robot)
-    inside = (labels.u_px >= 0) & (labels.u_px < width_px)
-    inside &= (labels.v_px >= 0) & (labels.v_px < height_px) & (labels.depth_m > 0)
+    inside = _inside(labels, width_px, height_px)
     left_out["labels outside their image"] += int((~inside).sum())
     every = _column(detected, "detections")
     detections = _points(every, None, in_detections, len(detected))

@@ -1,17 +1,19 @@
 """Figures of an evaluation: its errors, and a few images to be looked at."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
+from dmrl.estimation.score import ErrorTrace
 from dmrl.evaluation import Pairs
 from dmrl.images import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored
 from dmrl.plots import Example
-from dmrl.positions import Pair
 from dmrl.recording import read
 
 Array = NDArray[np.float64]
@@ -20,16 +22,23 @@ Array = NDArray[np.float64]
 SHARES = (0.2, 0.5, 0.8, 0.95)
 
 
-PLOTTED_PAIRS = 12
+PLOTTED = 12
 
 
-def draw_positions(folder: Path, pairs: list[Pair]) -> None:
-    """Write the errors of the first twelve pairs, over time, into a folder."""
-    for pair in pairs[:PLOTTED_PAIRS]:
-        judged, stem = pair.judged, folder / f"position-error-{pair.robot}-{pair.peer}"
-        plots.position_error(
-            judged.time_s, judged.error_m, judged.sigma_m, judged.kept, pair.name, stem
-        )
+class HasErrors(Protocol):
+    """Estimated or tracked positions beside true ones."""
+
+    @property
+    def trace(self) -> ErrorTrace:
+        """Their errors over time."""
+
+
+def draw_errors(folder: Path, judged: Sequence[HasErrors]) -> None:
+    """Write the errors of the first twelve pairs or observers, over time, into a folder."""
+    for one in judged[:PLOTTED]:
+        trace = one.trace
+        stem = folder / trace.name
+        plots.error_trace(trace.title, trace.time_s, trace.sigma_m, trace.errors_m, stem)
 
 
 def draw(

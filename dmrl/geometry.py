@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 STRIDE_PX = 8
 """Image pixels per grid cell, both ways."""
 
+UNDISTORT_ROUNDS = 8
+"""Newton steps; the lenses of small cameras settle in 4 to 1e-9."""
+
 # camera (x forward, y left, z up) -> optical (x right, y down, z forward); paper eq. 1.
 OPTICAL_FROM_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
@@ -40,6 +43,11 @@ class Camera:
         Principal point, pixel-edge coordinates.
     distortion
         k1, k2, p1, p2, k3 of the plumb-bob model; empty for none.
+    mount_rad
+        Roll, pitch and yaw of the camera against the body of its robot, signs as those of
+        ``camera_from_horizontal`` and yaw positive to the left.
+    delay_s
+        How much later than the exposure the log time of an image is.
     """
 
     width_px: int
@@ -49,6 +57,16 @@ class Camera:
     cx_px: float
     cy_px: float
     distortion: tuple[float, ...] = ()
+    mount_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    delay_s: float = 0.0
+
+    @property
+    def camera_from_body(self) -> Array:
+        """(3, 3) rotation: how the camera is mounted."""
+        roll, pitch, yaw = self.mount_rad
+        c, s = np.cos(yaw), np.sin(yaw)
+        turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return np.asarray(camera_from_horizontal(roll, pitch) @ turned)
 
     @property
     def image_from_optical(self) -> Array:
@@ -211,6 +229,8 @@ def pixels_from_horizontal(
     turn = matrix(cp, zero, -sp, sp * sr, cr, cp * sr, sp * cr, -sr, cp * cr)
     by_roll = matrix(zero, zero, zero, sp * cr, -sr, cp * cr, -sp * sr, -cr, -cp * sr)
     by_pitch = matrix(-sp, zero, -cp, cp * sr, zero, -sp * sr, cp * cr, zero, -sp * cr)
+    if any(camera.mount_rad):
+        turn, by_roll, by_pitch = (camera.camera_from_body @ m for m in (turn, by_roll, by_pitch))
     point = xyz_horizontal[:, :, None]
     by_state = np.concatenate([turn, by_roll @ point, by_pitch @ point], axis=2)
     depth, left, up = (turn @ point)[..., 0].T
@@ -263,3 +283,57 @@ def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
     along_x = radial + 2 * x**2 * slope + 2 * p1 * y + 6 * p2 * x
     along_y = radial + 2 * y**2 * slope + 6 * p1 * y + 2 * p2 * x
     return bent, np.stack([along_x, across, across, along_y], axis=-1).reshape(-1, 2, 2)
+
+
+def undistort(bent: Array, distortion: tuple[float, ...]) -> Array:
+    """(N, 2) points of the plane at unit depth that ``distort`` takes to ``bent``.
+
+    Parameters
+    ----------
+    bent
+        (N, 2) right and down over depth, as the lens shows them.
+    distortion
+        As in ``distort``.
+
+    Returns
+    -------
+    Array
+        NaN where the lens shows nothing: beyond the fold of its model.
+    """
+    plane = np.array(bent, float)
+    for _ in range(UNDISTORT_ROUNDS if any(distortion) else 0):
+        shown, jacobian = distort(plane, distortion)
+        plane = plane - np.linalg.solve(jacobian, (shown - bent)[..., None])[..., 0]
+    return plane
+
+
+def horizontal_from_pixels(
+    uv: Array,
+    depth_m: Array,
+    roll_rad: Array,
+    pitch_rad: Array,
+    camera: Camera,
+    *,
+    distorted: bool = True,
+) -> Array:
+    """(N, 3) points in the horizontal frame, metres: ``pixels_from_horizontal`` turned round.
+
+    Parameters
+    ----------
+    uv
+        (N, 2) pixels.
+    depth_m
+        (N,) along camera x, metres.
+    roll_rad, pitch_rad
+        (N,) attitude of the robot that carries the camera.
+    camera
+        Intrinsics and distortion.
+    distorted
+        Whether the image still has the lens's distortion.
+    """
+    plane = (uv - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
+    plane = undistort(plane, camera.distortion if distorted else ())
+    ahead = np.column_stack([np.ones(len(plane)), -plane]) * depth_m[:, None]
+    turns = [camera_from_horizontal(r, p) for r, p in zip(roll_rad, pitch_rad, strict=True)]
+    ahead = ahead @ camera.camera_from_body
+    return np.asarray(np.einsum("nji,nj->ni", np.reshape(turns, (-1, 3, 3)), ahead))

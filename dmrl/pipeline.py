@@ -32,6 +32,8 @@ STAGES: dict[str, int | None] = {
     "train": 1,
     "predict": 2,
     "evaluate": 1,
+    "quantize": 2,
+    "export": 1,
     "view": None,
 }
 # These go on with what a killed run has left.

@@ -162,46 +162,46 @@ def _violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float)
     axes.grid(axis="y", alpha=0.3)
 
 
-def position_error(
+def error_trace(
+    title: str,
     time_s: NDArray[np.float64],
-    error_m: NDArray[np.float64],
     sigma_m: NDArray[np.float64],
-    kept: NDArray[np.bool_],
-    pair: str,
+    errors_m: Mapping[str, NDArray[np.float64]],
     stem: Path,
 ) -> None:
-    """Errors of an estimated position over time, x above y, with their 3-sigma bands.
+    """Errors of positions over time, one axis above the other, with their 3-sigma bands.
 
     Parameters
     ----------
+    title
+        Words above it.
     time_s
         (N,) seconds.
-    error_m, sigma_m
-        (N, 2) estimate minus truth, and its standard deviation as the estimator has it.
-    kept
-        (N,) whether the estimator believes it.
-    pair
-        Words for the title.
+    sigma_m
+        (N, A) standard deviations, as the estimator has them.
+    errors_m
+        (N, A) errors by what made them, NaN where there are none; the last in black, on top.
     stem
         Path without suffix.
     """
+    colours = ["tab:red", "black"][-len(errors_m) :]
     with mpl.rc_context(STYLE):
-        figure = Figure((SIZE_INCHES[0], 4.4), layout="constrained")
-        for k, axes in enumerate(figure.subplots(2, 1, sharex=True, sharey=True)):
+        figure = Figure((SIZE_INCHES[0], 2.2 * sigma_m.shape[1]), layout="constrained")
+        rows: Any = figure.subplots(sigma_m.shape[1], 1, sharex=True, sharey=True)
+        for k, axes in enumerate(rows):
             band = 3 * sigma_m[:, k]
             axes.fill_between(time_s, -band, band, alpha=0.25, linewidth=0, label="3 sigma")
-            for mask, colour, word in ((kept, "black", "kept"), (~kept, "tab:red", "left out")):
-                axes.plot(
-                    time_s[mask], error_m[mask, k], ".", color=colour, markersize=2, label=word
-                )
+            for (word, error_m), colour in zip(errors_m.items(), colours, strict=True):
+                axes.plot(time_s, error_m[:, k], ".", color=colour, markersize=2, label=word)
             axes.axhline(0, color="grey", linewidth=0.8)
             axes.grid(alpha=0.3)
-            axes.set_ylabel(f"error in {'xy'[k]}, m")
-            # Far errors and wide bands at the start would flatten the rest.
-            limit = max(0.3, float(np.percentile(np.abs(error_m), 99)))
-            axes.set_ylim(-1.2 * limit, 1.2 * limit)
+            axes.set_ylabel(f"error in {'xyz'[k]}, m")
+        # Far errors and wide bands at the start would flatten the rest.
+        sizes = np.abs(np.concatenate([error.ravel() for error in errors_m.values()]))
+        limit = np.percentile(sizes[np.isfinite(sizes)], 99) if np.isfinite(sizes).any() else 0.0
+        axes.set_ylim(-1.2 * max(0.3, float(limit)), 1.2 * max(0.3, float(limit)))
         axes.set_xlabel("time, s")
-        figure.axes[0].set_title(f"{pair}: estimate minus truth")
+        figure.axes[0].set_title(title)
         figure.axes[0].legend(loc="upper right", fontsize=8, markerscale=4)
     save(figure, stem)
 
@@ -348,3 +348,97 @@ def _mark(axes: Any, example: Example) -> None:
                 markeredgewidth=edge,
                 label=words,
             )
+
+
+@dataclass(frozen=True, slots=True)
+class MapPair:
+    """One image, and the maps of two networks.
+
+    Parameters
+    ----------
+    title
+        Line above it.
+    rgb
+        (H, W, 3) uint8.
+    maps
+        What computed them, to its (rows, cols) confidence and depth; two of them.
+    """
+
+    title: str
+    rgb: NDArray[np.uint8]
+    maps: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
+    """A row per image: the image, then confidence and depth, each by one and by the other.
+
+    Colours run from 0 to the largest value of a column's pair over all rows.
+
+    Parameters
+    ----------
+    shown
+        At least one, all computed by the same two.
+    stem
+        Path without suffix.
+    """
+    names = list(shown[0].maps)
+    words = ("confidence", "depth, m")
+    with mpl.rc_context(STYLE):
+        figure = Figure((13.0, 2.1 * len(shown) + 1.1), layout="constrained")
+        figure.get_layout_engine().set(h_pad=0.12)  # type: ignore[call-arg, union-attr]
+        grid = figure.subplots(len(shown), 5, squeeze=False)
+        for channel, (name, colours) in enumerate(zip(words, ("inferno", "turbo"), strict=True)):
+            columns = slice(1 + 2 * channel, 3 + 2 * channel)
+            most = max(pair.maps[who][channel].max() for pair in shown for who in names)
+            for row, pair in zip(grid, shown, strict=True):
+                for axes, who in zip(row[columns], names, strict=True):
+                    drawn = axes.imshow(pair.maps[who][channel], vmin=0, vmax=most, cmap=colours)
+                    axes.set_title(who, fontsize=9)
+            figure.colorbar(drawn, ax=grid[:, columns], location="bottom", shrink=0.6, label=name)
+        for row, pair in zip(grid, shown, strict=True):
+            row[0].imshow(pair.rgb)
+            row[0].set_title(pair.title, fontsize=9)
+            for axes in row:
+                axes.set(xticks=[], yticks=[])
+    save(figure, stem)
+
+
+def trade_offs(
+    costs: Mapping[str, Sequence[float]],
+    gains: Sequence[float],
+    names: Sequence[str],
+    gain: str,
+    stem: Path,
+) -> None:
+    """A gain against each of several costs, one marker per name, the same in all.
+
+    Parameters
+    ----------
+    costs
+        Words of an axis to a value per name.
+    gains
+        A value per name.
+    names
+        What was measured.
+    gain
+        Words of the axis up.
+    stem
+        Path without suffix.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure((4.0 * len(costs), 4.2), layout="constrained")
+        for axes, (words, values) in zip(
+            figure.subplots(1, len(costs), sharey=True, squeeze=False)[0],
+            costs.items(),
+            strict=True,
+        ):
+            for place, name in enumerate(names):
+                axes.plot(
+                    values[place], gains[place], "osD^vP*X"[place % 8], markersize=8, label=name
+                )
+            axes.set(xlabel=words, xlim=(0, 1.08 * max(values)))
+            axes.grid(alpha=0.3)
+        figure.axes[0].set_ylabel(gain)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    save(figure, stem)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError
-from dmrl.estimation.score import DEFINITIONS, Figures, Judged, figures, overall
+from dmrl.estimation.score import DEFINITIONS, ErrorTrace, Figures, Judged, figures, overall
 from dmrl.geometry import Array
 from dmrl.messages import STATUS_OK
 from dmrl.recording import input_of, read_table, summary
 
+TITLE, EACH = "estimated positions against truth", "pair"
 GAP_S = 0.25
 """Truth is not interpolated over longer gaps."""
 
@@ -46,6 +47,21 @@ class Pair:
     def name(self) -> str:
         """Words for a table."""
         return f"{self.robot} sees {self.peer}"
+
+    @property
+    def trace(self) -> ErrorTrace:
+        """Errors over time, what the estimator believes apart from the rest."""
+        kept = self.judged.kept[:, None]
+        return ErrorTrace(
+            f"{self.name}: estimate minus truth",
+            f"position-error-{self.robot}-{self.peer}",
+            self.judged.time_s,
+            self.judged.sigma_m,
+            {
+                "left out": np.where(kept, np.nan, self.judged.error_m),
+                "kept": np.where(kept, self.judged.error_m, np.nan),
+            },
+        )
 
 
 def has_positions(recording: Path) -> bool:
@@ -89,7 +105,7 @@ def _judge(recording: Path, robot: str, peer: str) -> Pair:
     estimate = read_table(recording, topics.position(robot, peer))
     true = read_table(recording, topics.truth(robot, peer))
     time_ns, true_ns = _column(estimate, "log_time"), _column(true, "log_time")
-    near = _inside(time_ns.astype(np.int64), true_ns.astype(np.int64))
+    near = inside_truth(time_ns.astype(np.int64), true_ns.astype(np.int64))
     truth = np.stack(
         [np.interp(time_ns[near], true_ns, _column(true, axis)) for axis in "xy"], axis=1
     )
@@ -116,7 +132,7 @@ def _covariance(table: pa.Table) -> Array:
     return np.asarray(full[:, :2, :2], float)
 
 
-def _inside(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
+def inside_truth(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
     """(N,) whether truth lies close on both sides of a time."""
     if not len(true_ns):
         return np.zeros(len(time_ns), bool)

@@ -36,6 +36,8 @@ class Step:
         What it reads: outputs of earlier steps, or ``{data}/...`` below ``--data``.
     settings
         The stage's settings.
+    recipe
+        Path or name of a recipe of this stage, whose keys the settings overrule. Empty: none.
     optional
         Go on without it where it cannot be done.
     """
@@ -44,6 +46,7 @@ class Step:
     out: str
     inputs: tuple[str, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
+    recipe: str = ""
     optional: bool = False
 
 
@@ -145,6 +148,7 @@ def load_pipeline(
     steps = keys.get("step")
     if not isinstance(steps, list) or not steps:
         raise _faulty(name, [*faults, "step: at least one [[step]] is required"])
+    steps = [_with_recipe(step) for step in steps]
     for k, step in enumerate(steps):
         faults += [f"step.{k + 1}.{fault}" for fault in _step_faults(step, stages, schema_of)]
     if faults:
@@ -189,6 +193,17 @@ def _faulty(name: str | Path, faults: Iterable[str]) -> RecipeError:
     lines = list(faults)
     keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
     return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Mend them all")
+
+
+def _with_recipe(step: Any) -> Any:
+    """A step whose settings are its recipe's, where its own do not overrule them."""
+    match step:
+        case {"recipe": str(name), "stage": str(stage)} if name:
+            keys = read(name)
+            _check_kind(name, keys, stage)
+            theirs = {key: value for key, value in keys.items() if key != "kind"}
+            return {**step, "settings": {**theirs, **step.get("settings", {})}}
+    return step
 
 
 def _step_faults(

@@ -17,7 +17,7 @@ class Topic:
     pattern
         Topic with ``{robot}`` and ``{peer}`` left open.
     message
-        Full name of its message.
+        Full name of its message; a final ``*`` stands for any ending.
     frame
         Frame its values are in.
     units
@@ -35,6 +35,12 @@ class Topic:
     rate: str
     written_by: str
 
+    def carries(self, message: str) -> bool:
+        """Whether a message of this full name may be on the topic."""
+        if self.message.endswith("*"):
+            return message.startswith(self.message[:-1])
+        return message == self.message
+
 
 CAMERA_IMAGE = "/{robot}/camera/image"
 CALIBRATION = "/{robot}/camera/calibration"
@@ -50,6 +56,9 @@ GRID = "/{robot}/detections/grid"
 TRACKS = "/{robot}/tracks"
 MASKS = "/{robot}/camera/masks"
 DEPTHS = "/{robot}/camera/depth"
+POSE = "/{robot}/pose"
+TRUE_POSE = "/{robot}/pose/truth"
+LOG = "/{robot}/log/{event}"
 TRANSFORMS = "/tf"
 
 TOPICS = (
@@ -59,9 +68,16 @@ TOPICS = (
         "image",
         "png or jpeg",
         "camera",
-        "convert, render, fly",
+        "convert, record, render, fly",
     ),
-    Topic(CALIBRATION, "foxglove.CameraCalibration", "image", "px", "once", "convert, render, fly"),
+    Topic(
+        CALIBRATION,
+        "foxglove.CameraCalibration",
+        "image",
+        "px",
+        "once",
+        "convert, record, render, fly",
+    ),
     Topic(
         LABELS, "dmrl.v1.PeerLabels", "image", "px, m", "per image", "convert, render, fly, label"
     ),
@@ -76,11 +92,13 @@ TOPICS = (
         "<robot>/horizontal",
         "rad, rad/s",
         "100 Hz",
-        "convert, render, fly",
+        "convert, record, render, fly",
     ),
-    Topic(VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert, fly"),
-    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert, fly"),
-    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert, fly"),
+    Topic(
+        VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert, record, fly"
+    ),
+    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert, record, fly"),
+    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert, record, fly"),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
     Topic(
         TRUTH,
@@ -90,7 +108,10 @@ TOPICS = (
         "20 Hz",
         "convert, render, fly",
     ),
-    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "fly, render"),
+    Topic(POSE, "foxglove.PoseInFrame", "world", "m", "100 Hz", "convert"),
+    Topic(TRUE_POSE, "foxglove.PoseInFrame", "world", "m", "100 Hz", "convert"),
+    Topic(LOG, "dmrl.log.*", "-", "as logged", "as logged", "convert"),
+    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "convert, fly, render"),
 )
 
 
@@ -150,7 +171,7 @@ def grid(robot: str) -> str:
 
 
 def tracks(robot: str) -> str:
-    """Topic of the peers that a robot follows over time."""
+    """Topic of the peers that a robot's detections are followed as."""
     return TRACKS.format(robot=robot)
 
 
@@ -164,13 +185,28 @@ def truth(robot: str, peer: str) -> str:
     return TRUTH.format(robot=robot, peer=peer)
 
 
+def pose(robot: str) -> str:
+    """Topic of where a robot estimates itself to be."""
+    return POSE.format(robot=robot)
+
+
+def true_pose(robot: str) -> str:
+    """Topic of where a robot truly is."""
+    return TRUE_POSE.format(robot=robot)
+
+
+def log(robot: str, event: str) -> str:
+    """Topic of a robot's log variables, as they were logged."""
+    return LOG.format(robot=robot, event=event)
+
+
 @cache
 def _expression(pattern: str) -> re.Pattern[str]:
     return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(pattern)))
 
 
 def names(pattern: str, topic: str) -> dict[str, str] | None:
-    """What ``{robot}`` and ``{peer}`` of a pattern are in a topic, or None.
+    """What ``{robot}``, ``{peer}`` and ``{event}`` of a pattern are in a topic, or None.
 
     Examples
     --------

@@ -23,6 +23,7 @@ HEAVY = {
 OPTIONAL = (
     *("torch", "safetensors", "tensorboard", "h5py", "rerun", "rerun_cli", "matplotlib", "pandas"),
     *("filterpy", "datasets", "foxglove_schemas_protobuf", "grpc_tools", "mcap_protobuf"),
+    *("onnx", "onnxruntime"),
 )
 STAGES = Path(cli.__file__).parent / "stages"
 
@@ -62,7 +63,7 @@ def test_help_lists_every_command_in_the_order_of_the_work(
 
 def test_every_stage_is_in_the_table() -> None:
     with_command = {
-        path.stem
+        path.stem.replace("_", "-")
         for path in STAGES.glob("*.py")
         if "\ndef command(" in path.read_text(encoding="utf-8")
     }
@@ -71,7 +72,7 @@ def test_every_stage_is_in_the_table() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_s_table_line_is_the_first_line_of_its_docstring(name: str) -> None:
-    command = importlib.import_module(f"dmrl.stages.{name}").command
+    command = importlib.import_module(f"dmrl.stages.{name.replace('-', '_')}").command
     assert inspect.getdoc(command).splitlines()[0] == COMMANDS[name]
 
 

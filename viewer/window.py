@@ -1,5 +1,6 @@
 """rerun's viewer in a window, and pictures of it without a screen."""
 
+import subprocess
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,6 +18,7 @@ from dmrl.viewer.process import (
     PATIENCE_S,
     Viewer,
     command,
+    environment,
     free_port,
     last_line,
     listens,
@@ -107,6 +109,24 @@ def screenshot(
             raise OutputError(f"cannot draw {out}: {e}") from None
         unfinished.write_bytes(picture)
     return show.moment
+
+
+def open_window(*, headless: bool = False) -> tuple[subprocess.Popen[bytes], str]:
+    """An empty viewer, and the address where it listens.
+
+    Parameters
+    ----------
+    headless
+        Without a window.
+    """
+    port = free_port(LOOPBACK)
+    extra = ("--headless", "--window-size", PICTURE_SIZE) if headless else ()
+    words = command(LOOPBACK, *extra, "--port", str(port))
+    # Its own session: Ctrl-C ends the recording, not the window.
+    process = subprocess.Popen(
+        words, env=environment(), stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    return process, url_of(port)
 
 
 class _ViewerStopped(Exception):

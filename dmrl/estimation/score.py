@@ -3,6 +3,7 @@
 The vertical comes straight from two height sensors and says nothing about an estimator.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,29 @@ DEFINITIONS = {
     "kept_coverage_95": "share of true positions inside the 95 % ellipse, kept samples",
     "kept_rmse_m": "root of the mean squared horizontal error of the kept samples",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorTrace:
+    """Errors over time, to be drawn.
+
+    Parameters
+    ----------
+    title, name
+        Words above the figure, and its file's name.
+    time_s
+        (N,).
+    sigma_m
+        (N, A) standard deviations along A axes, as the estimator has them.
+    errors_m
+        (N, A) errors by what made them, NaN where there are none; the last is drawn on top.
+    """
+
+    title: str
+    name: str
+    time_s: Array
+    sigma_m: Array
+    errors_m: Mapping[str, Array]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """A camera's calibration in a TOML file."""
 
 import tomllib
-from dataclasses import asdict, fields
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
 from dmrl.errors import SourceError
@@ -9,13 +9,14 @@ from dmrl.geometry import Camera
 
 INTEGERS = ("width_px", "height_px")
 POSITIVE = (*INTEGERS, "fx_px", "fy_px")
-NEEDED = tuple(field.name for field in fields(Camera) if field.name != "distortion")
-KEYS = (*NEEDED, "distortion")
+NEEDED = tuple(field.name for field in fields(Camera) if field.default is MISSING)
+LISTS = ("distortion", "mount_rad")
+KEYS = (*NEEDED, *LISTS, "delay_s")
 
 
 def write_camera(camera: Camera) -> str:
     """A TOML document that ``read_camera`` reads."""
-    values = asdict(camera) | {"distortion": list(camera.distortion)}
+    values = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(camera).items()}
     lines = [f"{key} = {value}" for key, value in values.items()]
     return "\n".join(
         ["# Pixel-edge coordinates: the image covers [0, width] x [0, height].", *lines, ""]
@@ -39,12 +40,18 @@ def read_camera(path: Path) -> Camera:
     wrong = [key for key in values if key not in KEYS]
     wrong += [f"{key} (missing)" for key in NEEDED if key not in values]
     wrong += [key for key in NEEDED if key in values and not _is_number(key, values[key])]
-    distortion = values.get("distortion", [])
-    if not (isinstance(distortion, list) and all(_is_number("", d) for d in distortion)):
-        wrong.append("distortion")
+    given = {key: values[key] for key in LISTS if key in values}
+    wrong += [key for key, value in given.items() if not _is_list(key, value)]
+    wrong += ["delay_s"] * (not _is_number("", values.get("delay_s", 0.0)))
     if wrong:
         raise SourceError(f"{path}: wrong keys {', '.join(wrong)}. Keys: {', '.join(KEYS)}")
-    return Camera(**(values | {"distortion": tuple(map(float, distortion))}))
+    return Camera(**(values | {key: tuple(map(float, value)) for key, value in given.items()}))
+
+
+def _is_list(key: str, value: object) -> bool:
+    if not isinstance(value, list) or not all(_is_number("", one) for one in value):
+        return False
+    return key != "mount_rad" or len(value) == 3
 
 
 def _is_number(key: str, value: object) -> bool:

@@ -1,7 +1,7 @@
 """Positions of a peer, with their covariance, as labels of a robot's images."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,10 +50,18 @@ class Look:
         Standard deviation of roll and pitch.
     distorted
         Whether the images still have the lens's distortion.
+    cameras
+        By robot, in place of the recording's: with mount and delay.
     """
 
     attitude_std_rad: float
     distorted: bool = True
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+
+    def exposures_ns(self, robot: str, images_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """When images of a robot were taken, from their log times."""
+        delay_s = self.cameras[robot].delay_s if robot in self.cameras else 0.0
+        return images_ns - round(delay_s * 1e9)
 
 
 def image_labels(

@@ -70,14 +70,16 @@ def label_messages(
     """
     kept = _of_other_sources(recording, held, topics.labels(robot))
     fresh: dict[int, list[Any]] = defaultdict(list)
-    camera = camera_of(recording, held, robot)
+    camera = look.cameras.get(robot) or camera_of(recording, held, robot)
     images_ns = image_times(recording, held, robot)
+    exposures_ns = look.exposures_ns(robot, images_ns)
     for peer, found in positions.items() if camera else ():
-        at = np.isin(found.time_ns, images_ns)
+        at = np.isin(found.time_ns, exposures_ns)
         mine = Positions(found.time_ns[at], found.xyz_m[at], found.covariance[at], found.status[at])
         attitude = _attitude(logs, robot, mine.time_ns)
         labels = image_labels(peer, mine, attitude, camera, look) if camera else iter(())
-        for time_ns, label in zip(mine.time_ns.tolist(), labels, strict=True):
+        stamps = images_ns[np.searchsorted(exposures_ns, mine.time_ns)].tolist()
+        for time_ns, label in zip(stamps, labels, strict=True):
             fresh[time_ns] += [message("PeerLabel")(**label)] if label else []
     for time_ns in sorted({*kept, *fresh}):
         peers = [*kept.get(time_ns, []), *fresh.get(time_ns, [])]

@@ -1,61 +1,75 @@
-"""Shuffled batches out of images that stay where they are.
+"""Batches out of images that stay where they are: shuffled, in stated shares, ahead of use.
 
-The images of a dataset are a list of arrays mapped from its files. A batch is gathered into
-one reused buffer: one copy per image, no allocation, still uint8.
+The images of a dataset are a list of arrays mapped from its files. A plain batch is gathered
+into a buffer: one copy per image, still uint8. ``ahead`` makes the next batch in a thread
+while the network learns from this one.
 """
 
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from itertools import accumulate
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+Robots = NDArray[np.float32]
+"""(..., 10): ``FIELDS`` of each robot; a row whose u is NaN is no robot."""
+
+FIELDS = (
+    *("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m"),
+    *("left_px", "top_px", "right_px", "bottom_px"),
+)
+U, V, DEPTH, SIGMA_U, SIGMA_V, SIGMA_DEPTH = range(6)
+BOX = slice(6, 10)
+
+T = TypeVar("T")
+
 
 class Batch(NamedTuple):
-    """Views of a reused buffer: use them before asking for the next batch.
+    """Images and the robots in them.
 
-    ``images`` (N, 3, H, W) uint8, channels last in memory; ``confidence`` and ``depth_m``
-    (N, rows, cols) float32.
+    ``images`` (N, 3, H, W) uint8, channels last in memory; ``robots`` (N, K, 10) float32.
     """
 
     images: Tensor
-    confidence: Tensor
-    depth_m: Tensor
+    robots: Tensor
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Examples:
-    """Images with their grid labels.
+    """Images with their robots.
 
     Parameters
     ----------
     pixels
         Arrays of (n_i, H, W, 3) uint8, RGB, such as zero-copy views of a mapped file.
-    confidence
-        (N, rows, cols) float32, N the sum of the n_i.
-    depth_m
-        (N, rows, cols) float32, metres.
+    robots
+        (N, K, 10) float32, ``FIELDS`` of up to K robots in each of the N images, N the sum of
+        the n_i. Sigmas are 0 where the label is exact, a box NaN where there is none.
     """
 
     pixels: Sequence[NDArray[np.uint8]]
-    confidence: NDArray[np.float32]
-    depth_m: NDArray[np.float32]
+    robots: Robots
 
     def __post_init__(self) -> None:
         count = sum(len(chunk) for chunk in self.pixels)
-        if not count == len(self.confidence) == len(self.depth_m):
-            raise ValueError(
-                f"{count} images with {len(self.confidence)} confidence "
-                f"and {len(self.depth_m)} depth labels"
-            )
+        if count != len(self.robots):
+            raise ValueError(f"{count} images with robots of {len(self.robots)}")
         if len({chunk.shape[1:] for chunk in self.pixels}) > 1:
             raise ValueError("images of more than one size")
 
+    @cached_property
+    def _ends(self) -> list[int]:
+        return list(accumulate(len(chunk) for chunk in self.pixels))
+
     def __len__(self) -> int:
-        return len(self.confidence)
+        return len(self.robots)
 
     @property
     def image_shape(self) -> tuple[int, int, int]:
@@ -63,10 +77,43 @@ class Examples:
         height, width, channels = self.pixels[0].shape[1:]
         return height, width, channels
 
+    def select(self, chosen: NDArray[np.bool_]) -> "Examples":
+        """The chosen images, one chunk each, not copied."""
+        numbers = np.flatnonzero(chosen)
+        chunks = [self.image(int(index))[None] for index in numbers]
+        return Examples(chunks, self.robots[numbers])
 
-def order(count: int, *, seed: int, epoch: int) -> NDArray[np.int64]:
-    """The images in this epoch's order: a permutation keyed by seed and epoch alone."""
-    return np.random.default_rng([seed, epoch]).permutation(count)
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) image of a number."""
+        chunk = bisect_right(self._ends, index)
+        first = self._ends[chunk - 1] if chunk else 0
+        found: NDArray[np.uint8] = self.pixels[chunk][index - first]
+        return found
+
+
+def order(
+    count: int, *, seed: int, epoch: int, shares: NDArray[np.float64] | None = None
+) -> NDArray[np.int64]:
+    """The images in this epoch's order, keyed by seed and epoch alone.
+
+    Parameters
+    ----------
+    count
+        Images of an epoch.
+    seed, epoch
+        What the order is drawn from.
+    shares
+        (count,) how often each image shall come in an epoch, 1 on average. Whole parts come
+        surely, the rest by chance. None: each comes once.
+    """
+    rng = np.random.default_rng([seed, epoch])
+    if shares is None:
+        return rng.permutation(count)
+    # Systematic sampling: every image comes floor or ceil of its share, and the sum is exact.
+    ticks = np.floor(np.cumsum(shares[rng.permutation(count)]) * count / shares.sum() + 1e-9)
+    times = np.diff(ticks, prepend=0).astype(np.int64)
+    rng = np.random.default_rng([seed, epoch])
+    return rng.permutation(np.repeat(rng.permutation(count), times))
 
 
 def batch_count(count: int, batch_size: int) -> int:
@@ -74,26 +121,24 @@ def batch_count(count: int, batch_size: int) -> int:
     return -(-count // batch_size)
 
 
-def shuffled(examples: Examples, batch_size: int, *, seed: int, epoch: int) -> Iterator[Batch]:
-    """Batches of one epoch, in the order of ``order``.
+def gathered(examples: Examples, chosen: Sequence[int] | NDArray[np.int64]) -> Batch:
+    """The chosen examples as they are."""
+    images = np.stack([examples.image(int(index)) for index in chosen])
+    robots = torch.from_numpy(examples.robots[np.asarray(chosen)])
+    return Batch(torch.from_numpy(images).permute(0, 3, 1, 2), robots)
 
-    Yields
-    ------
-    Batch
-        ``batch_size`` examples, in the last batch what is left.
-    """
-    indices = order(len(examples), seed=seed, epoch=epoch)
-    ends = np.cumsum([len(chunk) for chunk in examples.pixels])
-    chunk_of = np.searchsorted(ends, indices, side="right")
-    row_of = indices - np.concatenate([[0], ends])[chunk_of]
-    buffer = np.empty((min(batch_size, len(examples)), *examples.image_shape), np.uint8)
-    images = torch.from_numpy(buffer).permute(0, 3, 1, 2)
-    for start in range(0, len(indices), batch_size):
-        chosen = indices[start : start + batch_size]
-        for slot, at in enumerate(range(start, start + len(chosen))):
-            buffer[slot] = examples.pixels[chunk_of[at]][row_of[at]]
-        yield Batch(
-            images[: len(chosen)],
-            torch.from_numpy(examples.confidence[chosen]),
-            torch.from_numpy(examples.depth_m[chosen]),
-        )
+
+def in_order(examples: Examples, batch_size: int) -> Iterator[Batch]:
+    """Every example once, from first to last."""
+    for start in range(0, len(examples), batch_size):
+        yield gathered(examples, np.arange(start, min(start + batch_size, len(examples))))
+
+
+def ahead(items: Iterator[T]) -> Iterator[T]:
+    """The same items, the next one made in a thread while one is used."""
+    with ThreadPoolExecutor(1) as pool:
+        ends = object()
+        coming = pool.submit(next, items, ends)
+        while (item := coming.result()) is not ends:
+            coming = pool.submit(next, items, ends)
+            yield item  # type: ignore[misc]

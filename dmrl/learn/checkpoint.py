@@ -5,6 +5,7 @@ replaced in one step once the tensors are whole, so it never names half a file.
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,9 +48,15 @@ def has_checkpoint(folder: Path) -> bool:
     return (folder / STATE_NAME).is_file()
 
 
-def save_checkpoint(folder: Path, network: Network, optimizer: Optimizer, state: State) -> None:
+def save_checkpoint(
+    folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, state: State
+) -> None:
     """Write the state of a training; the previous one is there until this one is whole."""
-    tensors = {f"network.{name}": value for name, value in weights_of(network).items()}
+    tensors = {
+        f"{role}.{name}": value
+        for role, network in networks.items()
+        for name, value in weights_of(network).items()
+    }
     for index, moments in optimizer.state_dict()["state"].items():
         for name, value in moments.items():
             tensors[f"optimizer.{index}.{name}"] = value.detach().cpu().contiguous()
@@ -65,9 +72,9 @@ def save_checkpoint(folder: Path, network: Network, optimizer: Optimizer, state:
 
 
 def load_checkpoint(
-    folder: Path, network: Network, optimizer: Optimizer, run: dict[str, Any]
+    folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, run: dict[str, Any]
 ) -> State:
-    """State of an interrupted training; network and optimizer are set to it.
+    """State of an interrupted training; networks (by role) and optimizer are set to it.
 
     Raises
     ------
@@ -85,10 +92,10 @@ def load_checkpoint(
     except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:
         raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
     _require_same(state.run, run, folder)
-    weights = {
-        k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")
-    }
-    set_weights(network, weights, folder)
+    for role, network in networks.items():
+        start = f"{role}."
+        mine = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
+        set_weights(network, mine, folder)
     _set_optimizer(optimizer, tensors)
     return state
 

@@ -1,15 +1,40 @@
-"""Confidence and depth grids to detections. NumPy only.
+"""Grids of a network's output to detections. NumPy only.
 
-A detection is a cell that is the most confident of its 3x3 neighbourhood, at the cell's
-centre, in order of confidence. (The published code walks the cells in raster order.)
+A detection is a cell that is the most confident of its 3x3 neighbourhood, in order of
+confidence. (The published code walks the cells in raster order.) It lies in the middle of the
+cell or, where the network says so, at an offset from it; then two cells may name one robot,
+and of detections closer than ``SAME_PX`` only the most confident stays.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+SAME_PX = 8.0
+"""Detections closer than this are of one robot."""
+
+
+class Grids(NamedTuple):
+    """What a network says of N images.
+
+    Parameters
+    ----------
+    confidence
+        (N, rows, cols), 0 to 1.
+    depth_m
+        (N, rows, cols), metres.
+    offset
+        (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells; None
+        for a network that has no such channels.
+    """
+
+    confidence: NDArray[np.floating]
+    depth_m: NDArray[np.floating]
+    offset: NDArray[np.floating] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +77,7 @@ def peaks(confidence: NDArray[np.floating]) -> NDArray[np.bool_]:
 def decode(
     confidence: NDArray[np.floating],
     depth_m: NDArray[np.floating],
+    offset: NDArray[np.floating] | None = None,
     *,
     stride_px: int = 8,
     most: int = 20,
@@ -63,6 +89,9 @@ def decode(
     ----------
     confidence, depth_m
         (N, rows, cols): 0 to 1, and metres.
+    offset
+        (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells. None:
+        the middle is as good as it gets.
     stride_px
         Pixels per cell, both ways.
     most
@@ -75,10 +104,30 @@ def decode(
     best = np.argsort(-score, axis=1, kind="stable")[:, :most]
     kept = np.take_along_axis(score, best, axis=1)
     row, col = np.divmod(best, cols)
-    return Found(
-        u_px=(col + 0.5) * stride_px,
-        v_px=(row + 0.5) * stride_px,
-        depth_m=np.take_along_axis(depth_m.reshape(images, -1), best, axis=1).astype(np.float64),
-        confidence=kept.astype(np.float64),
-        count=np.maximum((kept >= max(min_confidence, 0.0)).sum(axis=1), 1),
-    )
+    uv = np.stack((col + 0.5, row + 0.5)).astype(np.float64)
+    if offset is not None:
+        flat = offset.reshape(images, 2, -1)
+        uv += np.stack([np.take_along_axis(flat[:, axis], best, axis=1) for axis in range(2)])
+        uv = np.clip(uv, 0, np.array([cols, rows])[:, None, None])
+    uv *= stride_px
+    depth = np.take_along_axis(depth_m.reshape(images, -1), best, axis=1).astype(np.float64)
+    count = np.maximum((kept >= max(min_confidence, 0.0)).sum(axis=1), 1)
+    found = Found(uv[0], uv[1], depth, kept.astype(np.float64), count)
+    return found if offset is None else _without_doubles(found)
+
+
+def _without_doubles(found: Found) -> Found:
+    """The same without detections that lie by a more confident one."""
+    wide = found.u_px.shape[1]
+    stays = np.arange(wide) < found.count[:, None]
+    for k in range(1, int(found.count.max())):
+        away_px = np.hypot(
+            found.u_px[:, :k] - found.u_px[:, k : k + 1],
+            found.v_px[:, :k] - found.v_px[:, k : k + 1],
+        )
+        stays[:, k] &= ~((away_px < SAME_PX) & stays[:, :k]).any(axis=1)
+    # Those that stay first, in their order.
+    first = np.argsort(~stays, axis=1, kind="stable")
+    columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
+    u_px, v_px, depth_m, confidence = (np.take_along_axis(c, first, axis=1) for c in columns)
+    return Found(u_px, v_px, depth_m, confidence, stays.sum(axis=1))

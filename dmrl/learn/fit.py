@@ -1,78 +1,33 @@
 """Training: seeded, resumable, watched in TensorBoard."""
 
 import math
-from collections.abc import Generator, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from dmrl.errors import SettingError
-from dmrl.learn.batches import Batch, Examples, batch_count, shuffled
+from dmrl.learn.augment import Augmenter
+from dmrl.learn.batches import Batch, Examples, ahead, batch_count, gathered, order
 from dmrl.learn.checkpoint import State, load_checkpoint, save_checkpoint
-from dmrl.learn.losses import confidence_loss, depth_loss
-from dmrl.learn.network import Network, build, to_input
+from dmrl.learn.group import Group
+from dmrl.learn.network import Network, build
+from dmrl.learn.settings import FitSettings
+from dmrl.learn.step import ALONE, LOSSES, Average, new_optimizer, train_step
+from dmrl.learn.validate import validation_figures
 
 WATCH_STEPS = 10  # reading a loss makes an accelerator wait, so not at every step
-ADAM_EPSILON = 1e-7  # Keras' default, with which the recipe was published
 
 
-@dataclass(frozen=True, slots=True)
-class FitSettings:
-    """How a network is trained. The defaults are the published recipe.
-
-    Parameters
-    ----------
-    architecture
-        Name of the network.
-    epochs
-        Times that every image is seen.
-    batch_size
-        Images per step.
-    learning_rate
-        Of Adam, at the end of the warm-up.
-    final_learning_rate
-        At the last step, after a half cosine.
-    warmup_epochs
-        Epochs over which the learning rate rises linearly from zero.
-    confidence_weight
-        Factor of the confidence loss.
-    depth_weight
-        Factor of the depth loss, 1/m^2.
-    threshold
-        Confidence from which the model's detections are to be believed, 0 to 1.
-    seed
-        Of the first weights and the order of the images.
-    device
-        Where to compute; auto takes CUDA where there is one.
-    """
-
-    architecture: str = "locanet"
-    epochs: int = 15
-    batch_size: int = 5
-    learning_rate: float = 1e-3
-    final_learning_rate: float = 1e-6
-    warmup_epochs: int = 2
-    confidence_weight: float = 1.0
-    depth_weight: float = 1.0
-    threshold: float = 0.33
-    seed: int = 0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-
-    def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: must be at least 1")
-        if self.learning_rate <= 0 or not 0 <= self.final_learning_rate <= self.learning_rate:
-            raise ValueError("learning_rate: must be over 0 and not below final_learning_rate")
-        for name in ("warmup_epochs", "confidence_weight", "depth_weight", "seed"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: must not be negative")
-        if not 0 <= self.threshold <= 1:
-            raise ValueError("threshold: must be between 0 and 1")
+Board = Callable[[str, float, int], None]
+"""Takes a curve's name, its value and the step."""
 
 
 class Step(NamedTuple):
@@ -108,36 +63,6 @@ def learning_rate_at(step: int, steps_per_epoch: int, settings: FitSettings) -> 
     return low + (settings.learning_rate - low) * share
 
 
-def losses(network: Network, batch: Batch, settings: FitSettings) -> Tensor:
-    """(2,) weighted confidence and depth loss of a batch."""
-    device = next(network.parameters()).device
-    images, confidence, depth_m = (t.to(device, non_blocking=True) for t in batch)
-    out = network(to_input(images))
-    return torch.stack(
-        (
-            settings.confidence_weight * confidence_loss(out[:, 1], confidence),
-            settings.depth_weight * depth_loss(out[:, 0], depth_m, confidence),
-        )
-    )
-
-
-def train_step(
-    network: Network,
-    optimizer: torch.optim.Optimizer,
-    batch: Batch,
-    settings: FitSettings,
-    learning_rate: float,
-) -> Tensor:
-    """(2,) losses of a batch, after one step of the optimizer on their sum."""
-    for group in optimizer.param_groups:
-        group["lr"] = learning_rate
-    parts = losses(network, batch, settings)
-    optimizer.zero_grad(set_to_none=True)
-    parts.sum().backward()  # type: ignore[no-untyped-call]
-    optimizer.step()
-    return parts.detach()
-
-
 def new_network(settings: FitSettings, examples: Examples) -> Network:
     """The network to train, its first weights drawn with the seed.
 
@@ -151,18 +76,16 @@ def new_network(settings: FitSettings, examples: Examples) -> Network:
         raise SettingError("no images to train on. Give a dataset with a train split")
     height_px, width_px, _ = examples.image_shape
     cell = network.stride_px
-    grid = (height_px // cell, width_px // cell)
-    if height_px % cell or width_px % cell or examples.confidence.shape[1:] != grid:
+    if height_px % cell or width_px % cell:
         raise SettingError(
-            f"images of {width_px} x {height_px} px with labels on {examples.confidence.shape[1:]} "
-            f"cells do not fit {settings.architecture}, whose cells are {cell} px. "
-            "Make the dataset from images of another size"
+            f"images of {width_px} x {height_px} px do not fit {settings.architecture}, whose "
+            f"cells are {cell} px. Make the dataset from images of another size"
         )
     return network
 
 
 class Training:
-    """One training: iterate ``steps()`` to the end, then look at ``history``.
+    """One training: iterate ``steps()`` to the end, then look at ``history`` and ``network``.
 
     Parameters
     ----------
@@ -175,9 +98,13 @@ class Training:
     folder
         Gets a checkpoint after every epoch, and TensorBoard's log.
     validation
-        Images whose loss is logged after every epoch, and used for nothing else.
+        Images that are looked at after every epoch, and never learnt from.
+    shares
+        (N,) how often each image shall come in an epoch. None: once.
     identity
         Names the data, so that a training is resumed on the same.
+    group
+        The processes that train this network together; only the first writes to ``folder``.
     resume
         Go on from the checkpoint in ``folder``.
 
@@ -197,22 +124,36 @@ class Training:
         folder: Path,
         *,
         validation: Examples | None = None,
+        shares: NDArray[np.float64] | None = None,
         identity: str = "",
+        group: Group = ALONE,
         resume: bool = False,
     ) -> None:
-        self._network = network.to(device_of(settings.device))
-        self._examples, self._validation = examples, validation
+        self._group = group
+        self._learning = network.to(device_of(settings.device))
+        self._examples, self._validation, self._shares = examples, validation, shares
         self._settings, self._folder = settings, folder
-        self._optimizer = torch.optim.Adam(network.parameters(), eps=ADAM_EPSILON)
+        self._optimizer = new_optimizer(network, settings)
+        self._average = Average(network, settings.ema_steps) if settings.ema_steps else None
+        self._augmenter = (
+            None
+            if settings.augmentation.is_nothing
+            else Augmenter(examples, settings.augmentation, seed=settings.seed)
+        )
         self._steps_per_epoch = batch_count(len(examples), settings.batch_size)
         run = {**asdict(settings), "data": identity}
         self._state = State(run)
         if resume:
-            self._state = load_checkpoint(folder, network, self._optimizer, run)
+            self._state = load_checkpoint(folder, self._networks(), self._optimizer, run)
+
+    @property
+    def network(self) -> Network:
+        """The network to keep: the averaged one, where there is one."""
+        return self._average.network if self._average else self._learning
 
     @property
     def history(self) -> list[dict[str, float]]:
-        """Mean losses of every epoch so far."""
+        """Mean losses of every epoch so far, and figures of the validation images."""
         return self._state.history
 
     @property
@@ -234,50 +175,79 @@ class Training:
             If the loss is no longer a number.
         """
         first = self._state.epochs_done
-        log = self._folder / "tensorboard"
-        with SummaryWriter(log, purge_step=first * self._steps_per_epoch + 1) as board:
+        with self._board(first * self._steps_per_epoch + 1) as board:
             for epoch in range(first, self._settings.epochs):
-                self._network.train()
-                mean = yield from self._epoch(epoch, board)
-                if self._validation is not None:
-                    mean["validation_loss"] = self._validation_loss(self._validation)
-                    step = (epoch + 1) * self._steps_per_epoch
-                    board.add_scalar("loss/validation", mean["validation_loss"], step)
-                self._state = State(self._state.run, epoch + 1, [*self.history, mean])
-                save_checkpoint(self._folder, self._network, self._optimizer, self._state)
-        self._network.eval()
+                self._learning.train()
+                said = yield from self._epoch(epoch, board)
+                self._learning.eval()
+                if self._validation is not None and self._group.leads:
+                    said |= validation_figures(self.network, self._validation, self._settings)
+                    at = (epoch + 1) * self._steps_per_epoch
+                    for name in sorted(said.keys() - {"loss", *LOSSES}):
+                        board(name.replace("_", "/", 1), said[name], at)
+                self._state = State(self._state.run, epoch + 1, [*self.history, said])
+                if self._group.leads:
+                    save_checkpoint(self._folder, self._networks(), self._optimizer, self._state)
 
-    def _epoch(self, epoch: int, board: SummaryWriter) -> Generator[Step, None, dict[str, float]]:
-        """Train one epoch; returns its mean losses."""
+    @contextmanager
+    def _board(self, first_step: int) -> Iterator[Board]:
+        """TensorBoard's log; nothing in processes that do not lead."""
+        if not self._group.leads:
+            yield lambda name, value, step: None
+            return
+        with SummaryWriter(self._folder / "tensorboard", purge_step=first_step) as writer:
+            yield writer.add_scalar
+
+    def _networks(self) -> dict[str, Network]:
+        averaged = {"average": self._average.network} if self._average else {}
+        return {"network": self._learning, **averaged}
+
+    def _batches(self, epoch: int) -> Iterator[Batch]:
         size, seed = self._settings.batch_size, self._settings.seed
+        indices = order(len(self._examples), seed=seed, epoch=epoch, shares=self._shares)
+        for index, start in enumerate(range(0, len(indices), size)):
+            whole = indices[start : start + size]
+            # Where there are more processes than images some compute one that does not count.
+            chosen = self._group.part(whole) if len(whole) >= self._group.size else whole[:1]
+            if self._augmenter is None:
+                yield gathered(self._examples, chosen)
+            else:
+                yield self._augmenter.batch(
+                    chosen, epoch=epoch, index=index * self._group.size + self._group.rank
+                )
+
+    def _epoch(self, epoch: int, board: Board) -> Generator[Step, None, dict[str, float]]:
+        """Train one epoch; returns its mean losses."""
+        size = self._settings.batch_size
         seen: list[Tensor] = []
-        total, loss = torch.zeros(2), math.nan
-        batches = shuffled(self._examples, size, seed=seed, epoch=epoch)
-        for index, batch in enumerate(batches, start=1):
+        total, loss = torch.zeros(len(LOSSES)), math.nan
+        for index, batch in enumerate(ahead(self._batches(epoch)), start=1):
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
-            parts = train_step(self._network, self._optimizer, batch, self._settings, rate)
-            seen.append(parts * len(batch.images))
+            whole = min(size, len(self._examples) - (index - 1) * size)
+            parts = self._step(batch, rate, whole)
+            if self._average:
+                self._average.update(step)
+            seen.append(parts * whole)
             if index % WATCH_STEPS == 0 or index == self._steps_per_epoch:
                 recent = torch.stack(seen).cpu()
-                loss = float(recent.sum()) / ((len(seen) - 1) * size + len(batch.images))
+                loss = float(recent.sum()) / ((len(seen) - 1) * size + whole)
                 _require_finite(loss, epoch + 1, index)
-                board.add_scalar("loss/train", loss, step)
-                board.add_scalar("learning_rate", rate, step)
+                board("loss/train", loss, step)
+                board("learning_rate", rate, step)
                 total += recent.sum(dim=0)
                 seen.clear()
             yield Step(epoch + 1, loss)
-        confidence, depth = (total / len(self._examples)).tolist()
-        return {"loss": confidence + depth, "confidence_loss": confidence, "depth_loss": depth}
+        means = (total / len(self._examples)).tolist()
+        return {"loss": sum(means), **dict(zip(LOSSES, means, strict=True))}
 
-    def _validation_loss(self, examples: Examples) -> float:
-        self._network.eval()
-        total = 0.0
-        with torch.inference_mode():
-            for batch in shuffled(examples, self._settings.batch_size, seed=0, epoch=0):
-                parts = losses(self._network, batch, self._settings)
-                total += float(parts.sum()) * len(batch.images)
-        return total / len(examples)
+    def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:
+        """(3,) losses of a batch of ``whole`` images, of which this process has a part."""
+        group = self._group
+        share = len(group.part(np.arange(whole))) / whole
+        return train_step(
+            self._learning, self._optimizer, batch, self._settings, rate, group, share
+        )
 
 
 def _require_finite(loss: float, epoch: int, step: int) -> None:

@@ -16,8 +16,9 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from dmrl.errors import ModelError, SettingError
+from dmrl.learn.decode import Grids
 from dmrl.learn.keras import read_h5
-from dmrl.learn.network import ARCHITECTURES, Network, build, parameter_count, to_input
+from dmrl.learn.network import ARCHITECTURES, SUB_CELL, Network, build, parameter_count, to_input
 
 WEIGHTS_NAME = "model.safetensors"
 DESCRIPTION_NAME = "model.json"
@@ -25,6 +26,15 @@ PUBLISHED_THRESHOLD = 0.33
 """Confidence threshold of the published evaluation."""
 
 Grid = NDArray[np.float32]
+
+
+def grids_of(network: Network, images: Tensor) -> Grids:
+    """Grids of (N, 3, H, W) uint8 images; the network as it stands, on its device."""
+    device = next(network.parameters()).device
+    with torch.inference_mode():
+        out = network(to_input(images.to(device)))
+        offset = out[:, 2:4].cpu().numpy() if network.channels == SUB_CELL else None
+        return Grids(out[:, 1].sigmoid().cpu().numpy(), out[:, 0].exp().cpu().numpy(), offset)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +83,8 @@ class Model:
                 f"{cell} px, as {self.architecture} needs. Crop or scale the images first"
             )
 
-    def grids(self, images: NDArray[np.uint8]) -> tuple[Grid, Grid]:
-        """Confidence (0 to 1) and depth (m), each (N, rows, cols), of (N, H, W, 3) RGB images.
+    def grids(self, images: NDArray[np.uint8]) -> Grids:
+        """What the network says of (N, H, W, 3) RGB images.
 
         Raises
         ------
@@ -82,14 +92,9 @@ class Model:
             If the network cannot take images of this size.
         """
         self.require_size(images.shape[2], images.shape[1], self.name or self.architecture)
-        device = next(self.network.parameters()).device
-        with torch.inference_mode():
-            # torch takes writable arrays only; a view of a mapped file is copied here.
-            writable = np.require(images, requirements="W")
-            raw = torch.from_numpy(writable).permute(0, 3, 1, 2).to(device)
-            out = self.network(to_input(raw))
-            confidence, depth_m = out[:, 1].sigmoid(), out[:, 0].exp()
-        return confidence.cpu().numpy(), depth_m.cpu().numpy()
+        # torch takes writable arrays only; a view of a mapped file is copied here.
+        writable = np.require(images, requirements="W")
+        return grids_of(self.network, torch.from_numpy(writable).permute(0, 3, 1, 2))
 
 
 def weights_of(network: Network) -> dict[str, Tensor]:
@@ -141,6 +146,7 @@ def describe(model: Model) -> dict[str, Any]:
         "height_px": model.height_px,
         "stride_px": model.network.stride_px,
         "channels": 3,
+        "outputs": list(model.network.channels),
         "threshold": model.threshold,
         "label_source": model.label_source,
         "training": model.training,

@@ -1,8 +1,8 @@
 """The networks, by name. A new one is a class here, or in a file beside, and a row below.
 
-Every network takes images as ``to_input`` gives them and returns (N, 2, rows, cols), one cell
-per ``stride_px`` pixels both ways: channel 0 is log depth (metres), channel 1 the logit of the
-confidence that a robot's centre lies in the cell.
+Every network takes images as ``to_input`` gives them and returns (N, C, rows, cols), one cell
+per ``stride_px`` pixels both ways. Its ``channels`` name what each of the C is; the first two
+are the same for all, see ``CHANNEL_MEANINGS``.
 """
 
 from abc import ABC, abstractmethod
@@ -12,8 +12,19 @@ import torch
 from torch import Tensor, nn
 
 from dmrl.errors import SettingError
+from dmrl.learn.depthwise import Depthwise
 
 CHANNELS = 3
+CHANNEL_MEANINGS = {
+    "log_depth": "natural log of the depth, metres",
+    "confidence": "logit of the confidence that a robot's centre lies in the cell",
+    "offset_u": "centre minus middle of the cell, to the right, in cells",
+    "offset_v": "the same, downwards",
+}
+DETECTION = ("log_depth", "confidence")
+"""Channels of a network that knows a robot to the cell."""
+SUB_CELL = (*DETECTION, "offset_u", "offset_v")
+"""Channels of a network that knows where in its cell a robot is."""
 # One cell in 1120 holds a robot. With a zero-mean head the loss starts near 190 and the first
 # epochs go into learning that most cells are empty.
 CONFIDENCE_BIAS = -4.0
@@ -22,14 +33,16 @@ CONFIDENCE_BIAS = -4.0
 class Network(nn.Module, ABC):
     """What training, prediction and export ask of a network.
 
-    ``stride_px`` is the side of a grid cell; images are a whole number of cells.
+    ``stride_px`` is the side of a grid cell; images are a whole number of cells. ``channels``
+    are names in ``CHANNEL_MEANINGS``, in the order of the output.
     """
 
     stride_px: ClassVar[int] = 8
+    channels: ClassVar[tuple[str, ...]] = DETECTION
 
     @abstractmethod
     def forward(self, images: Tensor) -> Tensor:
-        """(N, 2, rows, cols) log depth and confidence logit of (N, 3, H, W) images."""
+        """(N, C, rows, cols) of ``channels``, of (N, 3, H, W) images."""
 
 
 class LocaNet(Network):
@@ -73,7 +86,85 @@ class LocaNet(Network):
         return out
 
 
-ARCHITECTURES: dict[str, type[Network]] = {"locanet": LocaNet}
+class ConvNorm(nn.Sequential):
+    """Convolution without bias, batch normalisation, and a ReLU unless told otherwise.
+
+    The three fold into one convolution: what an int8 path carries.
+    """
+
+    def __init__(
+        self,
+        ins: int,
+        outs: int,
+        kernel: int = 3,
+        *,
+        stride: int = 1,
+        dilation: int = 1,
+        depthwise: bool = False,
+        relu: bool = True,
+    ) -> None:
+        if depthwise:
+            conv: nn.Conv2d = Depthwise(ins, stride=stride, dilation=dilation)
+        else:
+            conv = nn.Conv2d(ins, outs, kernel, stride, kernel // 2, bias=False)
+        fan_out = kernel**2 * (1 if depthwise else outs)
+        nn.init.normal_(conv.weight, std=(2 / fan_out) ** 0.5)  # He et al. 2015
+        last = (nn.ReLU(inplace=True),) if relu else ()
+        super().__init__(conv, nn.BatchNorm2d(outs), *last)
+
+
+class Residual(nn.Module):
+    """A dilated depthwise 3x3 and a 1x1 convolution beside a shortcut; ReLU after the sum."""
+
+    def __init__(self, width: int, dilation: int) -> None:
+        super().__init__()
+        self.depthwise = ConvNorm(width, width, dilation=dilation, depthwise=True)
+        self.pointwise = ConvNorm(width, width, 1, relu=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, width, rows, cols) of the same."""
+        return torch.relu(x + self.pointwise(self.depthwise(x)))
+
+
+class DmrlNano(Network):
+    """dmrl's own small network: 24,836 parameters, 57.7 million products, receptive field 287 px.
+
+    Two dense strided 3x3 convolutions, two residual blocks at stride 4, where a robot 2 m away
+    is still a few cells wide, a separable step to stride 8, five residual blocks there whose
+    dilation grows to see a near robot whole, and a 1x1 convolution for the four channels.
+    """
+
+    channels: ClassVar[tuple[str, ...]] = SUB_CELL
+    widths: ClassVar[tuple[int, int, int]] = (16, 32, 48)
+    dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 1), (1, 2, 4, 8, 1))
+
+    def __init__(self) -> None:
+        super().__init__()
+        stem, fine, coarse = self.widths
+        self.body = nn.Sequential(
+            ConvNorm(CHANNELS, stem, stride=2),
+            ConvNorm(stem, fine, stride=2),
+            *(Residual(fine, dilation) for dilation in self.dilations[0]),
+            ConvNorm(fine, fine, stride=2, depthwise=True),
+            ConvNorm(fine, coarse, 1),
+            *(Residual(coarse, dilation) for dilation in self.dilations[1]),
+        )
+        self.head = nn.Conv2d(coarse, len(self.channels), 1)
+        nn.init.normal_(self.head.weight, std=0.01)
+        assert self.head.bias is not None
+        with torch.no_grad():
+            self.head.bias.zero_()
+            self.head.bias[self.channels.index("confidence")] = CONFIDENCE_BIAS
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(N, 4, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
+        features = self.body(images)
+        with torch.autocast(features.device.type, enabled=False):
+            out: Tensor = self.head(features.float())
+        return out
+
+
+ARCHITECTURES: dict[str, type[Network]] = {"dmrl-nano": DmrlNano, "locanet": LocaNet}
 
 
 def build(name: str, *, seed: int = 0) -> Network:
@@ -102,6 +193,26 @@ def to_input(images: Tensor) -> Tensor:
         (N, 3, H, W) uint8, RGB.
     """
     return images.to(torch.float32).mul_(1 / 128).sub_(1)
+
+
+def product_count(network: Network, height_px: int = 224, width_px: int = 320) -> int:
+    """Multiplications of one image's convolutions."""
+    total = 0
+
+    def count(layer: nn.Module, _: object, out: Tensor) -> None:
+        nonlocal total
+        assert isinstance(layer, nn.Conv2d)
+        total += out.shape[2] * out.shape[3] * layer.weight.numel()
+
+    hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
+    training = network.training
+    with torch.inference_mode():
+        image = next(network.parameters()).new_zeros(1, CHANNELS, height_px, width_px)
+        network.eval()(image)
+    network.train(training)
+    for hook in hooks:
+        hook.remove()
+    return total
 
 
 def parameter_count(network: Network) -> int:

@@ -1,7 +1,9 @@
-"""``dmrl evaluate``: detections against labels, or estimated positions against true ones."""
+"""``dmrl evaluate``: detections against labels; positions and tracks against the truth."""
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
@@ -9,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl import positions, topics
+from dmrl import positions, topics, tracks
 from dmrl.errors import MissingExtra
 from dmrl.evaluation import Pairs, join
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
@@ -24,8 +26,8 @@ except MissingExtra:
     figures = None
 
 Document = dict[str, Any]
-DOCUMENT_NAME = "evaluation.json"
-POSITIONS_NAME = "positions.json"
+KINDS = {"positions": positions, "tracks": tracks}
+"""What can be judged by true positions; both modules offer the same functions."""
 FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
 
 
@@ -36,7 +38,8 @@ class Settings:
     Parameters
     ----------
     what
-        "auto": detections where there are any, else estimated positions.
+        "auto": tracks where there are any with true positions, else detections, else estimated
+        positions.
     against
         Whose labels.
     split
@@ -49,10 +52,10 @@ class Settings:
     seed
         Of the bootstrap.
     settle_s
-        positions: errors in the first seconds count for what is kept only.
+        positions, tracks: errors in the first seconds do not count, but for what is kept.
     """
 
-    what: Literal["auto", "detections", "positions"] = "auto"
+    what: Literal["auto", "detections", "positions", "tracks"] = "auto"
     against: Literal["truth", "estimate", "hand", "published"] = "truth"
     split: str | None = None
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
@@ -84,15 +87,15 @@ class Evaluation:
 
 
 def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation | Document:
-    """Judge the detections of ``recording``, or its positions: then as JSON values.
+    """Judge the detections of ``recording``, or its positions or tracks: then as JSON values.
 
     Parameters
     ----------
     recording
-        With images, labels and detections; or with estimated and true positions.
+        With images, labels and detections; or with true positions and tracks or estimates.
     out
-        Folder to write plots and ``evaluation.json``, or ``positions.json``, to. None:
-        nothing is written.
+        Folder to write plots and ``evaluation.json``, ``positions.json`` or ``tracks.json`` to.
+        None: nothing is written.
     settings
         See `Settings`.
 
@@ -111,28 +114,39 @@ def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation | D
         refuse_existing(out)
         if figures is None:
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
-    if _judges_positions(recording, settings):
-        return _run_positions(recording, out, settings)
-    return run_detections(recording, out, settings)
+    what = settings.what if settings.what != "auto" else _what(recording)
+    if what == "detections":
+        return run_detections(recording, out, settings)
+    return _run_document(KINDS[what], f"{what}.json", recording, out, settings.settle_s)
 
 
-def _judges_positions(recording: Path, settings: Settings) -> bool:
-    if settings.what != "auto":
-        return settings.what == "positions"
+def _what(recording: Path) -> str:
+    """What the last stage that wrote anything worth judging has written."""
+    if tracks.can_judge(recording):
+        return "tracks"
     detected = topics.robots(list(summary(recording).topics), topics.DETECTIONS)
-    return not detected and positions.has_positions(recording)
+    return "positions" if not detected and positions.has_positions(recording) else "detections"
 
 
-def _run_positions(recording: Path, out: Path | None, settings: Settings) -> Document:
-    pairs = positions.judge(recording)
-    made = positions.document(recording, pairs, settings.settle_s)
+def _run_document(
+    kind: ModuleType, name: str, recording: Path, out: Path | None, settle_s: float
+) -> Document:
+    judged = kind.judge(recording)
+    made: Document = kind.document(recording, judged, settle_s)
     if out is not None:
-        with partial_folder(out) as folder:
-            text = json.dumps(made, indent=1, allow_nan=False)
-            (folder / POSITIONS_NAME).write_text(text + "\n", encoding="utf-8")
+        with _folder(out, name, made) as folder:
             assert figures is not None
-            figures.draw_positions(folder, pairs)
+            figures.draw_errors(folder, judged)
     return made
+
+
+@contextmanager
+def _folder(out: Path, name: str, made: Document) -> Iterator[Path]:
+    """A folder that gets the document first, and its name when all is in it."""
+    with partial_folder(out) as folder:
+        text = json.dumps(made, indent=1, allow_nan=False)
+        (folder / name).write_text(text + "\n", encoding="utf-8")
+        yield folder
 
 
 def run_detections(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
@@ -145,9 +159,8 @@ def run_detections(recording: Path, out: Path | None, settings: Settings) -> Eva
     bands = by_band(scored, threshold=threshold, draws=settings.draws, seed=settings.seed)
     evaluation = Evaluation(pairs, scored, bands, threshold)
     if out is not None:
-        with partial_folder(out) as folder:
-            text = json.dumps(document(recording, settings, evaluation), indent=1, allow_nan=False)
-            (folder / DOCUMENT_NAME).write_text(text + "\n", encoding="utf-8")
+        made = document(recording, settings, evaluation)
+        with _folder(out, "evaluation.json", made) as folder:
             assert figures is not None
             figures.draw(folder, recording, pairs, scored, settings.against, threshold)
     return evaluation
@@ -234,12 +247,12 @@ def print_evaluation(recording: Path, settings: Settings, evaluation: Evaluation
     )
 
 
-def print_positions(recording: Path, made: Document) -> None:
-    """Print the figures of positions, one row per pair."""
-    title = f"{recording}: estimated positions against truth"
-    headers = [words for _, words, _ in positions.COLUMNS]
-    print_table(title, ["pair", *headers], positions.rows(made))
-    print(f"{positions.NOTE}; settled after {made['settle_s']:g} s")
+def print_document(recording: Path, made: Document) -> None:
+    """Print the figures of positions, one row per pair, or of tracks, one per observer."""
+    kind = tracks if "robots" in made else positions
+    headers = [words for _, words, _ in kind.COLUMNS]
+    print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
+    print(f"{kind.NOTE}; settled after {made['settle_s']:g} s")
 
 
 def _range(band: BandFigures) -> str:
@@ -265,14 +278,16 @@ def command(
     plots_to: Annotated[Path | None, Parameter(name="--plots")] = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Judge detections against labels, or estimated positions against the truth.
+    """Judge detections against labels; tracks and positions against the truth.
 
     Parameters
     ----------
     recording
-        Recording with images, labels and detections; or with estimated and true positions.
+        Recording with images, labels and detections; or with true positions and tracks or
+        estimates.
     plots_to
-        Folder to write plots and evaluation.json, or positions.json, to. Must not exist.
+        Folder to write plots to, and evaluation.json, positions.json or tracks.json. Must not
+        exist.
     as_json
         Print one JSON document in place of the table.
     """
@@ -281,7 +296,7 @@ def command(
         if as_json:
             print_json(evaluation)
         else:
-            print_positions(recording, evaluation)
+            print_document(recording, evaluation)
     elif as_json:
         print_json(document(recording, settings, evaluation))
     else:

@@ -2,7 +2,7 @@
 
 import heapq
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +11,8 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.errors import MissingExtra, RecordingError
+from dmrl.errors import MissingExtra, RecordingError, SettingError
+from dmrl.formats.camera_toml import read_camera
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
 from dmrl.recording import (
@@ -26,7 +27,8 @@ from dmrl.recording import (
 from dmrl.tables import print_json, print_table
 
 try:
-    from dmrl.estimation.estimate import GATE_M, Estimate, estimate_ekf, estimate_pairs
+    from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+    from dmrl.estimation.gate import GATE_M
     from dmrl.estimation.pair import Pair
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import read_logs
@@ -56,13 +58,16 @@ class Settings:
     preset
         ekf: its noise, as published for simulation or in the firmware.
     gate_m
-        Largest sigma of a position that is labelled OK, metres.
+        A position that is off by more than this is a bad one, metres. About one in a hundred of
+        those that are OK is bad.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
     range_offset_m
         Known offset of every range, subtracted first: an antenna delay, 0.35 m for some.
     undistorted
         The images have no lens distortion any more, whatever the calibration says.
+    camera
+        A robot's camera, with mount and delay, as dmrl calibrate wrote it: --camera.cf1 FILE.
     """
 
     method: Literal["batch", "smoother", "ekf"] = "batch"
@@ -71,6 +76,7 @@ class Settings:
     attitude_std_rad: Positive = 0.015
     range_offset_m: float = 0.0
     undistorted: bool = False
+    camera: dict[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,17 +116,21 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     if not logs.pairs:
         why = "; ".join(logs.warnings) or "there are no ranges"
         raise RecordingError(f"{recording}: no pair can be estimated: {why}. Try: dmrl info")
+    if unknown := set(settings.camera) - set(logs.robots):
+        raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(logs.robots)}")
+    cameras = {robot: read_camera(path) for robot, path in settings.camera.items()}
+    look = Look(settings.attitude_std_rad, not settings.undistorted, cameras)
     estimates = _estimates(logs.pairs, settings)
     images = {robot: image_times(recording, held, robot) for robot in logs.robots}
+    exposures = {robot: look.exposures_ns(robot, times) for robot, times in images.items()}
     positions = {
-        pair: _positions(logs.start_ns, _oriented(logs.pairs, pair), estimate, images[pair[0]])
+        pair: _positions(logs.start_ns, _oriented(logs.pairs, pair), estimate, exposures[pair[0]])
         for pair, estimate in estimates.items()
     }
     reports = [
         pair_report(recording, held, pair, positions[pair], estimates[pair]) for pair in positions
     ]
     fresh = [position_messages(*pair, found) for pair, found in positions.items()]
-    look = Look(settings.attitude_std_rad, distorted=not settings.undistorted)
     labels = 0
     for robot in (robot for robot, times in images.items() if len(times)):
         mine = {peer: found for (one, peer), found in positions.items() if one == robot}
@@ -187,7 +197,8 @@ def _write(
     ]
     total = sum(held.topics[topic].count for topic in kept)
     copied: Iterable[RawMessage] = track(read_raw(recording, *kept), "Writing", total)
-    made = provenance("label", settings, [recording], libraries=("numpy", "scipy"))
+    inputs = [recording, *settings.camera.values()]
+    made = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     streams: list[Iterable[Any]] = [copied, *fresh]
     with RecordingWriter(out, made) as sink:
         copy_extras(held, sink)

@@ -4,14 +4,18 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from cyclopts import Parameter, validators
+from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.errors import MissingExtra, MissingTopic
+from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, open_detector
+from dmrl.errors import MissingTopic
 from dmrl.images import Rgb, decode
+from dmrl.learn.decode import Found
+from dmrl.learn.decode import decode as find
 from dmrl.messages import message
 from dmrl.progress import track
 from dmrl.recording import (
@@ -26,13 +30,7 @@ from dmrl.recording import (
 from dmrl.recording.inputs import sha256_of_file
 from dmrl.tables import print_json, print_table
 
-try:
-    from dmrl.learn.decode import Found
-    from dmrl.learn.decode import decode as find
-    from dmrl.learn.model import WEIGHTS_NAME, Grid, Model, load_model
-except ModuleNotFoundError as e:
-    raise MissingExtra(str(e.name), "train", "dmrl predict") from e
-
+Map = NDArray[np.floating]
 OWN = (topics.DETECTIONS, topics.GRID)
 HELD_MESSAGES = 10_000
 """Messages held back until their batch of images is full: bounds the memory."""
@@ -48,7 +46,8 @@ class Settings:
     Parameters
     ----------
     backend
-        What computes.
+        What computes. torch and onnx are float; onnx-int8, integer (NumPy) and c are int8, and
+        need a quantised model or an export folder.
     threshold
         Confidence from which detections are to be believed, written beside them, 0 to 1.
         Without it, the model's.
@@ -60,7 +59,7 @@ class Settings:
         Images that go through the network together.
     """
 
-    backend: Literal["torch"] = "torch"
+    backend: BackendName = "torch"
     threshold: Share | None = None
     min_confidence: Share = 0.01
     most: Positive = 20
@@ -83,7 +82,7 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     Parameters
     ----------
     model
-        Run folder, .safetensors or Keras .h5.
+        Run folder, .safetensors, Keras .h5, quantised model or export folder.
     recording
         With images of one robot or more.
     out
@@ -94,7 +93,7 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     Raises
     ------
     ModelError
-        If the model cannot be used.
+        If the model cannot be used, or not by this backend.
     RecordingError
         If the recording cannot be read, or has no images.
     SettingError
@@ -102,9 +101,9 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     OutputError
         If ``out`` exists.
     """
-    network = load_model(model)
+    detector = open_detector(model, settings.backend)
     if settings.threshold is not None:
-        network = replace(network, threshold=settings.threshold)
+        detector = replace(detector, threshold=settings.threshold)
     held = summary(recording)
     if not topics.robots(list(held.topics)):
         raise MissingTopic(topics.camera_image("*"), held.topics, recording)
@@ -112,22 +111,23 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     total = sum(held.topics[t].count for t in kept)
     messages = track(read_raw(recording, *kept), "Predicting", total)
     images = believed = 0
-    with RecordingWriter(out, _provenance(model, recording, settings)) as sink:
+    with RecordingWriter(out, _provenance(model, recording, settings, detector)) as sink:
         copy_extras(held, sink)
         for batch in _batches(messages, settings.batch_size):
-            pictures = [_decode(raw, network, recording) for raw in batch if _robot(raw)]
-            seen = _seen(pictures, network, settings)
+            pictures = [_decode(raw, detector, recording) for raw in batch if _robot(raw)]
+            seen = _seen(pictures, detector, settings)
             images += len(seen)
-            believed += sum(d.confidence >= network.threshold for s in seen for d in s.detections)
+            believed += sum(d.confidence >= detector.threshold for s in seen for d in s.detections)
             _write(batch, seen, sink)
     return Result(images, believed)
 
 
-def _provenance(model: Path, recording: Path, settings: Settings) -> Provenance:
-    made = provenance("predict", settings, (model, recording), libraries=("torch", "numpy"))
-    if model.is_dir():
+def _provenance(model: Path, recording: Path, settings: Settings, detector: Detector) -> Provenance:
+    libraries = LIBRARIES[settings.backend]
+    made = provenance("predict", settings, (model, recording), libraries=libraries)
+    if model.is_dir() and detector.file is not None:
         # The log of a training tells when it ran; the weights alone decide what is predicted.
-        weights = replace(made.inputs[0], sha256=sha256_of_file(model / WEIGHTS_NAME))
+        weights = replace(made.inputs[0], sha256=sha256_of_file(detector.file))
         made = replace(made, inputs=(weights, *made.inputs[1:]))
     return made
 
@@ -150,10 +150,10 @@ def _robot(raw: RawMessage) -> str | None:
     return found["robot"] if found else None
 
 
-def _decode(raw: RawMessage, model: Model, recording: Path) -> Rgb:
+def _decode(raw: RawMessage, detector: Detector, recording: Path) -> Rgb:
     what = f"{recording}: the image of {raw.topic} at {raw.time_ns} ns"
     rgb = decode(message("CompressedImage").FromString(raw.data).data, what)
-    model.require_size(rgb.shape[1], rgb.shape[0], what)
+    detector.require_size(rgb.shape[1], rgb.shape[0], what)
     return rgb
 
 
@@ -168,21 +168,20 @@ class _Seen(NamedTuple):
         return self.message.detections
 
 
-def _seen(pictures: list[Rgb], model: Model, settings: Settings) -> list[_Seen]:
+def _seen(pictures: list[Rgb], detector: Detector, settings: Settings) -> list[_Seen]:
     """What the network finds in each picture."""
     out = []
     for _, same_size in groupby(pictures, key=np.shape):
-        confidence, depth_m = model.grids(np.stack(list(same_size)))
+        grids = detector.grids(np.stack(list(same_size)))
         found = find(
-            confidence,
-            depth_m,
-            stride_px=model.network.stride_px,
+            *grids,
+            stride_px=detector.stride_px,
             most=settings.most,
             min_confidence=settings.min_confidence,
         )
-        for k in range(len(confidence)):
-            grid = _grid(confidence[k], depth_m[k], model.network.stride_px)
-            out.append(_Seen(_detections(found, k, model.threshold), grid))
+        for k in range(len(found.count)):
+            grid = _grid(grids.confidence[k], grids.depth_m[k], detector.stride_px)
+            out.append(_Seen(_detections(found, k, detector.threshold), grid))
     return out
 
 
@@ -194,7 +193,7 @@ def _detections(found: Found, image: int, threshold: float) -> Any:
     return message("Detections")(detections=detections, threshold=threshold)
 
 
-def _grid(confidence: Grid, depth_m: Grid, stride_px: int) -> Any:
+def _grid(confidence: Map, depth_m: Map, stride_px: int) -> Any:
     rows, cols = confidence.shape
     return message("GridMap")(
         rows=rows,
@@ -236,7 +235,8 @@ def command(
     Parameters
     ----------
     model
-        A run folder of dmrl train, a .safetensors or a Keras .h5.
+        A run folder of dmrl train, a .safetensors, a Keras .h5, a quantised model or an export
+        folder.
     recording
         Recording with images.
     out

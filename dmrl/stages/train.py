@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,11 +19,22 @@ from dmrl.recording import provenance
 from dmrl.tables import print_json, print_table
 
 try:
+    from dmrl.examples import material
     from dmrl.learn.batches import Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
-    from dmrl.learn.fit import FitSettings, Step, Training, new_network
-    from dmrl.learn.model import Model, load_model, save_model, set_weights, weights_of
+    from dmrl.learn.fit import Step, Training, new_network
+    from dmrl.learn.group import Group, join_group, leave_group
+    from dmrl.learn.model import (
+        PUBLISHED_THRESHOLD,
+        Model,
+        load_model,
+        save_model,
+        set_weights,
+        weights_of,
+    )
     from dmrl.learn.network import Network
+    from dmrl.learn.settings import FitSettings
+    from dmrl.learn.validate import best_threshold, scores
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "train", "dmrl train") from e
 
@@ -50,7 +62,8 @@ def run(
 ) -> Result:
     """Train on the train split of ``dataset`` and write the run folder ``out``.
 
-    A split named val is watched, where there is one, and used for nothing else.
+    The threshold is chosen on images held out: the split named val or, where there is none, a
+    share of the train split.
 
     Parameters
     ----------
@@ -77,29 +90,45 @@ def run(
     SettingError
         If the network cannot take the images, or the loss is no longer a number.
     """
+    group = join_group()
+    try:
+        return _run(dataset, out, settings, init, group, resume=resume)
+    finally:
+        leave_group()
+
+
+def _run(
+    dataset: Path, out: Path, settings: Settings, init: Path | None, group: Group, *, resume: bool
+) -> Result:
     refuse_existing(out)
-    _clear_the_way(partial_of(out), resume=resume)
+    if group.leads:
+        _clear_the_way(partial_of(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
-    examples = _examples(train)
-    watched = _examples(data.split("val")) if "val" in data.splits else None
+    examples, held_out, shares = material(data, settings)
     network = _first_network(settings, examples, init)
     inputs = (dataset,) if init is None else (dataset, init)
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
     identity = " ".join(source.sha256 for source in made.inputs)
-    with partial_folder(out, keep_on_error=True) as folder:
+    where = partial_folder(out, keep_on_error=True) if group.leads else nullcontext(partial_of(out))
+    with where as folder:
         training = Training(
             network,
             examples,
             settings,
             folder,
-            validation=watched,
+            validation=held_out,
+            shares=shares,
             identity=identity,
+            group=group,
             resume=resume and has_checkpoint(folder),
         )
+        if not group.leads:
+            return _train(training, settings, len(examples))
         made.write(folder)
         result = _train(training, settings, len(examples))
-        save_model(_model(network, settings, train, training.history), folder)
+        threshold = _threshold(training.network, held_out, settings)
+        save_model(_model(training, settings, train, len(examples), threshold), folder)
         remove_checkpoint(folder)
     return result
 
@@ -116,8 +145,11 @@ def _clear_the_way(partial: Path, *, resume: bool) -> None:
     shutil.rmtree(partial)
 
 
-def _examples(split: Split) -> Examples:
-    return Examples(split.pixels, split.confidence, split.depth)
+def _threshold(network: Network, held_out: Examples | None, settings: Settings) -> float:
+    if settings.threshold is not None:
+        return settings.threshold
+    best = best_threshold(scores(network, held_out)) if held_out is not None else None
+    return PUBLISHED_THRESHOLD if best is None else best
 
 
 def _first_network(settings: Settings, examples: Examples, init: Path | None) -> Network:
@@ -140,19 +172,19 @@ def _train(training: Training, settings: Settings, images: int) -> Result:
 
 
 def _model(
-    network: Network, settings: Settings, train: Split, history: list[dict[str, float]]
+    training: Training, settings: Settings, train: Split, images: int, threshold: float
 ) -> Model:
     height_px, width_px = train.image_shape
     peers = pc.list_flatten(train.table.column("peers"))
     sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
     return Model(
-        network,
+        training.network,
         settings.architecture,
         width_px=width_px,
         height_px=height_px,
-        threshold=settings.threshold,
+        threshold=threshold,
         label_source=", ".join(sorted(sources)),
-        training={"images": len(train), "settings": asdict(settings), "history": history},
+        training={"images": images, "settings": asdict(settings), "history": training.history},
     )
 
 
@@ -203,7 +235,7 @@ def command(
     out: Annotated[Path, Parameter(name="OUT_DIR")],
     /,
     *,
-    recipe: str = "locanet",
+    recipe: str = "dmrl_nano",
     init: Path | None = None,
     resume: bool = False,
     flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,

@@ -1,51 +1,84 @@
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 import torch
 
-from dmrl.learn.batches import Examples, batch_count, order, shuffled
+from dmrl.learn.batches import FIELDS, Examples, ahead, batch_count, gathered, in_order, order
 
 
 def numbered(*sizes: int) -> Examples:
-    """Images and labels whose every value is the image's number."""
+    """Images and robots whose every value is the image's number."""
     count = sum(sizes)
     images = np.arange(count, dtype=np.uint8)[:, None, None, None] + np.zeros((8, 16, 3), np.uint8)
-    grids = np.arange(count, dtype=np.float32)[:, None, None] + np.zeros((1, 2), np.float32)
-    return Examples(np.split(images, np.cumsum(sizes)[:-1]), grids, grids + 0.5)
+    robots = np.arange(count, dtype=np.float32)[:, None, None] + np.zeros((2, 10), np.float32)
+    return Examples(np.split(images, np.cumsum(sizes)[:-1]), robots)
 
 
-def test_every_image_comes_once_with_its_own_label() -> None:
+def test_every_image_comes_once_with_its_own_robots() -> None:
     seen: list[int] = []
-    for images, confidence, depth_m in shuffled(numbered(5, 0, 7, 1), 4, seed=0, epoch=0):
+    for images, robots in in_order(numbered(5, 0, 7, 1), 4):
         numbers = images[:, 0, 0, 0].tolist()
         assert (images == images[:, :1, :1, :1]).all()
-        assert confidence[:, 0, 0].tolist() == numbers
-        assert depth_m[:, 0, 1].tolist() == [n + 0.5 for n in numbers]
+        assert robots[:, 1, 9].tolist() == numbers
         seen += numbers
-    assert sorted(seen) == list(range(13))
+    assert seen == list(range(13))
 
 
-def test_batches_are_uint8_views_channels_last_and_the_last_is_short() -> None:
-    batches = [(len(b.images), b.images.dtype) for b in shuffled(numbered(10), 4, seed=0, epoch=0)]
+def test_batches_are_uint8_channels_last_and_the_last_is_short() -> None:
+    batches = [(len(b.images), b.images.dtype) for b in in_order(numbered(10), 4)]
     assert batches == [(4, torch.uint8), (4, torch.uint8), (2, torch.uint8)]
     assert batch_count(10, 4) == 3
-    first = next(shuffled(numbered(10), 4, seed=0, epoch=0)).images
-    assert first.shape == (4, 3, 8, 16)
+    first = gathered(numbered(10), [3, 1]).images
+    assert first.shape == (2, 3, 8, 16)
+    assert first[:, 0, 0, 0].tolist() == [3, 1]
     assert first.is_contiguous(memory_format=torch.channels_last)
+
+
+def test_selected_images_keep_their_robots() -> None:
+    some = numbered(3, 4).select(np.array([False, True, False, False, True, True, False]))
+    assert [int(some.image(k)[0, 0, 0]) for k in range(3)] == [1, 4, 5]
+    assert some.robots[:, 0, 0].tolist() == [1, 4, 5]
 
 
 def test_the_order_depends_on_seed_and_epoch_alone() -> None:
     np.testing.assert_array_equal(order(50, seed=1, epoch=2), order(50, seed=1, epoch=2))
     assert not np.array_equal(order(50, seed=1, epoch=2), order(50, seed=1, epoch=3))
     assert not np.array_equal(order(50, seed=1, epoch=2), order(50, seed=2, epoch=2))
+    assert sorted(order(50, seed=1, epoch=2)) == list(range(50))
 
 
-def test_labels_that_do_not_match_the_images_are_refused() -> None:
+def test_images_come_as_often_as_their_shares_say() -> None:
+    shares = np.array([4.0] * 10 + [0.25] * 40)
+    seen = np.zeros(50)
+    for epoch in range(40):
+        drawn = order(50, seed=0, epoch=epoch, shares=shares)
+        assert len(drawn) == 50
+        np.add.at(seen, drawn, 1)
+    np.testing.assert_allclose(seen[:10] / 40, 4.0, atol=0.03)
+    np.testing.assert_allclose(seen[10:].mean() / 40, 0.25, atol=0.01)
+    assert (seen[10:] > 0).all()
+
+
+def test_items_made_ahead_come_in_order_and_their_error_comes_through() -> None:
+    def items() -> Iterator[int]:
+        yield from range(5)
+        raise ZeroDivisionError
+
+    got = []
+    with pytest.raises(ZeroDivisionError):
+        for item in ahead(items()):
+            got.append(item)
+    assert got == [0, 1, 2, 3, 4]
+
+
+def test_robots_that_do_not_match_the_images_are_refused() -> None:
     good = numbered(4)
-    with pytest.raises(ValueError, match="4 images with 3 confidence and 4 depth labels"):
-        Examples(good.pixels, good.confidence[:3], good.depth_m)
+    with pytest.raises(ValueError, match="4 images with robots of 3"):
+        Examples(good.pixels, good.robots[:3])
     with pytest.raises(ValueError, match="more than one size"):
         Examples(
             [np.zeros((1, 8, 8, 3), np.uint8), np.zeros((1, 8, 16, 3), np.uint8)],
-            good.confidence[:2],
-            good.depth_m[:2],
+            good.robots[:2],
         )
+    assert len(FIELDS) == good.robots.shape[-1]

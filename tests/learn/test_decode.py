@@ -18,6 +18,29 @@ def test_peaks_come_best_first_at_the_cell_centre() -> None:
     np.testing.assert_allclose(found.confidence[0, :2], [0.9, 0.6])
 
 
+def test_an_offset_moves_a_peak_and_keeps_it_in_the_image() -> None:
+    confidence, offset = np.zeros((1, 4, 6)), np.zeros((1, 2, 4, 6))
+    confidence[0, 1, 2], confidence[0, 3, 5] = 0.6, 0.9
+    offset[0, :, 1, 2] = 0.25, -0.5
+    offset[0, :, 3, 5] = 0.75, 0.0
+    found = decode(confidence, np.ones((1, 4, 6)), offset)
+    assert found.u_px[0, :2].tolist() == [48.0, 22.0]
+    assert found.v_px[0, :2].tolist() == [28.0, 8.0]
+
+
+def test_two_cells_that_name_one_robot_give_one_detection() -> None:
+    confidence, offset = np.zeros((2, 4, 9)), np.zeros((2, 2, 4, 9))
+    confidence[0, 1, [1, 3, 7]] = 0.9, 0.8, 0.7
+    offset[0, 0, 1, 3] = -1.9
+    confidence[1, 2, 4] = 0.5
+    found = decode(confidence, np.arange(72.0).reshape(2, 4, 9), offset)
+    assert found.count.tolist() == [2, 1]
+    assert found.u_px[0, :2].tolist() == [12.0, 60.0]
+    assert found.confidence[0, :2].tolist() == [0.9, 0.7]
+    assert found.depth_m[0, :2].tolist() == [10.0, 16.0]
+    assert found.u_px[1, 0] == 36.0
+
+
 def test_the_best_cell_is_kept_however_low() -> None:
     confidence = np.full((2, 3, 3), 1e-6)
     confidence[0, 2, 2] = 2e-6

@@ -4,30 +4,46 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from dmrl import recipe
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn.batches import Examples
 from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
 from dmrl.learn.decode import decode
-from dmrl.learn.fit import FitSettings, Training, device_of, learning_rate_at, new_network
+from dmrl.learn.fit import Training, device_of, learning_rate_at, new_network
 from dmrl.learn.model import Model, save_model
 from dmrl.learn.network import Network
+from dmrl.learn.settings import FitSettings
+from dmrl.learn.validate import best_threshold, scores
 
-SETTINGS = FitSettings(epochs=4, batch_size=3, warmup_epochs=1, device="cpu")
+PUBLISHED = recipe.load("locanet", "train", FitSettings)
+SETTINGS = replace(PUBLISHED, epochs=4, batch_size=3, warmup_epochs=1, device="cpu")
+EVERYTHING = FitSettings(
+    epochs=3,
+    batch_size=4,
+    warmup_epochs=1,
+    ema_steps=20,
+    paste=1.0,
+    label_noise="weight",
+    precision="bfloat16",
+    device="cpu",
+)
 
 
 def dots(count: int) -> Examples:
     """Dark images with one bright square, labelled at its centre, depth 1.5 m."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 40, (count, 32, 48, 3), np.uint8)
-    confidence = np.zeros((count, 4, 6), np.float32)
+    robots = np.zeros((count, 1, 10), np.float32)
     for k, cell in enumerate(rng.integers(0, 24, count)):
         row, col = divmod(int(cell), 6)
         pixels[k, 8 * row + 2 : 8 * row + 6, 8 * col + 2 : 8 * col + 6] = 250
-        confidence[k, row, col] = 1
-    return Examples([pixels[:7], pixels[7:]], confidence, 1.5 * confidence)
+        box = (8 * col + 2, 8 * row + 2, 8 * col + 6, 8 * row + 6)
+        robots[k, 0] = (8 * col + 4, 8 * row + 4, 1.5, 0, 0, 0, *box)
+    return Examples([pixels[:7], pixels[7:]], robots)
 
 
 @pytest.fixture
@@ -43,29 +59,33 @@ def trained(
     training = Training(network, examples, settings, folder, identity="dots", resume=resume)
     for _ in training.steps():
         pass
-    save_model(Model(network, "locanet", training={"history": training.history}), folder)
+    kept = Model(training.network, settings.architecture, training={"history": training.history})
+    save_model(kept, folder)
     remove_checkpoint(folder)
-    return training, network
+    return training, training.network
 
 
-def stopped(examples: Examples, folder: Path, epochs: int, steps: int = 0) -> None:
+def stopped(
+    examples: Examples, folder: Path, epochs: int, steps: int, settings: FitSettings = SETTINGS
+) -> None:
     """A training that dies some steps into an epoch."""
     folder.mkdir()
-    network = new_network(SETTINGS, examples)
-    training = Training(network, examples, SETTINGS, folder, identity="dots")
+    network = new_network(settings, examples)
+    training = Training(network, examples, settings, folder, identity="dots")
     walk = training.steps()
-    for _ in range(epochs * 7 + steps):
+    for _ in range(epochs * -(-len(examples) // settings.batch_size) + steps):
         next(walk)
     walk.close()  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("steps", [1, 5])
+@pytest.mark.parametrize("settings", [SETTINGS, EVERYTHING], ids=["published", "everything"])
 def test_a_resumed_training_ends_with_the_same_bytes(
-    examples: Examples, tmp_path: Path, steps: int
+    examples: Examples, tmp_path: Path, steps: int, settings: FitSettings
 ) -> None:
-    trained(examples, tmp_path / "whole")
-    stopped(examples, tmp_path / "resumed", 2, steps)
-    trained(examples, tmp_path / "resumed", resume=True)
+    trained(examples, tmp_path / "whole", settings)
+    stopped(examples, tmp_path / "resumed", 2, steps, settings)
+    trained(examples, tmp_path / "resumed", settings, resume=True)
     for name in ("model.safetensors", "model.json"):
         whole, resumed = (tmp_path / f / name for f in ("whole", "resumed"))
         assert whole.read_bytes() == resumed.read_bytes()
@@ -88,9 +108,35 @@ def test_training_finds_the_dot(tmp_path: Path) -> None:
     images: NDArray[np.uint8] = np.concatenate(list(examples.pixels))
     found = decode(*Model(network, "locanet").grids(images))
     best = (found.v_px[:, 0] // 8 * 6 + found.u_px[:, 0] // 8).astype(int)
-    right = best == examples.confidence.reshape(-1, 24).argmax(axis=1)
+    right = best == examples.robots[:, 0, 1] // 8 * 6 + examples.robots[:, 0, 0] // 8
     assert right.mean() > 0.95
     np.testing.assert_allclose(found.depth_m[right, 0], 1.5, atol=0.3)
+
+
+def test_dmrl_nano_finds_the_dot_within_its_cell(tmp_path: Path) -> None:
+    examples = dots(64)
+    settings = FitSettings(
+        epochs=20, batch_size=8, ema_steps=40, rotation_deg=0.0, blur_share=0.0, device="cpu"
+    )
+    _, network = trained(examples, tmp_path / "run", settings)
+    scored = scores(network, examples)
+    assert np.median(scored.label_error.norm_px) < 1.0
+    assert np.nanmean(np.abs(scored.label_error.depth_m)) < 0.15
+    threshold = best_threshold(scored)
+    assert threshold is not None
+    assert 0.05 < threshold < 0.95
+
+
+def test_the_kept_weights_are_the_mean_of_those_of_many_steps(
+    examples: Examples, tmp_path: Path
+) -> None:
+    _, last = trained(examples, tmp_path / "last", replace(EVERYTHING, ema_steps=0))
+    _, mean = trained(examples, tmp_path / "mean", EVERYTHING)
+    _, one = trained(examples, tmp_path / "one", replace(EVERYTHING, ema_steps=1))
+    for a, b, c in zip(last.parameters(), mean.parameters(), one.parameters(), strict=True):
+        assert not torch.equal(a, b)
+        assert torch.isfinite(b).all()
+        torch.testing.assert_close(a.detach(), c, rtol=0.2, atol=0.05)
 
 
 def test_another_training_is_not_resumed(examples: Examples, tmp_path: Path) -> None:
@@ -124,12 +170,10 @@ def test_one_checkpoint_is_kept_and_none_after_the_end(examples: Examples, tmp_p
     assert not has_checkpoint(tmp_path / "run")
 
 
-def test_a_label_that_is_not_a_number_stops_the_training(
-    examples: Examples, tmp_path: Path
-) -> None:
-    examples.depth_m[examples.confidence > 0] = np.nan
-    with pytest.raises(SettingError, match="the loss is nan in epoch 1, step 7"):
-        trained(examples, tmp_path / "run")
+def test_a_loss_that_is_no_number_stops_the_training(examples: Examples, tmp_path: Path) -> None:
+    wild = replace(SETTINGS, learning_rate=1e30, warmup_epochs=0)
+    with pytest.raises(SettingError, match=r"the loss is nan in epoch 1, step 7\. Lower"):
+        trained(examples, tmp_path / "run", wild)
 
 
 def test_tensorboard_gets_loss_and_learning_rate(examples: Examples, tmp_path: Path) -> None:
@@ -154,7 +198,7 @@ def test_validation_is_watched_and_changes_nothing(examples: Examples, tmp_path:
 
 
 def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
-    rates = [learning_rate_at(step, 100, FitSettings()) for step in range(1, 1501)]
+    rates = [learning_rate_at(step, 100, PUBLISHED) for step in range(1, 1501)]
     assert rates[0] == pytest.approx(1e-3 / 200)
     assert rates[99] == pytest.approx(0.5e-3)
     assert max(rates) == rates[199] == pytest.approx(1e-3)
@@ -172,18 +216,26 @@ def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
         ("warmup_epochs", -1),
         ("depth_weight", -1.0),
         ("threshold", 1.5),
+        ("weight_decay", -0.1),
+        ("ema_steps", -1),
+        ("target_sigma_cells", -0.5),
+        ("mosaic_share", 1.01),
+        ("validation_share", 0.6),
+        ("zoom", (0.0, 1.0)),
+        ("zoom", (2.0, 1.0)),
+        ("shares", {"*": -1.0}),
     ],
 )
-def test_settings_out_of_range_are_named(name: str, value: float) -> None:
+def test_settings_out_of_range_are_named(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=r"learning_rate: must|" + name):
         replace(FitSettings(), **{name: value})  # type: ignore[arg-type]
 
 
 def test_images_that_do_not_fit_the_network_are_refused(examples: Examples) -> None:
-    odd = Examples([p[:, :30] for p in examples.pixels], examples.confidence, examples.depth_m)
-    with pytest.raises(SettingError, match=r"images of 48 x 30 px .* do not fit locanet"):
+    odd = Examples([p[:, :30] for p in examples.pixels], examples.robots)
+    with pytest.raises(SettingError, match=r"images of 48 x 30 px do not fit locanet"):
         new_network(SETTINGS, odd)
-    none = Examples([p[:0] for p in examples.pixels], examples.confidence[:0], examples.depth_m[:0])
+    none = Examples([p[:0] for p in examples.pixels], examples.robots[:0])
     with pytest.raises(SettingError, match="no images to train on"):
         new_network(SETTINGS, none)
 

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from dmrl.learn.losses import confidence_loss, depth_loss
+from dmrl.learn.losses import DepthLoss, confidence_loss, depth_loss, offset_loss
 
 
 def test_confidence_loss_is_the_published_sum_over_cells() -> None:
@@ -32,3 +32,31 @@ def test_a_far_off_log_depth_in_an_empty_cell_harms_nothing() -> None:
     assert float(loss.detach()) == 0
     assert log_depth.grad is not None
     assert float(log_depth.grad.abs().max()) == 0
+
+
+@pytest.mark.parametrize("kind", ["squared", "log"])
+def test_depth_that_is_not_known_harms_nothing(kind: DepthLoss) -> None:
+    log_depth = torch.zeros(1, 1, 2, requires_grad=True)
+    depth_m = torch.tensor([[[math.e, 0.0]]])
+    depth_loss(log_depth, depth_m, torch.tensor([[[1.0, 0.0]]]), kind).backward()  # type: ignore[no-untyped-call]
+    assert log_depth.grad is not None
+    assert log_depth.grad[0, 0, 1] == 0
+    assert log_depth.grad[0, 0, 0] == pytest.approx(-1 if kind == "log" else 2 - 2 * math.e)
+
+
+def test_without_focus_it_is_cross_entropy_and_cells_can_weigh_less() -> None:
+    logit, label = torch.tensor([[[0.5, -2.0]]]), torch.tensor([[[0.7, 0.0]]])
+    p = logit.sigmoid()
+    entropy = -(label * p.log() + (1 - label) * (1 - p).log())
+    torch.testing.assert_close(confidence_loss(logit, label, focus=0.0), entropy.sum())
+    half = torch.tensor([[[0.5, 1.0]]])
+    torch.testing.assert_close(
+        confidence_loss(logit, label, half, focus=0.0), (half * entropy).sum()
+    )
+
+
+def test_offset_loss_is_the_sum_of_both_ways_where_there_is_a_robot() -> None:
+    predicted = torch.tensor([[[[0.5, 9.0]], [[0.0, 9.0]]]])
+    wanted = torch.tensor([[[[0.1, 0.0]], [[-0.3, 0.0]]]])
+    weight = torch.tensor([[[0.5, 0.0]]])
+    assert float(offset_loss(predicted, wanted, weight)) == pytest.approx(0.35)

@@ -38,9 +38,32 @@ def test_a_saved_model_sees_the_same_when_it_is_loaded(run: Path) -> None:
     for path in (run, run / "model.safetensors"):
         model = load_model(path)
         assert (model.threshold, model.label_source) == (0.4, "truth")
-        for got, want in zip(model.grids(images), wanted, strict=True):
-            np.testing.assert_array_equal(got, want)
-            assert got.shape == (2, 8, 8)
+        got = model.grids(images)
+        np.testing.assert_array_equal(got.confidence, wanted.confidence)
+        np.testing.assert_array_equal(got.depth_m, wanted.depth_m)
+        assert got.confidence.shape == got.depth_m.shape == (2, 8, 8)
+        assert got.offset is None
+
+
+def test_dmrl_nano_says_where_in_the_cell(tmp_path: Path) -> None:
+    network = build("dmrl-nano", seed=1).eval()
+    with torch.no_grad():
+        network.head.bias[2:] = torch.tensor([0.25, -0.5])  # type: ignore[union-attr, index]
+        network.head.weight.zero_()  # type: ignore[union-attr, operator]
+    save_model(Model(network, "dmrl-nano"), tmp_path)
+    grids = load_model(tmp_path).grids(np.zeros((1, 16, 24, 3), np.uint8))
+    assert grids.offset is not None
+    assert grids.offset.shape == (1, 2, 2, 3)
+    assert grids.offset[0, :, 1, 2].tolist() == [0.25, -0.5]
+    said = json.loads((tmp_path / "model.json").read_text())
+    assert said["outputs"] == ["log_depth", "confidence", "offset_u", "offset_v"]
+
+
+def test_run_folders_of_before_the_offset_still_load(run: Path) -> None:
+    said = json.loads((run / "model.json").read_text())
+    del said["outputs"]
+    (run / "model.json").write_text(json.dumps(said))
+    assert load_model(run).threshold == 0.4
 
 
 def test_saving_twice_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
@@ -116,7 +139,11 @@ def test_damaged_weights_are_one_line(run: Path) -> None:
     ("key", "value", "text"),
     [
         ("threshold", "high", "has no valid threshold"),
-        ("architecture", "resnet", "asks for architecture resnet, this dmrl knows locanet"),
+        (
+            "architecture",
+            "resnet",
+            "asks for architecture resnet, this dmrl knows dmrl-nano, locanet",
+        ),
     ],
 )
 def test_a_wrong_description_is_named(run: Path, key: str, value: str, text: str) -> None:

@@ -2,11 +2,44 @@ import pytest
 import torch
 
 from dmrl.errors import SettingError
-from dmrl.learn.network import ARCHITECTURES, build, parameter_count, to_input
+from dmrl.learn.network import (
+    ARCHITECTURES,
+    CHANNEL_MEANINGS,
+    build,
+    parameter_count,
+    product_count,
+    to_input,
+)
 
 
 def test_locanet_has_the_published_number_of_parameters() -> None:
     assert parameter_count(build("locanet")) == 24_778
+
+
+def test_dmrl_nano_keeps_to_its_budget() -> None:
+    assert parameter_count(build("dmrl-nano")) == 24_836
+    assert product_count(build("dmrl-nano")) == 57_720_320
+    assert product_count(build("locanet")) == 77_557_760
+
+
+def test_dmrl_nano_sees_287_pixels_far() -> None:
+    network = build("dmrl-nano").eval()
+    for layer in network.modules():
+        if isinstance(layer, torch.nn.Conv2d):
+            layer.weight.data.abs_()
+    image = torch.ones(1, 3, 320, 640, requires_grad=True)
+    network(image)[0, 0, 20, 40].backward()  # type: ignore[no-untyped-call]
+    assert image.grad is not None
+    seen = image.grad.abs().sum(dim=(0, 1, 2)).nonzero()
+    assert int(seen.max() - seen.min()) + 1 == 287
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_layers_are_such_as_an_int8_path_carries(name: str) -> None:
+    kinds = (torch.nn.Conv2d, torch.nn.BatchNorm2d, torch.nn.ReLU)
+    leaves = [m for m in build(name).modules() if not list(m.children())]
+    assert all(isinstance(leaf, kinds) for leaf in leaves)
+    assert {m.kernel_size for m in leaves if isinstance(m, kinds[0])} == {(1, 1), (3, 3)}
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
@@ -14,7 +47,10 @@ def test_every_network_gives_one_cell_per_stride(name: str) -> None:
     network = build(name).eval()
     rows, cols = 224 // network.stride_px, 320 // network.stride_px
     with torch.no_grad():
-        assert network(torch.zeros(2, 3, 224, 320)).shape == (2, 2, rows, cols)
+        out = network(torch.zeros(2, 3, 224, 320))
+    assert out.shape == (2, len(network.channels), rows, cols)
+    assert network.channels[:2] == ("log_depth", "confidence")
+    assert set(network.channels) <= CHANNEL_MEANINGS.keys()
 
 
 def test_the_seed_decides_the_weights_and_leaves_torch_as_it_was() -> None:
@@ -46,5 +82,7 @@ def test_input_is_scaled_to_about_one_and_stays_channels_last() -> None:
 
 
 def test_an_unknown_architecture_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(SettingError, match=r"no architecture resnet\. Choose one of: locanet"):
+    with pytest.raises(
+        SettingError, match=r"no architecture resnet\. Choose one of: dmrl-nano, loc"
+    ):
         build("resnet")

@@ -4,12 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from dmrl import card
+from dmrl.dataset import open_dataset
 from dmrl.images import encode_png
 from dmrl.learn.model import Model, save_model
-from dmrl.learn.network import build
+from dmrl.learn.network import build, to_input
 from dmrl.messages import message
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
+from dmrl.stages import dataset, quantize
 from dmrl.topics import attitude, camera_image, labels
 
 STEP_NS = 100_000_000
@@ -43,3 +47,44 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("model")
     save_model(Model(build("locanet", seed=1).eval(), "locanet", threshold=0.4), folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def dots_dataset(dots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of the small flight."""
+    out = tmp_path_factory.mktemp("dots-dataset") / "dots"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(card, "plots", None)  # figures take longer than the rest
+        dataset.run([dots], out, dataset.Settings())
+    return out
+
+
+@pytest.fixture(scope="session", params=["locanet", "dmrl-nano"])
+def settled(
+    request: pytest.FixtureRequest, dots_dataset: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A run folder with random weights and normalisations that know the small flight."""
+    network = build(request.param, seed=1).train()
+    images = np.concatenate(open_dataset(dots_dataset).split("train").pixels)
+    seen = to_input(torch.from_numpy(images).permute(0, 3, 1, 2))
+    for norm in network.modules():
+        if isinstance(norm, torch.nn.BatchNorm2d):
+            norm.momentum = 1.0  # what it keeps is what it saw last
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.3 * torch.randn(parameter.shape, generator=torch.manual_seed(2))
+        network(seen)
+    folder = tmp_path_factory.mktemp("settled") / request.param
+    folder.mkdir()
+    save_model(Model(network.eval(), request.param, width_px=64, height_px=48), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def quantised(settled: Path, dots_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The int8 form of ``settled``."""
+    out = tmp_path_factory.mktemp("quantised") / settled.name
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quantize, "plots", None)
+        quantize.run(settled, dots_dataset, out, quantize.Settings())
+    return out

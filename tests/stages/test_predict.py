@@ -53,7 +53,7 @@ def test_the_grid_is_what_the_network_says_and_detections_are_its_peaks(
     out = tmp_path / "out.mcap"
     run(model, dots, out, Settings(min_confidence=0.0, most=3))
     image = next(read(dots, "/cf1/camera/image")).message
-    confidence, depth_m = load_model(model).grids(decode(image.data)[None])
+    confidence, depth_m, _ = load_model(model).grids(decode(image.data)[None])
     grid = next(read(out, OWN[1])).message
     assert (grid.rows, grid.cols, grid.stride_px) == (6, 8, 8)
     assert list(grid.channels) == ["confidence", "depth_m"]

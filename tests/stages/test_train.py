@@ -12,13 +12,16 @@ import pytest
 
 from dmrl import card, recipe
 from dmrl.cli import app
+from dmrl.dataset import open_dataset
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
+from dmrl.examples import examples_of, material
+from dmrl.learn.batches import FIELDS
 from dmrl.learn.model import load_model
 from dmrl.stages import dataset as dataset_stage
 from dmrl.stages import train
 from dmrl.stages.train import Flags, Settings, run
 
-SETTINGS = Settings(epochs=2, batch_size=4, device="cpu")
+SETTINGS = Settings(epochs=2, batch_size=4, device="cpu", validation_share=0.0)
 
 
 @pytest.fixture(scope="session")
@@ -72,7 +75,11 @@ def slow(*args):
     time.sleep(0.05)
     return step(*args)
 fit.train_step = slow
-run(Path(sys.argv[1]), Path(sys.argv[2]), Settings(epochs=4, batch_size=4, device="cpu"))
+run(
+    Path(sys.argv[1]),
+    Path(sys.argv[2]),
+    Settings(epochs=4, batch_size=4, device="cpu", validation_share=0.0),
+)
 """
 
 
@@ -122,8 +129,91 @@ def test_what_cannot_be_trained_is_said_in_one_line(dataset: Path, tmp_path: Pat
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
-def test_the_shipped_recipe_is_the_published_schedule() -> None:
-    assert recipe.load("locanet", "train", Settings) == Settings()
+def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers() -> None:
+    assert recipe.load("dmrl_nano", "train", Settings) == Settings()
+    published = recipe.load("locanet", "train", Settings)
+    assert published.augmentation.is_nothing
+    assert (published.architecture, published.epochs, published.batch_size) == ("locanet", 15, 5)
+    for name in recipe.names():
+        if recipe.read(name)["kind"] == "train":
+            recipe.load(name, "train", Settings)
+
+
+def test_the_threshold_is_chosen_on_images_held_out(dataset: Path, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, validation_share=0.2)
+    run(dataset, tmp_path / "run", settings)
+    model = load_model(tmp_path / "run")
+    assert model.training["images"] == 16
+    assert "validation_ap_16_px" in model.training["history"][0]
+    run(dataset, tmp_path / "given", replace(settings, threshold=0.45))
+    assert load_model(tmp_path / "given").threshold == 0.45
+
+
+def test_examples_carry_every_peer_with_its_box(dataset: Path) -> None:
+    split = open_dataset(dataset).split("train")
+    examples = examples_of(split)
+    for robots, peers in zip(examples.robots, split.table.column("peers").to_pylist(), strict=True):
+        found = robots[np.isfinite(robots[:, 0])]
+        assert len(found) == len(peers)
+        for robot, peer in zip(found, peers, strict=True):
+            np.testing.assert_allclose(robot[:6], [peer[n] for n in FIELDS[:6]], rtol=1e-6)
+            if peer["box_px"]:
+                np.testing.assert_allclose(robot[6:], peer["box_px"], rtol=1e-6)
+
+
+def test_the_last_images_of_a_recording_are_held_out(dataset: Path) -> None:
+    every = examples_of(open_dataset(dataset).split("train"))
+    found = material(open_dataset(dataset), Settings(validation_share=0.25))
+    assert (len(found.examples), found.shares) == (15, None)
+    assert found.held_out is not None
+    joined = np.concatenate([found.examples.robots, found.held_out.robots])
+    np.testing.assert_array_equal(joined, every.robots)
+    np.testing.assert_array_equal(found.held_out.image(0), every.image(15))
+    assert material(open_dataset(dataset), Settings(validation_share=0.0)).held_out is None
+
+
+def test_shares_are_of_recordings_by_name(dataset: Path, tmp_path: Path) -> None:
+    run(dataset, tmp_path / "run", replace(SETTINGS, shares={"dots*": 0.7}))
+    with pytest.raises(SettingError, match=r"no images left for flight-\*.*are dots\.mcap"):
+        run(dataset, tmp_path / "a", replace(SETTINGS, shares={"flight-*": 1.0, "*": 1.0}))
+    with pytest.raises(SettingError, match=r"shares: all are 0"):
+        run(dataset, tmp_path / "b", replace(SETTINGS, shares={"*": 0.0}))
+
+
+TORCHRUN = """
+import sys
+from pathlib import Path
+from dmrl.stages.train import Settings, run
+run(
+    Path(sys.argv[1]),
+    Path(sys.argv[2]),
+    Settings(epochs=2, batch_size=4, device="cpu", validation_share=0.2),
+)
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_network(dataset: Path, tmp_path: Path) -> None:
+    script = tmp_path / "two.py"
+    script.write_text(TORCHRUN)
+    words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    for name in ("a", "b"):
+        done = subprocess.run(
+            [sys.executable, *words, str(dataset), str(tmp_path / name)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stderr
+    first, second = ((tmp_path / n / "model.safetensors").read_bytes() for n in ("a", "b"))
+    assert first == second
+    alone = replace(SETTINGS, validation_share=0.2)
+    run(dataset, tmp_path / "alone", alone)
+    histories = [load_model(tmp_path / n).training["history"] for n in ("a", "alone")]
+    # The same batches, but other augmentation and statistics of half a batch each.
+    assert histories[0][-1]["loss"] == pytest.approx(histories[1][-1]["loss"], rel=0.3)
 
 
 def test_flags_win_over_the_recipe(dataset: Path, tmp_path: Path) -> None:
@@ -148,4 +238,4 @@ def test_json_names_the_model(
     train.command(dataset, tmp_path / "run", flags=Flags(epochs=1, device="cpu"), as_json=True)
     said = json.loads(capsys.readouterr().out)
     assert said["model"] == str(tmp_path / "run")
-    assert said["images"] == 20
+    assert said["images"] == 18  # two are held out, to choose the threshold on

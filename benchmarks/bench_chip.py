@@ -1,0 +1,119 @@
+"""The published chip's own maps against our int8 of the same weights.
+
+Run as ``python benchmarks/bench_chip.py DATA [--plot STEM]``, where DATA holds
+``aideck-frames`` and ``locanet-weights``. The chip computed two frames with the vendor's int8
+(one scale for all of its output: a step is 0.211 in the logit and in the log depth); our
+network is calibrated on the four frames there are: on their ranges, not on the chip's maps.
+"""
+
+import argparse
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl import plots
+from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
+from dmrl.deploy.equalise import equalise
+from dmrl.deploy.graph import graph_of
+from dmrl.deploy.quantise import About, quantise
+from dmrl.deploy.ranges import calibrate
+from dmrl.images import decode
+from dmrl.learn.model import load_model
+from dmrl.learn.trace import operations
+
+STEP = 0.211
+JUDGED, CALIBRATION = ("00216", "00495"), ("00185", "00216", "00375", "00495")
+CHANNELS = {"confidence": "pos", "log_depth": "dep"}
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How one map agrees with the chip's, in its steps."""
+
+    correlation: float
+    mean_steps: float
+    most_levels: int
+
+
+def chip_map(file: Path) -> NDArray[np.float64]:
+    """(28, 40) values of a map in the chip's form: P5, one byte a cell, 128 is 0."""
+    head, size, most, body = file.read_bytes().split(b"\n", 3)
+    cols, rows = (int(side) for side in size.split())
+    assert (head, int(most)) == (b"P5", 255)
+    levels = np.array(struct.unpack(f"{rows * cols}B", body[: rows * cols])) - 128.0
+    return STEP * levels.reshape(rows, cols)
+
+
+def agreement(chip: NDArray[np.float64], ours: NDArray[np.floating]) -> Agreement:
+    """Correlation, mean difference in steps, and the most levels that a cell is off by."""
+    levels = np.rint(ours / STEP) - np.rint(chip / STEP)
+    return Agreement(
+        float(np.corrcoef(chip.ravel(), ours.ravel())[0, 1]),
+        float(np.abs(chip - ours).mean() / STEP),
+        int(np.abs(levels).max()),
+    )
+
+
+def backends(data: Path) -> dict[str, Backend]:
+    """The published weights in float and in our int8."""
+    model = load_model(data / "locanet-weights" / "real.h5")
+    graph = graph_of(operations(model.network))
+    seen = [image_of(data, name)[None] for name in CALIBRATION]
+    graph, ranges = equalise(graph, calibrate(graph, seen))
+    network = model.network
+    about = About(model.name, "locanet", network.stride_px, network.channels, model.threshold)
+    return {
+        "float": Float(graph, network.channels),
+        "int8": integer(quantise(graph, ranges, about)),
+    }
+
+
+def image_of(data: Path, name: str) -> NDArray[np.uint8]:
+    """A frame of the AI-deck."""
+    file = data / "aideck-frames" / f"img{name}.ppm"
+    return decode(file.read_bytes(), file)
+
+
+def compare(data: Path) -> tuple[dict[tuple[str, str, str], Agreement], list[plots.MapPair]]:
+    """Agreement by frame, channel and backend, and the maps to draw."""
+    found, pictures = {}, []
+    for name in JUDGED:
+        image = image_of(data, name)
+        folder = data / "aideck-frames" / "gap8-maps"
+        chip = {c: chip_map(folder / f"{stem}{name}.ppm") for c, stem in CHANNELS.items()}
+        maps = {"chip": _maps({c: values[None] for c, values in chip.items()})}
+        for who, backend in backends(data).items():
+            outputs = backend.outputs(image[None])
+            for channel, values in chip.items():
+                found[name, channel, who] = agreement(values, outputs[channel][0])
+            maps[who] = _maps(outputs)
+        shown = {who: maps[who] for who in ("chip", "int8")}
+        pictures.append(plots.MapPair(f"frame {name}", image, shown))
+    return found, pictures
+
+
+def _maps(outputs: Outputs) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    grids = grids_of(outputs)
+    return grids.confidence[0], grids.depth_m[0]
+
+
+def main() -> None:
+    """Print the table, draw the maps."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--plot", type=Path)
+    asked = parser.parse_args()
+    found, pictures = compare(asked.data)
+    print(f"{'frame':<8}{'map':<12}{'ours':<7}{'correlation':>12}{'steps':>8}{'most levels':>13}")
+    for (name, channel, who), each in found.items():
+        numbers = f"{each.correlation:>12.3f}{each.mean_steps:>8.2f}{each.most_levels:>13}"
+        print(f"{name:<8}{channel:<12}{who:<7}{numbers}")
+    if asked.plot:
+        plots.map_pairs(pictures, asked.plot)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""One image on this computer: the C of an export against onnxruntime, int8 both, one thread.
+
+Run as ``python benchmarks/bench_deploy.py EXPORT_DIR [--rounds 30]`` on what ``dmrl export``
+wrote. Every round runs each way once, so that all see the same machine; prints the median CPU
+time of an image, the least, and the ratio of medians to onnxruntime int8.
+"""
+
+import argparse
+import shutil
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.deploy.backends import seen_by
+from dmrl.deploy.compiled import Compiled
+from dmrl.deploy.onnx_run import OnnxRun
+from dmrl.deploy.samples import load_samples
+from dmrl.deploy.store import load
+
+PEER = "onnxruntime int8"
+
+
+def ways(folder: Path) -> dict[str, Callable[[], object]]:
+    """What runs one image, by name."""
+    network, image = load(folder), load_samples(folder)[0]
+    seen = seen_by(network, image)
+    out: dict[str, Callable[[], object]] = {}
+    for name, file in ((PEER, "model.int8.onnx"), ("onnxruntime float", "model.onnx")):
+        session = OnnxRun(folder / file, threads=1)
+        out[name] = lambda session=session: session.outputs(image[None])
+    for compiler in ("clang", "gcc"):
+        if shutil.which(compiler):
+            compiled = Compiled(network, folder, compiler)
+            out[f"C, {compiler} -O3"] = lambda c=compiled: c.run(seen)
+    return out
+
+
+def main() -> None:
+    """Print a line for each way."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--rounds", type=int, default=30)
+    args = parser.parse_args()
+    runs = ways(args.folder)
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(args.rounds):
+        for name, run in runs.items():
+            before = time.process_time()
+            run()
+            times[name].append((time.process_time() - before) * 1e3)
+    peer = statistics.median(times[PEER])
+    for name, spent in times.items():
+        middle = statistics.median(spent)
+        print(
+            f"{name:28} {middle:7.2f} ms CPU an image, least {np.min(spent):.2f}, "
+            f"{middle / peer:.2f} x {PEER}"
+        )
+
+
+if __name__ == "__main__":
+    main()

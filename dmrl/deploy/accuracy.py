@@ -1,0 +1,40 @@
+"""Detections of a backend, and how good they are against labels."""
+
+import numpy as np
+
+from dmrl.deploy.backends import Outputs, grids_of
+from dmrl.learn.decode import decode
+from dmrl.learn.matching import Points
+from dmrl.learn.metrics import by_band, score
+
+
+def points_of(outputs: Outputs, stride_px: int) -> Points:
+    """Detections in N images."""
+    found = decode(*grids_of(outputs), stride_px=stride_px)
+    kept = np.arange(found.u_px.shape[1]) < found.count[:, None]
+    return Points(
+        np.nonzero(kept)[0],
+        found.u_px[kept],
+        found.v_px[kept],
+        found.depth_m[kept],
+        found.confidence[kept],
+    )
+
+
+def figures_of(
+    images: int, labels: Points, detections: Points, threshold: float
+) -> dict[str, float | None]:
+    """Figures over all distances, by the names in ``metrics.DEFINITIONS``; None: not measured."""
+    overall, *_ = by_band(score(images, labels, detections), threshold=threshold, draws=1)
+    return {
+        name: figure.value if np.isfinite(figure.value) else None
+        for name, figure in overall.figures.items()
+    }
+
+
+def argmax_kept(wanted: Outputs, got: Outputs) -> float:
+    """Share of images whose most confident cell is the same in both."""
+    best = [
+        each["confidence"].reshape(len(each["confidence"]), -1).argmax(1) for each in (wanted, got)
+    ]
+    return float((best[0] == best[1]).mean())

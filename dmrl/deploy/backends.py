@@ -1,0 +1,100 @@
+"""The ways to compute a network's output without torch; each is asked the same question."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy import reference
+from dmrl.deploy.graph import Float32, Graph, grey_of, outputs_of, tensors_of, to_input
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.quantise import HEAD_OF
+from dmrl.learn.decode import Grids
+
+Outputs = dict[str, Float32]
+"""(N, rows, cols) by the names that the network's class gives its ``channels``."""
+Levels = dict[str, NDArray[np.int8]]
+"""(rows, cols) by the name of the head."""
+
+
+class Backend(Protocol):
+    """What computes."""
+
+    def outputs(self, images: NDArray[np.uint8]) -> Outputs:
+        """Output for (N, height, width, 3) RGB images of the network's size."""
+
+
+def grids_of(outputs: Outputs) -> Grids:
+    """What an output says of N images."""
+    # Clipped far beyond what means anything, so that exp does not overflow.
+    logit = np.clip(outputs["confidence"].astype(np.float64), -60, 60)
+    depth_m = np.exp(np.minimum(outputs["log_depth"], 60))
+    offset = None
+    if "offset_u" in outputs and "offset_v" in outputs:
+        offset = np.stack([outputs["offset_u"], outputs["offset_v"]], axis=1)
+    return Grids((1 / (1 + np.exp(-logit))).astype(np.float32), depth_m, offset)
+
+
+class Float:
+    """The float network in NumPy, its normalisation folded.
+
+    Parameters
+    ----------
+    graph
+        The network.
+    channels
+        What each channel of its output is.
+    """
+
+    def __init__(self, graph: Graph, channels: tuple[str, ...]) -> None:
+        self.graph = graph
+        self.channels = channels
+
+    def outputs(self, images: NDArray[np.uint8]) -> Outputs:
+        """Output for (N, height, width, 3) RGB images."""
+        seen = grey_of(images) if self.graph.channels == 1 else images
+        output = outputs_of(self.graph, tensors_of(self.graph, to_input(seen)))
+        return dict(zip(self.channels, output.swapaxes(0, 1), strict=True))
+
+
+class OnLevels:
+    """An int8 network, computed image by image.
+
+    Parameters
+    ----------
+    network
+        What is computed.
+    run
+        From a (height, width, channels) image, as the network takes it, to its heads' grids.
+    """
+
+    def __init__(self, network: IntegerNetwork, run: Callable[[NDArray[np.uint8]], Levels]) -> None:
+        self.network = network
+        self.run = run
+
+    def outputs(self, images: NDArray[np.uint8]) -> Outputs:
+        """Output for (N, height, width, 3) RGB images: real values of the heads."""
+        seen = [seen_by(self.network, image) for image in images]
+        return real_outputs(self.network, [self.run(image) for image in seen])
+
+
+def integer(network: IntegerNetwork) -> OnLevels:
+    """The int8 network in NumPy: the reference."""
+    return OnLevels(network, lambda image: reference.run(network, image))
+
+
+def seen_by(network: IntegerNetwork, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A (height, width, 3) RGB image as the network takes it: RGB, or grey."""
+    return grey_of(image[None])[0] if network.channels == 1 else image
+
+
+def real_outputs(network: IntegerNetwork, levels: list[Levels]) -> Outputs:
+    """Real values of the int8 grids of N images."""
+    return {
+        channel: reference.real(
+            network.heads[head], np.stack([grids[head] for grids in levels])
+        ).astype(np.float32)
+        for channel, head in HEAD_OF.items()
+        if head in network.heads
+    }

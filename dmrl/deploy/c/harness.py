@@ -1,0 +1,73 @@
+"""A C program that runs the network on images from standard input, and what it answers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.c.text import fill, names_of
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.reference import Detection
+
+MOST = 20
+"""Detections that the program asks for."""
+DETECTION = np.dtype(
+    [
+        ("u_q4", "<i4"),
+        ("v_q4", "<i4"),
+        ("depth_mm", "<u2"),
+        ("confidence", "<u2"),
+        ("confidence_step", "i1"),
+        ("padding", "V3"),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the program gave for one image.
+
+    Parameters
+    ----------
+    grids
+        By head, as ``reference.run`` gives them.
+    detections
+        As ``reference.decode`` gives them.
+    stack_bytes
+        Stack used; 0 where it was not measured.
+    """
+
+    grids: dict[str, NDArray[np.int8]]
+    detections: list[Detection]
+    stack_bytes: int
+
+
+def harness(network: IntegerNetwork) -> str:
+    """Text of the program."""
+    return fill("harness.c", **names_of(network), most=MOST)
+
+
+def answers(network: IntegerNetwork, data: bytes) -> list[Answer]:
+    """What the program wrote, image by image; an answer that was cut short is left out."""
+    out, at = [], 0
+    shape = network.grid_shape
+    size = shape[0] * shape[1]
+    head = size * len(network.heads) + 8
+    while at + head <= len(data):
+        grids = np.frombuffer(data, np.int8, size * len(network.heads), at)
+        stack, count = np.frombuffer(data, "<i4", 2, at + head - 8).tolist()
+        at += head
+        if not 0 <= count <= MOST or at + count * DETECTION.itemsize > len(data):
+            break
+        rows = np.frombuffer(data, DETECTION, count, at)
+        at += count * DETECTION.itemsize
+        parts = grids.reshape(len(network.heads), *shape)
+        named = dict(zip(network.heads, parts, strict=True))
+        out.append(Answer(named, detections_of(rows), stack))
+    return out
+
+
+def detections_of(rows: NDArray[np.void]) -> list[Detection]:
+    """Detections in memory as the C lays them out."""
+    names = ("u_q4", "v_q4", "depth_mm", "confidence")
+    return [Detection(*(int(row[name]) for name in names)) for row in rows]

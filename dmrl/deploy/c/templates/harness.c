@@ -1,0 +1,120 @@
+/* Runs the network on every image that comes in on standard input, for `dmrl verify` and others;
+ * or, as a shared library, on one at a time.
+ *
+ * Out, for each image, in little endian: the grid of every head, int8, row by row; int32 stack
+ * bytes used (0 where not measured); int32 count of detections; that many of them, as in the
+ * header. On a bare RISC-V it makes its own system calls, so that it needs no library there. */
+#include "$prefix.h"
+
+static ${prefix}_t net;
+
+/* Runs one image; `grids` takes every head's grid, `found` as many detections as it returns. */
+int harness_run(const uint8_t *image, int8_t *grids, ${prefix}_detection_t *found, int most)
+{
+    const int count = ${prefix}_run(&net, image, found, most);
+    for (int head = 0; head < ${PREFIX}_HEADS; head++)
+        for (int row = 0; row < ${PREFIX}_ROWS; row++)
+            for (int col = 0; col < ${PREFIX}_COLS; col++)
+                *grids++ = ${prefix}_output(&net, head, row, col);
+    return count;
+}
+
+#ifndef HARNESS_SHARED
+#define MOST $most
+
+#if defined(__riscv)
+static long system_call(long number, long a, long b, long c)
+{
+    register long a0 __asm__("a0") = a, a1 __asm__("a1") = b, a2 __asm__("a2") = c;
+    register long a7 __asm__("a7") = number;
+    __asm__ volatile("ecall" : "+r"(a0) : "r"(a1), "r"(a2), "r"(a7) : "memory");
+    return a0;
+}
+#define read(file, data, count) system_call(63, file, (long)(data), (long)(count))
+#define write(file, data, count) system_call(64, file, (long)(data), (long)(count))
+#else
+#include <unistd.h>
+#endif
+
+static uint8_t image[${PREFIX}_IMAGE_BYTES];
+static ${prefix}_detection_t found[MOST];
+static int8_t grids[${PREFIX}_HEADS * ${PREFIX}_ROWS * ${PREFIX}_COLS];
+
+static int take_image(void)
+{
+    size_t there = 0;
+    while (there < sizeof image) {
+        const long more = read(0, image + there, sizeof image - there);
+        if (more <= 0)
+            return 0;
+        there += (size_t)more;
+    }
+    return 1;
+}
+
+static void give(const void *data, size_t count)
+{
+    const char *from = data;
+    while (count > 0) {
+        const long done = write(1, from, count);
+        if (done <= 0)
+            return;
+        from += done;
+        count -= (size_t)done;
+    }
+}
+
+#if defined(__riscv)
+enum { PAINT = 0x5a, PAINTED = 16384 };
+
+/* Paints the stack below, and afterwards counts the bytes that have lost the paint. */
+static __attribute__((noinline)) void paint(void)
+{
+    volatile uint8_t space[PAINTED];
+    for (int k = 0; k < PAINTED; k++)
+        space[k] = PAINT;
+}
+
+static __attribute__((noinline)) int32_t unpainted(void)
+{
+    volatile uint8_t space[PAINTED];
+    int32_t intact = 0;
+    while (intact < PAINTED && space[intact] == PAINT)
+        intact++;
+    return PAINTED - intact;
+}
+#else
+static void paint(void)
+{
+}
+
+static int32_t unpainted(void)
+{
+    return 0;
+}
+#endif
+
+int main(void)
+{
+    while (take_image()) {
+        paint();
+        const int32_t count = harness_run(image, grids, found, MOST);
+        const int32_t stack = unpainted();
+        give(grids, sizeof grids);
+        give(&stack, sizeof stack);
+        give(&count, sizeof count);
+        give(found, (size_t)count * sizeof found[0]);
+    }
+    return 0;
+}
+
+#if defined(__riscv)
+void _start(void)
+{
+    main();
+    system_call(93, 0, 0, 0);
+    for (;;)
+        ;
+}
+#endif
+#endif

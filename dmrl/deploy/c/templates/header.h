@@ -1,0 +1,80 @@
+/* $description
+ *
+ * Written by dmrl $version (`dmrl export`).
+ *
+ *   state      $state_bytes bytes of RAM (${PREFIX}_STATE_BYTES), yours: static ${prefix}_t net;
+ *   stack      at most $stack_bytes bytes (${PREFIX}_STACK_BYTES), without yours and without -O0
+ *   constants  $constant_bytes bytes of weights and tables
+ *   work       $macs multiply-accumulates an image
+ *
+ * No library, no floating point, no heap, no recursion, no global variables: two states may run
+ * side by side. Integers only; every machine and compiler gives the same result.
+ */
+#ifndef ${PREFIX}_H
+#define ${PREFIX}_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#define ${PREFIX}_WIDTH $width
+#define ${PREFIX}_HEIGHT $height
+#define ${PREFIX}_CHANNELS $channels /* 3: red, green, blue; 1: grey */
+#define ${PREFIX}_COLS $cols /* cells of ${PREFIX}_STRIDE x ${PREFIX}_STRIDE pixels */
+#define ${PREFIX}_ROWS $rows
+#define ${PREFIX}_STRIDE $stride
+
+/* 1: images are the camera's raw colour mosaic, one byte a pixel, its red pixels in the rows and
+ * columns whose number modulo 2 is RED_ROW and RED_COL (both 0: RGGB, as on the AI-deck).
+ * 0: images are as the network takes them, ${PREFIX}_CHANNELS bytes a pixel. */
+#ifndef ${PREFIX}_BAYER
+#define ${PREFIX}_BAYER $bayer
+#endif
+#ifndef ${PREFIX}_RED_ROW
+#define ${PREFIX}_RED_ROW 0
+#endif
+#ifndef ${PREFIX}_RED_COL
+#define ${PREFIX}_RED_COL 0
+#endif
+#define ${PREFIX}_ROW_BYTES (${PREFIX}_WIDTH * (${PREFIX}_BAYER ? 1 : ${PREFIX}_CHANNELS))
+#define ${PREFIX}_IMAGE_BYTES (${PREFIX}_HEIGHT * ${PREFIX}_ROW_BYTES)
+
+/* Confidence, in steps of the network's output, from which a detection is reported: $threshold.
+ * ${PREFIX}_THRESHOLD_STEP 128 reports none, -128 every peak. */
+#ifndef ${PREFIX}_THRESHOLD_STEP
+#define ${PREFIX}_THRESHOLD_STEP ($threshold_step)
+#endif
+
+#define ${PREFIX}_STATE_BYTES ($plain_bytes + (${PREFIX}_BAYER ? $bayer_bytes : 0))
+#define ${PREFIX}_STACK_BYTES $stack_bytes
+
+/* What the network gives for every cell. */
+enum { $heads, ${PREFIX}_HEADS };
+
+typedef struct {
+    int32_t u_q4, v_q4;      /* 1/16 px from the image's left and top edge */
+    uint16_t depth_mm;       /* along the optical axis */
+    uint16_t confidence;     /* 65535 is 1 */
+    int8_t confidence_step;  /* the same as the network gives it; what peaks are compared by */
+} ${prefix}_detection_t;
+
+/* Rings of rows between the layers; yours to hold, not to touch. */
+typedef struct {
+$members} ${prefix}_t;
+
+/* Makes ready for an image. Call it before the first row of every image. */
+void ${prefix}_init(${prefix}_t *net);
+
+/* Takes the next row, ${PREFIX}_ROW_BYTES bytes, and computes all that it allows; `row` may be
+ * overwritten afterwards. Returns 1 once the image is whole; rows beyond that are ignored. */
+int ${prefix}_row(${prefix}_t *net, const uint8_t *row);
+
+/* After the last row: writes at most `most` detections, best first, and returns how many. */
+int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int most);
+
+/* After the last row: the network's own output in a cell, in its steps. */
+int8_t ${prefix}_output(const ${prefix}_t *net, int head, int row, int col);
+
+/* All of it for an image that lies in memory, ${PREFIX}_IMAGE_BYTES bytes from the top left. */
+int ${prefix}_run(${prefix}_t *net, const uint8_t *image, ${prefix}_detection_t *found, int most);
+
+#endif

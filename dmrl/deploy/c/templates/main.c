@@ -1,0 +1,74 @@
+/* Self-test of $prefix.c: runs the vectors and compares, bit for bit. Returns 0 if all is well.
+ *
+ * Prints what it finds; with -DSILENT it needs no library, for a chip: then the value that main
+ * returns is the number of vectors that failed.
+ *
+ * Written by dmrl $version (`dmrl export`). */
+#include "${prefix}_vectors.h"
+
+#ifdef SILENT
+#define SAY(...)
+#else
+#include <stdio.h>
+#define SAY(...) printf(__VA_ARGS__)
+#endif
+
+static ${prefix}_t net;
+static ${prefix}_detection_t found[$most];
+static uint8_t line[${PREFIX}_ROW_BYTES];
+
+static const uint8_t *next_row(const vector_t *vector, int row, uint32_t *state)
+{
+    if (vector->image)
+        return vector->image + row * ${PREFIX}_ROW_BYTES;
+    for (int k = 0; k < ${PREFIX}_ROW_BYTES; k++) {
+        *state = *state * 1664525u + 1013904223u;
+        line[k] = (uint8_t)(*state >> 24);
+    }
+    return line;
+}
+
+static uint32_t checksum(void)
+{
+    uint32_t sum = 2166136261u;
+    for (int head = 0; head < ${PREFIX}_HEADS; head++)
+        for (int row = 0; row < ${PREFIX}_ROWS; row++)
+            for (int col = 0; col < ${PREFIX}_COLS; col++)
+                sum = (sum ^ (uint8_t)${prefix}_output(&net, head, row, col)) * 16777619u;
+    return sum;
+}
+
+static int same(const ${prefix}_detection_t *a, const ${prefix}_detection_t *b)
+{
+    return a->u_q4 == b->u_q4 && a->v_q4 == b->v_q4 && a->depth_mm == b->depth_mm
+           && a->confidence == b->confidence;
+}
+
+static int passes(const vector_t *vector)
+{
+    uint32_t state = 1;
+    ${prefix}_init(&net);
+    for (int row = 0; row < ${PREFIX}_HEIGHT; row++)
+        ${prefix}_row(&net, next_row(vector, row, &state));
+    const int count = ${prefix}_detect(&net, found, $most);
+    int right = count == vector->count && checksum() == vector->checksum;
+    for (int k = 0; k < count; k++) {
+        SAY("  u %.2f px, v %.2f px, depth %d mm, confidence %.3f\n", found[k].u_q4 / 16.0,
+            found[k].v_q4 / 16.0, found[k].depth_mm, found[k].confidence / 65535.0);
+        right = right && same(&found[k], &vector->found[k]);
+    }
+    return right;
+}
+
+int main(void)
+{
+    const int count = (int)(sizeof vectors / sizeof vectors[0]);
+    int failed = 0;
+    for (int k = 0; k < count; k++) {
+        SAY("vector %d, %s:\n", k, vectors[k].image ? "a picture" : "noise");
+        const int right = passes(&vectors[k]);
+        SAY("  %s\n", right ? "as the reference" : "DIFFERS from the reference");
+        failed += !right;
+    }
+    return failed;
+}

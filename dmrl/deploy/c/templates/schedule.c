@@ -1,0 +1,60 @@
+/* Output row r of a layer needs rows up to r * stride + last of what it reads. */
+typedef struct {
+    uint8_t source, other; /* both tensors of a sum; the same one twice otherwise */
+    int16_t stride, last, rows_in, rows_out;
+} layer_t;
+
+static const layer_t layers[$count] = {
+$table};
+
+static void compute(${prefix}_t *net, int layer, int row)
+{
+    switch (layer) {
+$cases    }
+}
+
+static int ready(const ${prefix}_t *net, int index)
+{
+    const layer_t *layer = &layers[index];
+    const int row = net->done[index + 1];
+    const int needed = smallest(row * layer->stride + layer->last, layer->rows_in - 1);
+    return row < layer->rows_out && net->done[layer->source] > needed
+           && net->done[layer->other] > needed;
+}
+
+/* Makes every output row that can be made. */
+static void advance(${prefix}_t *net)
+{
+    int layer = $count - 1;
+    while (layer >= 0) {
+        if (ready(net, layer)) {
+            compute(net, layer, net->done[layer + 1]);
+            net->done[layer + 1]++;
+            layer = $count - 1;
+        } else {
+            layer--;
+        }
+    }
+}
+
+/* Compilers would make these two loops calls of memset and memcpy, which not every target has:
+ * hence volatile. */
+static void fill(uint8_t *out, uint8_t value, size_t count)
+{
+    volatile uint8_t *to = out;
+    for (size_t i = 0; i < count; i++)
+        to[i] = value;
+}
+
+static void copy(uint8_t *out, const uint8_t *values, int count)
+{
+    volatile uint8_t *to = out;
+    for (int i = 0; i < count; i++)
+        to[i] = values[i];
+}
+
+void ${prefix}_init(${prefix}_t *net)
+{
+    fill((uint8_t *)net, 0, sizeof *net);
+$pads}
+

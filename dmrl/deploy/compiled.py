@@ -1,0 +1,93 @@
+"""The C of a network as a shared library: what ``predict --backend c`` computes with."""
+
+import ctypes
+import platform
+import shutil
+import tempfile
+import weakref
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.c import NAME, write_c
+from dmrl.deploy.c.harness import DETECTION, MOST, Answer, detections_of, harness
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.toolchain import host_compiler, run
+from dmrl.errors import ModelError
+
+FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
+# Rows are short: vectors of 512 bits would spend their time on what is left over.
+PC_FLAGS = ("-march=native", "-mprefer-vector-width=256")
+
+
+class Compiled:
+    """A network, compiled for this machine. Not for several threads: the C holds one state.
+
+    Parameters
+    ----------
+    network
+        What the C computes.
+    folder
+        An export folder, whose C is used. None: the C is written anew.
+    compiler
+        Program that compiles it. None: the first that is found.
+
+    Raises
+    ------
+    ToolError
+        If there is no C compiler, or the C does not compile.
+    ModelError
+        If the folder has no C, or the C cannot carry the network.
+    """
+
+    def __init__(
+        self, network: IntegerNetwork, folder: Path | None = None, compiler: str | None = None
+    ) -> None:
+        self.network = network
+        build = Path(tempfile.mkdtemp(prefix="dmrl-c-"))
+        self._remove = weakref.finalize(self, shutil.rmtree, build, ignore_errors=True)
+        if folder is None:
+            write_c(network, build, [])
+            folder = build
+        require_c(folder)
+        (build / "harness.c").write_text(harness(network), encoding="utf-8")
+        library = build / "network.so"
+        sources = (build / "harness.c", folder / f"{NAME}.c")
+        own = PC_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()
+        flags = (*FLAGS, *own, f"-D{NAME.upper()}_BAYER=0", "-I", folder)
+        run(
+            (compiler or host_compiler(), *flags, *sources, "-o", library),
+            f"compiling {folder / NAME}.c",
+        )
+        self._run = ctypes.CDLL(str(library)).harness_run
+
+    def answer(self, image: NDArray[np.uint8], most: int = MOST) -> Answer:
+        """Grids and detections of a (height, width, channels) image as the network takes it."""
+        network = self.network
+        assert image.shape == (network.height_px, network.width_px, network.channels)
+        pixels = np.ascontiguousarray(image, np.uint8)
+        grids = np.empty((len(network.heads), *network.grid_shape), np.int8)
+        found = np.zeros(most, DETECTION)
+        pointers = (ctypes.c_void_p(a.ctypes.data) for a in (pixels, grids, found))
+        count = self._run(*pointers, most)
+        named = dict(zip(network.heads, grids, strict=True))
+        return Answer(named, detections_of(found[:count]), 0)
+
+    def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
+        """Every head's grid, as ``reference.run`` gives it."""
+        return self.answer(image).grids
+
+
+def require_c(folder: Path) -> None:
+    """Nothing, if a folder holds the C of an export.
+
+    Raises
+    ------
+    ModelError
+        If a file is missing or empty.
+    """
+    for name in (f"{NAME}.c", f"{NAME}.h"):
+        file = folder / name
+        if not file.is_file() or not file.stat().st_size:
+            raise ModelError(f"no {name} in {folder}. Export the model again: dmrl export")

@@ -1,0 +1,210 @@
+"""A model, opened for one of the ways to compute it.
+
+Rooms are loaded by name when they are asked for: each needs packages that the others do not.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.backends import Backend, OnLevels, grids_of, integer
+from dmrl.deploy.c import NAME
+from dmrl.deploy.compiled import Compiled
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.store import INTEGER_NAME, load
+from dmrl.errors import MissingExtra, ModelError, SettingError
+from dmrl.learn.decode import Grids
+
+Images = NDArray[np.uint8]
+BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c"]
+
+FLOAT_ONNX_NAME = "model.onnx"
+INT8_ONNX_NAME = "model.int8.onnx"
+DESCRIPTION_NAME = "model.json"
+WEIGHTS_NAME = "model.safetensors"
+C_NAME = f"{NAME}.c"
+QUANTISE = "Make one with: dmrl quantize MODEL DATASET OUT"
+LIBRARIES: dict[BackendName, tuple[str, ...]] = {
+    "torch": ("torch", "numpy"),
+    "onnx": ("onnxruntime", "numpy"),
+    "onnx-int8": ("onnxruntime", "numpy"),
+    "integer": ("numpy",),
+    "c": ("numpy",),
+}
+"""Packages whose version can change what a backend gives."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detector:
+    """What turns images into grids.
+
+    Parameters
+    ----------
+    name
+        Of the model.
+    grids
+        What the model says of (N, height, width, 3) RGB images.
+    stride_px
+        Side of a grid cell.
+    threshold
+        Confidence from which a detection is to be believed, 0 to 1.
+    size_px
+        Width and height of the images that it takes; None: any whole number of cells.
+    file
+        What alone decides the result; None: the model as a whole.
+    """
+
+    name: str
+    grids: Callable[[Images], Grids]
+    stride_px: int
+    threshold: float
+    size_px: tuple[int, int] | None
+    file: Path | None = None
+
+    def require_size(self, width_px: int, height_px: int, what: object) -> None:
+        """Nothing, if images of this size can be taken.
+
+        Raises
+        ------
+        SettingError
+            If not.
+        """
+        if self.size_px is None and (width_px % self.stride_px or height_px % self.stride_px):
+            raise SettingError(
+                f"{what}: images of {width_px} x {height_px} px do not divide into cells of "
+                f"{self.stride_px} px, as {self.name} needs. Crop or scale the images first"
+            )
+        if self.size_px not in (None, (width_px, height_px)):
+            taken = "{} x {}".format(*self.size_px or ())
+            raise SettingError(
+                f"{what}: images of {width_px} x {height_px} px, {self.name} takes {taken} alone. "
+                "Crop or scale the images, or quantise the model for images of this size"
+            )
+
+
+def open_detector(model: Path, backend: BackendName) -> Detector:
+    """A model for a backend.
+
+    Parameters
+    ----------
+    model
+        Run folder, .safetensors, Keras .h5, quantised model or export folder.
+    backend
+        "torch" and "onnx" are float; "integer" (NumPy), "onnx-int8" and "c" are int8, and need
+        a quantised model or an export folder.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be used, or is not what the backend needs.
+    MissingExtra
+        If the backend needs a package that is not installed.
+    """
+    if not model.exists():
+        raise ModelError(f"no model {model}. Give a run folder, a Keras .h5 or an export folder")
+    return OPENS[backend](model, backend)
+
+
+def _torch(model: Path, _backend: BackendName) -> Detector:
+    if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
+        raise ModelError(
+            f"{model} is an export folder, which torch cannot run. Give --backend onnx, or the "
+            "model that was exported"
+        )
+    learned = _room("dmrl.learn.model", "train", "--backend torch").load_model(model)
+    file = model / WEIGHTS_NAME if model.is_dir() else None
+    stride_px = learned.network.stride_px
+    return Detector(model.name, learned.grids, stride_px, learned.threshold, None, file)
+
+
+def _onnx(model: Path, _backend: BackendName) -> Detector:
+    room = _room("dmrl.deploy.onnx_run", "deploy", "--backend onnx")
+    file = model / FLOAT_ONNX_NAME
+    if file.is_file():
+        runs = room.OnnxRun(file, file)
+        stride_px, threshold = _described(model / DESCRIPTION_NAME)
+    else:
+        learned = _room("dmrl.learn.model", "train", "a model to ONNX").load_model(model)
+        grey = (model / INTEGER_NAME).is_file() and load(model).channels == 1
+        export = _room("dmrl.deploy.float_onnx", "deploy", "--backend onnx")
+        runs = room.OnnxRun(export.float_onnx_of(learned, grey=grey), model)
+        stride_px, threshold = learned.network.stride_px, learned.threshold
+        file = model / WEIGHTS_NAME
+    size_px = (runs.width_px, runs.height_px)
+    decides = file if file.is_file() else None
+    return Detector(model.name, _grids(runs), stride_px, threshold, size_px, decides)
+
+
+def _onnx_int8(model: Path, backend: BackendName) -> Detector:
+    room = _room("dmrl.deploy.onnx_run", "deploy", "--backend onnx-int8")
+    network = _network(model, backend)
+    file = model / INT8_ONNX_NAME
+    if file.is_file():
+        return _of_network(model, network, room.OnnxRun(file, file), file)
+    written = _room("dmrl.deploy.onnx_write", "deploy", "--backend onnx-int8").int8_onnx(network)
+    return _of_network(model, network, room.OnnxRun(written, model), _integer_file(model))
+
+
+def _integer(model: Path, backend: BackendName) -> Detector:
+    network = _network(model, backend)
+    return _of_network(model, network, integer(network), _integer_file(model))
+
+
+def _c(model: Path, backend: BackendName) -> Detector:
+    network = _network(model, backend)
+    folder = model if (model / C_NAME).is_file() else None
+    runs = OnLevels(network, Compiled(network, folder).run)
+    return _of_network(model, network, runs, model / C_NAME if folder else _integer_file(model))
+
+
+def _network(model: Path, backend: BackendName) -> IntegerNetwork:
+    if model.is_file() and model.suffix != ".npz":
+        raise ModelError(f"{model} is float, --backend {backend} is int8. {QUANTISE}")
+    if model.is_dir() and not (model / INTEGER_NAME).is_file():
+        raise ModelError(f"{model} holds no int8 network, as --backend {backend} needs. {QUANTISE}")
+    return load(model)
+
+
+def _integer_file(model: Path) -> Path:
+    return model / INTEGER_NAME if model.is_dir() else model
+
+
+def _of_network(model: Path, network: IntegerNetwork, runs: Backend, file: Path) -> Detector:
+    size_px = (network.width_px, network.height_px)
+    return Detector(model.name, _grids(runs), network.stride_px, network.threshold, size_px, file)
+
+
+def _grids(runs: Backend) -> Callable[[Images], Grids]:
+    return lambda images: grids_of(runs.outputs(images))
+
+
+def _described(file: Path) -> tuple[int, float]:
+    """Stride and threshold that the description of an export folder says."""
+    try:
+        said = json.loads(file.read_text(encoding="utf-8"))
+        return int(said["stride_px"]), float(said["threshold"])
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise ModelError(f"{file} is damaged: {e}. Export the model again") from None
+
+
+def _room(name: str, extra: str, what: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as e:
+        raise MissingExtra(str(e.name), extra, what) from None
+
+
+OPENS: dict[BackendName, Callable[[Path, BackendName], Detector]] = {
+    "torch": _torch,
+    "onnx": _onnx,
+    "onnx-int8": _onnx_int8,
+    "integer": _integer,
+    "c": _c,
+}

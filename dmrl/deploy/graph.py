@@ -1,0 +1,307 @@
+"""A float network as plain layers: NumPy arrays, normalisation folded, ReLU fused.
+
+What can be carried to integers is decided here, once: everything after takes these layers.
+Tensors are numbered as in ``integer``: 0 is the image, layer i writes tensor i + 1.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.integer import PIXEL_ZERO
+from dmrl.deploy.windows import largest_of_blocks, taps_of
+from dmrl.errors import ModelError
+from dmrl.learn.operations import Op
+
+Array = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloatConv:
+    """Convolution, with ReLU or without. Fields as in ``integer.Conv``, in real numbers."""
+
+    name: str
+    sources: tuple[int]
+    weight: Array
+    bias: Array
+    stride: int = 1
+    dilation: int = 1
+    padding: int = 0
+    groups: int = 1
+    relu: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FloatPool:
+    """2x2 max-pool."""
+
+    name: str
+    sources: tuple[int]
+    relu: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FloatAdd:
+    """Sum of two tensors, with ReLU or without."""
+
+    name: str
+    sources: tuple[int, int]
+    relu: bool = False
+
+
+FloatLayer = FloatConv | FloatPool | FloatAdd
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Graph:
+    """A float network.
+
+    Parameters
+    ----------
+    layers
+        In the order of computing.
+    outputs
+        Tensor and channel of every channel of the network's output.
+    channels
+        Of the image: 3 for RGB, 1 for grey.
+    """
+
+    layers: tuple[FloatLayer, ...]
+    outputs: tuple[tuple[int, int], ...]
+    channels: int = 3
+
+    def grey(self) -> "Graph":
+        """The network on a grey image; exactly what it gives where R, G and B are equal."""
+        layers = [
+            replace(layer, weight=layer.weight.sum(axis=1, keepdims=True))
+            if 0 in layer.sources and isinstance(layer, FloatConv)
+            else layer
+            for layer in self.layers
+        ]
+        return replace(self, layers=tuple(layers), channels=1)
+
+
+WAYS_OUT = {
+    "ConvTranspose2d": "a convolution at the finer stride",
+    "AvgPool2d": "a strided convolution or a 2x2 max-pool",
+    "AdaptiveAvgPool2d": "a strided convolution",
+    "LeakyReLU": "ReLU",
+    "ReLU6": "ReLU",
+    "SiLU": "ReLU",
+    "GELU": "ReLU",
+    "Hardswish": "ReLU",
+    "PReLU": "ReLU",
+    "Sigmoid": "the logit, as the other networks give",
+    "sigmoid": "the logit, as the other networks give",
+    "GroupNorm": "BatchNorm2d",
+    "LayerNorm": "BatchNorm2d",
+    "InstanceNorm2d": "BatchNorm2d",
+    "Upsample": "a convolution at the finer stride",
+    "interpolate": "a convolution at the finer stride",
+    "mul": "a convolution, a residual sum or a 2x2 max-pool",
+    "concatenate": "a residual sum (only results can be concatenated)",
+}
+CARRIED = "convolutions (1x1 or 3x3), BatchNorm2d, ReLU, sums and 2x2 max-pools"
+
+
+class Cannot(ModelError):
+    """A layer that cannot be carried to integers; the message says what to use instead."""
+
+    def __init__(self, name: str, what: str, instead: str = CARRIED) -> None:
+        super().__init__(f"layer {name} is {what}, which int8 cannot carry. Use {instead}")
+
+
+def graph_of(operations: Sequence[Op]) -> Graph:
+    """The layers that a network's operations come to.
+
+    Parameters
+    ----------
+    operations
+        As ``learn.trace.operations`` gives them.
+
+    Raises
+    ------
+    ModelError
+        If one of them cannot be carried to integers; it is named, with what to use instead.
+    """
+    builder = _Builder(Counter(source for op in operations for source in op.sources))
+    for op in operations:
+        builder.take(op)
+    return Graph(tuple(builder.layers), builder.outputs, builder.channels)
+
+
+class _Builder:
+    """Reads operations in order and keeps the layers that they come to."""
+
+    def __init__(self, users: Counter[str]) -> None:
+        self.users = users
+        self.layers: list[FloatLayer] = []
+        self.tensor_of: dict[str, int] = {}
+        self.parts: dict[str, tuple[tuple[int, int], ...]] = {}
+        self.outputs: tuple[tuple[int, int], ...] = ()
+        self.channels = 3
+
+    def take(self, op: Op) -> None:
+        """Carry the next operation."""
+        for source in op.sources:
+            if source in self.parts and op.kind != "output":
+                raise Cannot(source, "a concatenation inside the network", "a residual sum")
+        takes = {
+            "image": self._image,
+            "conv": self._conv,
+            "norm": self._norm,
+            "relu": self._relu,
+            "max_pool": self._pool,
+            "add": self._add,
+            "concatenate": self._concatenate,
+            "output": self._output,
+        }
+        if op.kind not in takes:
+            article = "an" if op.kind[0].lower() in "aeiou" else "a"
+            raise Cannot(op.name, f"{article} {op.kind}", WAYS_OUT.get(op.kind, CARRIED))
+        takes[op.kind](op)
+
+    def _put(self, op: Op, layer: FloatLayer) -> None:
+        self.layers.append(layer)
+        self.tensor_of[op.name] = len(self.layers)
+
+    def _sources(self, op: Op) -> list[int]:
+        return [self.tensor_of[source] for source in op.sources]
+
+    def _image(self, op: Op) -> None:
+        self.tensor_of[op.name] = 0
+
+    def _conv(self, op: Op) -> None:
+        (source,) = self._sources(op)
+        weight, asked = op.values["weight"], op.settings
+        outs, ins, *kernel = weight.shape
+        stride, dilation, padding, groups = (
+            asked[name] for name in ("stride", "dilation", "padding", "groups")
+        )
+        if kernel not in ([1, 1], [3, 3]):
+            size = " x ".join(map(str, kernel))
+            raise Cannot(op.name, f"a {size} convolution", "1x1 or 3x3 convolutions")
+        if not all(isinstance(value, int) for value in (stride, dilation, padding)):
+            raise Cannot(op.name, "a convolution that differs by direction", "one stride both ways")
+        if padding not in (0, dilation * (kernel[0] // 2)) or "padding_mode" in asked:
+            raise Cannot(op.name, f"a convolution with padding {padding}", "'same' zero padding")
+        if groups > 1 and (ins > 1 or outs != groups):
+            raise Cannot(
+                op.name,
+                f"a convolution in {groups} groups",
+                "groups=1, or depthwise: as many groups as channels in and out",
+            )
+        if source == 0:
+            self.channels = ins * groups
+        bias = op.values["bias"]
+        self._put(
+            op, FloatConv(op.name, (source,), weight, bias, stride, dilation, padding, groups)
+        )
+
+    def _norm(self, op: Op) -> None:
+        (tensor,) = self._sources(op)
+        layer = self._own(op, tensor)
+        if not isinstance(layer, FloatConv) or layer.relu:
+            raise Cannot(
+                op.name, "a BatchNorm2d apart from a convolution", "it after a convolution"
+            )
+        factor, summand = op.values["factor"], op.values["summand"]
+        weight = layer.weight * factor[:, None, None, None]
+        self.layers[tensor - 1] = replace(layer, weight=weight, bias=layer.bias * factor + summand)
+        self.tensor_of[op.name] = tensor
+
+    def _relu(self, op: Op) -> None:
+        (tensor,) = self._sources(op)
+        layer = self._own(op, tensor)
+        if not isinstance(layer, FloatConv | FloatAdd):
+            raise Cannot(op.name, "a ReLU apart from a convolution or sum", "it right after one")
+        self.layers[tensor - 1] = replace(layer, relu=True)
+        self.tensor_of[op.name] = tensor
+
+    def _own(self, op: Op, tensor: int) -> FloatLayer | None:
+        """The layer whose output this operation alone reads; None if there is no such."""
+        alone = self.users[op.sources[0]] == 1
+        return self.layers[tensor - 1] if alone and tensor else None
+
+    def _pool(self, op: Op) -> None:
+        (source,) = self._sources(op)
+        plain = set(op.settings) == {"kernel", "stride"}
+        if source == 0:
+            raise Cannot(op.name, "a max-pool of the image", "a convolution first")
+        if not plain or any(side != 2 for side in op.settings.values()):
+            raise Cannot(op.name, f"a max-pool with {op.settings}", "2x2 max-pools with stride 2")
+        self._put(op, FloatPool(op.name, (source,)))
+
+    def _add(self, op: Op) -> None:
+        a, b = self._sources(op)
+        if 0 in (a, b):
+            raise Cannot(op.name, "a sum with the image", "a convolution first")
+        self._put(op, FloatAdd(op.name, (a, b)))
+
+    def _concatenate(self, op: Op) -> None:
+        parts = [self._channels_of(source) for source in op.sources]
+        self.parts[op.name] = tuple(part for each in parts for part in each)
+
+    def _channels_of(self, name: str) -> tuple[tuple[int, int], ...]:
+        tensor = self.tensor_of[name]
+        layer = self.layers[tensor - 1] if tensor else None
+        if not isinstance(layer, FloatConv) or layer.relu:
+            raise Cannot(name, "a result that no convolution gives", "a convolution without ReLU")
+        return tuple((tensor, channel) for channel in range(len(layer.bias)))
+
+    def _output(self, op: Op) -> None:
+        (source,) = op.sources
+        self.outputs = self.parts.get(source) or self._channels_of(source)
+
+
+def to_input(images: NDArray[np.uint8]) -> Float32:
+    """(N, C, H, W) input, ``x / 128 - 1``, of (N, H, W, C) images."""
+    planes = images.transpose(0, 3, 1, 2).astype(np.float32)
+    scaled: Float32 = planes / np.float32(PIXEL_ZERO) - np.float32(1)
+    return scaled
+
+
+def grey_of(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(N, H, W, 1) grey of (N, H, W, 3) RGB: ``(77 R + 150 G + 29 B + 128) >> 8``."""
+    weighted = images.astype(np.uint32) @ np.array([77, 150, 29], np.uint32)
+    return ((weighted + 128) >> 8).astype(np.uint8)[..., None]
+
+
+def tensors_of(graph: Graph, images: Float32) -> list[Float32]:
+    """The input and the output of every layer, each (N, channels, rows, cols)."""
+    tensors = [images]
+    for layer in graph.layers:
+        inputs = [tensors[k] for k in layer.sources]
+        if isinstance(layer, FloatConv):
+            out = _convolve(layer, inputs[0])
+        elif isinstance(layer, FloatAdd):
+            out = inputs[0] + inputs[1]
+        else:
+            out = largest_of_blocks(inputs[0])
+        tensors.append(np.maximum(out, 0) if layer.relu else out)
+    return tensors
+
+
+def outputs_of(graph: Graph, tensors: list[Float32]) -> Float32:
+    """(N, channels, rows, cols) output of the network, of what ``tensors_of`` gave."""
+    return np.stack([tensors[tensor][:, channel] for tensor, channel in graph.outputs], axis=1)
+
+
+def _convolve(layer: FloatConv, x: Float32) -> Float32:
+    padding = layer.padding
+    padded = np.pad(x, ((0, 0), (0, 0), (padding, padding), (padding, padding)))
+    taps = taps_of(padded, layer.weight.shape[2], layer.stride, layer.dilation)
+    count, _, _, rows, cols = taps.shape
+    outs = len(layer.bias)
+    weight = layer.weight.reshape(outs, -1).astype(np.float32)
+    if layer.groups > 1:
+        sums = np.einsum("ct,nctrs->ncrs", weight, taps)
+    else:
+        flat = taps.reshape(count, weight.shape[1], rows * cols)
+        sums = (weight @ flat).reshape(count, outs, rows, cols)
+    biased: Float32 = sums + layer.bias.astype(np.float32)[:, None, None]
+    return biased

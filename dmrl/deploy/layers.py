@@ -1,0 +1,146 @@
+"""How each layer of an int8 network compares with the float one, on the same images."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy import graph as floats
+from dmrl.deploy import reference
+from dmrl.deploy.graph import Float32, Graph, grey_of
+from dmrl.deploy.integer import Conv, IntegerNetwork
+from dmrl.deploy.reference import Quantised
+
+
+@dataclass(frozen=True, slots=True)
+class LayerFigures:
+    """A layer, and what int8 does to it.
+
+    Parameters
+    ----------
+    name, kind
+        Of the layer. A head, one channel of a layer's output, has the kind "head".
+    shape
+        Channels, rows and columns of its output.
+    products
+        Multiplications of an image.
+    low, high
+        Least and largest real value that it can hold.
+    sqnr_db
+        Power of the float values over that of the difference, decibels; all errors of the
+        layers before it are in it. None: there is no difference.
+    saturated
+        Share of the values on the last level: above it, or exactly there, 0 to 1.
+    """
+
+    name: str
+    kind: str
+    shape: tuple[int, int, int]
+    products: int
+    low: float
+    high: float
+    sqnr_db: float | None
+    saturated: float
+
+
+@dataclass
+class _Sums:
+    signal: float = 0.0
+    error: float = 0.0
+    saturated: int = 0
+    count: int = 0
+
+    def take(
+        self, wanted: Float32, got: NDArray[np.floating], levels: NDArray[np.integer], signed: bool
+    ) -> None:
+        self.signal += float((wanted.astype(np.float64) ** 2).sum())
+        self.error += float(((wanted - got) ** 2).sum())
+        last = (levels == 127) | (levels == -128) if signed else levels == 255
+        self.saturated += int(last.sum())
+        self.count += levels.size
+
+    @property
+    def sqnr_db(self) -> float | None:
+        return float(10 * np.log10(self.signal / self.error)) if self.signal * self.error else None
+
+
+def layer_figures(
+    graph: Graph, network: IntegerNetwork, images: Iterable[NDArray[np.uint8]]
+) -> list[LayerFigures]:
+    """Figures of every layer, then of every head.
+
+    Parameters
+    ----------
+    graph
+        The float network.
+    network
+        Its int8 form.
+    images
+        (height, width, 3) RGB, one after another.
+    """
+    layers = [_Sums() for _ in network.layers]
+    heads = {name: _Sums() for name in network.heads}
+    for image in images:
+        seen = grey_of(image[None])[0] if network.channels == 1 else image
+        wanted = floats.tensors_of(graph, floats.to_input(seen[None]))
+        got = list(reference.tensors_of(network, seen))
+        _take(network, [tensor[0] for tensor in wanted], got, layers, heads)
+    return [*_of_layers(network, layers), *_of_heads(network, heads)]
+
+
+def _take(
+    network: IntegerNetwork,
+    wanted: list[Float32],
+    got: list[Quantised],
+    layers: list[_Sums],
+    heads: dict[str, _Sums],
+) -> None:
+    for sums, layer, real, levels in zip(layers, network.layers, wanted[1:], got[1:], strict=True):
+        sums.take(real, levels * layer.scale, levels, layer.signed)
+    for name, head in network.heads.items():
+        levels = got[head.tensor][head.channel]
+        values = reference.real(head, levels.astype(np.int8))
+        heads[name].take(wanted[head.tensor][head.channel], values, levels, signed=True)
+
+
+def _of_layers(network: IntegerNetwork, sums: list[_Sums]) -> list[LayerFigures]:
+    shapes = network.shapes
+    of_heads = {head.tensor for head in network.heads.values()}
+    return [
+        LayerFigures(
+            layer.name,
+            layer.kind,
+            shapes[k + 1],
+            layer.macs((shapes[layer.source],)) if isinstance(layer, Conv) else 0,
+            -128 * layer.scale if layer.signed else 0.0,
+            (127 if layer.signed else 255) * layer.scale,
+            sums[k].sqnr_db,
+            sums[k].saturated / max(sums[k].count, 1),
+        )
+        for k, layer in enumerate(network.layers)
+        if k + 1 not in of_heads
+    ]
+
+
+def _of_heads(network: IntegerNetwork, sums: dict[str, _Sums]) -> list[LayerFigures]:
+    out = []
+    for name, head in network.heads.items():
+        layer = network.layers[head.tensor - 1]
+        assert isinstance(layer, Conv)
+        channels, *grid = network.shapes[head.tensor]
+        source = network.shapes[layer.source]
+        low, high = reference.real(head, np.array([-128, 127], np.int8))
+        out.append(
+            LayerFigures(
+                f"{layer.name}[{head.channel}] {name}",
+                "head",
+                (1, grid[0], grid[1]),
+                layer.macs((source,)) // channels,
+                float(low),
+                float(high),
+                sums[name].sqnr_db,
+                sums[name].saturated / max(sums[name].count, 1),
+            )
+        )
+    return out

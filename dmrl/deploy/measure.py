@@ -1,0 +1,148 @@
+"""What the C costs on a 32-bit RISC-V: bytes, instructions, and an estimate of the rate."""
+
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.c import NAME
+from dmrl.deploy.c.text import fill
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.targets import RISCV_FLAGS, Build
+from dmrl.deploy.toolchain import (
+    EMULATOR,
+    RISCV,
+    emulator_version,
+    host_compiler,
+    missing,
+    run,
+    run_both,
+)
+from dmrl.errors import ModelError, ToolError
+
+CLUSTER_HZ = 175e6
+"""Clock of the GAP8's cluster of eight cores."""
+KERNEL_MACS = 4.1
+"""Multiply-accumulates a cycle of hand-written 8-bit kernels on eight cores, over a whole network
+of this size; the peak of PULP-NN, in one large layer, is 15.5."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What one image costs on rv32imc at -O3.
+
+    Parameters
+    ----------
+    code_bytes, constant_bytes
+        Of the object.
+    instructions
+        Executed for one image; None: they could not be counted.
+    """
+
+    code_bytes: int
+    constant_bytes: int
+    instructions: int | None
+
+
+def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cost | None:
+    """Cost of the C of an export folder; None without the cross compiler.
+
+    Raises
+    ------
+    ToolError
+        If the C does not compile, or the emulator fails.
+    """
+    if missing(RISCV):
+        return None
+    with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
+        code, constants = _sizes(folder, Path(place))
+        counted = None
+        if not missing(EMULATOR):
+            counted = _instructions(network, folder, Path(place), image)
+    return Cost(code, constants, counted)
+
+
+def state_bytes(folder: Path) -> int:
+    """Bytes of RAM that the header of an export folder states; compilers hold it to that.
+
+    Raises
+    ------
+    ModelError
+        If it states none.
+    """
+    text = (folder / f"{NAME}.h").read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"_STATE_BYTES \((\d+)", text)
+    if not found:
+        raise ModelError(f"{folder / NAME}.h is damaged. Export the model again: dmrl export")
+    return int(found[1])
+
+
+def _sizes(folder: Path, build: Path) -> tuple[int, int]:
+    """Bytes of code and of constants of the object."""
+    target = build / f"{NAME}.o"
+    flags = ("-std=c99", "-O3", *RISCV_FLAGS, f"-D{NAME.upper()}_BAYER=0")
+    run((RISCV, *flags, "-c", folder / f"{NAME}.c", "-o", target), "measuring the C")
+    said = run((RISCV.replace("gcc", "size"), "-A", target), "measuring the C").decode()
+    sections = re.findall(r"^(\.\S+)\s+(\d+)", said, flags=re.MULTILINE)
+    code = sum(int(size) for name, size in sections if name.startswith(".text"))
+    constants = sum(int(size) for name, size in sections if "rodata" in name)
+    return code, constants
+
+
+def _instructions(
+    network: IntegerNetwork, folder: Path, build: Path, image: NDArray[np.uint8]
+) -> int | None:
+    """Instructions of one image: what two images take more than one."""
+    plugin, source = build / "count.so", build / "count.c"
+    source.write_text(fill("count.c"), encoding="utf-8")
+    # Version 1 of the plugin interface until QEMU 9, which no longer takes it.
+    version = 1 if emulator_version() < 9 else 2
+    flags = ("-O2", "-shared", "-fPIC", f"-DPLUGIN_VERSION={version}")
+    program = Build("-O3", RISCV, ("-O3", *RISCV_FLAGS), emulated=True).program(
+        network, folder, build
+    )
+    counts = []
+    try:
+        run((host_compiler(), *flags, source, "-o", plugin), "counting instructions")
+        for times in (1, 2):
+            command = (EMULATOR, "-plugin", plugin, *program[1:])
+            _, said = run_both(command, "counting instructions", data=image.tobytes() * times)
+            found = re.search(r"executed (\d+)", said)
+            if not found:
+                return None
+            counts.append(int(found[1]))
+    except ToolError:
+        return None  # an emulator built without plugins
+    return counts[1] - counts[0]
+
+
+def rates(network: IntegerNetwork, found: Cost | None) -> list[tuple[float, str]]:
+    """Estimated images a second on a GAP8, each with what it assumes.
+
+    Parameters
+    ----------
+    network
+        The network.
+    found
+        Its cost, if known.
+    """
+    out = []
+    if found and found.instructions:
+        out.append(
+            (
+                CLUSTER_HZ / found.instructions,
+                f"this C on one of the cluster's 8 cores at {CLUSTER_HZ / 1e6:.0f} MHz, one "
+                "rv32imc instruction a cycle, no waiting for memory",
+            )
+        )
+    out.append(
+        (
+            CLUSTER_HZ * KERNEL_MACS / network.macs,
+            f"hand-written 8-bit SIMD kernels (not exported) on all 8 cores at "
+            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS} multiply-accumulates a cycle",
+        )
+    )
+    return out

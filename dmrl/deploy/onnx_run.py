@@ -1,0 +1,76 @@
+"""ONNX files through onnxruntime: the fast way on a computer. The home of onnxruntime."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.backends import Outputs
+from dmrl.deploy.graph import grey_of
+from dmrl.errors import MissingExtra, ModelError
+
+try:
+    import onnxruntime
+except ImportError as e:
+    raise MissingExtra("onnxruntime", "deploy", "running ONNX") from e
+
+CHANNEL_OF = {"confidence_logit": "confidence"}
+"""Channel of an ONNX output, where it is not the output's own name."""
+
+
+class OnnxRun:
+    """A backend on an ONNX file that dmrl wrote, float or int8.
+
+    Parameters
+    ----------
+    model
+        The file, or its bytes.
+    where
+        Its name in errors.
+    threads
+        Of onnxruntime; 0: as many as there are cores.
+
+    Raises
+    ------
+    ModelError
+        If it cannot be run, or is not a network that dmrl wrote.
+    """
+
+    def __init__(self, model: Path | bytes, where: object = "the model", threads: int = 0) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3
+        if not _has_vnni():
+            # Such processors add pairs of products in 16 bits, which overflow; the slower way
+            # does not.
+            options.add_session_config_entry("session.x64quantprecision", "1")
+        source = model if isinstance(model, bytes) else str(model)
+        try:
+            self._session = onnxruntime.InferenceSession(
+                source, options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as e:  # its exceptions have no common base
+            why = " ".join(str(e).split())
+            raise ModelError(f"{where} cannot be run: {why}. Export the model again") from None
+        inputs = self._session.get_inputs()
+        self.names = [output.name for output in self._session.get_outputs()]
+        if [i.name for i in inputs] != ["image"] or "confidence_logit" not in self.names:
+            raise ModelError(f"{where} is not a network that dmrl export wrote. Give one")
+        self.height_px, self.width_px, self.channels = (int(side) for side in inputs[0].shape[1:])
+
+    def outputs(self, images: NDArray[np.uint8]) -> Outputs:
+        """Output for (N, height, width, 3) RGB images."""
+        seen = grey_of(images) if self.channels == 1 else np.ascontiguousarray(images)
+        values = self._session.run(self.names, {"image": seen})
+        return {
+            CHANNEL_OF.get(name, name): value
+            for name, value in zip(self.names, values, strict=True)
+        }
+
+
+def _has_vnni() -> bool:
+    """Whether the processor is known to multiply bytes without overflow."""
+    try:
+        return "vnni" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return False

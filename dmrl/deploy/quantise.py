@@ -1,0 +1,231 @@
+"""A float network to int8, after training: ranges of calibration images, then rounding.
+
+Weights per output channel, activations per tensor with zero point 0, each head with a scale of
+its own; ranges are the largest values seen. (Clipping at a percentile costs accuracy: the few
+large values are the robots.)
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.graph import (
+    FloatAdd,
+    FloatConv,
+    FloatPool,
+    Graph,
+)
+from dmrl.deploy.integer import (
+    CONFIDENCE_ONE,
+    PIXEL_ZERO,
+    SUBPIXEL,
+    Add,
+    AnyLayer,
+    Conv,
+    Head,
+    Int32,
+    IntegerNetwork,
+    MaxPool,
+)
+from dmrl.deploy.ranges import Ranges
+from dmrl.errors import SettingError
+
+Array = NDArray[np.float64]
+
+HEAD_OF = {
+    "log_depth": "depth",
+    "confidence": "confidence",
+    "offset_u": "offset_u",
+    "offset_v": "offset_v",
+}
+"""The head that each channel of a network's output becomes; other channels are left behind."""
+HEAD_ROOM = 0.05
+"""Share of its range that a head keeps free at either end, for images not seen before."""
+LEVELS = np.arange(-128.0, 128.0)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What an integer network says of itself.
+
+    Parameters
+    ----------
+    name, architecture, stride_px, threshold
+        See ``IntegerNetwork``.
+    channels
+        What the channels of the output are, as the network's class names them.
+    """
+
+    name: str
+    architecture: str
+    stride_px: int
+    channels: tuple[str, ...]
+    threshold: float
+
+
+def quantise(graph: Graph, ranges: Ranges, about: About) -> IntegerNetwork:
+    """The int8 network of a float one.
+
+    Raises
+    ------
+    SettingError
+        If the network gives no confidence or no depth.
+    """
+    heads = {
+        HEAD_OF[channel]: _head(graph, ranges, k, HEAD_OF[channel], about.stride_px)
+        for k, channel in enumerate(about.channels)
+        if channel in HEAD_OF
+    }
+    if absent := sorted({"confidence", "depth"} - heads.keys()):
+        raise SettingError(f"{about.name} gives no {absent[0]}, which detections are made of")
+    layers: list[AnyLayer] = []
+    scales = [1 / PIXEL_ZERO]
+    signed = [False]
+    for index, layer in enumerate(graph.layers):
+        tensor = index + 1
+        own = [head for head in heads.values() if head.tensor == tensor]
+        made: AnyLayer
+        if isinstance(layer, FloatConv):
+            made = _conv(layer, scales, ranges, tensor, own)
+        elif isinstance(layer, FloatAdd):
+            made = _add(layer, scales, ranges, tensor)
+        else:
+            made = _pool(layer, scales, signed)
+        layers.append(made)
+        scales.append(made.scale)
+        signed.append(made.signed)
+    return IntegerNetwork(
+        about.name,
+        about.architecture,
+        graph.channels,
+        ranges.height_px,
+        ranges.width_px,
+        about.stride_px,
+        tuple(layers),
+        threshold=about.threshold,
+        **heads,
+    )
+
+
+def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) -> Head:
+    """Scale and zero point of a head: its range, some room, and 0, on the 256 levels."""
+    tensor, channel = graph.outputs[output]
+    least, most = ranges.low[tensor][channel], ranges.high[tensor][channel]
+    room = HEAD_ROOM * (most - least)
+    low, high = min(least - room, 0.0), max(most + room, 0.0)
+    scale = float(high - low) / 255 or 1.0
+    zero_point = int(np.clip(np.rint(-128 - low / scale), -128, 127))
+    meaning = MEANINGS[name](scale * (LEVELS - zero_point), stride_px)
+    return Head(tensor, channel, scale, zero_point, np.rint(meaning).astype(np.int32))
+
+
+def _confidence_of(logit: Array, _stride_px: int) -> Array:
+    confidence: Array = CONFIDENCE_ONE / (1 + np.exp(-np.clip(logit, -60, 60)))
+    return confidence
+
+
+def _millimetres_of(log_depth: Array, _stride_px: int) -> Array:
+    depth: Array = np.minimum(1000 * np.exp(np.minimum(log_depth, 20)), 65535)
+    return depth
+
+
+def _place_of(offset: Array, stride_px: int) -> Array:
+    """Place in a cell, 1/16 px, of an offset from its centre in cells."""
+    return np.clip((offset + 0.5) * stride_px * SUBPIXEL, -32768, 32767)
+
+
+MEANINGS: dict[str, Callable[[Array, int], Array]] = {
+    "confidence": _confidence_of,
+    "depth": _millimetres_of,
+    "offset_u": _place_of,
+    "offset_v": _place_of,
+}
+
+
+def _activation_scale(ranges: Ranges, tensor: int, *, signed: bool) -> float:
+    low, high = float(ranges.low[tensor].min()), float(ranges.high[tensor].max())
+    return max(-low, high) / 127 if signed else high / 255
+
+
+def _conv(
+    layer: FloatConv, scales: list[float], ranges: Ranges, tensor: int, heads: list[Head]
+) -> Conv:
+    outs = len(layer.bias)
+    scale = 1.0 if heads else _activation_scale(ranges, tensor, signed=not layer.relu)
+    out_scale, zero_point = np.full(outs, scale), np.zeros(outs)
+    for head in heads:
+        out_scale[head.channel], zero_point[head.channel] = head.scale, head.zero_point
+    weight, bias, factor = _integers(layer, scales[layer.sources[0]], out_scale, zero_point)
+    if layer.sources[0] == 0:
+        bias -= PIXEL_ZERO * weight.sum(axis=(1, 2, 3))
+    multiplier, shift = _fixed_point(factor)
+    return Conv(
+        layer.name,
+        layer.sources[0],
+        weight.astype(np.int8),
+        bias.astype(np.int32),
+        multiplier,
+        shift,
+        layer.stride,
+        layer.dilation,
+        layer.padding,
+        layer.groups,
+        signed=not layer.relu,
+        pad_value=PIXEL_ZERO if layer.sources[0] == 0 else 0,
+        scale=scale,
+    )
+
+
+def _integers(
+    layer: FloatConv, in_scale: float, out_scale: Array, zero_point: Array
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Weights, bias and the real factor from sum to output, per output channel.
+
+    The scale of a channel's weights is set by its largest weight; by its bias, where that would
+    not fit beside the sum; or by the smallest factor that a shift of 62 can express.
+    """
+    largest = np.abs(layer.weight).max(axis=(1, 2, 3))
+    room = 2**31 - 1 - 128 * 255 * layer.weight[0].size
+    bias = layer.bias + zero_point * out_scale
+    least = 2.0**-31 * out_scale / in_scale
+    weight_scale = np.maximum.reduce([largest / 127, np.abs(bias) / (in_scale * room), least])
+    weight = np.rint(layer.weight / weight_scale[:, None, None, None]).astype(np.int64)
+    sum_scale = in_scale * weight_scale
+    return weight, np.rint(bias / sum_scale).astype(np.int64), sum_scale / out_scale
+
+
+def _fixed_point(factor: Array) -> tuple[Int32, Int32]:
+    """Multipliers of 31 bits and shifts: ``factor = multiplier / 2^shift``."""
+    mantissa, exponent = np.frexp(factor)
+    multiplier = np.rint(mantissa * 2**31).astype(np.int64)
+    carried = multiplier == 2**31
+    multiplier = np.where(carried, 2**30, multiplier)
+    return multiplier.astype(np.int32), (31 - exponent - carried).astype(np.int32)
+
+
+def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> Add:
+    signed = not layer.relu and bool((ranges.low[tensor] < 0).any())
+    a, b = (scales[source] for source in layer.sources)
+    # A sum that cancels may be small; a shift below 1 cannot be.
+    scale = max(_activation_scale(ranges, tensor, signed=signed), max(a, b) * 2.0**-19)
+    _, exponent = np.frexp(max(a, b) / scale)
+    shift = 21 - int(exponent)
+    multipliers = [round(part / scale * 2**shift) for part in (a, b)]
+    if max(multipliers) == 2**21:
+        shift -= 1
+        multipliers = [round(part / scale * 2**shift) for part in (a, b)]
+    return Add(
+        layer.name,
+        layer.sources,
+        (multipliers[0], multipliers[1]),
+        shift,
+        signed=signed,
+        scale=scale,
+    )
+
+
+def _pool(layer: FloatPool, scales: list[float], signed: list[bool]) -> MaxPool:
+    source = layer.sources[0]
+    return MaxPool(layer.name, source, signed=signed[source], scale=scales[source])

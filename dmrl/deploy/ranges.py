@@ -1,0 +1,94 @@
+"""Ranges of a network's tensors over calibration images."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.graph import Graph, grey_of, tensors_of, to_input
+from dmrl.errors import SettingError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges:
+    """What calibration images gave.
+
+    Parameters
+    ----------
+    low, high
+        (channels,) least and largest value of every channel, for each tensor.
+    images
+        How many there were.
+    height_px, width_px
+        Of the images.
+    """
+
+    low: tuple[Array, ...]
+    high: tuple[Array, ...]
+    images: int
+    height_px: int
+    width_px: int
+
+    def with_more(self, other: "Ranges") -> "Ranges":
+        """The ranges over both sets of images, which are of one size."""
+        return Ranges(
+            tuple(np.minimum(a, b) for a, b in zip(self.low, other.low, strict=True)),
+            tuple(np.maximum(a, b) for a, b in zip(self.high, other.high, strict=True)),
+            self.images + other.images,
+            self.height_px,
+            self.width_px,
+        )
+
+
+def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
+    """Ranges of every tensor over calibration images.
+
+    Parameters
+    ----------
+    graph
+        The network.
+    batches
+        (n, height, width, 3) RGB images, all of one size; a network of grey images sees them
+        in grey.
+
+    Raises
+    ------
+    SettingError
+        If there are no images, every one of them is of a single colour, or a layer is zero
+        for all of them.
+    """
+    ranges: Ranges | None = None
+    varied = False
+    for batch in batches:
+        varied = varied or bool((np.ptp(batch, axis=(1, 2)) > 0).any())
+        more = _ranges(graph, batch)
+        ranges = more if ranges is None else ranges.with_more(more)
+    if ranges is None:
+        raise SettingError("no images to calibrate on. Give a dataset with images")
+    if not varied:
+        raise SettingError(
+            f"each of the {ranges.images} calibration images is of a single colour, so nothing "
+            "can be learned of the ranges. Give images as the camera takes them"
+        )
+    for layer, high, low in zip(graph.layers, ranges.high[1:], ranges.low[1:], strict=True):
+        if not (high.any() or low.any()):
+            raise SettingError(
+                f"layer {layer.name} is zero for all of the {ranges.images} calibration images. "
+                "Give more of them, or train the network"
+            )
+    return ranges
+
+
+def _ranges(graph: Graph, images: NDArray[np.uint8]) -> Ranges:
+    seen = grey_of(images) if graph.channels == 1 else images
+    tensors = tensors_of(graph, to_input(seen))
+    return Ranges(
+        tuple(tensor.min(axis=(0, 2, 3)).astype(np.float64) for tensor in tensors),
+        tuple(tensor.max(axis=(0, 2, 3)).astype(np.float64) for tensor in tensors),
+        len(images),
+        images.shape[1],
+        images.shape[2],
+    )

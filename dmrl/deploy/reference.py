@@ -1,0 +1,166 @@
+"""What an int8 network computes, bit for bit: the specification of every other backend.
+
+NumPy only. Sums of products are taken in float64, which holds every integer below 2^53: they
+are exact, and BLAS makes them fast.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.integer import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
+from dmrl.deploy.windows import largest_of_blocks, taps_of
+from dmrl.learn.decode import SAME_PX
+
+Quantised = NDArray[np.int16]
+"""Values of uint8 or int8 tensors; int16 holds both."""
+
+
+def run(network: IntegerNetwork, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
+    """Every head's grid, (rows, cols) int8, of one image.
+
+    Parameters
+    ----------
+    network
+        The network.
+    image
+        (height, width, channels) uint8: RGB, or one channel of grey.
+    """
+    tensors = list(tensors_of(network, image))
+    return {
+        name: tensors[head.tensor][head.channel].astype(np.int8)
+        for name, head in network.heads.items()
+    }
+
+
+def tensors_of(network: IntegerNetwork, image: NDArray[np.uint8]) -> Iterator[Quantised]:
+    """The image and the output of every layer, in order, each (channels, rows, cols)."""
+    assert image.shape == (network.height_px, network.width_px, network.channels)
+    tensors = [image.transpose(2, 0, 1).astype(np.int16)]
+    yield tensors[0]
+    for layer in network.layers:
+        tensors.append(compute(layer, *(tensors[k] for k in layer.sources)))
+        yield tensors[-1]
+
+
+def compute(layer: AnyLayer, *inputs: Quantised) -> Quantised:
+    """Output of a layer, (channels, rows, cols)."""
+    if isinstance(layer, Conv):
+        return convolve(layer, inputs[0])
+    if isinstance(layer, Add):
+        a, b = (x.astype(np.int64) * m for x, m in zip(inputs, layer.multipliers, strict=True))
+        return clamp((a + b + (1 << (layer.shift - 1))) >> layer.shift, signed=layer.signed)
+    return largest_of_blocks(inputs[0])
+
+
+def convolve(layer: Conv, x: Quantised) -> Quantised:
+    """Output of a convolution, requantised: ``clamp((acc * m + 2^(s - 1)) >> s)``."""
+    acc = accumulate(layer, x)
+    shift = layer.shift.astype(np.int64)[:, None, None]
+    product = acc * layer.multiplier.astype(np.int64)[:, None, None]
+    return clamp((product + (1 << (shift - 1))) >> shift, signed=layer.signed)
+
+
+def accumulate(layer: Conv, x: Quantised) -> NDArray[np.int64]:
+    """Sums of products and bias, (out, rows, cols), before requantising."""
+    pad = layer.padding
+    padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad)), constant_values=layer.pad_value)
+    taps = taps_of(padded, layer.kernel, layer.stride, layer.dilation).astype(np.float64)
+    outs, (rows, cols) = len(layer.weight), taps.shape[2:]
+    weight = layer.weight.reshape(outs, -1).astype(np.float64)
+    if layer.depthwise:
+        sums = np.einsum("ct,ctrs->crs", weight, taps)
+    else:
+        sums = (weight @ taps.reshape(weight.shape[1], rows * cols)).reshape(outs, rows, cols)
+    acc: NDArray[np.int64] = sums.astype(np.int64) + layer.bias[:, None, None]
+    return acc
+
+
+def clamp(values: NDArray[np.int64], *, signed: bool) -> Quantised:
+    """Values within int8, or within uint8."""
+    low, high = (-128, 127) if signed else (0, 255)
+    return np.clip(values, low, high).astype(np.int16)
+
+
+def real(head: Head, q: NDArray[np.int8]) -> NDArray[np.float64]:
+    """Real values (log depth, logit, offset) of a head's grid."""
+    return head.scale * (q.astype(np.float64) - head.zero_point)
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """A robot, in integers.
+
+    Parameters
+    ----------
+    u_q4, v_q4
+        Pixel-edge coordinates, 1/16 px.
+    depth_mm
+        Along the optical axis, 0 to 65535.
+    confidence
+        0 to 65535 for 0 to 1.
+    """
+
+    u_q4: int
+    v_q4: int
+    depth_mm: int
+    confidence: int
+
+
+def decode(
+    network: IntegerNetwork, grids: dict[str, NDArray[np.int8]], most: int = 20
+) -> list[Detection]:
+    """Detections in the grids of ``run``, best first.
+
+    A detection is a cell whose confidence q reaches ``network.threshold_q``, exceeds that of its
+    neighbours before it in raster order, and is not exceeded by the neighbours after it (3x3).
+    They go in falling q, in raster order where equal; the first ``most`` are taken.
+
+    Where the network has offsets, the positions are clipped to the image, 0 and its sides
+    included, and, in that order, a detection less than ``SAME_PX`` from one that stays is
+    dropped: ``du^2 + dv^2 < (16 SAME_PX)^2`` in 1/16 px.
+    """
+    q = grids["confidence"].astype(np.int64)
+    rows, cols = q.shape
+    around = np.pad(q, 1, constant_values=-129)
+    peak = q >= network.threshold_q
+    for row in range(3):
+        for col in range(3):
+            neighbour = around[row : row + rows, col : col + cols]
+            if (row, col) < (1, 1):
+                peak &= q > neighbour
+            elif (row, col) > (1, 1):
+                peak &= q >= neighbour
+    cells = np.flatnonzero(peak)
+    best = cells[np.argsort(-q.ravel()[cells], kind="stable")][:most]
+    found = [_detection(network, grids, int(cell)) for cell in best]
+    return found if network.offset_u is None else _without_doubles(found)
+
+
+def _detection(network: IntegerNetwork, grids: dict[str, NDArray[np.int8]], cell: int) -> Detection:
+    rows, cols = network.grid_shape
+    row, col = divmod(cell, cols)
+    step = network.stride_px * SUBPIXEL
+    value = {
+        name: int(head.table[int(grids[name][row, col]) + 128])
+        for name, head in network.heads.items()
+    }
+    return Detection(
+        u_q4=min(max(col * step + value.get("offset_u", step // 2), 0), cols * step),
+        v_q4=min(max(row * step + value.get("offset_v", step // 2), 0), rows * step),
+        depth_mm=value["depth"],
+        confidence=value["confidence"],
+    )
+
+
+def _without_doubles(found: list[Detection]) -> list[Detection]:
+    """The same without detections that lie by a more confident one."""
+    near = int(SAME_PX * SUBPIXEL) ** 2
+    kept: list[Detection] = []
+    for one in found:
+        away = [(one.u_q4 - other.u_q4) ** 2 + (one.v_q4 - other.v_q4) ** 2 for other in kept]
+        if not away or min(away) >= near:
+            kept.append(one)
+    return kept

@@ -1,0 +1,38 @@
+"""A few images that go along with an int8 model: what its C is checked on."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.errors import ModelError
+
+SAMPLES_NAME = "samples.npz"
+SAMPLES = 4
+
+
+def save_samples(images: NDArray[np.uint8], folder: Path) -> None:
+    """Write (N, height, width, 3) RGB images into a folder."""
+    np.savez_compressed(folder / SAMPLES_NAME, allow_pickle=False, images=images)
+
+
+def load_samples(folder: Path) -> NDArray[np.uint8]:
+    """The (N, height, width, 3) RGB images of a folder.
+
+    Raises
+    ------
+    ModelError
+        If there are none, or they are damaged.
+    """
+    file = folder / SAMPLES_NAME
+    try:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            images = np.asarray(archive["images"])
+    except FileNotFoundError:
+        raise ModelError(f"no {file}. Quantise the model again") from None
+    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as e:
+        raise ModelError(f"{file} is damaged: {e}. Quantise the model again") from None
+    if images.ndim != 4 or images.shape[3] != 3 or images.dtype != np.uint8:
+        raise ModelError(f"{file} holds no RGB images. Quantise the model again")
+    return images

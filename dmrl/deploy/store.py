@@ -1,0 +1,101 @@
+"""Integer networks on disk: one .npz of arrays and a JSON description; nothing is pickled."""
+
+import json
+import zipfile
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.integer import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
+from dmrl.errors import ModelError
+
+INTEGER_NAME = "integer.npz"
+"""Name of the file in a quantised model and in an export folder."""
+FORMAT = 1
+KINDS: dict[str, type[AnyLayer]] = {kind.kind: kind for kind in (Conv, MaxPool, Add)}
+HEADS = ("confidence", "depth", "offset_u", "offset_v")
+PLAIN = ("name", "architecture", "channels", "height_px", "width_px", "stride_px", "threshold")
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def save(network: IntegerNetwork, path: Path) -> None:
+    """Write a network. Same network, same bytes."""
+    arrays: Arrays = {}
+    layers = [
+        {"kind": layer.kind, **_packed(layer, f"layer{k}", arrays)}
+        for k, layer in enumerate(network.layers)
+    ]
+    heads = {name: _packed(head, name, arrays) for name, head in network.heads.items()}
+    plain = {name: getattr(network, name) for name in PLAIN}
+    said = {"format": FORMAT, **plain, "layers": layers, "heads": heads}
+    text = np.frombuffer(json.dumps(said).encode(), np.uint8)
+    np.savez_compressed(path, allow_pickle=False, description=text, **arrays)
+
+
+def _packed(part: AnyLayer | Head, prefix: str, arrays: Arrays) -> dict[str, Any]:
+    """The plain fields of a part; its arrays go to ``arrays``."""
+    plain = {}
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if isinstance(value, np.ndarray):
+            arrays[f"{prefix}.{field.name}"] = value
+        else:
+            plain[field.name] = value
+    return plain
+
+
+def load(path: Path) -> IntegerNetwork:
+    """The network of a file that ``save`` wrote.
+
+    Parameters
+    ----------
+    path
+        The file, or a folder that holds one: a quantised model or an export folder.
+
+    Raises
+    ------
+    ModelError
+        If there is none, or it is damaged or not sound.
+    """
+    file = path / INTEGER_NAME if path.is_dir() else path
+    if not file.is_file():
+        raise ModelError(f"no {file.name} in {file.parent}. Make one with: dmrl quantize")
+    try:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        said = json.loads(arrays.pop("description").tobytes())
+        if said["format"] != FORMAT:
+            raise ModelError(
+                f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Update dmrl"
+            )
+        return _network(said, arrays)
+    except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as e:
+        raise ModelError(f"{file} is damaged: {e}. Quantise the model again") from None
+
+
+def _network(said: dict[str, Any], arrays: Arrays) -> IntegerNetwork:
+    layers = tuple(
+        KINDS[layer.pop("kind")](**_unpacked(layer, f"layer{k}", arrays))
+        for k, layer in enumerate(said["layers"])
+    )
+    heads = {
+        name: Head(**_unpacked(head, name, arrays))
+        for name, head in said["heads"].items()
+        if name in HEADS
+    }
+    fields: dict[str, Any] = {name: said[name] for name in PLAIN} | heads
+    return IntegerNetwork(layers=layers, **fields)
+
+
+def _unpacked(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, Any]:
+    own = {
+        name.removeprefix(f"{prefix}."): value
+        for name, value in arrays.items()
+        if name.startswith(f"{prefix}.")
+    }
+    tuples = {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
+    return {**tuples, **own}

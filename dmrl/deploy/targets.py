@@ -1,0 +1,116 @@
+"""Where the C of an export is proved: compilers, their settings, and how each result is run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dmrl.deploy.c import NAME
+from dmrl.deploy.c.harness import harness
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.toolchain import EMULATOR, RISCV, missing, run
+
+RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding",
+               "-Wl,--no-relax")  # fmt: skip
+"""For rv32imc without any library. No start-up code sets the register that relaxed code needs."""
+SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+LEVELS = ("-O0", "-O1", "-O2", "-O3")
+
+
+@dataclass(frozen=True, slots=True)
+class Build:
+    """One way to compile the C.
+
+    Parameters
+    ----------
+    label
+        For people: the settings.
+    compiler
+        Program.
+    flags
+        Its flags.
+    bayer
+        Whether it takes raw mosaics.
+    emulated
+        Whether the program runs in the emulator.
+    """
+
+    label: str
+    compiler: str
+    flags: tuple[str, ...]
+    bayer: bool = False
+    emulated: bool = False
+
+    def program(self, network: IntegerNetwork, folder: Path, build: Path) -> list[str | Path]:
+        """Compile the C of an export folder; how to call what comes of it.
+
+        Parameters
+        ----------
+        network
+            What the C computes.
+        folder
+            The export folder.
+        build
+            Folder for what is compiled.
+
+        Raises
+        ------
+        ToolError
+            If it does not compile.
+        """
+        harness_c, program = build / "harness.c", build / "program"
+        harness_c.write_text(harness(network), encoding="utf-8")
+        mode = f"-D{NAME.upper()}_BAYER={int(self.bayer)}"
+        flags: tuple[str | Path, ...] = (*self.flags, mode, "-I", folder)
+        sources = (harness_c, folder / f"{NAME}.c")
+        last: tuple[str, ...] = ("-lgcc",) if self.emulated else ()
+        what = f"{self.compiler} {self.label}"
+        run((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)
+        return [EMULATOR, program] if self.emulated else [program]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A compiler or checker, with all its builds."""
+
+    name: str
+    builds: tuple[Build, ...]
+
+    @property
+    def skipped(self) -> str:
+        """Why it cannot be tried on this machine; empty: it can."""
+        needed = [self.builds[0].compiler]
+        return missing(*needed, *([EMULATOR] if self.builds[0].emulated else []))
+
+
+def targets() -> tuple[Target, ...]:
+    """Every target."""
+    hosts = tuple(
+        Target(
+            name,
+            (
+                *(Build(level, name, (level,)) for level in LEVELS),
+                Build("-O3 Bayer", name, ("-O3",), bayer=True),
+            ),
+        )
+        for name in ("gcc", "clang")
+    )
+    # gcc brings its sanitizers along; clang's are a package of their own.
+    checker = "clang" if missing("gcc") and not missing("clang") else "gcc"
+    label = f"{checker} address, undefined"
+    return (
+        *hosts,
+        Target(
+            "sanitizers",
+            (
+                Build(label, checker, SANITIZERS),
+                Build(f"{label}, Bayer", checker, SANITIZERS, bayer=True),
+            ),
+        ),
+        Target(
+            "riscv32",
+            (
+                Build("-O3", RISCV, ("-O3", *RISCV_FLAGS), emulated=True),
+                Build("-Os", RISCV, ("-Os", *RISCV_FLAGS), emulated=True),
+                Build("-O3 Bayer", RISCV, ("-O3", *RISCV_FLAGS), bayer=True, emulated=True),
+            ),
+        ),
+    )

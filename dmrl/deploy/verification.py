@@ -1,0 +1,165 @@
+"""Whether the C of an export computes what the reference does, bit for bit, on every target."""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.bayer import demosaic, mosaic
+from dmrl.deploy.c.harness import MOST, Answer, answers
+from dmrl.deploy.c.source import STACK_BYTES
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.reference import decode
+from dmrl.deploy.reference import run as reference_run
+from dmrl.deploy.targets import Build, Target
+from dmrl.deploy.toolchain import run
+from dmrl.errors import ToolError
+
+Image = NDArray[np.uint8]
+BAYER_IMAGES = 4
+"""Images that a build for raw mosaics is tried on: it differs in the first rows of code alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class BuildResult:
+    """What one build gave.
+
+    Parameters
+    ----------
+    label
+        The compiler's settings.
+    images
+        It was tried on.
+    mismatches
+        Images in which any grid or detection differs from the reference.
+    stack_bytes
+        Largest stack it used; 0 where not measured.
+    """
+
+    label: str
+    images: int
+    mismatches: int
+    stack_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class TargetResult:
+    """What a target gave.
+
+    Parameters
+    ----------
+    target
+        Its name.
+    builds
+        That were tried.
+    skipped
+        Why it was not tried; empty: it was.
+    error
+        What went wrong; empty: nothing.
+    """
+
+    target: str
+    builds: list[BuildResult] = field(default_factory=list)
+    skipped: str = ""
+    error: str = ""
+
+    @property
+    def mismatches(self) -> int:
+        """Images, over all builds, in which something differs."""
+        return sum(build.mismatches for build in self.builds)
+
+    @property
+    def proved(self) -> bool:
+        """Whether it was tried and everything is as the reference says."""
+        return not (self.skipped or self.error or self.mismatches)
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Images as the network takes them, raw mosaics of some, and what must come of both."""
+
+    images: Sequence[Image]
+    raws: Sequence[Image]
+    of_images: list[Answer]
+    of_raws: list[Answer]
+
+
+def expected(network: IntegerNetwork, images: Sequence[Image]) -> Expected:
+    """What the reference says of (height, width, channels) images as the network takes them."""
+    raws = [mosaic(image) for image in images[:BAYER_IMAGES]]
+    seen = [demosaic(raw, channels=network.channels) for raw in raws]
+    return Expected(
+        images, raws, [_answer(network, i) for i in images], [_answer(network, i) for i in seen]
+    )
+
+
+def _answer(network: IntegerNetwork, image: Image) -> Answer:
+    grids = reference_run(network, image)
+    return Answer(grids, decode(network, grids, MOST), 0)
+
+
+def prove(
+    network: IntegerNetwork,
+    folder: Path,
+    target: Target,
+    wanted: Expected,
+    *,
+    on_build: Callable[[str], None] = lambda _: None,
+) -> TargetResult:
+    """Try every build of a target on every image.
+
+    Parameters
+    ----------
+    network
+        What the C of the export should compute.
+    folder
+        The export folder.
+    target
+        What to try.
+    wanted
+        Images and what must come of them.
+    on_build
+        Called with what is tried next.
+    """
+    result = TargetResult(target.name, skipped=target.skipped)
+    if result.skipped:
+        return result
+    for build in target.builds:
+        on_build(f"{target.name} {build.label}")
+        try:
+            result.builds.append(_try(network, folder, build, wanted))
+        except ToolError as e:
+            return TargetResult(target.name, result.builds, error=str(e))
+    return result
+
+
+def _try(network: IntegerNetwork, folder: Path, build: Build, wanted: Expected) -> BuildResult:
+    images = wanted.raws if build.bayer else wanted.images
+    right = wanted.of_raws if build.bayer else wanted.of_images
+    with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
+        command = build.program(network, folder, Path(place))
+        data = b"".join(image.tobytes() for image in images)
+        found = answers(network, run(command, f"{build.compiler} {build.label}", data=data))
+    if len(found) != len(images):
+        raise ToolError(
+            f"{build.compiler} {build.label}: answered {len(found)} of {len(images)} images. "
+            "Export the model again"
+        )
+    stack_bytes = max(a.stack_bytes for a in found)
+    if stack_bytes > STACK_BYTES:
+        raise ToolError(
+            f"{build.compiler} {build.label}: uses {stack_bytes} bytes of stack, the header states "
+            f"{STACK_BYTES}. Give its task more, and report it"
+        )
+    wrong = sum(not same(a, b) for a, b in zip(found, right, strict=True))
+    return BuildResult(build.label, len(images), wrong, stack_bytes)
+
+
+def same(a: Answer, b: Answer) -> bool:
+    """Whether two answers agree in every grid and every detection."""
+    return a.detections == b.detections and all(
+        np.array_equal(a.grids[head], b.grids[head]) for head in b.grids
+    )

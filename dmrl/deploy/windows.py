@@ -1,0 +1,46 @@
+"""The windows that a convolution or a max-pool sees, as arrays. Any numbers."""
+
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+def taps_of(padded: NDArray[Number], kernel: int, stride: int, dilation: int) -> NDArray[Number]:
+    """Every input of every output of a convolution.
+
+    Parameters
+    ----------
+    padded
+        (..., channels, rows, cols), padding included.
+    kernel, stride, dilation
+        The same both ways.
+
+    Returns
+    -------
+    NDArray
+        (..., channels, kernel * kernel, out_rows, out_cols), kernel places in raster order.
+    """
+    reach = dilation * (kernel - 1)
+    rows, cols = ((side - reach - 1) // stride + 1 for side in padded.shape[-2:])
+    places = range(0, reach + 1, dilation)
+    windows = [
+        padded[
+            ...,
+            top : top + stride * (rows - 1) + 1 : stride,
+            left : left + stride * (cols - 1) + 1 : stride,
+        ]
+        for top in places
+        for left in places
+    ]
+    return np.stack(windows, axis=-3)
+
+
+def largest_of_blocks(x: NDArray[Number]) -> NDArray[Number]:
+    """(..., rows // 2, cols // 2) largest value of each 2x2 block."""
+    rows, cols = x.shape[-2] // 2, x.shape[-1] // 2
+    blocks = x[..., : 2 * rows, : 2 * cols].reshape(*x.shape[:-2], rows, 2, cols, 2)
+    out: NDArray[Any] = blocks.max(axis=(-3, -1))
+    return out

@@ -1,0 +1,89 @@
+"""Intrinsics of a camera from pictures of a chessboard, by OpenCV (Zhang 2000)."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.errors import MissingExtra
+from dmrl.geometry import Camera
+
+try:
+    import cv2
+except ImportError as e:
+    raise MissingExtra("cv2", "calibrate", "dmrl calibrate") from e
+
+LEAST_BOARDS = 5
+"""Fewer views leave focal length and distortion to chance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A camera, and how well it is known.
+
+    Parameters
+    ----------
+    camera
+        Focal lengths, centre and distortion; k3 is zero, since corners rarely reach as far out as
+        would be needed to tell it from k1 and k2.
+    focal_std_px, centre_std_px
+        (2,) standard errors.
+    rms_px
+        Root mean square distance of corners from where the camera puts them.
+    """
+
+    camera: Camera
+    focal_std_px: tuple[float, float]
+    centre_std_px: tuple[float, float]
+    rms_px: float
+
+
+def corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.float32] | None:
+    """(columns x rows, 2) inner corners of a board in a picture; None where there is none.
+
+    Parameters
+    ----------
+    grey
+        (H, W) picture.
+    columns, rows
+        Inner corners of the board.
+
+    Returns
+    -------
+    Array
+        Pixel-edge coordinates: OpenCV's, and half a pixel.
+    """
+    # Not CALIB_CB_NORMALIZE_IMAGE: stretching flat backgrounds hides boards in front of them.
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    found, at = cv2.findChessboardCornersSB(grey, (columns, rows), flags=flags)
+    return np.asarray(at, np.float32).reshape(-1, 2) + np.float32(0.5) if found else None
+
+
+def intrinsics(
+    boards: Iterable[NDArray[np.float32]],
+    shape: tuple[int, int],
+    size_px: tuple[int, int],
+) -> Intrinsics:
+    """The camera that saw boards.
+
+    Parameters
+    ----------
+    boards
+        (columns x rows, 2) corners of each view, pixel-edge coordinates.
+    shape
+        Columns and rows of inner corners.
+    size_px
+        Width and height of the pictures.
+    """
+    columns, rows = shape
+    flat = np.zeros((columns * rows, 3), np.float32)
+    flat[:, :2] = np.mgrid[:columns, :rows].T.reshape(-1, 2)
+    views = [view - np.float32(0.5) for view in boards]
+    rms_px, matrix, bend, _, _, errors, _, _ = cv2.calibrateCameraExtended(
+        [flat] * len(views), views, size_px, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+    )
+    fx, fy, cx, cy = (float(matrix[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx_std, fy_std, cx_std, cy_std = (float(e) for e in np.ravel(errors)[:4])
+    camera = Camera(*size_px, fx, fy, cx + 0.5, cy + 0.5, tuple(np.ravel(bend)[:5].tolist()))
+    return Intrinsics(camera, (fx_std, fy_std), (cx_std, cy_std), float(rms_px))

@@ -1,0 +1,110 @@
+"""Datasets to what a training learns from: images with their robots, some of them held out."""
+
+import fnmatch
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from dmrl.dataset import Dataset, Split
+from dmrl.errors import SettingError
+from dmrl.learn.batches import FIELDS, Examples
+from dmrl.learn.settings import FitSettings
+
+
+class Material(NamedTuple):
+    """Images to learn from, and what else a training needs.
+
+    Parameters
+    ----------
+    examples
+        To learn from.
+    held_out
+        To look at and to choose the threshold on: the split named val or, where there is none,
+        a share of the train split. None: nothing is held out.
+    shares
+        (N,) how often each of ``examples`` shall come in an epoch, 1 on average. None: once.
+    """
+
+    examples: Examples
+    held_out: Examples | None
+    shares: NDArray[np.float64] | None
+
+
+def material(data: Dataset, settings: FitSettings) -> Material:
+    """What a training with these settings learns from, and what it is watched on.
+
+    Raises
+    ------
+    DatasetError
+        If there is no train split.
+    SettingError
+        If the shares do not fit the recordings.
+    """
+    train = data.split("train")
+    every, sources = examples_of(train), np.array(train.table.column("source").to_pylist())
+    held = np.zeros(len(every), bool)
+    watched = examples_of(data.split("val")) if "val" in data.splits else None
+    if watched is None and settings.validation_share:
+        held = _last_of_each(sources, settings.validation_share)
+        watched = every.select(held) if held.any() else None
+    learnt = every.select(~held) if held.any() else every
+    return Material(learnt, watched, _shares(sources[~held], settings.shares))
+
+
+def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
+    """The last share of the images of each recording."""
+    held = np.zeros(len(sources), bool)
+    for source in np.unique(sources):
+        mine = np.flatnonzero(sources == source)
+        held[mine[len(mine) - int(share * len(mine)) :]] = True
+    return held
+
+
+def _shares(sources: NDArray[np.str_], wanted: dict[str, float]) -> NDArray[np.float64] | None:
+    """How often each image shall come in an epoch, by the shares of the recordings.
+
+    Raises
+    ------
+    SettingError
+        If a pattern fits no recording, or a recording fits none.
+    """
+    if not wanted:
+        return None
+    out = np.full(len(sources), np.nan)
+    names = sorted(set(sources.tolist()))
+    for pattern, share in wanted.items():
+        mine = np.isin(sources, fnmatch.filter(names, pattern)) & np.isnan(out)
+        if not mine.any():
+            raise SettingError(
+                f"shares: no images left for {pattern}. The recordings are {', '.join(names)}"
+            )
+        out[mine] = share / mine.sum()
+    if np.isnan(out).any():
+        forgotten = sources[np.isnan(out)][0]
+        raise SettingError(f'shares: none for {forgotten}. Name it, or add "*"')
+    if not out.sum():
+        raise SettingError("shares: all are 0. Give one that is not")
+    shares: NDArray[np.float64] = out / out.mean()
+    return shares
+
+
+def examples_of(split: Split) -> Examples:
+    """Images of a split with the robots in them."""
+    column = split.table.column("peers").combine_chunks()
+    counts = pc.list_value_length(column).to_numpy(zero_copy_only=False).astype(np.int64)
+    peers = column.flatten()
+    flat = np.full((len(peers), len(FIELDS)), np.nan, np.float32)
+    for index, name in enumerate(FIELDS[:6]):
+        flat[:, index] = pc.struct_field(peers, name).to_numpy(zero_copy_only=False)
+    boxes = pc.struct_field(peers, "box_px")
+    boxed = pc.list_value_length(boxes).to_numpy(zero_copy_only=False) == 4
+    corners = boxes.filter(pa.array(boxed)).flatten().to_numpy(zero_copy_only=False)
+    flat[boxed, 6:] = corners.reshape(-1, 4)
+    robots = np.full((len(counts), max(int(counts.max(initial=0)), 1), len(FIELDS)), np.nan)
+    image = np.repeat(np.arange(len(counts)), counts)
+    place = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
+    robots[image, place] = flat
+    return Examples(split.pixels, robots.astype(np.float32))

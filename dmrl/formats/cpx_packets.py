@@ -1,0 +1,148 @@
+"""CPX packets, the AI-deck's, out of a stream's bytes and back; counters that wrap.
+
+A packet is ``u16 length | u8 dst:3 src:3 last:1 | u8 function:6 version:2 | data``. Over TCP,
+Bitcraze's firmware counts the two bytes of routing in the length; the nanocockpit firmware
+does not.
+"""
+
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+STM32, ESP32, HOST, GAP8 = 1, 2, 3, 4
+APP, STREAMER = 5, 6
+
+ROUTE = struct.Struct("<HBB")
+PACKET_MAX_BYTES = 4094
+
+# To the host, from any chip; the functions that are defined; version 0. Little else looks so.
+PLAUSIBLE = re.compile(rb"[\x0b\x13\x23\x4b\x53\x63][\x01-\x06\x0e\x0f]")
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One CPX packet: where from, where to, for what, and its data."""
+
+    source: int
+    destination: int
+    function: int
+    data: bytes
+    last: bool = True
+
+
+class Unwrapped:
+    """A counter of few bits as one that does not wrap.
+
+    Parameters
+    ----------
+    bits
+        Of the counter.
+    forward
+        True: it never steps back, so that up to 2**bits - 1 may be missing. False: the
+        nearest value counts, before or after.
+    """
+
+    def __init__(self, bits: int, *, forward: bool = False) -> None:
+        self._period = 1 << bits
+        self._back = 0 if forward else self._period // 2
+        self._last: int | None = None
+
+    def __call__(self, value: int) -> int:
+        """The counter's value with its wraps added.
+
+        Examples
+        --------
+        >>> unwrapped = Unwrapped(8)
+        >>> [unwrapped(value) for value in (254, 255, 1, 0)]
+        [254, 255, 257, 256]
+        """
+        self._last = self.near(value)
+        return self._last
+
+    def near(self, value: int) -> int:
+        """The same, but the value is not remembered, and may have bits more than the counter."""
+        if self._last is None:
+            return value
+        return self._last + (value - self._last + self._back) % self._period - self._back
+
+
+class PacketReader:
+    """Packets out of a stream's bytes; finds its step again after bytes that are none.
+
+    Attributes
+    ----------
+    skipped_bytes
+        Bytes that belonged to no packet.
+    """
+
+    def __init__(self) -> None:
+        self.skipped_bytes = 0
+        self._buffer = bytearray()
+        self._in_step = True
+        self._streamer = False
+
+    def feed(self, data: bytes) -> Iterator[Packet]:
+        """The packets that are whole with these bytes."""
+        self._buffer += data
+        at = 0
+        while (step := self._step(at)) is not None:
+            at, packet = step
+            if packet is not None:
+                yield packet
+        del self._buffer[:at]
+
+    def _step(self, at: int) -> tuple[int, Packet | None] | None:
+        """Where to go on, with a packet if there is one at ``at``; None: more bytes wanted."""
+        size = self._size(at)
+        if size is None:
+            return None
+        end = at + ROUTE.size + size
+        if size >= 0 and not self._in_step:
+            # Four bytes may look like a header by chance; two in a row at the right distance
+            # do not.
+            after = self._size(end)
+            if after is None:
+                return None
+            size = size if after >= 0 else -1
+        if size < 0:
+            return self._skip(at)
+        if len(self._buffer) < end:
+            return None
+        _, route, function = ROUTE.unpack_from(self._buffer, at)
+        self._in_step = True
+        self._streamer |= function == STREAMER
+        data = bytes(self._buffer[at + ROUTE.size : end])
+        return end, Packet(route >> 3 & 7, route & 7, function & 63, data, bool(route & 64))
+
+    def _size(self, at: int) -> int | None:
+        """Bytes of data behind a header; -1 if it is none, None if it is not all there."""
+        if len(self._buffer) < at + ROUTE.size:
+            return None
+        length, _, function = ROUTE.unpack_from(self._buffer, at)
+        counted = 0 if self._streamer or function == STREAMER else 2
+        plausible = PLAUSIBLE.match(self._buffer, at + 2) and counted <= length <= PACKET_MAX_BYTES
+        return length - counted if plausible else -1
+
+    def _skip(self, at: int) -> tuple[int, None]:
+        found = PLAUSIBLE.search(self._buffer, at + 3)
+        end = found.start() - 2 if found else len(self._buffer) - ROUTE.size + 1
+        self._in_step = False
+        self.skipped_bytes += end - at
+        return end, None
+
+
+def pack_packet(packet: Packet) -> bytes:
+    """The bytes of a packet over TCP.
+
+    Raises
+    ------
+    ValueError
+        If its data is longer than a packet can be.
+    """
+    counted = 0 if packet.function == STREAMER else 2
+    length = len(packet.data) + counted
+    if length > PACKET_MAX_BYTES:
+        raise ValueError(f"a packet of {length} bytes; {PACKET_MAX_BYTES} at most")
+    route = packet.destination | packet.source << 3 | packet.last << 6
+    return ROUTE.pack(length, route, packet.function) + packet.data

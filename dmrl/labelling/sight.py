@@ -1,0 +1,273 @@
+"""What a recording says of one observer: its detections, how it moved, and its ranges."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.errors import MissingTopic, RecordingError
+from dmrl.estimation.camera_pose import Flight, PeerPath
+from dmrl.estimation.view import Motion, View
+from dmrl.geometry import Array, Camera
+from dmrl.messages import STATUS_OK
+from dmrl.recording import Summary, read_table
+
+LONGEST_GAP_S = 0.1
+"""A range further from an image than this says nothing about it."""
+
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One observer's detections with its own motion, image by image.
+
+    Parameters
+    ----------
+    robot
+        Its name.
+    camera
+        Its camera; no distortion if the images have none any more.
+    logged_ns, time_ns
+        (K,) log times of the images, and when they were taken.
+    detections
+        (M, 3) u and v in pixels, depth in metres, of all images.
+    first
+        (K + 1,) row of each image's first detection, and the end.
+    attitude_rad
+        (K, 2) roll and pitch.
+    path_m, yaw_rad
+        (K, 3) and (K,) where the observer was by its own sensors, in a frame fixed to ground,
+        and its heading there.
+    range_m
+        (K,) distances by peer, NaN where there was none.
+    warnings
+        One line for each thing that was missing.
+    """
+
+    robot: str
+    camera: Camera
+    logged_ns: Times
+    time_ns: Times
+    detections: Array
+    first: Times
+    attitude_rad: Array
+    path_m: Array
+    yaw_rad: Array
+    range_m: dict[str, Array]
+    warnings: list[str]
+
+    def motion(self, k: int) -> Motion:
+        """Of the observer between images k - 1 and k."""
+        if k == 0:
+            return Motion(0.0, np.zeros(3), 0.0)
+        c, s = np.cos(self.yaw_rad[k - 1]), np.sin(self.yaw_rad[k - 1])
+        x, y, z = self.path_m[k] - self.path_m[k - 1]
+        shift_m = np.array([c * x + s * y, -s * x + c * y, z])
+        dt_s = float(self.time_ns[k] - self.time_ns[k - 1]) * 1e-9
+        return Motion(dt_s, shift_m, float(self.yaw_rad[k] - self.yaw_rad[k - 1]))
+
+    def view(self, k: int) -> View:
+        """Detections of image k."""
+        rows = self.detections[self.first[k] : self.first[k + 1]]
+        roll_rad, pitch_rad = self.attitude_rad[k]
+        return View(rows[:, :2], rows[:, 2], float(roll_rad), float(pitch_rad))
+
+    def ranges(self, k: int) -> dict[str, float]:
+        """Distance by peer, metres, of those that were heard near image k."""
+        near = ((peer, float(values[k])) for peer, values in self.range_m.items())
+        return {peer: value for peer, value in near if np.isfinite(value)}
+
+
+def read_sight(
+    recording: Path, held: Summary, robot: str, camera: Camera, threshold: float | None
+) -> Sight:
+    """One observer of a recording.
+
+    Parameters
+    ----------
+    recording, held
+        With detections, and its summary.
+    robot
+        The observer.
+    camera
+        Its camera; no distortion if the images have none any more.
+    threshold
+        Least confidence of a detection; None: what the detector named.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read, or has no attitude of that robot.
+    """
+    logged_ns, detections, first = _detections(recording, robot, threshold)
+    time_ns = logged_ns - round(camera.delay_s * 1e9)
+    attitude = _attitude(recording, held, robot)
+    warnings: list[str] = []
+    yaw_rad, path_m = _path(recording, held, robot, attitude, time_ns, warnings)
+    return Sight(
+        robot,
+        camera,
+        logged_ns,
+        time_ns,
+        detections,
+        first,
+        np.column_stack([np.interp(time_ns, attitude[0], c) for c in attitude[1].T[:2]]),
+        path_m,
+        yaw_rad,
+        _ranges(recording, held, robot, time_ns),
+        warnings,
+    )
+
+
+def camera_flight(
+    recording: Path, held: Summary, robot: str, threshold: float | None, positions: str
+) -> Flight:
+    """What one observer saw and where its peers were, to calibrate its camera with.
+
+    Parameters
+    ----------
+    recording, held
+        With detections, attitude and positions, and its summary.
+    robot
+        The observer.
+    threshold
+        Least confidence of a detection; None: what the detector named.
+    positions
+        Pattern of the topics of positions, `topics.POSITION` or `topics.TRUTH`.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read, or lacks one of these.
+    """
+    links = {topic: topics.names(positions, topic) for topic in held.topics}
+    peers = {n["peer"]: topic for topic, n in links.items() if n and n["robot"] == robot}
+    if not peers:
+        raise MissingTopic(positions.format(robot=robot, peer="*"), held.topics, recording)
+    time_ns, detections, first = _detections(recording, robot, threshold)
+    attitude_ns, attitude = _attitude(recording, held, robot)
+
+    def seconds(at_ns: Times) -> Array:
+        return np.asarray((at_ns - held.start_ns) * 1e-9)
+
+    return Flight(
+        seconds(time_ns),
+        np.repeat(np.arange(len(time_ns)), np.diff(first)),
+        detections[:, :2],
+        seconds(attitude_ns),
+        attitude[:, :2],
+        {peer: _known(recording, topic, held.start_ns) for peer, topic in peers.items()},
+    )
+
+
+def _known(recording: Path, topic: str, start_ns: int) -> PeerPath:
+    """The positions of a topic that are OK."""
+    table = read_table(recording, topic)
+    table = table.filter(pc.equal(table["status"], STATUS_OK))
+    covariance = [row if len(row) == 9 else [0.0] * 9 for row in table["covariance"].to_pylist()]
+    return PeerPath(
+        (table["log_time"].to_numpy() - start_ns) * 1e-9,
+        np.column_stack([table[axis].to_numpy() for axis in "xyz"]),
+        np.reshape(covariance, (-1, 3, 3)),
+    )
+
+
+def _attitude(recording: Path, held: Summary, robot: str) -> tuple[Times, Array]:
+    """Times, and (N, 3) roll, pitch and yaw rate."""
+    topic = topics.attitude(robot)
+    if topic not in held.topics:
+        raise MissingTopic(topic, held.topics, recording)
+    found = _columns(recording, topic, "roll_rad", "pitch_rad", "yaw_rate_radps")
+    if found is None:
+        raise RecordingError(f"{recording}: {topic} holds no numbers. Try: dmrl info {recording}")
+    return found
+
+
+def _detections(recording: Path, robot: str, threshold: float | None) -> tuple[Times, Array, Times]:
+    """Log times of the images, what was detected, and where each image's begin."""
+    table = read_table(recording, topics.detections(robot)).combine_chunks()
+    lists = table["detections"].combine_chunks()
+    if hasattr(lists, "chunks"):
+        lists = lists.chunk(0)
+    flat = lists.flatten()
+    names = ("u_px", "v_px", "depth_m", "confidence")
+    values = np.column_stack([flat.field(name).to_numpy(zero_copy_only=False) for name in names])
+    image = np.repeat(np.arange(len(table)), np.diff(lists.offsets.to_numpy()))
+    least = np.array(table["threshold"].to_numpy()) if threshold is None else threshold
+    keep = (values[:, 3] >= np.broadcast_to(least, len(table))[image]) & (values[:, 2] > 0)
+    first = np.searchsorted(image[keep], np.arange(len(table) + 1))
+    return table["log_time"].to_numpy(), values[keep, :3].astype(float), first
+
+
+def _columns(recording: Path, topic: str, *fields: str) -> tuple[Times, Array] | None:
+    """Times and finite values of a topic; None where there are none."""
+    table = read_table(recording, topic, fields=fields)
+    values = np.column_stack([table[name].to_numpy() for name in fields]).astype(float)
+    good = np.isfinite(values).all(axis=1)
+    return (table["log_time"].to_numpy()[good], values[good]) if good.any() else None
+
+
+def _path(
+    recording: Path,
+    held: Summary,
+    robot: str,
+    attitude: tuple[Times, Array],
+    time_ns: Times,
+    warnings: list[str],
+) -> tuple[Array, Array]:
+    """(K,) heading and (K, 3) position at the images: yaw rate and velocity, summed up."""
+    at_ns, values = attitude
+    yaw_rad = _summed(at_ns, values[:, 2:])[:, 0]
+    path_m = np.zeros((len(time_ns), 3))
+    moving = _if_there(recording, held, topics.velocity(robot), "vx_mps", "vy_mps")
+    if moving is None:
+        warnings.append(f"{topics.velocity(robot)}: not there; {robot} is taken to stand still")
+    else:
+        heading = np.interp(moving[0], at_ns, yaw_rad)
+        forward = np.exp(1j * heading) * (moving[1] @ [1, 1j])
+        along = _summed(moving[0], np.column_stack([forward.real, forward.imag]))
+        for axis in range(2):
+            path_m[:, axis] = np.interp(time_ns, moving[0], along[:, axis])
+    high = _if_there(recording, held, topics.height(robot), "height_m")
+    if high is None:
+        warnings.append(f"{topics.height(robot)}: not there; {robot} is taken to keep its height")
+    else:
+        path_m[:, 2] = np.interp(time_ns, high[0], high[1][:, 0])
+    return np.interp(time_ns, at_ns, yaw_rad), path_m
+
+
+def _if_there(
+    recording: Path, held: Summary, topic: str, *fields: str
+) -> tuple[Times, Array] | None:
+    return _columns(recording, topic, *fields) if topic in held.topics else None
+
+
+def _summed(time_ns: Times, rate: Array) -> Array:
+    """(N, C) integral of rates per second from the first time on, by trapezia."""
+    steps = np.diff(time_ns)[:, None] * 1e-9 * (rate[1:] + rate[:-1]) / 2
+    return np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def _ranges(recording: Path, held: Summary, robot: str, time_ns: Times) -> dict[str, Array]:
+    """(K,) distance to each peer at the images, measured by either."""
+    found: dict[str, Array] = {}
+    for topic in held.topics:
+        link = topics.names(topics.RANGE, topic)
+        if link is None or robot not in link.values():
+            continue
+        peer = link["peer"] if link["robot"] == robot else link["robot"]
+        measured = _columns(recording, topic, "range_m")
+        if measured is None:
+            continue
+        at_ns, values = measured
+        after = np.minimum(np.searchsorted(at_ns, time_ns), len(at_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(time_ns - at_ns[before] < at_ns[after] - time_ns, before, after)
+        far = np.abs(at_ns[nearest] - time_ns) > LONGEST_GAP_S * 1e9
+        here = np.where(far, np.nan, values[nearest, 0])
+        found[peer] = np.fmin(found.get(peer, here), here)
+    return found

@@ -1,0 +1,256 @@
+"""New images out of old ones, with labels that stay true.
+
+An image is made of layers. A layer shows a window of one source image, turned, mirrored and
+zoomed, in a rectangle of the canvas: the whole canvas, the parts of a mosaic, or a patch cut
+out around one robot. One bilinear sampling a layer does all of the geometry.
+
+A camera of fixed intrinsics sees a robot z times as large when it is z times as near, so a
+zoom by z divides the depth by z. A turn about the optical axis keeps it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dmrl.learn.batches import BOX, DEPTH, Batch, Examples, Robots, U, V
+from dmrl.learn.layers import (
+    Rect,
+    Rng,
+    Window,
+    feather,
+    inside,
+    moved,
+    parts,
+    present,
+    sample,
+)
+
+MAX_ROBOTS = 12
+"""Robots of one canvas that are labelled, at most."""
+PATCH_MARGIN = 1.25
+"""Side of a pasted patch over that of the robot's box."""
+DISTRACTOR_SHARE = 0.4
+"""Share of patches that show any place of any image."""
+FOCUS_SHARE = 0.8
+"""Share of mosaic windows that hold a robot of their image; the rest fall where they may."""
+DEPTH_SLACK = 1.1
+"""How far beyond the nearest and the farthest label zooming may bring a robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """How images are varied. All zero: not at all.
+
+    Parameters
+    ----------
+    flip_share
+        Share of windows mirrored left to right.
+    zoom
+        Least and greatest magnification of a window; it is also kept to where the robot's
+        depth stays among those of the labels.
+    rotation_deg
+        Greatest turn about the optical axis, either way.
+    mosaic_share
+        Share of images put together from windows of two or four.
+    paste
+        Mean number of patches of other images pasted into one, most of them around a robot.
+    colour
+        Spread (one sigma) of contrast, brightness and each channel's gain, 0 to 1.
+    noise
+        Greatest sigma of sensor noise, 0 to 1 of full scale.
+    blur_share
+        Share of images that are slightly out of focus.
+    """
+
+    flip_share: float = 0.0
+    zoom: tuple[float, float] = (1.0, 1.0)
+    rotation_deg: float = 0.0
+    mosaic_share: float = 0.0
+    paste: float = 0.0
+    colour: float = 0.0
+    noise: float = 0.0
+    blur_share: float = 0.0
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether images stay as they are."""
+        return self == Augmentation()
+
+
+class Augmenter:
+    """Makes augmented batches of one set of examples.
+
+    Parameters
+    ----------
+    examples
+        The images to vary.
+    settings
+        How.
+    seed
+        Batches depend on the seed, the epoch and their place in it alone.
+    """
+
+    def __init__(self, examples: Examples, settings: Augmentation, *, seed: int) -> None:
+        self._examples, self._settings, self._seed = examples, settings, seed
+        self._height, self._width, _ = examples.image_shape
+        robots = examples.robots
+        there = np.isfinite(robots[..., U])
+        depths = robots[..., DEPTH][there]
+        self._depths = (
+            (float(depths.min()) / DEPTH_SLACK, float(depths.max()) * DEPTH_SLACK)
+            if len(depths)
+            else (0.0, math.inf)
+        )
+        self._pasteable = np.argwhere(there & np.isfinite(robots[..., BOX]).all(axis=-1))
+        self._grain = torch.empty(0)
+        if settings.noise:
+            grain = np.random.default_rng([seed, 1]).standard_normal(
+                2 * self._height * self._width * 3, np.float32
+            )
+            self._grain = torch.from_numpy(grain)
+
+    def batch(self, chosen: Sequence[int] | NDArray[np.int64], *, epoch: int, index: int) -> Batch:
+        """An augmented batch: one canvas for each of the chosen images.
+
+        Parameters
+        ----------
+        chosen
+            Numbers of images.
+        epoch, index
+            The epoch, and the batch's place in it.
+        """
+        rng = np.random.default_rng([self._seed, epoch, index])
+        canvas = torch.empty(len(chosen), self._height, self._width, 3)
+        robots = np.full((len(chosen), MAX_ROBOTS, 10), np.nan, np.float32)
+        for slot, number in enumerate(chosen):
+            found = self._draw(canvas[slot], int(number), rng)
+            robots[slot, : min(len(found), MAX_ROBOTS)] = found[:MAX_ROBOTS]
+        pixels = canvas.clamp_(0, 255).to(torch.uint8)
+        return Batch(pixels.permute(0, 3, 1, 2), torch.from_numpy(robots))
+
+    def _draw(self, canvas: Tensor, number: int, rng: Rng) -> Robots:
+        """Fill a canvas (H, W, 3); returns (n, 10) the robots in it."""
+        robots = np.empty((0, 10), np.float32)
+        whole = (0, 0, self._width, self._height)
+        mosaic = rng.random() < self._settings.mosaic_share
+        rects = parts(whole, rng) if mosaic else [whole]
+        others = rng.integers(len(self._examples), size=len(rects) - 1)
+        for rect, source in zip(rects, (number, *others.tolist()), strict=True):
+            robots = self._layer(canvas, rect, source, robots, rng)
+        for _ in range(int(rng.poisson(self._settings.paste))):
+            robots = self._patch(canvas, robots, rng)
+        self._spoil(canvas, rng)
+        return robots
+
+    def _layer(self, canvas: Tensor, rect: Rect, source: int, robots: Robots, rng: Rng) -> Robots:
+        """Show a window of a source in a rectangle; the robots of the canvas after it."""
+        width, height = rect[2] - rect[0], rect[3] - rect[1]
+        mine = present(self._examples.robots[source])
+        focus = mine[rng.integers(len(mine))] if len(mine) else None
+        zoom = self._zoom(focus, rng)
+        zoom = max(zoom, width / self._width, height / self._height)  # no look past the source
+        middle = np.array([self._width / 2, self._height / 2])
+        half = np.array([width, height]) / (2 * zoom)
+        low, high = half, np.maximum(2 * middle - half, half)
+        if focus is not None and rng.random() < FOCUS_SHARE:
+            nearest, farthest = (focus[[U, V]] + sign * half for sign in (-1, 1))
+            low, high = np.clip(nearest, low, high), np.clip(farthest, low, high)
+        window = self._window(rng.uniform(low, high), np.array([width, height]), zoom, rng)
+        return self._show(canvas, rect, source, window, mine, robots, rng)
+
+    def _patch(self, canvas: Tensor, robots: Robots, rng: Rng) -> Robots:
+        """Paste a robot of another image with what is close around it, or as much without one.
+
+        Without the latter, the edge of a patch would tell that a robot is in it.
+        """
+        if not len(self._pasteable):
+            return robots
+        source, which = self._pasteable[rng.integers(len(self._pasteable))].tolist()
+        robot = self._examples.robots[source, which]
+        zoom = self._zoom(robot, rng)
+        box = robot[BOX]
+        size = np.ceil(zoom * PATCH_MARGIN * np.array([box[2] - box[0], box[3] - box[1]])) + 8
+        room = np.array([self._width, self._height]) - size
+        if (room < 0).any():
+            return robots
+        left, top = np.floor(rng.uniform(0, room + 1)).astype(int).tolist()
+        rect = (left, top, left + int(size[0]), top + int(size[1]))
+        centre = np.array([box[0] + box[2], box[1] + box[3]]) / 2 + rng.uniform(-2, 2, 2)
+        if rng.random() < DISTRACTOR_SHARE:
+            source = int(rng.integers(len(self._examples)))
+            centre = rng.uniform((0, 0), (self._width, self._height))
+        window = self._window(centre, size, zoom, rng)
+        mine = present(self._examples.robots[source])
+        return self._show(canvas, rect, source, window, mine, robots, rng, soft=True)
+
+    def _zoom(self, robot: Robots | None, rng: Rng) -> float:
+        """A magnification, log-uniform; the robot's depth stays in the range of the labels."""
+        low, high = self._settings.zoom
+        if robot is not None:
+            depth_m = float(robot[DEPTH])
+            low = max(low, min(depth_m / self._depths[1], 1.0))
+            high = max(min(high, max(depth_m / self._depths[0], 1.0)), low)
+        return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+    def _window(
+        self, centre: NDArray[np.float64], size: NDArray[np.float64], zoom: float, rng: Rng
+    ) -> Window:
+        """The window of a rectangle of this size that looks at a source's point."""
+        most = math.radians(self._settings.rotation_deg)
+        angle = rng.uniform(-most, most)
+        mirror = -1.0 if rng.random() < self._settings.flip_share else 1.0
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        matrix = turn @ np.diag([mirror, 1.0]) / zoom
+        return Window(matrix, centre - matrix @ (np.asarray(size) / 2), zoom)
+
+    def _show(
+        self,
+        canvas: Tensor,
+        rect: Rect,
+        source: int,
+        window: Window,
+        mine: Robots,
+        robots: Robots,
+        rng: Rng,
+        *,
+        soft: bool = False,
+    ) -> Robots:
+        left, top, right, bottom = rect
+        pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
+        self._tint(pixels, rng)
+        place = canvas[top:bottom, left:right]
+        if soft:
+            place.lerp_(pixels, feather(bottom - top, right - left))
+        else:
+            place.copy_(pixels)
+        seen = moved(mine, window, rect)
+        kept = robots[~inside(robots, rect)]
+        return np.concatenate([kept, seen[inside(seen, rect) & self._in_source(mine)]])
+
+    def _in_source(self, robots: Robots) -> NDArray[np.bool_]:
+        return inside(robots, (0, 0, self._width, self._height))
+
+    def _tint(self, pixels: Tensor, rng: Rng) -> None:
+        """Other contrast, brightness and white balance, in place; 0 to 255."""
+        if spread := self._settings.colour:
+            gain = np.exp(rng.normal(0, spread, 1) + rng.normal(0, spread / 2, 3))
+            lift = 128 * (1 - gain) + rng.normal(0, 128 * spread, 1)
+            pixels.mul_(torch.from_numpy(gain.astype(np.float32)))
+            pixels.add_(torch.from_numpy(lift.astype(np.float32)))
+
+    def _spoil(self, canvas: Tensor, rng: Rng) -> None:
+        """Defocus and sensor noise, in place."""
+        if rng.random() < self._settings.blur_share:
+            share = rng.uniform(0.1, 1 / 3)
+            for lines in (canvas, canvas.transpose(0, 1)):
+                beside = lines[:-2] + lines[2:]
+                lines[1:-1].mul_(1 - 2 * share).add_(beside, alpha=share)
+        if self._settings.noise:
+            at = int(rng.integers(len(self._grain) - canvas.numel()))
+            grain = self._grain[at : at + canvas.numel()].view(canvas.shape)
+            canvas.add_(grain, alpha=255 * self._settings.noise * rng.random())

@@ -1,0 +1,155 @@
+"""Every setting of a training, with dmrl's own defaults."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from dmrl.learn.augment import Augmentation
+from dmrl.learn.losses import DepthLoss
+from dmrl.learn.targets import LabelNoise
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """How a network is trained.
+
+    Parameters
+    ----------
+    architecture
+        Name of the network.
+    epochs
+        Times that as many images are seen as there are.
+    batch_size
+        Images per step.
+    learning_rate
+        Of the optimizer, at the end of the warm-up.
+    final_learning_rate
+        At the last step, after a half cosine.
+    warmup_epochs
+        Epochs over which the learning rate rises linearly from zero.
+    weight_decay
+        Of AdamW, on convolution weights. 0: plain Adam.
+    ema_steps
+        Steps over which the weights that are kept are averaged. 0: the last weights are kept.
+    target_sigma_cells
+        Width (one sigma) of a robot in the confidence targets, cells. 0: one cell, as
+        published.
+    focus
+        Exponent of the focal confidence loss. 0: plain cross entropy.
+    confidence_weight
+        Factor of the confidence loss.
+    depth_loss
+        "log": absolute error of the log depth. "squared": squared error in m^2, as published.
+    depth_weight
+        Factor of the depth loss.
+    offset_weight
+        Factor of the sub-cell offset's loss, for networks that have the channels.
+    label_noise
+        What the labels' sigmas do: "ignore" them, "weight" the cells, or "soften" the targets.
+    shares
+        How much of an epoch comes from which recordings: patterns of their names, as in
+        { "flight-*" = 0.7, "renders*" = 0.3 }. Empty: every image once.
+    validation_share
+        Share of the training images held out, where the dataset has no split named val, to
+        choose the threshold on. The last of each recording, so that neighbours in time stay
+        together.
+    threshold
+        Confidence from which the model's detections are to be believed, 0 to 1. Without it,
+        that of the best F1 on the images held out, or 0.33 where none are.
+    flip_share
+        Share of windows mirrored left to right, 0 to 1.
+    zoom
+        Least and greatest magnification. Depth follows it, and stays among those of the labels.
+    rotation_deg
+        Greatest turn about the optical axis, either way.
+    mosaic_share
+        Share of images put together from windows of two or four, 0 to 1.
+    paste
+        Mean number of patches of other images pasted into one. Needs labels with boxes.
+    colour
+        Spread (one sigma) of contrast, brightness and white balance, 0 to 1.
+    noise
+        Greatest sigma of sensor noise, 0 to 1 of full scale.
+    blur_share
+        Share of images slightly out of focus, 0 to 1.
+    precision
+        What the network is trained in. "bfloat16": the body in bfloat16, weights, head and
+        losses in float32; half as long again as fast on CPUs that have it.
+    seed
+        Of the first weights, the order of the images and their augmentation.
+    device
+        Where to compute; auto takes CUDA where there is one.
+    """
+
+    architecture: str = "dmrl-nano"
+    epochs: int = 60
+    batch_size: int = 16
+    learning_rate: float = 4e-3
+    final_learning_rate: float = 1e-5
+    warmup_epochs: int = 2
+    weight_decay: float = 1e-2
+    ema_steps: int = 500
+    target_sigma_cells: float = 0.7
+    focus: float = 2.0
+    confidence_weight: float = 1.0
+    depth_loss: DepthLoss = "log"
+    depth_weight: float = 1.0
+    offset_weight: float = 0.5
+    label_noise: LabelNoise = "ignore"
+    shares: dict[str, float] = field(default_factory=dict)
+    validation_share: float = 0.1
+    threshold: float | None = None
+    flip_share: float = 0.5
+    zoom: tuple[float, float] = (0.6, 1.6)
+    rotation_deg: float = 8.0
+    mosaic_share: float = 0.5
+    paste: float = 0.0
+    colour: float = 0.05
+    noise: float = 0.01
+    blur_share: float = 0.1
+    precision: Literal["float32", "bfloat16"] = "float32"
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: must be at least 1")
+        if self.learning_rate <= 0 or not 0 <= self.final_learning_rate <= self.learning_rate:
+            raise ValueError("learning_rate: must be over 0 and not below final_learning_rate")
+        for name in NOT_NEGATIVE:
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: must not be negative")
+        for name in SHARES:
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 1:
+                raise ValueError(f"{name}: must be between 0 and 1")
+        if self.validation_share > 0.5:
+            raise ValueError("validation_share: must be at most 0.5")
+        if not 0 < self.zoom[0] <= self.zoom[1]:
+            raise ValueError("zoom: must be over 0, the lesser first")
+        if any(share < 0 for share in self.shares.values()):
+            raise ValueError("shares: must not be negative")
+
+    @property
+    def augmentation(self) -> Augmentation:
+        """The keys that say how images are varied."""
+        return Augmentation(
+            self.flip_share,
+            self.zoom,
+            self.rotation_deg,
+            self.mosaic_share,
+            self.paste,
+            self.colour,
+            self.noise,
+            self.blur_share,
+        )
+
+
+SHARES = (
+    *("validation_share", "threshold", "flip_share", "mosaic_share"),
+    *("blur_share", "colour", "noise"),
+)
+NOT_NEGATIVE = (
+    *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus"),
+    *("confidence_weight", "depth_weight", "offset_weight", "rotation_deg", "paste", "seed"),
+)

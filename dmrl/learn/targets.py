@@ -1,0 +1,130 @@
+"""What the network shall say in every cell, from the robots of an image.
+
+One rule gives both the paper's labels and softer ones. A robot is present in a cell by
+g = exp(-d^2 / 2 s^2), d the distance from the middle of the cell to the robot's centre in
+cells; at s = 0 g is 1 in the cell of the centre and 0 elsewhere (paper eq. 4). The cell's
+depth and offset are those of the robot that is most present there, the nearer one of equals.
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dmrl.learn.batches import DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, U, V
+
+PRESENT = 0.1
+"""Cells where g is below this learn neither depth nor offset."""
+TOLERANCE_PX, TOLERANCE_DEPTH = 8.0, 0.1
+"""A label with such a sigma (pixels; share of the depth) counts half."""
+
+LabelNoise = Literal["ignore", "weight", "soften"]
+
+
+class Targets(NamedTuple):
+    """Targets of N images, all float32.
+
+    Parameters
+    ----------
+    confidence
+        (N, rows, cols), 0 to 1.
+    confidence_weight
+        (N, rows, cols) weight of a cell in the confidence loss; 1 where labels are exact.
+    weight, offset_weight
+        (N, rows, cols) weight of a cell in the loss of the depth and of the offset; 0 away
+        from robots.
+    depth_m
+        (N, rows, cols) metres; 1 where the weight is 0.
+    offset
+        (N, 2, rows, cols) centre minus middle of the cell, (u, v), cells.
+    """
+
+    confidence: Tensor
+    confidence_weight: Tensor
+    weight: Tensor
+    offset_weight: Tensor
+    depth_m: Tensor
+    offset: Tensor
+
+
+def targets(
+    robots: Tensor,
+    shape: tuple[int, int],
+    *,
+    sigma_cells: float,
+    stride_px: int = 8,
+    label_noise: LabelNoise = "ignore",
+) -> Targets:
+    """Targets of a batch.
+
+    Parameters
+    ----------
+    robots
+        (N, K, 10), see ``batches.FIELDS``. A robot whose centre is outside the image is in no
+        cell, but may reach into it.
+    shape
+        Rows and columns of the grid.
+    sigma_cells
+        s of this module's rule.
+    stride_px
+        Pixels per cell, both ways.
+    label_noise
+        What the labels' sigmas do. "weight": a robot's cells count by
+        1 / (1 + (sigma / tolerance)^2). "soften": s^2 grows by the square of the sigma, the
+        height of g sinks with it, as the mean of g over where the robot may be.
+    """
+    robots = robots.to(torch.float32)
+    ahead = torch.isfinite(robots[..., :3]).all(dim=-1) & (robots[..., DEPTH] > 0)
+    clean = torch.nan_to_num(robots, nan=0.0)
+    centre = clean[..., (U, V)] / stride_px
+    sigma_px = (clean[..., SIGMA_U].square() + clean[..., SIGMA_V].square()).div(2).sqrt()
+    rows, cols = (torch.arange(n, device=robots.device) + 0.5 for n in shape)
+    du = centre[..., 0, None, None] - cols  # (N, K, 1, cols)
+    dv = centre[..., 1, None, None] - rows[:, None]  # (N, K, rows, 1)
+    present = _presence(du, dv, sigma_cells, sigma_px / stride_px, soften=label_noise == "soften")
+    present = present * ahead[..., None, None]
+    # A hair more presence for the nearer of equals.
+    rank = present * (1 + 1e-3 / (1 + clean[..., DEPTH, None, None]))
+    best = rank.argmax(dim=1, keepdim=True)
+
+    def of_best(values: Tensor) -> Tensor:
+        return values.expand(present.shape).gather(1, best)[:, 0]
+
+    confidence = present.amax(dim=1)
+    near = confidence * (confidence >= PRESENT)
+    trust_px, trust_depth = torch.ones_like(near), torch.ones_like(near)
+    if label_noise == "weight":
+        relative = clean[..., SIGMA_DEPTH] / clean[..., DEPTH].clamp(min=1e-3)
+        trust_px = of_best(_trust(sigma_px / TOLERANCE_PX))
+        trust_depth = of_best(_trust(relative / TOLERANCE_DEPTH))
+    found = near > 0
+    return Targets(
+        confidence,
+        torch.where(confidence > 0.01, trust_px, 1.0),
+        near * trust_depth,
+        near * trust_px,
+        torch.where(found, of_best(clean[..., DEPTH, None, None]), 1.0),
+        torch.stack((of_best(du), of_best(dv)), dim=1) * found[:, None],
+    )
+
+
+def _presence(
+    du: Tensor, dv: Tensor, sigma_cells: float, sigma_label: Tensor, *, soften: bool
+) -> Tensor:
+    """(N, K, rows, cols) g of every robot in every cell."""
+    if sigma_cells == 0:
+        # Half open, so that a centre on a border is in one cell.
+        inside: Tensor = (du >= -0.5) & (du < 0.5) & (dv >= -0.5) & (dv < 0.5)
+        return inside.to(torch.float32)
+    variance = torch.full_like(sigma_label, sigma_cells**2)
+    height = torch.ones_like(variance)
+    if soften:
+        height = variance / (variance + sigma_label.square())
+        variance = variance + sigma_label.square()
+    scale = (-0.5 / variance)[..., None, None]
+    # exp of a sum is the product of two small ones: rows and columns, not cells.
+    return (scale * du.square()).exp() * (scale * dv.square()).exp() * height[..., None, None]
+
+
+def _trust(ratio: Tensor) -> Tensor:
+    return (1 / (1 + ratio.square()))[..., None, None]

@@ -1,0 +1,84 @@
+"""How good a network is on images held out, and which threshold suits it."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dmrl.learn.batches import DEPTH, Examples, U, V, in_order
+from dmrl.learn.decode import decode
+from dmrl.learn.matching import Points
+from dmrl.learn.metrics import Scored, figures, score
+from dmrl.learn.model import grids_of
+from dmrl.learn.network import Network
+from dmrl.learn.settings import FitSettings
+from dmrl.learn.step import losses
+
+WATCHED = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
+"""Figures of ``metrics`` that are watched during a training."""
+EVERYWHERE = (0.0, np.inf)
+
+
+def validation_figures(
+    network: Network, examples: Examples, settings: FitSettings
+) -> dict[str, float]:
+    """Loss and figures on images held out, each name beginning with validation.
+
+    Parameters
+    ----------
+    network
+        In evaluation mode.
+    examples
+        Images held out, as they are.
+    settings
+        The recipe, for its losses and batch size.
+    """
+    total = 0.0
+    with torch.inference_mode():
+        for batch in in_order(examples, settings.batch_size):
+            total += float(losses(network, batch, settings).sum()) * len(batch.images)
+    scored = scores(network, examples)
+    found = figures(scored, EVERYWHERE, 0.5, np.ones((1, len(examples))))
+    watched = {f"validation_{name}": float(found[name][0]) for name in WATCHED}
+    return {"validation_loss": total / len(examples), **watched}
+
+
+def scores(network: Network, examples: Examples, batch_size: int = 16) -> Scored:
+    """A network's detections in images, matched with their labels."""
+    parts = []
+    for batch in in_order(examples, batch_size):
+        found = decode(*grids_of(network, batch.images), stride_px=network.stride_px)
+        image, place = np.nonzero(np.arange(found.u_px.shape[1]) < found.count[:, None])
+        columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
+        parts.append(Points(image, *(column[image, place] for column in columns)))
+    first = np.arange(0, len(examples), batch_size)
+    return score(len(examples), labels(examples), Points.concatenate(parts, first))
+
+
+def labels(examples: Examples) -> Points:
+    """Robots whose centres are inside the images."""
+    height_px, width_px, _ = examples.image_shape
+    robots = examples.robots.astype(np.float64)
+    u, v = robots[..., U], robots[..., V]
+    with np.errstate(invalid="ignore"):
+        inside = (u >= 0) & (u < width_px) & (v >= 0) & (v < height_px)
+    image, _ = np.nonzero(inside)
+    depth_m = robots[..., DEPTH][inside]
+    return Points(image, u[inside], v[inside], depth_m, np.ones(len(image)))
+
+
+def best_threshold(scored: Scored) -> float | None:
+    """Confidence that gives the best F1, detections right within 16 px; None without labels.
+
+    Halfway between the last detection that pays and the next below it, so that the choice does
+    not hang on one detection's last digits.
+    """
+    right: NDArray[np.bool_] = scored.right_16_px >= 0
+    if not len(scored.labels) or not right.any():
+        return None
+    descending = np.argsort(-scored.detections.confidence, kind="stable")
+    confidence = scored.detections.confidence[descending]
+    true = np.cumsum(right[descending])
+    f1 = 2 * true / (np.arange(1, len(true) + 1) + len(scored.labels))
+    best = int(np.argmax(f1))
+    below = confidence[best + 1] if best + 1 < len(confidence) else 0.0
+    return float((confidence[best] + below) / 2)

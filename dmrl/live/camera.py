@@ -1,0 +1,207 @@
+"""An AI-deck's camera over WiFi: its images as samples, connected again whenever it is lost."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.cpx import PORT, Image, ImageReader
+from dmrl.formats.sample import calibration
+from dmrl.formats.sample import image as image_sample
+from dmrl.geometry import AIDECK, Camera
+from dmrl.live.clocks import HostTime, SenderClock, SteadySender
+from dmrl.live.feed import Feed, Health, Received
+from dmrl.live.pictures import SENSOR_PX, Colours, Stored, encoded
+
+US = 1_000
+CONNECT_S = 3.0
+SILENT_S = 3.0
+RETRY_S = 1.0
+READ_BYTES = 1 << 16
+GARBAGE_BYTES = 1 << 20
+"""So many bytes without an image are no image stream."""
+
+RobotTime = Callable[[float], int | None]
+
+
+def address(text: str) -> tuple[str, int]:
+    """Host and port of "HOST:PORT", or "HOST" for the AI-deck's own port.
+
+    Raises
+    ------
+    SettingError
+        If it is neither.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon:
+        host, port = text, str(PORT)
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise SettingError(f"camera={text} is no HOST:PORT. Try camera=192.168.4.1:{PORT}")
+    return host, int(port)
+
+
+@dataclass(slots=True)
+class _Times:
+    """When images were taken, on this computer's time; of one connection.
+
+    The best that the camera tells counts: its image's time on the robot's clock, on its own,
+    or nothing but when it arrives.
+    """
+
+    robot_time: RobotTime
+    clock: SenderClock = field(default_factory=SenderClock)
+    steady: SteadySender = field(default_factory=SteadySender)
+
+    def __call__(self, image: Image, arrival_ns: int) -> int:
+        if image.robot_time_us is not None:
+            known = self.robot_time(image.robot_time_us / 1000)
+            if known is not None:
+                return known
+        if image.time_us is None:
+            return self.steady(arrival_ns)
+        self.clock.hear(image.time_us * US, arrival_ns)
+        return min(self.clock.host_ns(image.time_us * US), arrival_ns)
+
+
+class CameraClient(threading.Thread):
+    """One camera, from now until stopped.
+
+    Parameters
+    ----------
+    robot
+        That carries it.
+    host, port
+        Where it listens.
+    feed
+        Where the samples go: the calibration first, then images.
+    now
+        This computer's time.
+    colours
+        Whether raw images have colour filters before their pixels.
+    stored
+        See `encoded`.
+    camera
+        Its calibration; None: the AI-deck's, where the size fits.
+    robot_time
+        A time of the robot's clock, milliseconds, on this computer's; None while unknown.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        host: str,
+        port: int,
+        feed: Feed,
+        now: HostTime,
+        *,
+        colours: Colours = "colour",
+        stored: Stored = "png",
+        camera: Camera | None = None,
+        robot_time: RobotTime = lambda _: None,
+    ) -> None:
+        super().__init__(name=f"camera {robot}", daemon=True)
+        self.health = Health(f"{robot} camera")
+        self.robot, self._where = robot, (host, port)
+        self._feed, self._now = feed, now
+        self._form = colours, stored
+        self._camera, self._robot_time = camera, robot_time
+        self._stop_wanted = threading.Event()
+        self._size_px: tuple[int, int] | None = None
+        self._warned: set[str] = set()
+
+    def stop(self) -> None:
+        """Ask it to end; `join` waits for that."""
+        self._stop_wanted.set()
+
+    def run(self) -> None:
+        """Connect, hand on images, and again."""
+        while not self._stop_wanted.is_set():
+            why = self._connection()
+            if self._stop_wanted.is_set():
+                break
+            if self.health.state != why:
+                host, port = self._where
+                self._feed.say(f"{self.robot}: camera {why} at {host}:{port}; trying again")
+            self.health.state = why
+            self._stop_wanted.wait(RETRY_S)
+        self.health.state = "stopped"
+
+    def _connection(self) -> str:
+        """Listen until it ends. Why it ended."""
+        try:
+            with socket.create_connection(self._where, timeout=CONNECT_S) as connection:
+                connection.settimeout(0.2)
+                return self._listen(connection)
+        except ConnectionRefusedError:
+            return "refuses connections"
+        except TimeoutError:
+            return "does not answer"
+        except OSError as e:
+            return f"cannot be reached ({e.strerror or e})"
+
+    def _listen(self, connection: socket.socket) -> str:
+        reader, times = ImageReader(), _Times(self._robot_time)
+        self.health.connections += 1
+        broken, last_s, useless_bytes = 0, time.monotonic(), 0
+        frame_id: int | None = None
+        while not self._stop_wanted.is_set():
+            try:
+                data = connection.recv(READ_BYTES)
+            except TimeoutError:
+                if time.monotonic() - last_s > SILENT_S:
+                    return "is silent"
+                continue
+            if not data:
+                return "closed the connection"
+            last_s, arrival_ns = time.monotonic(), self._now()
+            useless_bytes += len(data)
+            for image in reader.feed(data):
+                self.health.state, useless_bytes = "connected", 0
+                frame_id = self._count(image, frame_id)
+                self._hand_on(image, times(image, arrival_ns), arrival_ns)
+            self.health.broken += reader.broken - broken
+            broken = reader.broken
+            if useless_bytes > GARBAGE_BYTES:
+                return "sends no CPX images"
+        return "stopped"
+
+    def _count(self, image: Image, before: int | None) -> int | None:
+        if image.frame_id is not None and before is not None:
+            self.health.lost += image.frame_id - before - 1
+        return image.frame_id
+
+    def _hand_on(self, image: Image, time_ns: int, arrival_ns: int) -> None:
+        try:
+            data, kind = encoded(image, *self._form)
+        except SourceError as e:
+            self.health.broken += 1
+            self._warn(f"{self.robot}: {e}")
+            return
+        self._calibrate((image.width_px, image.height_px), time_ns, arrival_ns)
+        self.health.last_arrival_ns = arrival_ns
+        self._feed.put(Received(image_sample(time_ns, self.robot, data, kind), arrival_ns))
+        self.health.received += 1
+
+    def _calibrate(self, sent_px: tuple[int, int], time_ns: int, arrival_ns: int) -> None:
+        """Hand on the calibration before the first image, if there is one of its size."""
+        size_px = (AIDECK.width_px, AIDECK.height_px) if sent_px == SENSOR_PX else sent_px
+        if size_px == self._size_px:
+            return
+        if self._size_px is not None:
+            self._warn(f"{self.robot}: images are {size_px} px now, {self._size_px} px before")
+        self._size_px = size_px
+        camera = self._camera or AIDECK
+        if (camera.width_px, camera.height_px) == size_px:
+            self._feed.put(Received(calibration(time_ns, self.robot, camera), arrival_ns))
+            return
+        self._warn(
+            f"{self.robot}: images are {size_px[0]} x {size_px[1]} px, the calibration is of "
+            f"{camera.width_px} x {camera.height_px} px and left out; labels will need one"
+        )
+
+    def _warn(self, line: str) -> None:
+        if line not in self._warned:
+            self._warned.add(line)
+            self._feed.say(line)

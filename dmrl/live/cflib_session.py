@@ -1,0 +1,162 @@
+"""cflib, loaded when a link is opened and not before. Its only home.
+
+It is GPL-3.0, and so an extra.
+"""
+
+import logging
+import socket
+import threading
+import time
+from typing import Any
+
+from dmrl.errors import MissingExtra, SettingError
+from dmrl.live.log_plan import SLOW_PERIOD_MS, Block, Plan
+
+UDP_BUFFER_BYTES = 1 << 22
+"""Asked for, so that a busy computer loses nothing; the system gives what it allows."""
+
+
+def load_cflib() -> None:
+    """Have cflib and its drivers ready.
+
+    Raises
+    ------
+    MissingExtra
+        If it is not installed.
+    """
+    try:
+        import cflib.crtp  # noqa: PLC0415 - an extra
+        from cflib.crazyflie import Crazyflie  # noqa: F401, PLC0415
+    except ModuleNotFoundError as e:
+        if (e.name or "").split(".")[0] != "cflib":
+            raise
+        raise MissingExtra("cflib", "record", "dmrl record") from None
+    log = logging.getLogger("cflib")
+    if not log.handlers:
+        # It would print what `Health` says better.
+        log.addHandler(logging.NullHandler())
+        log.propagate = False
+    if not cflib.crtp.CLASSES:
+        cflib.crtp.init_drivers()
+
+
+def check_uri(uri: str) -> None:
+    """Nothing, if a driver of cflib takes such an address.
+
+    Raises
+    ------
+    MissingExtra
+        If cflib is not installed.
+    SettingError
+        If none does.
+    """
+    load_cflib()
+    scheme, rest = uri.partition("://")[::2]
+    host, port = rest.rpartition(":")[::2]
+    bad_port = scheme in ("udp", "tcp") and not (host and port.isdecimal() and int(port) < 65536)
+    if scheme not in ("radio", "usb", "udp", "tcp") or not rest or bad_port:
+        raise SettingError(
+            f"{uri} is no address of a Crazyflie. Try radio://0/80/2M/E7E7E7E7E7 or "
+            "udp://127.0.0.1:19850"
+        )
+
+
+class Session:
+    """One use of a link: opened, started, closed.
+
+    Parameters
+    ----------
+    cache
+        Folder where cflib keeps the drones' tables of contents.
+
+    Attributes
+    ----------
+    ready
+        Set when the drone's log can be asked for.
+    lost, refused
+        Why the link ended, or a block was not taken; empty while all is well.
+    last_packet_s
+        When something came last, monotonic; 0: never.
+    """
+
+    def __init__(self, cache: str) -> None:
+        from cflib.crazyflie import Crazyflie  # noqa: PLC0415 - an extra
+
+        crazyflie = Crazyflie(rw_cache=cache)
+        self.ready = threading.Event()
+        self.lost = ""
+        self.refused = ""
+        self.last_packet_s = self._opened_s = 0.0
+        self._drone = crazyflie
+        self._configs: list[Any] = []
+        # Closing a link would send a set-point of zero, which drops a drone that flies by
+        # itself.
+        crazyflie.commander.send_setpoint = lambda *_: None
+        crazyflie.connected.add_callback(lambda _: self.ready.set())
+        crazyflie.connection_failed.add_callback(self._gone)
+        crazyflie.connection_lost.add_callback(self._gone)
+        crazyflie.packet_received.add_callback(self._heard)
+
+    def open(self, uri: str) -> None:
+        """Begin to connect; `ready` or `lost` says how it went."""
+        self._drone.open_link(uri)
+        self._opened_s = time.monotonic()
+        link = getattr(self._drone.link, "socket", None)
+        if isinstance(link, socket.socket):
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER_BYTES)
+
+    def silent_s(self) -> float:
+        """For how long nothing came."""
+        return time.monotonic() - max(self.last_packet_s, self._opened_s)
+
+    def toc(self) -> dict[str, str]:
+        """Type of each log variable."""
+        groups = self._drone.log.toc.toc
+        return {
+            f"{group}.{name}": element.ctype
+            for group, elements in groups.items()
+            for name, element in elements.items()
+        }
+
+    def start(self, wanted: Plan, take: Any) -> None:
+        """Have the drone send all blocks.
+
+        Raises
+        ------
+        SettingError
+            If cflib does not take a block.
+        """
+        for number, block in enumerate(wanted.blocks):
+            config = self._config(number, block)
+            config.data_received_cb.add_callback(take)
+            config.error_cb.add_callback(self._refuse)
+            try:
+                self._drone.log.add_config(config)
+            except (KeyError, AttributeError) as e:
+                raise SettingError(f"cflib takes no block {number}: {e}. Log less") from e
+            config.start()
+            self._configs.append(config)
+
+    def _config(self, number: int, block: Block) -> Any:
+        from cflib.crazyflie.log import LogConfig  # noqa: PLC0415 - an extra
+
+        name = "slow" if block.period_ms == SLOW_PERIOD_MS else f"block {number}"
+        config = LogConfig(name, block.period_ms)
+        for variable in block.variables:
+            config.add_variable(variable.name, variable.sent_as)
+        return config
+
+    def close(self) -> None:
+        """Stop the blocks and end the link."""
+        for config in self._configs:
+            config.stop()
+        self._drone.close_link()
+
+    def _gone(self, _uri: str, why: str) -> None:
+        self.lost = why or "lost"
+
+    def _refuse(self, _block: Any, why: str) -> None:
+        self.refused = why
+
+    def _heard(self, _packet: Any) -> None:
+        self.last_packet_s = time.monotonic()

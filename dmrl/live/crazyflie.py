@@ -1,0 +1,220 @@
+"""A link to a Crazyflie: its log as samples."""
+
+import math
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from dmrl.errors import SettingError
+from dmrl.formats.cpx_packets import Unwrapped
+from dmrl.live.cflib_session import Session
+from dmrl.live.clocks import HostTime, SenderClock
+from dmrl.live.feed import Feed, Health, Received
+from dmrl.live.log_plan import Plan, Reading, plan
+
+MS = 1_000_000
+TIMESTAMP_BITS = 24
+SILENT_S = 5.0
+"""Without a log packet for so long, a link is taken to be dead."""
+FIRST_ANSWER_S, NEXT_ANSWER_S = 2.0, 5.0
+"""Without an answer for so long, setting up is given up; all of it may take much longer."""
+RETRY_S = 1.0
+
+
+@dataclass(slots=True)
+class _Stream:
+    """What is known of the packets of one block."""
+
+    period_ms: int
+    last_ms: int | None = None
+
+    def lost_before(self, time_ms: int) -> int:
+        """Packets that are missing between the last one and this."""
+        last, self.last_ms = self.last_ms, time_ms
+        return 0 if last is None else max(round((time_ms - last) / self.period_ms) - 1, 0)
+
+
+@dataclass(slots=True)
+class _Flight:
+    """What one connection's packets become.
+
+    A new one for each connection: the drone may have been started anew, its clock with it.
+    """
+
+    reading: Reading
+    clock: SenderClock = field(default_factory=SenderClock)
+    streams: dict[str, _Stream] = field(default_factory=dict)
+    unwrapped: Unwrapped = field(default_factory=lambda: Unwrapped(TIMESTAMP_BITS))
+    held: list[tuple[int, Mapping[str, float], int]] = field(default_factory=list)
+
+    def take(
+        self, block: str, timestamp: int, values: Mapping[str, float], arrival_ns: int
+    ) -> Iterator[Received]:
+        """Samples that can be told the time of now."""
+        time_ms = self.unwrapped(timestamp)
+        self.clock.hear(time_ms * MS, arrival_ns)
+        self.held.append((time_ms, values, arrival_ns))
+        if self.clock.settled:
+            yield from self.rest()
+
+    def rest(self) -> Iterator[Received]:
+        """Samples of all packets that wait for the clock."""
+        held, self.held = self.held, []
+        for time_ms, values, arrival_ns in held:
+            for sample in self.reading.samples(self.clock.host_ns(time_ms * MS), values):
+                yield Received(sample, arrival_ns)
+
+
+class Link(threading.Thread):
+    """One drone's log, from now until stopped, connected again whenever it is lost.
+
+    Never sends a set-point: a drone in the air stays there whatever happens to this program.
+
+    Parameters
+    ----------
+    robot
+        Its name.
+    uri
+        Its address, as cflib takes it.
+    peers
+        See `plan`.
+    period_ms
+        See `plan`.
+    feed
+        Where the samples go.
+    now
+        This computer's time.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        uri: str,
+        peers: Mapping[int, str],
+        period_ms: int,
+        feed: Feed,
+        now: HostTime,
+    ) -> None:
+        super().__init__(name=f"link {robot}", daemon=True)
+        self.health = Health(robot)
+        self.robot, self.uri = robot, uri
+        self.reading: Reading | None = None
+        self._peers, self._period_ms, self._feed, self._now = peers, period_ms, feed, now
+        self._stop_wanted = threading.Event()
+        self._flight: _Flight | None = None
+        self._lock = threading.Lock()
+        self._fault: Exception | None = None
+
+    def stop(self) -> None:
+        """Ask it to end; `join` waits for that."""
+        self._stop_wanted.set()
+
+    def robot_time(self, robot_ms: float) -> int | None:
+        """A time of the drone's clock on this computer's; None while that is not known.
+
+        Parameters
+        ----------
+        robot_ms
+            With all bits, or with those of the log's time stamps only.
+        """
+        flight = self._flight
+        if flight is None or not flight.clock.settled:
+            return None
+        whole_ms = math.floor(robot_ms)
+        near_ms = flight.unwrapped.near(whole_ms) + (robot_ms - whole_ms)
+        return flight.clock.host_ns(round(near_ms * MS))
+
+    def run(self) -> None:
+        """Connect, hand on samples, and again."""
+        with TemporaryDirectory(prefix="dmrl-record-") as cache:
+            while not self._stop_wanted.is_set():
+                try:
+                    self._connection(cache)
+                except SettingError as e:
+                    self.health.state = str(e)
+                    self._feed.say(str(e))
+                    return
+                self._stop_wanted.wait(RETRY_S)
+
+    def _connection(self, cache: str) -> None:
+        session = Session(cache)
+        try:
+            why = self._set_up(session)
+            if why is None:
+                why = self._listen(session)
+        finally:
+            session.close()
+            self._let_go()
+        if self._stop_wanted.is_set() and self.health.connections:
+            self.health.state = "stopped"
+            return
+        if self.health.state != why:
+            self._feed.say(f"{self.robot}: {why} at {self.uri}; trying again")
+        self.health.state = why
+
+    def _set_up(self, session: Session) -> str | None:
+        """Connect and start the blocks. Why it failed, or None."""
+        session.open(self.uri)
+        while not session.ready.wait(0.1):
+            if session.lost or self._stop_wanted.is_set():
+                return "nobody answers" if not session.last_packet_s else "lost while connecting"
+            if session.silent_s() > (NEXT_ANSWER_S if session.last_packet_s else FIRST_ANSWER_S):
+                return "nobody answers" if not session.last_packet_s else "stopped answering"
+        wanted = plan(session.toc(), self._peers, self._period_ms, robot=self.robot)
+        self._report_missing(wanted)
+        flight = _Flight(Reading(self.robot, wanted))
+        self._flight, self.reading = flight, flight.reading
+        session.start(wanted, self._take)
+        return None
+
+    def _report_missing(self, wanted: Plan) -> None:
+        missing = sorted(set(self._peers.values()) - set(wanted.peers.values()))
+        if missing and not self.health.connections:
+            self._feed.say(f"{self.robot} logs no distance to {', '.join(missing)}")
+
+    def _listen(self, session: Session) -> str:
+        """Wait for the end. Why it ended."""
+        self.health.state = "connected"
+        self.health.connections += 1
+        self.health.last_arrival_ns = self._now()
+        while not self._stop_wanted.wait(0.1):
+            if self._fault is not None:
+                raise self._fault
+            if session.lost:
+                return "lost"
+            if session.refused:
+                return f"refuses to log: {session.refused}"
+            if self._now() - self.health.last_arrival_ns > SILENT_S * 1e9:
+                return "silent"
+        return "stopped"
+
+    def _take(self, timestamp: int, values: Mapping[str, float], block: Any) -> None:
+        """Called by cflib's thread with each packet; cflib swallows what is raised there."""
+        arrival_ns = self._now()
+        try:
+            self._take_at(arrival_ns, timestamp, values, block)
+        except Exception as e:
+            self._fault = e
+
+    def _take_at(
+        self, arrival_ns: int, timestamp: int, values: Mapping[str, float], block: Any
+    ) -> None:
+        with self._lock:
+            flight = self._flight
+            if flight is None:
+                return
+            self.health.received += 1
+            self.health.last_arrival_ns = arrival_ns
+            for received in flight.take(block.name, timestamp, values, arrival_ns):
+                self._feed.put(received)
+            stream = flight.streams.setdefault(block.name, _Stream(block.period_in_ms))
+            self.health.lost += stream.lost_before(flight.unwrapped(timestamp))
+
+    def _let_go(self) -> None:
+        with self._lock:
+            if self._flight is not None:
+                for received in self._flight.rest():
+                    self._feed.put(received)
+            self._flight = None

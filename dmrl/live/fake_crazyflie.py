@@ -1,0 +1,253 @@
+"""A Crazyflie that is not there: the CRTP log protocol over UDP.
+
+One CRTP packet per datagram, as cflib's ``udp://`` driver sends them: a header byte
+``port:4 link:2 channel:2``, then at most 30 bytes. Answered is what cflib asks for until it
+is connected (link, platform, log, memories, parameters), and then log blocks are sent.
+"""
+
+import errno
+import socket
+import struct
+import threading
+import zlib
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dmrl.errors import SettingError
+from dmrl.live.fake_flight import FakeFlight, Faults, FlightClock
+from dmrl.live.log_plan import BLOCK_BYTES, BLOCKS_MAX
+
+PARAM, COMMANDER, MEMORY, LOG, GENERIC, PLATFORM, LINK = 2, 3, 4, 5, 7, 13, 15
+PROTOCOL_VERSION = 10
+LOG_TYPES = {
+    "uint8_t": (1, "B"),
+    "uint16_t": (2, "H"),
+    "uint32_t": (3, "I"),
+    "int8_t": (4, "b"),
+    "int16_t": (5, "h"),
+    "int32_t": (6, "i"),
+    "float": (7, "f"),
+    "FP16": (8, "e"),
+}
+FORMATS = dict(LOG_TYPES.values())
+PARAMETERS = (
+    ("firmware.revision0", 0x0A | 0x40, struct.pack("<I", 0x0D32A1)),
+    ("stabilizer.estimator", 0x08, b"\x02"),
+)
+POLL_S = 0.05
+Address = tuple[str, int]
+
+
+@dataclass(slots=True)
+class _Block:
+    """A log block: (index of the variable, format it is sent in) each, and when it is due."""
+
+    variables: list[tuple[int, str]] = field(default_factory=list)
+    period_ms: int = 0
+    due_ms: float = 0.0
+    to: Address = ("", 0)
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize("<" + "".join(kind for _, kind in self.variables))
+
+
+class FakeCrazyflie(threading.Thread):
+    """One drone, from now until stopped.
+
+    Parameters
+    ----------
+    robot
+        Its name.
+    address
+        Host and port to listen at.
+    flight
+        What it measures.
+    clock
+        Common time of the flight.
+    faults
+        What goes wrong.
+    seed
+        Which packets are dropped.
+
+    Raises
+    ------
+    SettingError
+        If the port cannot be had.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        address: Address,
+        flight: FakeFlight,
+        clock: FlightClock,
+        faults: Faults,
+        seed: int,
+    ) -> None:
+        super().__init__(name=f"fake {robot}", daemon=True)
+        self.robot, self.sent, self.dropped, self.setpoints = robot, 0, 0, 0
+        self._variables = list(flight.variables().items())
+        self._clock, self._faults = clock, faults
+        self._chance = np.random.default_rng(seed)
+        self._blocks: dict[int, _Block] = {}
+        self._stop_wanted = threading.Event()
+        self._rows = [_row(name, LOG_TYPES[v.kind][0]) for name, v in self._variables]
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(address)
+        except OSError as e:
+            self._socket.close()
+            host, port = address
+            why = e.strerror or e
+            raise SettingError(f"udp://{host}:{port}: {why}. Name another --uri") from None
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return int(self._socket.getsockname()[1])
+
+    def stop(self) -> None:
+        """Ask it to end; `join` waits for that."""
+        self._stop_wanted.set()
+
+    def close(self) -> None:
+        """Give the port back, if it was never started."""
+        if self.ident is None:
+            self._socket.close()
+
+    def run(self) -> None:
+        """Answer and log."""
+        with self._socket:
+            while not self._stop_wanted.is_set():
+                now_s = self._clock.now_s()
+                dead = self._faults.dead(now_s)
+                if dead:
+                    self._blocks.clear()
+                self._socket.settimeout(self._wait_s(now_s))
+                with suppress(TimeoutError, ConnectionError):  # the latter: a client is gone
+                    packet, sender = self._socket.recvfrom(64)
+                    if packet and not dead:
+                        self._answer(packet, sender)
+                if not dead:
+                    self._send_due()
+
+    def _wait_s(self, now_s: float) -> float:
+        running = [block.due_ms for block in self._blocks.values() if block.period_ms]
+        if not running:
+            return POLL_S
+        due_s = self._faults.reached_s(min(running), now_s)
+        return min(max((due_s - now_s) / self._clock.speed, 1e-4), POLL_S)
+
+    def _send_due(self) -> None:
+        now_s = self._clock.now_s()
+        shown_ms = self._faults.clock_ms(now_s)
+        for number, block in list(self._blocks.items()):
+            while block.period_ms and block.due_ms <= shown_ms and now_s < self._clock.end_s:
+                self._log(number, block, self._faults.reached_s(block.due_ms, now_s))
+                block.due_ms += block.period_ms
+
+    def _log(self, number: int, block: _Block, time_s: float) -> None:
+        if self._chance.random() < self._faults.drop:
+            self.dropped += 1
+            return
+        stamp = struct.pack("<I", int(block.due_ms) % (1 << 24))[:3]
+        values = b"".join(
+            struct.pack("<" + kind, _fitting(kind, self._variables[index][1].at(time_s)))
+            for index, kind in block.variables
+        )
+        self._send(LOG, 2, bytes([number]) + stamp + values, block.to)
+        self.sent += 1
+
+    def _send(self, port: int, channel: int, data: bytes, to: Address) -> None:
+        with suppress(ConnectionError):  # whoever listened may be gone
+            self._socket.sendto(bytes([port << 4 | 3 << 2 | channel]) + data, to)
+
+    def _answer(self, packet: bytes, sender: Address) -> None:
+        port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
+        reply: bytes | None = None
+        if port == LINK:
+            reply = data if channel in (0, 3) else b"Bitcraze Crazyflie\0"
+        elif port == PLATFORM and channel == 1 and data[:1] == b"\0":
+            reply = bytes([0, PROTOCOL_VERSION])
+        elif port == MEMORY and channel == 0 and data[:1] == b"\1":
+            reply = b"\1\0"
+        elif port == LOG and channel == 0:
+            reply = _contents(data, self._rows, zlib.crc32(b"".join(self._rows)))
+        elif port == LOG and channel == 1 and data:
+            reply = self._control(data, sender)
+        elif port == PARAM:
+            reply = _parameter(channel, data)
+        elif port in (COMMANDER, GENERIC):
+            self.setpoints += 1
+        if reply is not None:
+            self._send(port, channel, reply, sender)
+
+    def _control(self, data: bytes, sender: Address) -> bytes:
+        """Do what a log command says; the answer is command, block, error number."""
+        command, number = data[0], data[1] if len(data) > 1 else 0
+        if command == 5:  # reset
+            self._blocks.clear()
+        elif command in (6, 7):  # create, append
+            return bytes([command, number, self._create(command == 6, number, data[2:])])
+        elif number not in self._blocks:
+            return bytes([command, number, errno.ENOENT])
+        elif command == 2:  # delete
+            del self._blocks[number]
+        elif command in (3, 4):  # start, stop
+            self._start(self._blocks[number], 10 * data[2] if command == 3 else 0, sender)
+        return bytes([command, number, 0])
+
+    def _create(self, new: bool, number: int, data: bytes) -> int:
+        if new and number in self._blocks:
+            return errno.EEXIST
+        if new and len(self._blocks) >= BLOCKS_MAX:
+            return errno.ENOMEM
+        block = _Block() if new else self._blocks[number]
+        for kind, index in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
+            if index >= len(self._variables) or kind & 15 not in FORMATS:
+                return errno.ENOENT
+            block.variables.append((index, FORMATS[kind & 15]))
+        if block.size > BLOCK_BYTES:
+            return errno.E2BIG
+        self._blocks[number] = block
+        return 0
+
+    def _start(self, block: _Block, period_ms: int, sender: Address) -> None:
+        if period_ms:
+            self._clock.take_off()
+        shown_ms = self._faults.clock_ms(self._clock.now_s())
+        block.due_ms = float(np.ceil(shown_ms / max(period_ms, 1)) * period_ms)
+        block.period_ms, block.to = period_ms, sender
+
+
+def _fitting(kind: str, value: float) -> float | int:
+    return value if kind in "fe" else round(value)
+
+
+def _row(name: str, kind: int) -> bytes:
+    return bytes([kind]) + name.replace(".", "\0").encode() + b"\0"
+
+
+def _contents(data: bytes, rows: list[bytes], crc: int) -> bytes | None:
+    """The answer to a question about a table of contents, version 2."""
+    if data[:1] == b"\3":
+        return struct.pack("<BHIBB", 3, len(rows), crc, BLOCKS_MAX, 128)
+    if data[:1] == b"\2" and len(data) >= 3:
+        index = struct.unpack_from("<H", data, 1)[0]
+        return data[:3] + rows[index] if index < len(rows) else data[:3]
+    return None
+
+
+def _parameter(channel: int, data: bytes) -> bytes | None:
+    if channel == 0:
+        rows = [_row(name, kind) for name, kind, _ in PARAMETERS]
+        return _contents(data, rows, zlib.crc32(b"".join(rows)))
+    if channel in (1, 2) and len(data) >= 2:
+        index = struct.unpack_from("<H", data)[0]
+        if index >= len(PARAMETERS):
+            return data[:2] + bytes([errno.ENOENT])
+        return data[:2] + b"\0" + PARAMETERS[index][2] if channel == 1 else data
+    return None

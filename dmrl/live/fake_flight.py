@@ -1,0 +1,165 @@
+"""A flight as a drone that is not there would log it."""
+
+import math
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmrl.geometry import Array
+from dmrl.live.log_plan import number_of
+
+Signal = tuple[Array, Array]
+"""Times (N,), seconds since take-off, and values (N,)."""
+
+BATTERY_FULL_V, BATTERY_EMPTY_V, BATTERY_S = 4.15, 3.3, 420.0
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """One log variable: its type as cflib names it, and what it was over the flight."""
+
+    kind: str
+    signal: Signal
+
+    def at(self, time_s: float) -> float:
+        """The last value before a time."""
+        times, values = self.signal
+        return float(values[max(int(np.searchsorted(times, time_s, side="right")) - 1, 0)])
+
+
+@dataclass(frozen=True, slots=True)
+class FakeFlight:
+    """What one robot measured.
+
+    Parameters
+    ----------
+    attitude
+        (N,), (N, 4): roll, pitch, yaw (rad), yaw rate (rad/s), as in dmrl.v1.Attitude.
+    velocity
+        (N,), (N, 2): forward, left (m/s).
+    height
+        (N,), (N,): metres.
+    ranges
+        Distances to each peer, (N,), (N,), metres.
+    """
+
+    attitude: tuple[Array, Array]
+    velocity: tuple[Array, Array]
+    height: Signal
+    ranges: Mapping[str, Signal]
+
+    @property
+    def end_s(self) -> float:
+        """When it lands."""
+        return float(self.attitude[0][-1])
+
+    def variables(self) -> dict[str, Variable]:
+        """Log variables, with the units and signs of the Crazyflie's firmware."""
+        time_s, (roll, pitch, yaw, yaw_rate) = self.attitude[0], self.attitude[1].T
+        vx, vy = (np.interp(time_s, self.velocity[0], part) for part in self.velocity[1].T)
+        roll_rate, pitch_rate = np.gradient(roll, time_s), np.gradient(pitch, time_s)
+        body = (
+            roll_rate - np.sin(pitch) * yaw_rate,
+            np.cos(roll) * pitch_rate + np.sin(roll) * np.cos(pitch) * yaw_rate,
+            np.cos(roll) * np.cos(pitch) * yaw_rate - np.sin(roll) * pitch_rate,
+        )
+        floats = {
+            "stateEstimate.vx": np.cos(yaw) * vx - np.sin(yaw) * vy,
+            "stateEstimate.vy": np.sin(yaw) * vx + np.cos(yaw) * vy,
+            "stateEstimate.roll": np.degrees(roll),
+            "stateEstimate.pitch": -np.degrees(pitch),
+            "stateEstimate.yaw": np.degrees((yaw + np.pi) % (2 * np.pi) - np.pi),
+        }
+        floats |= {f"gyro.{axis}": np.degrees(rate) for axis, rate in zip("xyz", body, strict=True)}
+        known = {name: Variable("float", (time_s, values)) for name, values in floats.items()}
+        known["stateEstimate.z"] = Variable("float", self.height)
+        millimetres = np.clip(np.rint(1000 * self.height[1]), 0, 65535)
+        known["range.zrange"] = Variable("uint16_t", (self.height[0], millimetres))
+        for peer, (ranged_s, range_m) in self.ranges.items():
+            # Before the first ranging, the firmware's variable is 0.
+            distance = np.concatenate([[-math.inf], ranged_s]), np.concatenate([[0.0], range_m])
+            known[f"ranging.distance{number_of(peer)}"] = Variable("float", distance)
+        left_v = BATTERY_FULL_V - (BATTERY_FULL_V - BATTERY_EMPTY_V) * time_s / BATTERY_S
+        known["pm.vbat"] = Variable("float", (time_s, np.maximum(left_v, BATTERY_EMPTY_V)))
+        return known
+
+
+class FlightClock:
+    """Time of a flight that begins when somebody listens.
+
+    Parameters
+    ----------
+    speed
+        Seconds of the flight per second.
+    end_s
+        When it ends, seconds since take-off.
+    """
+
+    def __init__(self, speed: float, end_s: float) -> None:
+        self.speed, self.end_s = speed, end_s
+        self._start_s: float | None = None
+        self._lock = threading.Lock()
+
+    def take_off(self) -> None:
+        """Begin, if it has not begun."""
+        with self._lock:
+            if self._start_s is None:
+                self._start_s = time.monotonic()
+
+    @property
+    def flying(self) -> bool:
+        """Whether it has begun."""
+        return self._start_s is not None
+
+    @property
+    def landed(self) -> bool:
+        """Whether it is over."""
+        return self.flying and self.now_s() >= self.end_s
+
+    def now_s(self) -> float:
+        """Seconds since take-off; 0 before."""
+        if self._start_s is None:
+            return 0.0
+        return (time.monotonic() - self._start_s) * self.speed
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What goes wrong with a fake drone.
+
+    Parameters
+    ----------
+    drop
+        Share of log packets and images that are not sent.
+    dead_s
+        First and last second of the flight in which it is silent; it starts anew after it.
+    boot_ms
+        What its clock shows at take-off.
+    drift_ppm
+        How much faster its clock runs than true time.
+    """
+
+    drop: float = 0.0
+    dead_s: tuple[float, float] = (math.inf, math.inf)
+    boot_ms: float = 12_340.0
+    drift_ppm: float = 0.0
+
+    def dead(self, time_s: float) -> bool:
+        """Whether it is silent at a time of the flight."""
+        return self.dead_s[0] <= time_s < self.dead_s[1]
+
+    def clock_ms(self, time_s: float) -> float:
+        """What its clock shows at a time of the flight."""
+        began_s = self.dead_s[1] if time_s >= self.dead_s[1] else 0.0
+        return self.boot_ms + 1000 * (time_s - began_s) * (1 + 1e-6 * self.drift_ppm)
+
+    def reached_s(self, clock_ms: float, time_s: float) -> float:
+        """The time of the flight, near ``time_s``, at which its clock shows this."""
+        return time_s + (clock_ms - self.clock_ms(time_s)) / 1000 / (1 + 1e-6 * self.drift_ppm)
+
+
+Pictures = Iterator[tuple[float, bytes]]
+"""Times, seconds since take-off, and encoded pictures, in order."""

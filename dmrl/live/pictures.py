@@ -1,0 +1,66 @@
+"""What a camera sent, as a picture that can be stored."""
+
+from typing import Literal
+
+import numpy as np
+
+from dmrl import images
+from dmrl.errors import SourceError
+from dmrl.formats.cpx import Image
+from dmrl.geometry import AIDECK
+
+SENSOR_PX = (324, 244)
+"""Width and height of all that the AI-deck's camera sees."""
+LEFT_PX, TOP_PX = 2, 10
+"""What is cut off on the left and at the top: the calibration is of the rest."""
+
+Colours = Literal["colour", "grey"]
+Stored = Literal["png", "jpeg"]
+JPEG_QUALITY = 95
+
+
+def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[bytes, str]:
+    """The picture, and "png" or "jpeg".
+
+    Images of the whole sensor are cut to the 320 x 224 px that the calibration is of. A JPEG
+    that need not be cut keeps its bytes.
+
+    Parameters
+    ----------
+    image
+        As it came.
+    colours
+        Whether there are colour filters before the pixels of a raw image.
+    stored
+        What becomes of the rest: PNG, so that nothing is lost, or JPEG, a fifth of that.
+
+    Raises
+    ------
+    SourceError
+        If a JPEG cannot be decoded, or has another size than the camera said.
+    """
+    whole = (image.width_px, image.height_px) == SENSOR_PX
+    if image.encoding == "jpeg":
+        width_px, height_px, kind = images.size(image.data, "the camera's JPEG")
+        if (width_px, height_px) != (image.width_px, image.height_px) or kind != "jpeg":
+            raise SourceError(
+                f"the camera's {kind} is {width_px} x {height_px} px, not "
+                f"{image.width_px} x {image.height_px} px as it said. Start the deck anew"
+            )
+        if not whole:
+            return image.data, "jpeg"
+        return _stored(_cut(images.decode(image.data, "the camera's JPEG")), stored), stored
+    pixels = np.frombuffer(image.data, np.uint8).reshape(image.height_px, image.width_px)
+    if whole:
+        pixels = _cut(pixels)
+    return _stored(images.demosaic(pixels) if colours == "colour" else pixels, stored), stored
+
+
+def _stored(pixels: images.Rgb, stored: Stored) -> bytes:
+    if stored == "png":
+        return images.encode_png(pixels)
+    return images.encode_jpeg(pixels, JPEG_QUALITY)
+
+
+def _cut(pixels: images.Rgb) -> images.Rgb:
+    return pixels[TOP_PX : TOP_PX + AIDECK.height_px, LEFT_PX : LEFT_PX + AIDECK.width_px]

@@ -1,0 +1,85 @@
+"""Robots as the user names them."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dmrl.errors import SettingError
+from dmrl.live.camera import address
+from dmrl.live.log_plan import number_of
+
+ROBOT = re.compile(r"[A-Za-z0-9_-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """One robot to record.
+
+    Parameters
+    ----------
+    name
+        As it stands in topics.
+    uri
+        Of its Crazyflie.
+    camera
+        Host and port of its AI-deck; None: it has none.
+    calibration
+        TOML file with its camera; None: the AI-deck of the paper.
+    """
+
+    name: str
+    uri: str
+    camera: tuple[str, int] | None = None
+    calibration: Path | None = None
+
+
+def robot_of(text: str) -> Robot:
+    """A robot as the command line names it: ``cf1=URI[,camera=HOST:PORT][,calibration=FILE]``.
+
+    Raises
+    ------
+    SettingError
+        If it is not that.
+    """
+    name, equals, rest = text.partition("=")
+    uri, *options = rest.split(",")
+    if not equals or not ROBOT.fullmatch(name) or not uri:
+        raise SettingError(
+            f"--robot {text}: write NAME=URI, such as cf1=radio://0/80/2M/E7E7E7E7E7"
+        )
+    given = dict(option.partition("=")[::2] for option in options)
+    if unknown := sorted(given.keys() - {"camera", "calibration"}):
+        raise SettingError(f"--robot {text}: no option {unknown[0]}. There are camera, calibration")
+    camera = address(given["camera"]) if "camera" in given else None
+    calibration = Path(given["calibration"]) if "calibration" in given else None
+    return Robot(name, uri, camera, calibration)
+
+
+def peers_of(robot: str, names: Sequence[str], given: Sequence[str]) -> dict[int, str]:
+    """Whom ``ranging.distance<number>`` of a robot is the distance to, by number.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    names
+        All robots.
+    given
+        "N=NAME" as the user says it; empty: the number at the end of each name.
+
+    Raises
+    ------
+    SettingError
+        If a text is not that.
+    """
+    found: dict[int, str] = {}
+    for text in given:
+        number, equals, name = text.partition("=")
+        if not equals or not number.isdecimal() or not ROBOT.fullmatch(name):
+            raise SettingError(f"--peer {text}: write N=NAME, such as 1=cf2")
+        found[int(number)] = name
+    if not given:
+        numbers = {name: number_of(name) for name in names}
+        found = {number: name for name, number in numbers.items() if number is not None}
+    return {number: name for number, name in found.items() if name != robot}

@@ -1,0 +1,112 @@
+"""How the links are doing, as a table that is drawn again and again on standard error."""
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+from rich import box
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from dmrl.live.crazyflie import Link
+from dmrl.live.feed import Health
+
+RATE_S = 1.0
+"""Rates are of the last second, or a little more."""
+LOW_BATTERY_V = 3.5
+
+
+class _Rate:
+    """How often a count goes up, per second."""
+
+    def __init__(self) -> None:
+        self._since_s, self._count, self.per_s = time.monotonic(), 0, 0.0
+
+    def update(self, count: int) -> float:
+        passed_s = time.monotonic() - self._since_s
+        if passed_s >= RATE_S:
+            self.per_s = (count - self._count) / passed_s
+            self._since_s, self._count = time.monotonic(), count
+        return self.per_s
+
+
+class LiveTable:
+    """The table, where standard error is a terminal; nothing but the news where it is not.
+
+    Parameters
+    ----------
+    links
+        Of the robots.
+    cameras
+        State of the cameras.
+    """
+
+    def __init__(self, links: Sequence[Link], cameras: Sequence[Health]) -> None:
+        self._links = links
+        self._healths = [*(link.health for link in links), *cameras]
+        self._rates = {health.source: _Rate() for health in self._healths}
+        self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+        self._live: Live | None = None
+        self._started_s = time.monotonic()
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live = Live(console=self._console, auto_refresh=False, transient=True)
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def say(self, line: str) -> None:
+        """Print a line of news above the table."""
+        self._console.print(line)
+
+    def update(self, messages: int) -> None:
+        """Draw it again.
+
+        Parameters
+        ----------
+        messages
+            Written so far.
+        """
+        rates = {h.source: self._rates[h.source].update(h.received) for h in self._healths}
+        if self._live is not None:
+            with suppress(BlockingIOError):
+                self._live.update(self._table(rates, messages), refresh=True)
+
+    def _table(self, rates: dict[str, float], messages: int) -> Table:
+        passed_s = int(time.monotonic() - self._started_s)
+        title = f"{passed_s // 60}:{passed_s % 60:02d}  {messages} messages  (Ctrl-C ends it)"
+        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+        for column in ("", "state", "per s", "lost", "broken", "battery", "ranges"):
+            right = column in ("per s", "lost", "broken")
+            table.add_column(column, justify="right" if right else "left", no_wrap=True)
+        links = {link.health.source: link for link in self._links}
+        for health in self._healths:
+            rate = f"{rates[health.source]:.1f}"
+            counts = (rate, str(health.lost), str(health.broken))
+            more = _of_robot(links[health.source]) if health.source in links else ("", "")
+            table.add_row(health.source, health.state, *counts, *more)
+        return table
+
+
+def _of_robot(link: Link) -> tuple[str, str]:
+    """Battery and distances of a robot, in words."""
+    reading = link.reading
+    if reading is None:
+        return "", ""
+    battery = "" if reading.battery_v is None else f"{reading.battery_v:.2f} V"
+    if reading.battery_v is not None and reading.battery_v < LOW_BATTERY_V:
+        battery += " low"
+    ranges = ", ".join(f"{peer} {value:.2f} m" for peer, value in sorted(reading.ranges_m.items()))
+    return battery, ranges

@@ -1,0 +1,199 @@
+"""Tracks of a recording beside the true positions, and beside what single images said."""
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.errors import MissingTopic, RecordingError
+from dmrl.estimation.track_score import DEFINITIONS, NEAR_M, Judged, assigned, figures
+from dmrl.geometry import Array, horizontal_from_pixels, inside, pixels_from_horizontal
+from dmrl.labelling.sight import Sight, read_sight
+from dmrl.labelling.write import camera_of
+from dmrl.positions import inside_truth
+from dmrl.recording import input_of, read, read_table, summary
+
+TITLE, EACH = "tracks against truth", "observer"
+
+
+def can_judge(recording: Path) -> bool:
+    """Whether a recording holds tracks, and the truth about them."""
+    held = list(summary(recording).topics)
+    return any(_peers(held, robot) for robot in topics.robots(held, topics.TRACKS))
+
+
+def _peers(held: list[str], robot: str) -> list[str]:
+    links = (topics.names(topics.TRUTH, topic) for topic in held)
+    return sorted(n["peer"] for n in links if n is not None and n["robot"] == robot)
+
+
+def judge(recording: Path) -> list[Judged]:
+    """Every observer with tracks and true positions.
+
+    Parameters
+    ----------
+    recording
+        With ``/<robot>/tracks``, what they were made from, and ``/<robot>/peer/<peer>/truth``.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read, or has no robot with both.
+    """
+    held = list(summary(recording).topics)
+    robots = topics.robots(held, topics.TRACKS)
+    if not robots:
+        raise RecordingError(f"{recording} has no tracks. Try: dmrl track {recording} OUT.mcap")
+    judged = [_judge(recording, robot, peers) for robot in robots if (peers := _peers(held, robot))]
+    if not judged:
+        raise RecordingError(
+            f"{recording} has no true position of any peer. Judge a simulated flight, or one with "
+            "motion capture"
+        )
+    return judged
+
+
+class _Row(NamedTuple):
+    """One peer in view of one image; see `Judged`."""
+
+    image: int
+    peer: str
+    named: str
+    error_m: Array
+    single_error_m: Array
+    covariance: Array
+
+
+def _judge(recording: Path, robot: str, peers: list[str]) -> Judged:
+    held = summary(recording)
+    camera = camera_of(recording, held, robot)
+    if camera is None:
+        raise MissingTopic(topics.calibration(robot), held.topics, recording)
+    sight = read_sight(recording, held, robot, camera, 0.0)
+    truth, shown = _truth(recording, sight, peers)
+    rows: list[_Row] = []
+    lives: Counter[int] = Counter()
+    strays: Counter[int] = Counter()
+    place = {int(time_ns): k for k, time_ns in enumerate(sight.logged_ns)}
+    for stamped in read(recording, topics.tracks(robot)):
+        k, tracks = place.get(stamped.time_ns), list(stamped.message.tracks)
+        if k is None:
+            continue
+        rows += _rows(sight, k, tracks, truth[:, k], dict(enumerate(peers)), shown[:, k])
+        lives.update(t.id for t in tracks)
+        owned = set(assigned(truth[:, k], _places(tracks), NEAR_M).tolist())
+        strays.update(t.id for i, t in enumerate(tracks) if i not in owned)
+    time_s = (sight.time_ns - sight.time_ns[:1]) * 1e-9
+    return Judged(
+        robot,
+        np.asarray(time_s[np.array([row.image for row in rows], int)], float),
+        [row.peer for row in rows],
+        [row.named for row in rows],
+        np.reshape([row.error_m for row in rows], (-1, 3)),
+        np.reshape([row.single_error_m for row in rows], (-1, 3)),
+        np.reshape([row.covariance for row in rows], (-1, 3, 3)),
+        sum(2 * strays[number] > lives[number] for number in lives),
+        float(time_s[-1]) if len(time_s) else 0.0,
+    )
+
+
+def _rows(
+    sight: Sight,
+    k: int,
+    tracks: list[Any],
+    truth_m: Array,
+    peers: Mapping[int, str],
+    shown: NDArray[np.bool_],
+) -> list[_Row]:
+    """The peers in view of image k, with their tracks and detections."""
+    seen = np.flatnonzero(shown)
+    view = sight.view(k)
+    uv, depth_m = view.uv[: len(seen)], view.depth_m[: len(seen)]
+    roll, pitch = (np.full(len(uv), angle) for angle in (view.roll_rad, view.pitch_rad))
+    single = horizontal_from_pixels(uv, depth_m, roll, pitch, sight.camera)
+    found = _places(tracks)
+    rows = []
+    pairs = zip(assigned(truth_m[seen], found), assigned(truth_m[seen], single), strict=True)
+    for j, (mine, own) in zip(seen.tolist(), pairs, strict=True):
+        nothing = np.full(3, np.nan)
+        rows.append(
+            _Row(
+                k,
+                peers[j],
+                tracks[mine].peer if mine >= 0 else "",
+                found[mine] - truth_m[j] if mine >= 0 else nothing,
+                single[own] - truth_m[j] if own >= 0 else nothing,
+                np.array(tracks[mine].covariance if mine >= 0 else [np.nan] * 9),
+            )
+        )
+    return rows
+
+
+def _places(tracks: list[Any]) -> Array:
+    """(D, 3) positions of Track messages, metres."""
+    return np.array([[t.x, t.y, t.z] for t in tracks]).reshape(-1, 3)
+
+
+def _truth(recording: Path, sight: Sight, peers: list[str]) -> tuple[Array, NDArray[np.bool_]]:
+    """(J, K, 3) true positions at the images, NaN where unknown; (J, K) whether in the image."""
+    xyz = np.full((len(peers), len(sight.time_ns), 3), np.nan)
+    shown = np.zeros(xyz.shape[:2], bool)
+    for j, peer in enumerate(peers):
+        true = read_table(recording, topics.truth(sight.robot, peer), fields=("x", "y", "z"))
+        true_ns = true["log_time"].to_numpy()
+        known = inside_truth(sight.time_ns, true_ns)
+        at = sight.time_ns[known]
+        xyz[j, known] = np.column_stack(
+            [np.interp(at, true_ns, true[axis].to_numpy()) for axis in "xyz"]
+        )
+        roll, pitch = sight.attitude_rad.T
+        uv, depth_m, _ = pixels_from_horizontal(xyz[j], roll, pitch, sight.camera)
+        shown[j] = inside(uv, sight.camera.width_px, sight.camera.height_px) & (depth_m > 0)
+    return xyz, shown
+
+
+def document(recording: Path, judged: list[Judged], settle_s: float) -> dict[str, Any]:
+    """Everything that was measured, as JSON values; null where there was nothing to measure."""
+    source = input_of(recording)
+    return {
+        "recording": {"name": source.name, "sha256": source.sha256},
+        "settle_s": settle_s,
+        "robots": [{"robot": one.robot, **figures(one, settle_s)} for one in judged],
+        "definitions": DEFINITIONS,
+    }
+
+
+# Name of a figure, its words in the table, and its format.
+COLUMNS = (
+    ("in_view", "in view", ".0f"),
+    ("rmse_m", "RMSE, m", ".3f"),
+    ("single_rmse_m", "of images, m", ".3f"),
+    ("reduction", "less by", ".0%"),
+    ("median_m", "median, m", ".3f"),
+    ("single_median_m", "of images, m", ".3f"),
+    ("coverage_95", "in 95 %", ".0%"),
+    ("followed", "followed", ".0%"),
+    ("detected", "detected", ".0%"),
+    ("false_tracks_per_min", "false/min", ".1f"),
+    ("named_right", "named right", ".0%"),
+)
+NOTE = (
+    "3D errors of the peers in view; of images: of the detections in single images; followed, "
+    f"detected: a track, a detection within {NEAR_M:g} m; false: tracks of nobody"
+)
+
+
+def rows(made: Mapping[str, Any]) -> list[list[str]]:
+    """One row per observer of a ``document``."""
+    return [
+        [one["robot"], *(_cell(one[key], form) for key, _, form in COLUMNS)]
+        for one in made["robots"]
+    ]
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,101 @@
+"""Random small float networks, and their int8 form by the quantiser."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.deploy.equalise import equalise
+from dmrl.deploy.graph import (
+    FloatAdd,
+    FloatConv,
+    FloatLayer,
+    FloatPool,
+    Graph,
+    tensors_of,
+    to_input,
+)
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.quantise import About, quantise
+from dmrl.deploy.ranges import calibrate
+
+SUB_CELL = ("log_depth", "confidence", "offset_u", "offset_v")
+
+
+class _Growing:
+    def __init__(self, rng: np.random.Generator, images: NDArray[np.uint8]) -> None:
+        self.rng = rng
+        self.layers: list[FloatLayer] = []
+        self.channels = images.shape[3]
+        self.input = to_input(images)
+
+    @property
+    def graph(self) -> Graph:
+        return Graph(tuple(self.layers), (), self.channels)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Channels, rows and columns of the last tensor."""
+        return tensors_of(self.graph, self.input)[-1].shape[1:]
+
+    def conv(self, outs: int, kernel: int, *, depthwise: bool = False, stride: int = 1,
+             dilation: int = 1, relu: bool = True) -> None:  # fmt: skip
+        ins = self.shape[0]
+        shape = (ins, 1, kernel, kernel) if depthwise else (outs, ins, kernel, kernel)
+        spread = 1.5 / np.sqrt(np.prod(shape[1:]))
+        # Channels of very different size, as normalisation leaves them.
+        size = np.exp(self.rng.normal(0, 1, shape[0]))
+        weight = self.rng.normal(0, spread, shape) * size[:, None, None, None]
+        bias = self.rng.normal(0.2, 0.3, shape[0]) * size
+        padding = dilation * (kernel // 2)
+        groups = ins if depthwise else 1
+        source = (len(self.layers),)
+        name = f"conv{len(self.layers)}"
+        self.layers.append(
+            FloatConv(name, source, weight, bias, stride, dilation, padding, groups, relu)
+        )
+
+    def residual(self, dilation: int) -> None:
+        source, width = len(self.layers), self.shape[0]
+        self.conv(0, 3, depthwise=True, dilation=dilation)
+        self.conv(width, 1, relu=False)
+        relu = bool(self.rng.random() < 0.7)
+        self.layers.append(FloatAdd(f"add{source}", (source, len(self.layers)), relu))
+
+    def grow(self) -> None:
+        rng, small = self.rng, min(self.shape[1:]) < 6
+        stride = 1 if small else int(rng.choice([1, 2]))
+        dilation = int(rng.choice([1, 2, 4]))
+        match rng.choice(["conv", "depthwise", "pool", "residual", "pointwise"]):
+            case "pool" if self.layers and not small:
+                self.layers.append(FloatPool(f"pool{len(self.layers)}", (len(self.layers),)))
+            case "depthwise" if self.layers:
+                self.conv(0, 3, depthwise=True, stride=stride, dilation=dilation)
+            case "residual" if self.layers:
+                self.residual(dilation)
+            case "pointwise":
+                self.conv(int(rng.integers(1, 13)), 1, relu=bool(rng.random() < 0.8))
+            case _:
+                self.conv(int(rng.integers(2, 13)), 3, stride=stride)
+
+
+def random_graph(seed: int) -> tuple[Graph, tuple[str, ...], NDArray[np.uint8]]:
+    """A float network, its channels, and (4, height, width, channels) images for it."""
+    rng = np.random.default_rng(seed)
+    height, width = (int(side) for side in rng.integers(12, 41, 2))
+    images = rng.integers(0, 256, (4, height, width, int(rng.choice([1, 3])))).astype(np.uint8)
+    net = _Growing(rng, images)
+    for _ in range(int(rng.integers(2, 6))):
+        net.grow()
+    channels = SUB_CELL if rng.random() < 0.5 else SUB_CELL[:2]
+    net.conv(len(channels), 1, relu=False)
+    tensor = len(net.layers)
+    outputs = tuple((tensor, place) for place in range(len(channels)))
+    return Graph(tuple(net.layers), outputs, images.shape[3]), channels, images
+
+
+def quantised_network(seed: int) -> IntegerNetwork:
+    """The int8 form of ``random_graph(seed)``, of at most 40 x 40 px."""
+    graph, channels, images = random_graph(seed)
+    rgb = np.repeat(images, 3, axis=3) if graph.channels == 1 else images
+    graph, ranges = equalise(graph, calibrate(graph, [rgb]))
+    about = About("random", "random", 8, channels, 0.3)
+    return quantise(graph, ranges, about)

@@ -1,0 +1,230 @@
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from dmrl.deploy.bayer import demosaic
+from dmrl.deploy.c import write_c
+from dmrl.deploy.c.harness import answers
+from dmrl.deploy.c.source import source
+from dmrl.deploy.c.text import names_of
+from dmrl.deploy.compiled import Compiled
+from dmrl.deploy.graph import graph_of
+from dmrl.deploy.integer import Conv, IntegerNetwork
+from dmrl.deploy.quantise import About, quantise
+from dmrl.deploy.ranges import calibrate
+from dmrl.deploy.reference import decode, run
+from dmrl.deploy.targets import RISCV_FLAGS, SANITIZERS, Build, Target
+from dmrl.deploy.toolchain import RISCV
+from dmrl.deploy.verification import TargetResult, expected, prove
+from dmrl.errors import ModelError, SettingError, ToolError
+from dmrl.learn.network import build
+from dmrl.learn.trace import operations
+
+from .graphs import quantised_network
+from .networks import random_network
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
+QUICK = Target("gcc", (Build("-O1", "gcc", ("-O1",)),))
+CHECKED = Target("sanitizers", (Build("-O1", "gcc", SANITIZERS),))
+
+
+def quantisable(seed: int) -> IntegerNetwork:
+    """``quantised_network``; of the next thousand where one has a layer that never fires."""
+    try:
+        return quantised_network(seed)
+    except SettingError:
+        return quantisable(seed + 1000)
+
+
+def noise(network: IntegerNetwork, count: int, seed: int = 0) -> NDArray[np.uint8]:
+    shape = (count, network.height_px, network.width_px, network.channels)
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def proved(network: IntegerNetwork, folder: Path, target: Target) -> TargetResult:
+    write_c(network, folder, [])
+    return prove(network, folder, target, expected(network, list(noise(network, 3))))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_networks_come_through_quantiser_and_c_bit_for_bit(
+    seed: int, tmp_path: Path
+) -> None:
+    result = proved(quantisable(seed), tmp_path, QUICK)
+    assert (result.error, result.mismatches) == ("", 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(200))
+def test_two_hundred_random_networks_do_so_under_the_sanitizers(seed: int, tmp_path: Path) -> None:
+    result = proved(quantisable(seed), tmp_path, CHECKED)
+    assert (result.error, result.mismatches) == ("", 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_integers_will_do_shifts_below_33_and_missing_padding_too(
+    seed: int, tmp_path: Path
+) -> None:
+    result = proved(random_network(seed), tmp_path, CHECKED)
+    assert (result.error, result.mismatches) == ("", 0)
+
+
+@pytest.mark.parametrize(
+    ("channels", "phase"), [(3, (0, 0)), (3, (0, 1)), (3, (1, 0)), (3, (1, 1)), (1, (0, 1))]
+)
+def test_raw_mosaics_of_any_phase_are_seen_as_the_reference_sees_them(
+    channels: int, phase: tuple[int, int], tmp_path: Path
+) -> None:
+    network = next(n for n in map(quantised_network, range(20)) if n.channels == channels)
+    write_c(network, tmp_path, [])
+    flags = tuple(
+        f"-DLOCANET_RED_{axis}={k}" for axis, k in zip(("ROW", "COL"), phase, strict=True)
+    )
+    build = Build("Bayer", "gcc", ("-O1", *flags), bayer=True)
+    raw = noise(network, 1)[0, ..., 0]
+    command = build.program(network, tmp_path, tmp_path)
+    said = subprocess.run(command, input=raw.tobytes(), check=True, capture_output=True)
+    row, col = phase
+    seen = demosaic(raw, channels=channels, red_row=row, red_col=col)
+    (answer,) = answers(network, said.stdout)
+    wanted = run(network, seen)
+    assert all(np.array_equal(answer.grids[head], wanted[head]) for head in wanted)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_the_c_is_strict_c99_without_a_warning(compiler: str, tmp_path: Path) -> None:
+    if shutil.which(compiler) is None:
+        pytest.skip(f"no {compiler}")
+    for k, network in enumerate((quantised_network(0), quantised_network(1), random_network(3))):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        write_c(network, folder, [])
+        for bayer in ("0", "1"):
+            command = [compiler, *STRICT, f"-DLOCANET_BAYER={bayer}", "-fsyntax-only", "locanet.c"]
+            subprocess.run(command, cwd=folder, check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("level", ["-O0", "-O2", "-O3", "-Os"])
+def test_the_c_calls_no_library(level: str, tmp_path: Path) -> None:
+    if shutil.which(RISCV) is None:
+        pytest.skip(f"no {RISCV}")
+    write_c(quantised_network(1), tmp_path, [])
+    flags = ("-std=c99", level, *RISCV_FLAGS)
+    subprocess.run([RISCV, *flags, "-c", "locanet.c", "-o", "locanet.o"], cwd=tmp_path, check=True)
+    tool = RISCV.replace("gcc", "nm")
+    said = subprocess.run([tool, "-u", "locanet.o"], cwd=tmp_path, check=True, capture_output=True)
+    assert said.stdout == b""
+
+
+def test_the_self_test_passes_and_fails_when_a_weight_is_changed(tmp_path: Path) -> None:
+    network = quantised_network(2)
+    write_c(network, tmp_path, list(noise(network, 1, seed=5)))
+    done = subprocess.run(["make", "test"], cwd=tmp_path, check=True, capture_output=True)
+    assert done.stdout.count(b"as the reference") == 2
+    (tmp_path / "other").mkdir()
+    write_c(_changed(network), tmp_path / "other", [])
+    shutil.copy(tmp_path / "other" / "locanet.c", tmp_path)
+    failed = subprocess.run(["make", "test"], cwd=tmp_path, capture_output=True, check=False)
+    assert failed.returncode != 0
+    assert b"DIFFERS" in failed.stdout
+
+
+def test_the_self_test_needs_no_library_when_silent(tmp_path: Path) -> None:
+    if shutil.which(RISCV) is None:
+        pytest.skip(f"no {RISCV}")
+    write_c(quantised_network(2), tmp_path, [])
+    flags = ("-std=c99", "-O2", *RISCV_FLAGS, "-DSILENT", "-Wl,--entry=main")
+    command = [RISCV, *flags, "main.c", "locanet.c", "-o", "self_test"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+
+
+def test_a_self_test_for_raw_mosaics_passes_as_well(tmp_path: Path) -> None:
+    network = next(n for n in map(quantised_network, range(20)) if n.channels == 3)
+    write_c(network, tmp_path, list(noise(network, 1)), bayer=True)
+    done = subprocess.run(["make", "test"], cwd=tmp_path, check=True, capture_output=True)
+    assert done.stdout.count(b"as the reference") == 2
+
+
+def _changed(network: IntegerNetwork) -> IntegerNetwork:
+    """The same network, one weight of the last convolution moved."""
+    last = network.layers[-1]
+    assert isinstance(last, Conv)
+    weight = last.weight.copy()
+    weight[0, 0, 0, 0] += 1 if weight[0, 0, 0, 0] < 100 else -1
+    return replace(network, layers=(*network.layers[:-1], replace(last, weight=weight)))
+
+
+def test_layers_may_have_any_names(tmp_path: Path) -> None:
+    network = max(map(random_network, range(20)), key=lambda n: len(n.layers))
+    names = ("conv", "conv_weights", "while", "locanet_run", "3", "Conv", "passing_0", "")
+    layers = tuple(
+        replace(layer, name=names[k % len(names)]) for k, layer in enumerate(network.layers)
+    )
+    result = proved(replace(network, layers=layers), tmp_path, QUICK)
+    assert (result.error, result.mismatches) == ("", 0)
+
+
+def test_the_same_network_gives_the_same_text() -> None:
+    network = quantised_network(4)
+    one, two = (source(network, names_of(network), bayer=False) for _ in range(2))
+    assert one == two
+
+
+def test_of_many_peaks_the_first_stay() -> None:
+    network = replace(quantised_network(1), threshold=0.0)
+    compiled = Compiled(network)
+    image = noise(network, 1)[0]
+    grids = run(network, image)
+    for most in (0, 1, 2, 5):
+        assert compiled.answer(image, most).detections == decode(network, grids, most)
+
+
+def test_a_layer_that_the_c_cannot_carry_is_named() -> None:
+    network = next(n for n in map(quantised_network, range(20)) if _depthwise(n) is not None)
+    at = _depthwise(network)
+    assert at is not None
+    layers = list(network.layers)
+    conv = layers[at]
+    assert isinstance(conv, Conv)
+    layers[at] = replace(conv, name="odd", weight=conv.weight[:, :, :1, :1], padding=0)
+    odd = replace(network, layers=tuple(layers))
+    with pytest.raises(ModelError, match="layer odd is a depthwise 1x1"):
+        source(odd, names_of(odd), bayer=False)
+
+
+def _depthwise(network: IntegerNetwork) -> int | None:
+    return next(
+        (
+            k
+            for k, layer in enumerate(network.layers)
+            if isinstance(layer, Conv) and layer.depthwise
+        ),
+        None,
+    )
+
+
+def test_without_a_compiler_the_package_to_install_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ToolError, match="apt-get install gcc"):
+        Compiled(quantised_network(0))
+
+
+@pytest.mark.parametrize(("name", "bytes_"), [("locanet", 32_000), ("dmrl-nano", 128_000)])
+def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
+    with torch.random.fork_rng(devices=[]):
+        network = build(name).eval()
+    graph = graph_of(operations(network))
+    images = np.random.default_rng(0).integers(0, 256, (1, 224, 320, 3), np.uint8)
+    about = About(name, name, network.stride_px, network.channels, 0.3)
+    integers = quantise(graph, calibrate(graph, [images]), about)
+    made = source(integers, names_of(integers), bayer=False)
+    assert made.state_bytes + made.bayer_bytes <= bytes_

@@ -1,0 +1,17 @@
+"""The published chip's own maps of two real frames."""
+
+import runpy
+from pathlib import Path
+
+BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "bench_chip.py"
+
+
+def test_int8_agrees_with_the_chip_as_float_does(data: Path) -> None:
+    found, pictures = runpy.run_path(str(BENCHMARK))["compare"](data)
+    assert len(pictures) == 2
+    for (_, channel, _), agreement in found.items():
+        assert agreement.correlation > 0.949
+        if channel == "confidence":
+            assert agreement.mean_steps <= 1.1
+        else:
+            assert agreement.most_levels <= 1

@@ -1,0 +1,122 @@
+"""From torch to plain layers."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from dmrl.deploy.graph import (
+    Graph,
+    graph_of,
+    grey_of,
+    outputs_of,
+    tensors_of,
+    to_input,
+)
+from dmrl.errors import ModelError
+from dmrl.learn import network as networks
+from dmrl.learn.network import Network, build
+from dmrl.learn.trace import operations
+
+IMAGES = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3)).astype(np.uint8)
+
+
+def settled(name: str) -> Network:
+    """A network with statistics of images behind its normalisations, as training leaves it."""
+    network = build(name, seed=1).train()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape, generator=torch.manual_seed(2))
+        for _ in range(5):
+            network(torch_input(IMAGES))
+    return network.eval()
+
+
+def torch_input(images: np.ndarray) -> Tensor:
+    return networks.to_input(torch.from_numpy(images).permute(0, 3, 1, 2))
+
+
+def outputs(graph: Graph, images: np.ndarray) -> np.ndarray:
+    return outputs_of(graph, tensors_of(graph, to_input(images)))
+
+
+@pytest.mark.parametrize("name", ["locanet", "dmrl-nano"])
+def test_the_layers_compute_what_torch_computes(name: str) -> None:
+    network = settled(name)
+    with torch.no_grad():
+        wanted = network(torch_input(IMAGES)).numpy()
+    got = outputs(graph_of(operations(network)), IMAGES)
+    assert np.ptp(wanted) > 0.1
+    np.testing.assert_allclose(got, wanted, atol=2e-5 * np.abs(wanted).max())
+
+
+def test_a_grey_network_gives_the_same_on_grey_images() -> None:
+    graph = graph_of(operations(settled("locanet")))
+    grey = grey_of(IMAGES)
+    wanted = outputs(graph, np.repeat(grey, 3, axis=3))
+    np.testing.assert_allclose(outputs(graph.grey(), grey), wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_grey_of_a_grey_picture_is_itself() -> None:
+    levels = np.arange(256, dtype=np.uint8).reshape(1, 16, 16, 1)
+    np.testing.assert_array_equal(grey_of(np.repeat(levels, 3, axis=3)), levels)
+
+
+class Odd(Network):
+    """A network with a part of its own between two convolutions."""
+
+    def __init__(self, part: nn.Module | Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.first, self.last = nn.Conv2d(3, 4, 3, padding=1), nn.LazyConv2d(2, 1)
+        self.part = part
+        self(torch.zeros(1, 3, 16, 16))
+
+    def forward(self, images: Tensor) -> Tensor:
+        out: Tensor = self.last(self.part(self.first(images)))
+        return out
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (nn.LeakyReLU(), r"layer part is a LeakyReLU, .* Use ReLU$"),
+        (nn.AvgPool2d(2), r"layer part is an AvgPool2d, .* Use a strided convolution"),
+        (nn.Conv2d(4, 4, 5), r"layer part is a 5 x 5 convolution, .* Use 1x1 or 3x3"),
+        (nn.Conv2d(4, 4, 3, groups=2), r"layer part is a convolution in 2 groups, .* depthwise"),
+        (nn.Conv2d(4, 4, 3, padding=2), r"layer part is a convolution with padding 2, .* 'same'"),
+        (nn.Conv2d(4, 4, 3, (1, 2)), r"layer part .* differs by direction, .* one stride"),
+        (nn.MaxPool2d(3), r"layer part is a max-pool with .* Use 2x2 max-pools"),
+        (nn.MaxPool2d(2, ceil_mode=True), r"layer part is a max-pool with .*ceil.* Use 2x2"),
+        (nn.Sequential(nn.ReLU(), nn.BatchNorm2d(4)), r"part.1 is a BatchNorm2d apart from a conv"),
+        (lambda x: torch.cat([x, x], 1), r"layer cat is a concatenation inside the network"),
+        (lambda x: x * x, r"layer mul is a mul, .* Use a convolution"),
+        (lambda x: x + 1, r"layer add is an add of a number"),
+        (lambda x: x if x.sum() > 0 else -x, r"layer sum is a sum, .* Use convolutions"),
+    ],
+)
+def test_what_cannot_be_carried_is_named_with_what_to_use_instead(
+    part: nn.Module | Callable[[Tensor], Tensor], words: str
+) -> None:
+    with pytest.raises(ModelError, match=words):
+        graph_of(operations(Odd(part)))
+
+
+def test_heads_may_be_convolutions_of_their_own() -> None:
+    class TwoHeads(Network):
+        def __init__(self) -> None:
+            super().__init__()
+            self.body = nn.Conv2d(3, 4, 3, padding=1)
+            self.depth, self.confidence = nn.Conv2d(4, 1, 1), nn.Conv2d(4, 1, 1)
+
+        def forward(self, images: Tensor) -> Tensor:
+            x = self.body(images).relu()
+            return torch.cat([self.depth(x), self.confidence(x)], 1)
+
+    network = TwoHeads().eval()
+    graph = graph_of(operations(network))
+    assert graph.outputs == ((2, 0), (3, 0))
+    with torch.no_grad():
+        wanted = network(torch_input(IMAGES)).numpy()
+    np.testing.assert_allclose(outputs(graph, IMAGES), wanted, atol=1e-5)

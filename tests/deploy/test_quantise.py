@@ -1,0 +1,133 @@
+"""From float to int8."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.deploy.backends import Float, integer
+from dmrl.deploy.equalise import equalise
+from dmrl.deploy.graph import FloatConv, Graph, outputs_of, tensors_of, to_input
+from dmrl.deploy.integer import Conv
+from dmrl.deploy.layers import layer_figures
+from dmrl.deploy.quantise import About, quantise
+from dmrl.deploy.ranges import calibrate
+from dmrl.errors import ModelError, SettingError
+
+from .graphs import quantised_network, random_graph
+
+ABOUT = About("small", "small", 8, ("log_depth", "confidence"), 0.3)
+NOISE = np.random.default_rng(1).integers(0, 256, (3, 16, 24, 3)).astype(np.uint8)
+
+
+def rgb_images(seed: int) -> np.ndarray:
+    images = random_graph(seed)[2]
+    return np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
+
+
+def small(weight: float = 1.0, bias: float = 0.0) -> Graph:
+    """A 3x3 convolution with ReLU, then a head of two channels."""
+    rng = np.random.default_rng(0)
+    first = FloatConv("first", (0,), weight * rng.normal(0, 0.3, (4, 3, 3, 3)),
+                      np.full(4, bias), padding=1, relu=True)  # fmt: skip
+    head = FloatConv("head", (1,), rng.normal(0, 0.5, (2, 4, 1, 1)), np.array([0.1, -2.0]))
+    return Graph((first, head), ((2, 0), (2, 1)))
+
+
+def test_int8_is_near_float_on_most_random_networks() -> None:
+    sqnr_db = []
+    for seed in range(60):
+        graph, channels, _ = random_graph(seed)
+        images = rgb_images(seed)
+        wanted = Float(graph, channels).outputs(images)
+        got = integer(quantised_network(seed)).outputs(images)
+        for name, value in wanted.items():
+            error = ((value - got[name]) ** 2).mean()
+            sqnr_db.append(10 * np.log10((value**2).mean() / error))
+    assert np.median(sqnr_db) > 30
+    assert np.quantile(sqnr_db, 0.05) > 15
+
+
+def test_equalising_changes_nothing_but_the_ranges() -> None:
+    moved = 0
+    for seed in range(30):
+        graph, _, images = random_graph(seed)
+        ranges = calibrate(graph, [rgb_images(seed)])
+        even, even_ranges = equalise(graph, ranges)
+        wanted = outputs_of(graph, tensors_of(graph, to_input(images)))
+        tensors = tensors_of(even, to_input(images))
+        np.testing.assert_allclose(
+            outputs_of(even, tensors), wanted, atol=1e-4 * np.abs(wanted).max()
+        )
+        for tensor, high in zip(tensors, even_ranges.high, strict=True):
+            np.testing.assert_allclose(tensor.max(axis=(0, 2, 3)), high, rtol=1e-3, atol=1e-4)
+        moved += any(
+            not np.allclose(a, b) for a, b in zip(ranges.high, even_ranges.high, strict=True)
+        )
+    assert moved > 20
+
+
+def test_a_bias_that_outweighs_its_channel_still_fits() -> None:
+    graph = small(weight=1e-7, bias=3.0)
+    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
+    first, head = layer_figures(graph, network, NOISE)[0], network.layers[0]
+    assert isinstance(head, Conv)
+    assert np.abs(head.bias.astype(np.int64)).max() < 2**31 - 1
+    assert first.sqnr_db is not None
+    assert first.sqnr_db > 40
+
+
+def test_the_grid_of_levels_holds_the_range_and_zero() -> None:
+    graph = small()
+    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
+    wanted = outputs_of(graph, tensors_of(graph, to_input(NOISE)))
+    for head, values in ((network.depth, wanted[:, 0]), (network.confidence, wanted[:, 1])):
+        ends = head.scale * (np.array([-128, 127]) - head.zero_point)
+        assert ends[0] <= values.min() < values.max() <= ends[1]
+        assert ends[0] <= 0 <= ends[1]
+
+
+def test_tables_say_what_the_levels_mean() -> None:
+    network = quantise(small(), calibrate(small(), [NOISE]), ABOUT)
+    logit = network.confidence.scale * (np.arange(-128, 128) - network.confidence.zero_point)
+    np.testing.assert_allclose(
+        network.confidence.table / 65535, 1 / (1 + np.exp(-logit)), atol=1e-5
+    )
+    log_depth = network.depth.scale * (np.arange(-128, 128) - network.depth.zero_point)
+    np.testing.assert_allclose(network.depth.table / 1000, np.exp(log_depth), atol=6e-4)
+    q = network.threshold_q
+    assert network.confidence.table[q + 127] < 0.3 * 65535 <= network.confidence.table[q + 128]
+
+
+def test_images_of_one_colour_are_refused() -> None:
+    plain = np.stack([np.full((16, 24, 3), level, np.uint8) for level in (0, 90, 255)])
+    with pytest.raises(SettingError, match=r"the 3 calibration images is of a single colour"):
+        calibrate(small(), [plain])
+
+
+def test_no_images_are_refused() -> None:
+    with pytest.raises(SettingError, match="no images to calibrate on"):
+        calibrate(small(), [])
+
+
+def test_a_layer_that_is_always_zero_is_named() -> None:
+    with pytest.raises(SettingError, match="layer first is zero for all of the 3 calibration"):
+        calibrate(small(bias=-100.0), [NOISE])
+
+
+def test_a_network_without_confidence_is_refused() -> None:
+    ranges = calibrate(small(), [NOISE])
+    with pytest.raises(SettingError, match="gives no confidence"):
+        quantise(small(), ranges, replace(ABOUT, channels=("log_depth", "class")))
+
+
+def test_a_network_that_breaks_its_promises_is_refused() -> None:
+    network = quantise(small(), calibrate(small(), [NOISE]), ABOUT)
+    first = network.layers[0]
+    assert isinstance(first, Conv)
+    loud = replace(first, bias=np.full(4, 2**31 - 1, np.int32))
+    with pytest.raises(ModelError, match="layer first can overflow int32"):
+        replace(network, layers=(loud, *network.layers[1:]))
+    late = replace(first, source=2)
+    with pytest.raises(ModelError, match="layer first reads tensors"):
+        replace(network, layers=(late, *network.layers[1:]))

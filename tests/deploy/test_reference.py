@@ -1,0 +1,120 @@
+"""The integer rules, against arithmetic done by hand."""
+
+import numpy as np
+import pytest
+
+from dmrl.deploy.backends import grids_of, integer
+from dmrl.deploy.integer import Add, Conv, IntegerNetwork, MaxPool
+from dmrl.deploy.reference import Detection, compute, decode, run
+from dmrl.learn.decode import decode as float_decode
+
+from .graphs import quantised_network
+from .networks import random_network
+
+
+def by_hand(layer: Conv, x: np.ndarray) -> np.ndarray:
+    """A convolution in Python's own integers."""
+    outs, rows, cols = layer.shape((x.shape,))
+    out = np.zeros((outs, rows, cols), np.int64)
+    low, high = (-128, 127) if layer.signed else (0, 255)
+    for o, r, c in np.ndindex(outs, rows, cols):
+        acc = int(layer.bias[o])
+        for i, kr, kc in np.ndindex(layer.weight.shape[1:]):
+            channel = o if layer.depthwise else i
+            row = r * layer.stride - layer.padding + kr * layer.dilation
+            col = c * layer.stride - layer.padding + kc * layer.dilation
+            inside = 0 <= row < x.shape[1] and 0 <= col < x.shape[2]
+            value = int(x[channel, row, col]) if inside else layer.pad_value
+            acc += int(layer.weight[o, i, kr, kc]) * value
+        assert -(2**31) <= acc < 2**31
+        shift = int(layer.shift[o])
+        scaled = (acc * int(layer.multiplier[o]) + (1 << (shift - 1))) >> shift
+        out[o, r, c] = min(max(scaled, low), high)
+    return out
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_every_convolution_is_what_it_is_by_hand(seed: int) -> None:
+    network = random_network(seed)
+    rng = np.random.default_rng(seed)
+    for layer, shape in zip(network.layers, network.shapes[1:], strict=True):
+        source = network.shapes[layer.sources[0]]
+        x = rng.integers(0, 256, (source[0], *(min(side, 11) for side in source[1:])))
+        if isinstance(layer, Conv) and shape[0] * x.shape[0] < 60:
+            np.testing.assert_array_equal(compute(layer, x.astype(np.int16)), by_hand(layer, x))
+
+
+def test_half_goes_up_on_either_side_of_zero() -> None:
+    layer = Add("add", (0, 1), (2**20, 2**20), 21, signed=True)  # (a + b) / 2
+    a, b = (np.array(v, np.int16).reshape(1, 1, -1) for v in ([3, -3, 1, -1], [0, 0, 0, 0]))
+    assert compute(layer, a, b).ravel().tolist() == [2, -1, 1, 0]
+
+
+def test_unsigned_outputs_are_clamped_at_zero() -> None:
+    layer = Add("add", (0, 1), (2**20, 2**20), 20)
+    a = np.array([-5, 5, 200], np.int16).reshape(1, 1, 3)
+    assert compute(layer, a, a).ravel().tolist() == [0, 10, 255]
+
+
+def test_an_odd_last_row_is_left_out_of_a_pool() -> None:
+    x = np.arange(15, dtype=np.int16).reshape(1, 3, 5)
+    assert compute(MaxPool("pool", 0), x).tolist() == [[[6, 8]]]
+
+
+def network_with(offsets: bool) -> IntegerNetwork:
+    """The first random network that has offsets, or has none."""
+    found = (quantised_network(seed) for seed in range(50))
+    return next(n for n in found if (n.offset_u is not None) == offsets and n.grid_shape > (4, 4))
+
+
+def grids(network: IntegerNetwork, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Heads as a network gives them: many equal values."""
+    return {
+        name: rng.integers(-20, 21, network.grid_shape).astype(np.int8) * 6
+        for name in network.heads
+    }
+
+
+@pytest.mark.parametrize("offsets", [False, True])
+def test_integer_detections_are_the_float_ones(offsets: bool) -> None:
+    network, rng = network_with(offsets), np.random.default_rng(3)
+    backend = integer(network)
+    believed = 0
+    for _ in range(50):
+        levels = grids(network, rng)
+        backend.run = lambda _, levels=levels: levels
+        blank = np.zeros((1, network.height_px, network.width_px, 3), np.uint8)
+        found = float_decode(*grids_of(backend.outputs(blank)), stride_px=8)
+        sure = found.confidence[0, : found.count[0]] >= 0.3
+        got = decode(network, levels)
+        if offsets and len(got) != sure.sum():
+            continue  # 1/16 px decided whether two are one
+        assert len(got) == sure.sum()
+        believed += len(got)
+        for k, one in enumerate(got):
+            assert abs(one.u_q4 / 16 - found.u_px[0, k]) <= 1 / 16
+            assert abs(one.v_q4 / 16 - found.v_px[0, k]) <= 1 / 16
+            assert abs(one.depth_mm / 1000 - min(found.depth_m[0, k], 65.535)) < 1e-3
+            assert abs(one.confidence / 65535 - found.confidence[0, k]) < 1e-4
+    assert believed > 50
+
+
+def test_equal_neighbours_are_one_detection_the_first() -> None:
+    network = network_with(offsets=False)
+    levels = {name: np.full(network.grid_shape, -128, np.int8) for name in network.heads}
+    levels["confidence"][1, 1:3] = 127
+    wanted = Detection(
+        12 * 16, 12 * 16, int(network.depth.table[0]), int(network.confidence.table[255])
+    )
+    assert network.threshold_q <= 127
+    assert decode(network, levels) == [wanted]
+
+
+def test_the_heads_are_channels_of_their_tensor() -> None:
+    network = random_network(5)
+    image = np.random.default_rng(0).integers(
+        0, 256, (network.height_px, network.width_px, network.channels), np.uint8
+    )
+    got = run(network, image)
+    assert set(got) == set(network.heads)
+    assert all(grid.shape == network.grid_shape for grid in got.values())

@@ -1,0 +1,74 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.camera_pose import Flight, Noise, PeerPath, calibrate
+from dmrl.geometry import AIDECK, Camera, inside, pixels_from_horizontal
+
+TRUE = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
+
+
+def flight(seed: int, camera: Camera = TRUE, images: int = 400, outliers: float = 0.1) -> Flight:
+    """A peer that wanders in view; what the camera saw of it, 3 px off, now and then nonsense."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0, images / 10 + 2, 0.05)
+    phase = rng.uniform(0, 6, 4)
+    xyz = np.column_stack(
+        [
+            1.4 + 0.4 * np.sin(0.7 * time_s + phase[0]),
+            0.5 * np.sin(1.3 * time_s + phase[1]),
+            -0.15 + 0.2 * np.sin(0.9 * time_s + phase[2]),
+        ]
+    )
+    attitude = 0.08 * np.column_stack([np.sin(2.1 * time_s + phase[3]), np.cos(1.7 * time_s)])
+    image_s = 1.0 + np.arange(images) / 10
+    at_s = image_s - camera.delay_s
+    there = np.column_stack([np.interp(at_s, time_s, axis) for axis in xyz.T])
+    roll, pitch = (np.interp(at_s, time_s, angle) for angle in attitude.T)
+    uv, _, _ = pixels_from_horizontal(there, roll, pitch, camera)
+    uv += rng.normal(0, 3.0, uv.shape)
+    wild = rng.random(images) < outliers
+    uv[wild] = rng.uniform((0, 0), (320, 224), (int(wild.sum()), 2))
+    seen = np.flatnonzero(inside(uv, 320, 224))
+    covariance = np.broadcast_to(0.01**2 * np.eye(3), (len(time_s), 3, 3))
+    peers = {"cf2": PeerPath(time_s, xyz, covariance)}
+    return Flight(image_s, seen, uv[seen], time_s, attitude, peers)
+
+
+def test_mount_and_delay_are_found_again() -> None:
+    found = calibrate([flight(0, images=1200)], AIDECK, Noise(3.0, 0.005))
+    assert found is not None
+    assert np.degrees(found.camera.mount_rad) == pytest.approx(np.degrees(TRUE.mount_rad), abs=0.3)
+    assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.005)
+    assert found.after_px < 0.6 * found.before_px
+    errors = np.subtract(found.camera.mount_rad, TRUE.mount_rad) / found.mount_std_rad
+    assert np.abs(errors).max() < 4.0
+
+
+def test_a_camera_that_is_right_is_left_as_it_is() -> None:
+    found = calibrate([flight(1, AIDECK)], AIDECK, Noise(3.0, 0.005))
+    assert found is not None
+    assert np.abs(np.degrees(found.camera.mount_rad)).max() < 0.3
+    assert abs(found.camera.delay_s) < 0.005
+
+
+def test_several_flights_are_left_out_in_turn() -> None:
+    found = calibrate([flight(seed, images=150) for seed in range(4)], AIDECK, Noise(3.0, 0.005))
+    assert found is not None
+    assert np.degrees(found.camera.mount_rad) == pytest.approx(np.degrees(TRUE.mount_rad), abs=0.3)
+    assert 0 < max(found.mount_std_rad) < np.radians(0.5)
+
+
+def test_detections_that_fit_nothing_give_nothing() -> None:
+    assert calibrate([flight(2, outliers=1.0, images=60)], AIDECK, Noise()) is None
+
+
+def test_gaps_in_the_positions_are_not_bridged() -> None:
+    whole = flight(3)
+    peer = whole.peers["cf2"]
+    keep = (peer.time_s < 10) | (peer.time_s > 25)
+    holed = PeerPath(peer.time_s[keep], peer.xyz_m[keep], peer.covariance[keep])
+    found = calibrate([replace(whole, peers={"cf2": holed})], AIDECK, Noise(3.0, 0.005))
+    assert found is not None
+    assert found.matched < 300

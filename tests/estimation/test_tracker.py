@@ -1,0 +1,200 @@
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from dmrl.estimation.identity import Identity
+from dmrl.estimation.tracker import Tracker, Tuning
+from dmrl.estimation.view import Motion, View
+from dmrl.geometry import AIDECK, Array, horizontal_from_pixels, inside, pixels_from_horizontal
+
+TUNING = Tuning()
+DT_S = 0.1
+LEVEL = np.zeros(1)
+
+
+@dataclass(frozen=True)
+class Detector:
+    """What a network makes of peers in view: noise as the tuning says, misses, false alarms."""
+
+    rng: np.random.Generator
+    share: float = TUNING.detection_share
+    false_per_image: float = TUNING.false_per_image
+
+    def view(self, peers: Array, bias: Array) -> View:
+        uv, depth_m, _ = pixels_from_horizontal(
+            peers, np.zeros(len(peers)), np.zeros(len(peers)), AIDECK
+        )
+        seen = inside(uv, 320, 224) & (depth_m > 0) & (self.rng.random(len(peers)) < self.share)
+        noise = self.rng.normal(size=(len(peers), 3))
+        tilt_px = TUNING.attitude_std_rad * AIDECK.fx_px * self.rng.normal(size=2)
+        uv = uv + TUNING.pixel_std_px * noise[:, :2] + tilt_px
+        depth_m = depth_m * np.exp(TUNING.depth_std_ratio * noise[:, 2] + bias)
+        alarms = self.rng.poisson(self.false_per_image)
+        false_uv = self.rng.uniform((0, 0), (320, 224), (alarms, 2))
+        false_m = 0.3 * np.exp(self.rng.uniform(0, np.log(20), alarms))
+        return View(
+            np.concatenate([uv[seen], false_uv]),
+            np.concatenate([depth_m[seen], false_m]),
+            0.0,
+            0.0,
+        )
+
+
+def wandering(rng: np.random.Generator, steps: int, start: Array) -> Iterator[Array]:
+    """Positions of a peer that flies about its start, metres."""
+    place, speed = start.copy(), np.zeros(3)
+    for _ in range(steps):
+        speed += 0.8 * np.sqrt(DT_S) * rng.normal(size=3) - DT_S * (0.8 * speed + (place - start))
+        place = place + DT_S * speed
+        yield place
+
+
+def depth_biases(rng: np.random.Generator, steps: int, peers: int) -> Iterator[Array]:
+    keep = np.exp(-DT_S / TUNING.depth_bias_s)
+    bias = rng.normal(size=peers)
+    for _ in range(steps):
+        yield TUNING.depth_bias_ratio * bias
+        bias = keep * bias + np.sqrt(1 - keep**2) * rng.normal(size=peers)
+
+
+@dataclass
+class Outcome:
+    """One run: squared errors of tracks and of single detections, and who was followed."""
+
+    squared: list[float]
+    track_m2: list[float]
+    single_m2: list[float]
+    ids: list[int]
+    false_tracks: int
+
+
+def followed(seed: int, starts: Array, steps: int = 600) -> Outcome:
+    rng = np.random.default_rng(seed)
+    tracker, detector = Tracker(AIDECK, TUNING), Detector(rng)
+    paths = [wandering(rng, steps, start) for start in starts]
+    out = Outcome([], [], [], [], 0)
+    false: set[int] = set()
+    for biases in depth_biases(rng, steps, len(starts)):
+        truth = np.array([next(path) for path in paths])
+        view = detector.view(truth, biases)
+        tracks = tracker.step(Motion(DT_S, np.zeros(3), 0.0), view)
+        level = np.zeros(len(view.uv))
+        single = horizontal_from_pixels(view.uv, view.depth_m, level, level, AIDECK)
+        for track in tracks:
+            apart = np.linalg.norm(track.position_m - truth, axis=1)
+            if apart.min() > 1.0:
+                false.add(track.number)
+                continue
+            error = track.position_m - truth[apart.argmin()]
+            out.squared.append(error @ np.linalg.inv(track.covariance) @ error)
+            nearest = np.linalg.norm(single - truth[apart.argmin()], axis=1).min(initial=np.inf)
+            if nearest < 1.0:
+                out.track_m2.append(float(error @ error))
+                out.single_m2.append(float(nearest**2))
+            out.ids.append(track.number)
+    out.false_tracks = len(false)
+    return out
+
+
+def test_a_peer_is_followed_through_misses_and_false_alarms() -> None:
+    run = followed(1, np.array([[1.5, 0.0, 0.0]]), steps=150)
+    assert len(run.ids) > 100
+    longest = max(run.ids.count(number) for number in set(run.ids))
+    assert longest > 0.4 * len(run.ids)
+    assert np.sqrt(np.mean(run.track_m2)) < 0.4
+
+
+def test_the_filter_knows_its_error_while_its_model_holds() -> None:
+    """No false alarms, no misses: what is left is the filter's own arithmetic."""
+    squared: list[float] = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        tracker, detector = Tracker(AIDECK, TUNING), Detector(rng, 1.0, 0.0)
+        path = wandering(rng, 60, np.array([1.5, 0.0, 0.0]))
+        for truth, bias in zip(path, depth_biases(rng, 60, 1), strict=True):
+            for track in tracker.step(STILL, detector.view(truth[None], bias)):
+                error = track.position_m - truth
+                squared.append(error @ np.linalg.inv(track.covariance) @ error)
+    assert 0.88 <= np.mean(np.array(squared) <= chi2.ppf(0.95, 3)) <= 0.99
+
+
+def view_of(xyz: Array, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> View:
+    angles = np.full(len(xyz), roll_rad), np.full(len(xyz), pitch_rad)
+    uv, depth_m, _ = pixels_from_horizontal(xyz, *angles, AIDECK)
+    return View(uv, depth_m, roll_rad, pitch_rad)
+
+
+NOTHING = View(np.zeros((0, 2)), np.zeros(0), 0.0, 0.0)
+STILL = Motion(DT_S, np.zeros(3), 0.0)
+
+
+def test_a_standing_peer_has_no_velocity_whatever_the_observer_does() -> None:
+    tracker = Tracker(AIDECK, TUNING)
+    peer, own, yaw = np.array([1.8, 0.0, 0.1]), np.zeros(3), 0.0
+    for k in range(60):
+        step, turn = np.array([0.01, 0.02 * np.sin(k / 5), 0.005]), 0.02 * np.cos(k / 7)
+        c, s = np.cos(yaw), np.sin(yaw)
+        own = own + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])
+        yaw += turn
+        c, s = np.cos(yaw), np.sin(yaw)
+        x, y, z = peer - own
+        here = np.array([[c * x + s * y, -s * x + c * y, z]])
+        tracks = tracker.step(Motion(DT_S, step, turn), view_of(here, 0.1, -0.05))
+    (track,) = tracks
+    assert np.allclose(track.position_m, here[0], atol=0.02)
+    assert np.abs(track.velocity_mps).max() < 0.05
+
+
+def test_a_peer_that_is_gone_is_given_up_and_one_out_of_view_is_not_at_once() -> None:
+    tracker = Tracker(AIDECK, TUNING)
+    for _ in range(10):
+        tracker.step(STILL, view_of(np.array([[1.5, 0.0, 0.0]])))
+    assert len(tracker.step(STILL, NOTHING)) == 1
+    turned = Motion(DT_S, np.zeros(3), 1.5)  # the peer is now beside the image
+    assert len(tracker.step(turned, NOTHING)) == 1
+    assert all(len(tracker.step(STILL, NOTHING)) == 1 for _ in range(3))
+    for _ in range(100):
+        left = tracker.step(STILL, NOTHING)
+    assert not left
+
+
+def test_single_false_alarms_never_become_tracks() -> None:
+    tracker, rng = Tracker(AIDECK, TUNING), np.random.default_rng(0)
+    for _ in range(100):
+        xyz = np.array([[rng.uniform(0.5, 3.0), 0.0, 0.0]]) * [1.0, 1.0, 1.0]
+        xyz[0, 1:] = xyz[0, 0] * rng.uniform(-0.4, 0.4, 2)
+        view = view_of(xyz) if rng.random() < 0.3 else NOTHING
+        assert not tracker.step(STILL, view)
+
+
+def test_two_peers_keep_their_numbers_and_get_their_names_by_range() -> None:
+    tracker, identity = Tracker(AIDECK, TUNING), Identity()
+    peers = np.array([[1.0, 0.3, 0.0], [2.2, -0.4, 0.1]])
+    distances = dict(zip(("cf2", "cf3"), np.linalg.norm(peers, axis=1).tolist(), strict=True))
+    numbers = set()
+    for _ in range(40):
+        tracks = tracker.step(STILL, view_of(peers))
+        names = identity.names(tracks, distances, DT_S)
+        numbers |= {track.number for track in tracks}
+    assert len(numbers) == 2
+    for track in tracks:
+        nearest = np.linalg.norm(peers - track.position_m, axis=1).argmin()
+        assert names[track.number] == ("cf2", "cf3")[nearest]
+
+
+def test_a_track_that_no_range_fits_has_no_name() -> None:
+    tracker, identity = Tracker(AIDECK, TUNING), Identity()
+    for _ in range(40):
+        tracks = tracker.step(STILL, view_of(np.array([[1.0, 0.0, 0.0]])))
+        names = identity.names(tracks, {"cf2": 4.0, "cf3": 5.0}, DT_S)
+    assert tracks
+    assert not names
+
+
+def test_an_image_without_detections_and_one_behind_the_lens_s_fold_are_taken() -> None:
+    tracker = Tracker(AIDECK, TUNING)
+    assert tracker.step(STILL, NOTHING) == []
+    far_out = View(np.array([[5000.0, 5000.0]]), np.ones(1), 0.0, 0.0)
+    assert tracker.step(STILL, far_out) == []

@@ -1,0 +1,121 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from dmrl.learn.augment import Augmentation, Augmenter
+from dmrl.learn.batches import Batch, Examples
+
+GEOMETRY = Augmentation(
+    flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0
+)
+SIDE_M = 12.0
+"""A square of s pixels stands for a robot at a depth of SIDE_M / s."""
+
+
+def squares(count: int = 24, seed: int = 0) -> Examples:
+    """Dark images with one bright square each; its side tells its depth."""
+    rng = np.random.default_rng(seed)
+    pixels = np.zeros((count, 112, 160, 3), np.uint8)
+    robots = np.full((count, 2, 10), np.nan, np.float32)
+    for k in range(count):
+        side = int(rng.integers(8, 25))
+        left, top = int(rng.integers(2, 158 - side)), int(rng.integers(2, 110 - side))
+        pixels[k, top : top + side, left : left + side] = 255
+        centre = (left + side / 2, top + side / 2, SIDE_M / side, 1.0, 1.0, 0.1)
+        robots[k, 0] = (*centre, left, top, left + side, top + side)
+    return Examples([pixels], robots)
+
+
+def batches(settings: Augmentation, count: int = 10) -> list[Batch]:
+    augmenter = Augmenter(squares(), settings, seed=0)
+    return [augmenter.batch(range(24), epoch=0, index=k) for k in range(count)]
+
+
+def lonely(batch: Batch) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Image and robot where there is one robot and it is whole and far from the rim."""
+    out = []
+    for image, robots in zip(batch.images.numpy(), batch.robots.numpy(), strict=True):
+        found = robots[np.isfinite(robots[:, 0])].astype(np.float64)
+        if len(found) != 1:
+            continue
+        half = SIDE_M / found[0, 2]
+        margin = np.array([[found[0, 0], 160 - found[0, 0]], [found[0, 1], 112 - found[0, 1]]])
+        if (margin > 1.5 * half).all():
+            out.append((image[0].astype(np.float64), found[0]))
+    return out
+
+
+def test_labels_stay_at_the_robots_and_depth_follows_the_zoom() -> None:
+    settings = replace(GEOMETRY, mosaic_share=0.0, paste=0.0)
+    checked = 0
+    for batch in batches(settings, 30):
+        for image, robot in lonely(batch):
+            mass = image.sum()
+            v, u = np.indices(image.shape) + 0.5
+            at = np.array([(u * image).sum(), (v * image).sum()]) / mass
+            side = math.sqrt(mass / 255)
+            np.testing.assert_allclose(at, robot[:2], atol=0.35)
+            assert side * robot[2] == pytest.approx(SIDE_M, rel=0.05)
+            checked += 1
+    assert checked > 100
+
+
+def test_pasted_robots_are_labelled_and_covered_ones_are_not() -> None:
+    for batch in batches(replace(GEOMETRY, rotation_deg=0.0, paste=2.0)):
+        bright = batch.images[:, 0].numpy()
+        for image, robots in zip(bright, batch.robots.numpy(), strict=True):
+            for robot in robots[np.isfinite(robots[:, 0])]:
+                u, v = np.clip(robot[:2].astype(int), 0, (159, 111))
+                near = image[max(v - 2, 0) : v + 3, max(u - 2, 0) : u + 3]
+                assert near.max() > 120
+
+
+def test_depths_stay_in_the_range_of_the_labels() -> None:
+    depths = [
+        batch.robots[..., 2] for batch in batches(replace(GEOMETRY, zoom=(0.2, 5.0), paste=0.0))
+    ]
+    found = torch.cat(depths).flatten()
+    found = found[torch.isfinite(found)]
+    assert found.max() <= SIDE_M / 8 * 1.1 * 1.001
+    assert found.min() >= SIDE_M / 24 / 1.1 * 0.999
+    assert found.min() < 0.6
+    assert found.max() > 1.3
+
+
+def test_sigmas_follow_the_zoom() -> None:
+    for batch in batches(replace(GEOMETRY, mosaic_share=0.0, paste=0.0), 3):
+        robots = batch.robots[torch.isfinite(batch.robots[..., 0])]
+        zoom = robots[:, 3]
+        assert zoom.min() < 1.1 < 1.3 < zoom.max()
+        torch.testing.assert_close(robots[:, 4], zoom)
+        torch.testing.assert_close(robots[:, 5], 0.1 / zoom)
+
+
+def test_a_batch_depends_on_seed_epoch_and_place_alone() -> None:
+    examples = squares()
+    everything = replace(GEOMETRY, colour=0.1, noise=0.05, blur_share=0.5)
+    first, again = (Augmenter(examples, everything, seed=3) for _ in range(2))
+    first.batch([5], epoch=0, index=0)
+    a, b = (x.batch([1, 2], epoch=2, index=7) for x in (first, again))
+    assert torch.equal(a.images, b.images)
+    assert torch.equal(a.robots.nan_to_num(), b.robots.nan_to_num())
+    other = again.batch([1, 2], epoch=2, index=8)
+    assert not torch.equal(a.images, other.images)
+
+
+def test_images_without_robots_or_boxes_can_be_varied_too() -> None:
+    empty = Examples(
+        [np.zeros((2, 112, 160, 3), np.uint8)], np.full((2, 1, 10), np.nan, np.float32)
+    )
+    batch = Augmenter(empty, GEOMETRY, seed=0).batch([0, 1], epoch=0, index=0)
+    assert not torch.isfinite(batch.robots[..., 0]).any()
+    assert batch.images.shape == (2, 3, 112, 160)
+
+
+def test_nothing_is_nothing() -> None:
+    assert Augmentation().is_nothing
+    assert not replace(Augmentation(), flip_share=0.1).is_nothing

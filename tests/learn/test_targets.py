@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+import torch
+
+from dmrl.geometry import grid_label
+from dmrl.learn.targets import targets
+
+SHAPE = (28, 40)
+
+
+def robots(*rows: tuple[float, ...]) -> torch.Tensor:
+    """(1, K, 10) from u, v, depth and, where given, sigmas."""
+    out = torch.full((1, len(rows), 10), float("nan"))
+    for k, row in enumerate(rows):
+        out[0, k, 3:6] = 0
+        out[0, k, : len(row)] = torch.tensor(row)
+    return out
+
+
+def test_without_width_they_are_the_grid_labels_of_the_paper() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        found = np.c_[rng.uniform(-20, 340, 6), rng.uniform(-20, 240, 6), rng.uniform(0.2, 2, 6)]
+        found[0, :2] = 64, 80  # on a border
+        found[2, :2] = found[1, :2]  # two in one cell
+        got = targets(robots(*found), SHAPE, sigma_cells=0)
+        confidence, depth_m = grid_label(found[:, :2], found[:, 2])
+        np.testing.assert_array_equal(got.confidence[0], confidence)
+        np.testing.assert_array_equal(got.weight[0], confidence)
+        np.testing.assert_allclose(got.depth_m[0].numpy() * confidence, depth_m, rtol=1e-6)
+
+
+def test_with_width_the_offset_leads_from_every_near_cell_to_the_centre() -> None:
+    got = targets(robots((101.5, 50.25, 1.3)), SHAPE, sigma_cells=0.7)
+    rows, cols = torch.nonzero(got.weight[0], as_tuple=True)
+    assert len(rows) > 4
+    u = (cols + 0.5 + got.offset[0, 0, rows, cols]) * 8
+    v = (rows + 0.5 + got.offset[0, 1, rows, cols]) * 8
+    torch.testing.assert_close(u, torch.full_like(u, 101.5))
+    torch.testing.assert_close(v, torch.full_like(v, 50.25))
+    assert got.confidence[0].argmax() == 6 * 40 + 12
+    torch.testing.assert_close(got.depth_m[0, rows, cols], torch.full_like(u, 1.3))
+
+
+def test_each_cell_belongs_to_the_nearest_centre() -> None:
+    got = targets(robots((100, 100, 1.0), (116, 100, 2.0)), SHAPE, sigma_cells=0.7)
+    assert got.depth_m[0, 12, 11:16].tolist() == pytest.approx([1, 1, 1, 2, 2])
+
+
+def test_no_robot_is_no_presence_and_no_weight() -> None:
+    got = targets(robots((float("nan"), 0, 0), (50, 50, -1)), SHAPE, sigma_cells=0.7)
+    assert all((x == 0).all() for x in (got.confidence, got.weight, got.offset))
+    assert (got.confidence_weight == 1).all()
+    assert all(torch.isfinite(x).all() for x in got)
+
+
+def test_a_noisy_label_weighs_less_or_is_spread_out() -> None:
+    exact, noisy = (100.0, 100.0, 1.0), (100.0, 100.0, 1.0, 8.0, 8.0, 0.1)
+    plain = targets(robots(noisy), SHAPE, sigma_cells=0.7)
+    for one, other in zip(plain, targets(robots(exact), SHAPE, sigma_cells=0.7), strict=True):
+        torch.testing.assert_close(one, other)
+    weighted = targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="weight")
+    torch.testing.assert_close(weighted.weight, plain.weight / 2)
+    torch.testing.assert_close(weighted.offset_weight, plain.weight / 2)
+    assert weighted.confidence_weight[0, 12, 12] == 0.5
+    assert weighted.confidence_weight[0, 0, 0] == 1
+    softened = targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="soften")
+    assert softened.confidence.max() < 0.5 * plain.confidence.max()
+    # Spread, not lost: the sum over cells stays.
+    torch.testing.assert_close(softened.confidence.sum(), plain.confidence.sum(), rtol=1e-2, atol=0)

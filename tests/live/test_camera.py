@@ -1,0 +1,124 @@
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SettingError
+from dmrl.formats import cpx
+from dmrl.formats.cpx import Image
+from dmrl.formats.cpx_pack import pack_image
+from dmrl.formats.cpx_packets import APP, GAP8, HOST, Packet, pack_packet
+from dmrl.live.camera import GARBAGE_BYTES, CameraClient, address
+from dmrl.live.clocks import HostTime
+from dmrl.live.feed import Feed, Received
+
+PATIENCE_S = 20.0
+RNG = np.random.default_rng(5)
+Start = Callable[[int], tuple[CameraClient, Feed]]
+RAW = Image(320, 224, "raw", RNG.bytes(320 * 224))
+
+
+def wait(what: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.01)
+
+
+class Deck:
+    """A camera that sends one answer to each client, and closes the connection."""
+
+    def __init__(self, *answers: bytes) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._thread = threading.Thread(target=self._run, args=(answers,), daemon=True)
+        self._thread.start()
+
+    def _run(self, answers: tuple[bytes, ...]) -> None:
+        for answer in answers:
+            client, _ = self._listener.accept()
+            with client:
+                client.sendall(answer)
+        self._listener.close()
+
+
+@pytest.fixture
+def client() -> Iterator[Start]:
+    started: list[CameraClient] = []
+
+    def start(port: int) -> tuple[CameraClient, Feed]:
+        feed = Feed()
+        started.append(CameraClient("cf1", "127.0.0.1", port, feed, HostTime()))
+        started[-1].start()
+        return started[-1], feed
+
+    yield start
+    for one in started:
+        one.stop()
+    for one in started:
+        one.join(timeout=PATIENCE_S)
+
+
+def taken(feed: Feed) -> tuple[list[Received], list[str]]:
+    items = feed.take(0.0)
+    return [i for i in items if isinstance(i, Received)], [i for i in items if isinstance(i, str)]
+
+
+def test_images_come_after_their_calibration_over_two_connections(client: Start) -> None:
+    deck = Deck(pack_image(RAW), pack_image(RAW) * 2)
+    camera, feed = client(deck.port)
+    wait(lambda: camera.health.received == 3)
+    received, said = taken(feed)
+    topics = [item.sample.topic for item in received]
+    assert topics == ["/cf1/camera/calibration", *["/cf1/camera/image"] * 3]
+    assert camera.health.connections == 2
+    assert "closed the connection" in said[0]
+
+
+def test_a_closed_port_is_said_once_and_tried_again(client: Start) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken_port:
+        port = taken_port.getsockname()[1]
+    camera, feed = client(port)
+    wait(lambda: camera.health.state == "refuses connections")
+    assert camera.is_alive()
+    assert taken(feed)[1] == [f"cf1: camera refuses connections at 127.0.0.1:{port}; trying again"]
+
+
+def test_garbage_ends_the_connection_and_gives_no_image(client: Start) -> None:
+    deck = Deck(RNG.bytes(2 * GARBAGE_BYTES))
+    camera, feed = client(deck.port)
+    wait(lambda: camera.health.state == "sends no CPX images")
+    assert camera.health.received == 0
+    assert taken(feed)[0] == []
+
+
+def test_images_that_are_not_what_they_say_are_counted_and_left_out(client: Start) -> None:
+    header = cpx.HEADER.pack(cpx.MAGIC, 320, 224, 1, 0, 100)
+    wrong = [Packet(GAP8, HOST, APP, data) for data in (header, bytes(100))]
+    no_jpeg = Image(320, 224, "jpeg", b"\xff\xd8" + bytes(500))
+    deck = Deck(b"".join(map(pack_packet, wrong)) + pack_image(no_jpeg) + pack_image(RAW))
+    camera, feed = client(deck.port)
+    wait(lambda: camera.health.received == 1)
+    assert camera.health.broken == 2
+    assert len(taken(feed)[0]) == 2
+
+
+def test_images_of_another_size_come_without_a_calibration(client: Start) -> None:
+    camera, feed = client(Deck(pack_image(Image(16, 16, "raw", bytes(256)))).port)
+    wait(lambda: camera.health.received == 1)
+    received, said = taken(feed)
+    assert [item.sample.topic for item in received] == ["/cf1/camera/image"]
+    assert "16 x 16 px, the calibration is of 320 x 224 px" in said[0]
+
+
+@pytest.mark.parametrize("text", ["", ":5000", "host:", "host:0", "host:70000", "host:x"])
+def test_what_is_no_address_is_refused(text: str) -> None:
+    with pytest.raises(SettingError, match="HOST:PORT"):
+        address(text)
+
+
+def test_without_a_port_the_decks_own_is_taken() -> None:
+    assert address("192.168.4.1") == ("192.168.4.1", 5000)

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from dmrl.live.clocks import SenderClock, SteadySender
+
+MS = 1_000_000
+BASE_NS = 1_700_000_000_000_000_000
+
+
+@pytest.mark.parametrize("drift_ppm", [-50.0, 0.0, 20.0, 100.0])
+def test_a_drifting_clock_is_followed_to_a_millisecond_through_jitter(drift_ppm: float) -> None:
+    rng = np.random.default_rng(1)
+    clock, errors_ms = SenderClock(), []
+    for k in range(12_000):
+        sender_ns = 10 * MS * k
+        true_ns = BASE_NS + round(sender_ns * (1 + 1e-6 * drift_ppm))
+        clock.hear(sender_ns, true_ns + round((2 + rng.exponential(8)) * MS))
+        if clock.settled:
+            errors_ms.append((clock.host_ns(sender_ns) - true_ns) / MS)
+    # 2 ms is the least delay, which nobody can see.
+    assert min(errors_ms) > 0.5
+    assert max(errors_ms) < 2.5
+
+
+def test_settled_times_keep_the_senders_steps() -> None:
+    rng = np.random.default_rng(2)
+    clock, times = SenderClock(), []
+    for k in range(1000):
+        clock.hear(10 * MS * k, BASE_NS + 10 * MS * k + round(rng.exponential(30) * MS))
+        if clock.settled:
+            times.append(clock.host_ns(10 * MS * k))
+    steps = np.diff(times)
+    assert np.abs(steps - 10 * MS).max() <= SenderClock.SLEW * 10 * MS + 1
+
+
+def test_a_clock_of_another_pace_is_left_alone() -> None:
+    clock = SenderClock()
+    for k in range(2000):
+        clock.hear(40 * MS * k, BASE_NS + 10 * MS * k)
+    assert clock.host_ns(40 * MS) - clock.host_ns(0) == 40 * MS
+    assert abs(clock.host_ns(0) - BASE_NS) < 4_000 * MS
+
+
+def test_arrivals_of_a_steady_sender_are_evened_out_and_never_in_the_future() -> None:
+    rng = np.random.default_rng(3)
+    sender, errors_ms, raw_ms, last = SteadySender(), [], [], 0
+    for k in range(1000):
+        true_ns = 50 * MS * k
+        last = arrival = max(true_ns + round(rng.exponential(15) * MS), last)
+        sent = sender(arrival)
+        assert sent <= arrival
+        errors_ms.append((sent - true_ns) / MS)
+        raw_ms.append((arrival - true_ns) / MS)
+    assert np.std(errors_ms[100:]) < 0.4 * np.std(raw_ms[100:])
+
+
+def test_after_a_pause_arrivals_stand_as_they_are() -> None:
+    sender = SteadySender()
+    for k in range(20):
+        sender(50 * MS * k)
+    assert sender(5000 * MS) == 5000 * MS
+    assert sender(5050 * MS) == 5050 * MS

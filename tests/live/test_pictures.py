@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+
+from dmrl import images
+from dmrl.errors import SourceError
+from dmrl.formats.cpx import Image
+from dmrl.live.fake_camera import whole_sensor
+from dmrl.live.pictures import encoded
+
+RNG = np.random.default_rng(4)
+SMOOTH = np.clip(
+    128 + 60 * np.sin(np.mgrid[:224, :320].sum(axis=0)[..., None] / (20.0, 31.0, 47.0)), 0, 255
+).astype(np.uint8)
+
+
+def test_a_mosaic_is_filled_in_as_opencv_does() -> None:
+    cv2 = pytest.importorskip("cv2")
+    raw = RNG.integers(0, 256, (60, 80), np.uint8)
+    expected = cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB)
+    assert (images.demosaic(raw) == expected)[1:-1, 1:-1].all()
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (5, 7), (244, 324)])
+def test_what_a_pixel_measured_stays_as_it_was(shape: tuple[int, int]) -> None:
+    raw = RNG.integers(0, 256, shape, np.uint8)
+    assert (images.mosaic(images.demosaic(raw)) == raw).all()
+
+
+def test_the_whole_sensor_is_cut_to_what_the_calibration_is_of() -> None:
+    raw = images.mosaic(whole_sensor(SMOOTH))
+    data, kind = encoded(Image(324, 244, "raw", raw.tobytes()), "colour")
+    assert kind == "png"
+    difference = np.abs(images.decode(data).astype(int) - SMOOTH)
+    assert difference[1:-1, 1:-1].max() <= 4
+    grey, _ = encoded(Image(324, 244, "raw", raw.tobytes()), "grey")
+    assert (images.decode(grey)[..., 1] == raw[10:234, 2:322]).all()
+
+
+def test_a_jpeg_of_the_right_size_keeps_its_bytes() -> None:
+    jpeg = images.encode_jpeg(SMOOTH)
+    assert encoded(Image(320, 224, "jpeg", jpeg), "colour") == (jpeg, "jpeg")
+    whole = images.encode_jpeg(whole_sensor(SMOOTH))
+    data, kind = encoded(Image(324, 244, "jpeg", whole), "colour", "jpeg")
+    assert images.size(data) == (320, 224, kind)
+
+
+def test_a_jpeg_of_another_size_than_was_said_is_refused() -> None:
+    jpeg = images.encode_jpeg(SMOOTH)
+    with pytest.raises(SourceError, match="not 160 x 120 px as it said"):
+        encoded(Image(160, 120, "jpeg", jpeg), "colour")

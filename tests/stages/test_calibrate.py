@@ -1,0 +1,143 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
+from dmrl.formats.camera_toml import read_camera
+from dmrl.geometry import AIDECK
+from dmrl.images import encode_png
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, read
+from dmrl.stages import calibrate, fly, label
+from dmrl.stages.calibrate import Settings
+
+from ..estimation.test_board import picture, pose
+from .detector import with_detections
+
+CROOKED = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight whose camera is mounted crookedly, and whose images are stamped late."""
+    folder = tmp_path_factory.mktemp("calibrate")
+    flight = folder / "flight.mcap"
+    fly.run(flight, fly.Settings(2, 40.0, noise="calibrated", seed=1001))
+    return with_detections(flight, folder / "seen.mcap", camera=CROOKED)
+
+
+@pytest.fixture(scope="module")
+def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("boards")
+    rng = np.random.default_rng(0)
+    for k in range(14):
+        grey = picture(*pose(rng))
+        (folder / f"{k}.png").write_bytes(encode_png(np.repeat(grey[..., None], 3, axis=2)))
+    return folder
+
+
+def test_mount_and_delay_come_from_a_flight(seen: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.toml"
+    found = calibrate.run([seen], out, Settings(against="truth"))
+    assert read_camera(out) == found.camera
+    errors = np.degrees(np.subtract(found.camera.mount_rad, CROOKED.mount_rad))
+    assert np.abs(errors).max() < 0.3
+    assert found.camera.delay_s == pytest.approx(0.03, abs=0.005)
+
+
+def test_labels_made_with_it_lie_where_the_peer_was_seen(seen: Path, tmp_path: Path) -> None:
+    camera = tmp_path / "camera.toml"
+    calibrate.run([seen], camera, Settings(against="truth"))
+    with_images = tmp_path / "images.mcap"
+    blank = message("CompressedImage")(
+        data=encode_png(np.zeros((224, 320, 3), np.uint8)), format="png"
+    )
+    with RecordingWriter(with_images, Provenance("test")) as sink:
+        for one in read(seen):
+            sink.write(one.time_ns, one.topic, one.message)
+            if one.topic == "/cf1/detections":
+                sink.write(one.time_ns, "/cf1/camera/image", blank)
+    distance = {}
+    for name, settings in {
+        "plain": label.Settings(gate_m=0.5),
+        "calibrated": label.Settings(gate_m=0.5, camera={"cf1": camera}),
+    }.items():
+        out = tmp_path / f"{name}.mcap"
+        label.run(with_images, out, settings)
+        distance[name] = _median_px(out)
+    assert distance["calibrated"] < 0.8 * distance["plain"]
+
+
+def _median_px(recording: Path) -> float:
+    found = {one.time_ns: one.message.detections for one in read(recording, "/cf1/detections")}
+    apart = [
+        min(np.hypot(d.u_px - peer.u_px, d.v_px - peer.v_px) for d in found[one.time_ns])
+        for one in read(recording, "/cf1/labels")
+        for peer in one.message.peers
+        if peer.status == 0 and found[one.time_ns]
+    ]
+    return float(np.median(apart))
+
+
+def test_intrinsics_come_from_a_folder_of_boards(boards: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.toml"
+    found = calibrate.run([boards], out, Settings(board="7x5"))
+    assert read_camera(out).fx_px == pytest.approx(AIDECK.fx_px, rel=0.03)
+    assert found.figures["with_board"] >= 5
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (Settings(), "--board"),
+        (Settings(board="9"), "columns x rows"),
+        (Settings(board="1x1"), "columns x rows"),
+    ],
+)
+def test_a_folder_needs_a_board(
+    boards: Path, tmp_path: Path, settings: Settings, words: str
+) -> None:
+    with pytest.raises(SettingError, match=words):
+        calibrate.run([boards], tmp_path / "camera.toml", settings)
+
+
+def test_pictures_without_that_board_are_counted(boards: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.toml"
+    with pytest.raises(SourceError, match="in 0 of 14 pictures"):
+        calibrate.run([boards], out, Settings(board="6x9"))
+    assert not out.exists()
+
+
+def test_pictures_of_two_sizes_are_refused(boards: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "boards"
+    folder.mkdir()
+    (folder / "a.png").write_bytes((boards / "0.png").read_bytes())
+    (folder / "b.png").write_bytes(encode_png(np.zeros((10, 12, 3), np.uint8)))
+    with pytest.raises(SourceError, match=r"b\.png is 12x10 px"):
+        calibrate.run([folder], tmp_path / "camera.toml", Settings(board="7x5"))
+
+
+def test_a_flight_without_positions_says_what_is_missing(seen: Path, tmp_path: Path) -> None:
+    with pytest.raises(MissingTopic, match="position"):
+        calibrate.run([seen], tmp_path / "camera.toml", Settings())
+
+
+def test_detections_of_something_else_are_refused(seen: Path, tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.mcap"
+    with RecordingWriter(wrong, Provenance("test")) as sink:
+        for one in read(seen):
+            if one.topic == "/cf1/detections":
+                for detection in one.message.detections:
+                    detection.u_px = 1.0
+            sink.write(one.time_ns, one.topic, one.message)
+    with pytest.raises(RecordingError, match="fewer than 50"):
+        calibrate.run([wrong], tmp_path / "camera.toml", Settings(against="truth"))
+
+
+def test_an_existing_output_is_refused(seen: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.toml"
+    out.write_text("")
+    with pytest.raises(OutputError):
+        calibrate.run([seen], out, Settings(against="truth"))

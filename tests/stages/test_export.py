@@ -1,0 +1,125 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.cli import app
+from dmrl.deploy import detector
+from dmrl.errors import MissingExtra, ModelError, SettingError
+from dmrl.recording import read, summary
+from dmrl.stages import predict
+from dmrl.stages.export import Settings, run
+
+INT8 = ("onnx-int8", "integer", "c")
+
+
+@pytest.fixture(scope="session")
+def exported(quantised: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("exported") / quantised.name
+    run(quantised, out, Settings())
+    return out
+
+
+def grids(model: Path, recording: Path, out: Path, backend: str) -> np.ndarray:
+    """(images, confidence and depth, rows, cols) that a backend gives."""
+    file = out / f"{model.parent.name}-{backend}.mcap"
+    predict.run(model, recording, file, predict.Settings(backend=backend))
+    made = summary(file).provenance
+    assert made is not None
+    assert made.settings["backend"] == backend
+    maps = [grid.message for grid in read(file, "/cf1/detections/grid")]
+    shape = (2, maps[0].rows, maps[0].cols)
+    return np.stack([np.frombuffer(grid.data, "<f4").reshape(shape) for grid in maps])
+
+
+def test_every_backend_runs_a_quantised_model_and_an_export(
+    quantised: Path, exported: Path, dots: Path, tmp_path: Path
+) -> None:
+    wanted = grids(quantised, dots, tmp_path, "torch")
+    assert np.ptp(wanted[:, 0]) > 0.1
+    for model in (quantised, exported):
+        onnx = grids(model, dots, tmp_path, "onnx")
+        np.testing.assert_allclose(onnx, wanted, rtol=1e-3, atol=1e-4)
+    reference = grids(quantised, dots, tmp_path, "integer")
+    assert 0 < np.abs(reference[:, 0] - wanted[:, 0]).mean() < 0.1
+    np.testing.assert_array_equal(grids(exported, dots, tmp_path, "integer"), reference)
+    np.testing.assert_array_equal(grids(exported, dots, tmp_path, "c"), reference)
+    for model in (quantised, exported):
+        fast = grids(model, dots, tmp_path, "onnx-int8")
+        assert np.abs(fast - reference)[:, 0].mean() < 0.01
+
+
+def test_an_export_says_what_it_holds(
+    quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "export"
+    app(["export", str(quantised), str(out), "--json"], result_action="return_value")
+    said = json.loads(capsys.readouterr().out)
+    names = {path.name for path in out.iterdir()}
+    assert said["files"].keys() == names
+    assert names >= {"model.onnx", "model.int8.onnx", "integer.npz", "locanet.c", "locanet.h"}
+    made = json.loads((out / "provenance.json").read_text())
+    assert made["inputs"][0]["provenance"]["stage"] == "quantize"
+
+
+def test_a_float_model_becomes_float_onnx_alone(
+    settled: Path, dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = run(settled, tmp_path / "export", Settings())
+    assert {each.name for each in written} == {"model.onnx", "model.json", "provenance.json"}
+    assert f"dmrl quantize {settled} DATASET OUT" in capsys.readouterr().err
+    assert len(grids(tmp_path / "export", dots, tmp_path, "onnx")) == 30
+
+
+def test_same_inputs_same_bytes(quantised: Path, exported: Path, tmp_path: Path) -> None:
+    run(quantised, tmp_path / "again", Settings())
+    for path in exported.iterdir():
+        assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes(), path.name
+
+
+@pytest.mark.parametrize("backend", INT8)
+def test_a_float_model_has_no_int8_backend(settled: Path, backend: str) -> None:
+    with pytest.raises(ModelError, match=rf"no int8 network, as --backend {backend} .*quantize"):
+        detector.open_detector(settled, backend)
+
+
+def test_an_export_is_no_model_for_torch(exported: Path, tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="is an export folder, which torch cannot run"):
+        detector.open_detector(exported, "torch")
+    with pytest.raises(ModelError, match="is an export folder already"):
+        run(exported, tmp_path / "again", Settings())
+
+
+@pytest.mark.parametrize("backend", ["onnx", "onnx-int8", "integer"])
+def test_images_of_another_size_are_refused(exported: Path, backend: str) -> None:
+    opened = detector.open_detector(exported, backend)
+    with pytest.raises(SettingError, match=r"an image: images of 72 x 48 px, .* takes 64 x 48 al"):
+        opened.require_size(72, 48, "an image")
+
+
+def test_a_missing_package_is_named_with_its_extra(
+    settled: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent(name: str) -> None:
+        raise ModuleNotFoundError(name="onnxruntime")
+
+    monkeypatch.setattr(detector, "import_module", absent)
+    with pytest.raises(MissingExtra, match=r"onnxruntime.* pip install 'dmrl\[deploy\]'"):
+        detector.open_detector(settled, "onnx")
+
+
+@pytest.mark.parametrize("backend", detector.OPENS)
+def test_no_model_is_said(tmp_path: Path, backend: str) -> None:
+    with pytest.raises(ModelError, match=r"no model .*nowhere"):
+        detector.open_detector(tmp_path / "nowhere", backend)
+
+
+def test_a_damaged_description_is_said(exported: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in exported.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    (copy / "model.json").write_text("{}")
+    with pytest.raises(ModelError, match=r"model.json is damaged"):
+        detector.open_detector(copy, "onnx")

@@ -1,0 +1,244 @@
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import MissingExtra, OutputError, RecordingError, SettingError
+from dmrl.images import decode
+from dmrl.live import crazyflie
+from dmrl.live.robots import Robot, robot_of
+from dmrl.recording import read, read_table, recover
+from dmrl.stages import fake_drone, fly, record
+from dmrl.stages.fake_drone import Fleet
+from dmrl.stages.record import Result
+
+pytest.importorskip("cflib", reason="cflib (extra record) is not installed")
+
+# cflib's own threads may meet a link that another of them has just closed.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+
+PATIENCE_S = 40.0
+PICTURES_HZ, FIRST_PICTURE_S = 2.0, 0.25
+ANY = ("udp://127.0.0.1:0", "udp://127.0.0.1:0")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two robots that fly for 3 s."""
+    path = tmp_path_factory.mktemp("flight") / "sim.mcap"
+    pictures = {"camera": True, "camera_rate_hz": PICTURES_HZ}
+    fly.run(path, fly.Settings(duration_s=3.0, noise="ideal", seed=3, **pictures))
+    return path
+
+
+def robots(fleet: Fleet) -> list[Robot]:
+    ports = {camera.robot: camera.port for camera in fleet.cameras}
+    return [
+        Robot(
+            d.robot,
+            f"udp://127.0.0.1:{d.port}",
+            ("127.0.0.1", ports[d.robot]) if d.robot in ports else None,
+        )
+        for d in fleet.drones
+    ]
+
+
+def recorded(out: Path, fleet: Fleet, until: Callable[[], bool]) -> Result:
+    """Record until something is so."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline and not until():
+            time.sleep(0.02)
+        time.sleep(0.3)  # what is still on its way
+        ended.set()
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    result = record.run(out, robots(fleet), record.Settings(), ended=ended)
+    watcher.join()
+    return result
+
+
+def by_source(result: Result) -> dict[str, tuple[int, int, int]]:
+    return {h.source: (h.received, h.lost, h.broken) for h in result.healths}
+
+
+def test_all_that_was_sent_is_recorded_as_it_was_flown(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    # The clock of the drones wraps one second after take-off.
+    settings = fake_drone.Settings(sends="streamer", boot_ms=float((1 << 24) - 1000))
+    with fake_drone.fleet(flight, ANY, (0, 0), settings) as fleet:
+        result = recorded(out, fleet, lambda: fleet.clock.landed)
+    got = by_source(result)
+    for drone in fleet.drones:
+        received, lost, broken = got[drone.robot]
+        assert lost == broken == 0
+        assert received == drone.sent > 500
+        assert drone.setpoints == 0
+    for camera in fleet.cameras:
+        assert got[f"{camera.robot} camera"] == (camera.sent, 0, 0)
+    starts = {robot: assert_as_flown(flight, out, robot) for robot in ("cf1", "cf2")}
+    assert abs(starts["cf1"] - starts["cf2"]) < 20e6
+
+
+def assert_as_flown(flight: Path, out: Path, robot: str) -> float:
+    """Checks values and images against their times; the log time of take-off, nanoseconds."""
+    fields = ("roll_rad", "pitch_rad", "yaw_rate_radps")
+    flown, got = (read_table(p, f"/{robot}/attitude", fields=fields) for p in (flight, out))
+    values, expected = (np.column_stack([t[f].to_numpy() for f in fields]) for t in (got, flown))
+    first = int(np.abs(expected[:, :2] - values[0, :2]).sum(axis=1).argmin())
+    assert np.allclose(values, expected[first : first + len(values)], atol=(1e-6, 1e-6, 0.02))
+    times = got["log_time"].to_numpy()
+    assert np.abs(np.diff(times) - 10e6).max() < 0.1e6
+    start_ns = float(times[0]) - 10e6 * first
+    pictures = [decode(m.message.data).astype(int) for m in read(flight, f"/{robot}/camera/image")]
+    for stamped in read(out, f"/{robot}/camera/image"):
+        # On the drone's own clock, but for the 1.5 ms that its state takes to the camera.
+        number = ((stamped.time_ns - start_ns) * 1e-9 - FIRST_PICTURE_S) * PICTURES_HZ
+        assert abs(number - round(number)) < 0.01 * PICTURES_HZ
+        assert np.abs(decode(stamped.message.data) - pictures[round(number)]).mean() < 8
+    return start_ns
+
+
+def test_dropped_packets_are_counted_and_a_dead_drone_stops_nobody(
+    flight: Path, tmp_path: Path
+) -> None:
+    settings = fake_drone.Settings(drop=0.05, dies=("cf2=1",), sends="stamped")
+    with fake_drone.fleet(flight, ANY, (0,), settings) as fleet:
+        result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
+    cf1, cf2 = fleet.drones
+    received, lost, _ = by_source(result)["cf1"]
+    assert received == cf1.sent > 500
+    # What is dropped before the first packet of a block or after its last one nobody can see.
+    assert cf1.dropped - 3 <= lost <= cf1.dropped and cf1.dropped > 10
+    assert by_source(result)["cf2"][0] == cf2.sent
+    assert result.messages["/cf1/attitude"] > 250 and result.messages["/cf2/attitude"] < 150
+
+
+def test_a_drone_that_starts_anew_is_connected_again(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, seconds in {"SILENT_S": 1.0, "FIRST_ANSWER_S": 0.5, "RETRY_S": 0.1}.items():
+        monkeypatch.setattr(crazyflie, name, seconds)
+    settings = fake_drone.Settings(dies=("cf1=0.5:0.8",), speed=0.3)
+    with fake_drone.fleet(flight, ANY[:1], (), settings) as fleet:
+        (drone,) = fleet.drones
+        result = recorded(tmp_path / "out.mcap", fleet, lambda: drone.sent > 160)
+    assert result.healths[0].connections >= 2
+    times = read_table(tmp_path / "out.mcap", "/cf1/attitude", fields=[])["log_time"].to_numpy()
+    assert (np.diff(times) > 0).all()
+
+
+def test_a_killed_session_comes_back_to_its_last_second(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    with fake_drone.fleet(flight, ANY, (0, 0), fake_drone.Settings()) as fleet:
+        named = [
+            f"--robot={r.name}={r.uri},camera={r.camera[0]}:{r.camera[1]}"
+            for r in robots(fleet)
+            if r.camera
+        ]
+        command = [sys.executable, "-m", "dmrl.cli", "record", str(out), *named]
+        with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
+            deadline = time.monotonic() + PATIENCE_S
+            while fleet.clock.now_s() < 2.9 and time.monotonic() < deadline:
+                time.sleep(0.02)
+            process.send_signal(signal.SIGKILL)
+            killed_ns = time.time_ns()
+    assert not out.exists()
+    partial = tmp_path / "out.mcap.partial"
+    mended = tmp_path / "mended.mcap"
+    assert recover(partial, mended).messages > 0
+    times = read_table(mended, "/cf1/attitude", fields=[])["publish_time"].to_numpy()
+    assert len(times) > 50
+    # One second by design; the rest is for a busy machine.
+    assert killed_ns - times.max() < 2.5e9
+    with pytest.raises(OutputError, match="cut off\\. Bring it back with dmrl recover"):
+        record.run(out, [Robot("cf1", "udp://127.0.0.1:9")], record.Settings())
+
+
+def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
+    with fake_drone.fleet(flight, ANY[:1], (), fake_drone.Settings()) as fleet:
+        (drone,) = fleet.drones
+
+        def interrupt() -> None:
+            while drone.sent < 150:
+                time.sleep(0.02)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        threading.Thread(target=interrupt, daemon=True).start()
+        out = tmp_path / "out.mcap"
+        result = record.run(out, robots(fleet), record.Settings(duration_s=PATIENCE_S))
+    assert sum(1 for _ in read(out, "/cf1/attitude")) == result.messages["/cf1/attitude"] >= 70
+
+
+def test_nobody_there_leaves_no_recording(tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    nobody = [Robot("cf1", "udp://127.0.0.1:9")]
+    with pytest.raises(RecordingError, match=r"nothing came for .* \(cf1 at udp://127.0.0.1:9"):
+        record.run(out, nobody, record.Settings(duration_s=0.5))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("cf1", "write NAME=URI"),
+        ("c/f=udp://127.0.0.1:1", "write NAME=URI"),
+        ("cf1=udp://127.0.0.1:1,kamera=1", "no option kamera"),
+        ("cf1=udp://127.0.0.1:1,camera=h:x", "HOST:PORT"),
+    ],
+)
+def test_a_robot_that_cannot_be_understood_is_refused(text: str, why: str) -> None:
+    with pytest.raises(SettingError, match=why):
+        robot_of(text)
+
+
+@pytest.mark.parametrize("uri", ["cf1", "foo://bar", "udp://127.0.0.1", "udp://h:99999"])
+def test_an_address_of_no_driver_is_refused(uri: str, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="no address of a Crazyflie"):
+        record.run(tmp_path / "out.mcap", [Robot("cf1", uri)], record.Settings())
+
+
+def test_two_robots_of_one_name_are_refused(tmp_path: Path) -> None:
+    twice = [Robot("cf1", "udp://127.0.0.1:1"), Robot("cf1", "udp://127.0.0.1:2")]
+    with pytest.raises(SettingError, match="two robots with the name cf1"):
+        record.run(tmp_path / "out.mcap", twice, record.Settings())
+
+
+def test_without_cflib_the_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == "cflib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "cflib", None)
+    with pytest.raises(MissingExtra, match=re.escape("pip install 'dmrl[record]'")):
+        record.run(tmp_path / "out.mcap", [Robot("cf1", "udp://127.0.0.1:1")], record.Settings())
+
+
+@pytest.mark.parametrize(
+    ("uris", "cameras", "settings", "why"),
+    [
+        (("udp://127.0.0.1:0",) * 3, (), {}, "3 --uri and 0 --camera for 2 robots"),
+        (("radio://0",), (), {}, "write udp://HOST:PORT"),
+        (("udp://127.0.0.1:0",), (70000,), {}, "--camera 70000"),
+        (("udp://127.0.0.1:0",), (), {"dies": ("cf9=3",)}, "--dies cf9=3"),
+    ],
+)
+def test_a_fleet_that_cannot_be_is_refused(
+    flight: Path, uris: tuple[str, ...], cameras: tuple[int, ...], settings: dict, why: str
+) -> None:
+    with (
+        pytest.raises(SettingError, match=why),
+        fake_drone.fleet(flight, uris, cameras, fake_drone.Settings(**settings)),
+    ):
+        pass

@@ -1,0 +1,136 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
+from dmrl.recording import read, read_raw, summary, trim
+from dmrl.recording.inputs import sha256_of_file
+from dmrl.stages import evaluate, fly, track
+from dmrl.stages.track import Settings
+
+from .detector import with_detections
+
+
+@pytest.fixture(scope="module")
+def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a minute of three robots; what a network would have found from cf1."""
+    folder = tmp_path_factory.mktemp("track")
+    flight = folder / "flight.mcap"
+    fly.run(flight, fly.Settings(3, 30.0, noise="calibrated", seed=11))
+    return with_detections(flight, folder / "detected.mcap")
+
+
+@pytest.fixture(scope="module")
+def tracked(detected: Path) -> Path:
+    out = detected.with_name("tracked.mcap")
+    track.run(detected, out, Settings())
+    return out
+
+
+def test_every_image_gets_its_tracks_in_the_observers_frame(tracked: Path) -> None:
+    made = list(read(tracked, topics.tracks("cf1")))
+    images = [one.time_ns for one in read(tracked, topics.detections("cf1"))]
+    assert [one.time_ns for one in made] == images
+    assert {one.message.frame_id for one in made} == {"cf1/horizontal"}
+    entries = [entry for one in made for entry in one.message.tracks]
+    covariance = np.array([entry.covariance for entry in entries]).reshape(-1, 3, 3)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+    assert {entry.peer for entry in entries} <= {"", "cf2", "cf3"}
+
+
+def test_tracks_are_better_than_single_images_and_honest(tracked: Path) -> None:
+    made = evaluate.run(tracked, None, evaluate.Settings(settle_s=3.0))
+    assert isinstance(made, dict)
+    (one,) = made["robots"]
+    assert one["robot"] == "cf1"
+    assert one["reduction"] > 0.3
+    assert one["coverage_95"] > 0.85
+    assert one["named_right"] > 0.9
+    assert one["false_tracks_per_min"] <= 4
+
+
+def test_other_messages_stay_and_old_tracks_go(
+    detected: Path, tracked: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "again.mcap"
+    track.run(tracked, again, Settings())
+    kept = [raw.data for raw in read_raw(detected)]
+    others = [t for t in summary(again).topics if t != topics.tracks("cf1")]
+    assert [raw.data for raw in read_raw(again, *others)] == kept
+    assert summary(again).topics[topics.tracks("cf1")].count == len(
+        list(read(detected, topics.detections("cf1")))
+    )
+
+
+def test_the_same_input_gives_the_same_bytes(detected: Path, tracked: Path, tmp_path: Path) -> None:
+    out = tmp_path / tracked.name
+    track.run(detected, out, Settings())
+    assert sha256_of_file(out) == sha256_of_file(tracked)
+
+
+@pytest.mark.parametrize(
+    ("topic", "words"),
+    [
+        ("/cf1/detections", "/*/detections"),
+        ("/cf1/attitude", "/cf1/attitude"),
+    ],
+)
+def test_what_is_missing_is_named(detected: Path, tmp_path: Path, topic: str, words: str) -> None:
+    short = tmp_path / "short.mcap"
+    others = [t for t in summary(detected).topics if t != topic]
+    trim(detected, short, topics=others)
+    out = tmp_path / "out.mcap"
+    with pytest.raises(MissingTopic, match=r"detections|attitude") as caught:
+        track.run(short, out, Settings())
+    assert words in str(caught.value)
+    assert not out.exists()
+
+
+def test_without_velocity_and_height_it_warns_and_goes_on(
+    detected: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short, out = tmp_path / "short.mcap", tmp_path / "out.mcap"
+    gone = ("/cf1/velocity", "/cf1/height")
+    trim(detected, short, topics=[t for t in summary(detected).topics if t not in gone])
+    track.run(short, out, Settings())
+    said = capsys.readouterr().err
+    assert "taken to stand still" in said
+    assert "taken to keep its height" in said
+
+
+def test_an_existing_output_is_refused(detected: Path, tracked: Path) -> None:
+    with pytest.raises(OutputError):
+        track.run(detected, tracked, Settings())
+
+
+def test_a_camera_of_a_robot_that_is_not_there_is_named(detected: Path, tmp_path: Path) -> None:
+    camera = tmp_path / "camera.toml"
+    with pytest.raises(SettingError, match=r"camera\.cf9"):
+        track.run(detected, tmp_path / "out.mcap", Settings(camera={"cf9": camera}))
+
+
+def test_tracks_without_truth_cannot_be_judged(tracked: Path, tmp_path: Path) -> None:
+    short = tmp_path / "short.mcap"
+    kept = [t for t in summary(tracked).topics if not topics.names(topics.TRUTH, t)]
+    trim(tracked, short, topics=kept)
+    with pytest.raises(RecordingError, match="no true position"):
+        evaluate.run(short, None, evaluate.Settings(what="tracks"))
+
+
+def test_the_plots_show_the_errors_of_both(tracked: Path, tmp_path: Path) -> None:
+    out = tmp_path / "plots"
+    evaluate.run(tracked, out, evaluate.Settings(what="tracks"))
+    assert {path.name for path in out.iterdir()} == {
+        "tracks.json",
+        "track-error-cf1.png",
+        "track-error-cf1.svg",
+    }
+
+
+def test_a_file_that_is_no_recording_is_one_error(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"no")
+    with pytest.raises(DmrlError):
+        track.run(bad, tmp_path / "out.mcap", Settings())

@@ -1,0 +1,151 @@
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.cli import app
+from dmrl.deploy.c import write_c
+from dmrl.deploy.integer import Conv, IntegerNetwork
+from dmrl.deploy.samples import save_samples
+from dmrl.deploy.store import INTEGER_NAME, save
+from dmrl.errors import DatasetError, ModelError, SettingError
+from dmrl.stages.verify import Settings, document, run
+
+from ..deploy.networks import random_network
+
+TOOLS = ("gcc", "clang", "riscv64-unknown-elf-gcc", "qemu-riscv32")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+SEED = 3
+GCC = Settings(targets=("gcc",), images=2, noise=1)
+
+
+def export(network: IntegerNetwork, folder: Path, carries: IntegerNetwork | None = None) -> Path:
+    """An export folder; its C may carry another network than it says."""
+    folder.mkdir()
+    write_c(carries or network, folder, [])
+    save(network, folder / INTEGER_NAME)
+    shape = (3, network.height_px, network.width_px, 3)
+    save_samples(np.random.default_rng(1).integers(0, 256, shape, np.uint8), folder)
+    return folder
+
+
+def changed(network: IntegerNetwork) -> IntegerNetwork:
+    """The same network but for one bias of its last convolution."""
+    last = network.layers[-1]
+    assert isinstance(last, Conv)
+    bias = last.bias.copy()
+    bias[0] += 1 << 20
+    return replace(network, layers=(*network.layers[:-1], replace(last, bias=bias)))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export(random_network(SEED), tmp_path_factory.mktemp("verify") / "export")
+
+
+@pytest.fixture(scope="module")
+def everything(folder: Path) -> dict[str, Any]:
+    if absent := [tool for tool in TOOLS if shutil.which(tool) is None]:
+        pytest.skip(f"no {absent[0]}")
+    return document(run(folder, Settings(images=2, noise=2)))
+
+
+def test_every_target_computes_what_the_reference_does(everything: dict[str, Any]) -> None:
+    assert [t["target"] for t in everything["targets"]] == ["gcc", "clang", "sanitizers", "riscv32"]
+    assert all(t["mismatches"] == 0 for t in everything["targets"])
+    assert not any(t["skipped"] or t["error"] for t in everything["targets"])
+    assert (everything["images"], everything["noise_images"]) == (2, 2)
+
+
+def test_what_the_c_costs_is_measured(everything: dict[str, Any]) -> None:
+    assert 500 < everything["code_bytes"] < 50_000
+    assert 0 < everything["stack_bytes"] <= 512
+    # A multiplication and an addition at the least; small layers cost more around them.
+    assert 2 < everything["instructions_per_mac"] < 60
+    assert [e["images_per_s"] > 0 for e in everything["gap8_estimates"]] == [True, True]
+    assert all("175 MHz" in e["assuming"] for e in everything["gap8_estimates"])
+
+
+def test_counting_instructions_gives_the_same_number_again(
+    everything: dict[str, Any], folder: Path
+) -> None:
+    again = document(run(folder, replace(GCC, targets=())))
+    assert again["instructions"] == everything["instructions"]
+
+
+@needs_gcc
+def test_c_of_another_network_is_found_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = random_network(SEED)
+    wrong = export(network, tmp_path / "export", carries=changed(network))
+    assert app(["verify", str(wrong), "--targets", "gcc", "--json"], result_action="return_value")
+    (gcc,) = json.loads(capsys.readouterr().out)["targets"]
+    assert gcc["mismatches"] > 0
+    assert not gcc["error"]
+
+
+@needs_gcc
+def test_c_that_does_not_compile_is_an_error_of_its_target(folder: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "export"
+    shutil.copytree(folder, broken)
+    text = (broken / "locanet.c").read_text()
+    (broken / "locanet.c").write_text(text[: len(text) // 2])
+    result = run(broken, replace(GCC, targets=("sanitizers",)))
+    assert result.wrong
+    assert "error" in result.targets[0].error
+
+
+def test_without_tools_every_target_is_skipped_and_said_so(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = ["verify", str(folder), "--images", "1", "--noise", "0"]
+    assert app(words, result_action="return_value") == 0
+    said = capsys.readouterr().out
+    assert said.count("skipped: no ") == 4
+    assert "apt-get install gcc-riscv64-unknown-elf" in said
+    assert "apt-get install clang" in said
+    assert app([*words, "--require"], result_action="return_value") == 1
+
+
+def test_an_empty_folder_is_no_export(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=str(tmp_path)):
+        run(tmp_path, GCC)
+
+
+@pytest.mark.parametrize("name", ["locanet.c", "locanet.h", INTEGER_NAME])
+@pytest.mark.parametrize("damage", ["removed", "emptied"])
+def test_a_damaged_export_is_named(folder: Path, tmp_path: Path, name: str, damage: str) -> None:
+    broken = tmp_path / "export"
+    shutil.copytree(folder, broken)
+    (broken / name).unlink()
+    if damage == "emptied":
+        (broken / name).touch()
+    with pytest.raises(ModelError, match="export"):
+        run(broken, GCC)
+
+
+def test_images_of_another_size_are_refused(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "export"
+    shutil.copytree(folder, other)
+    save_samples(np.zeros((1, 8, 8, 3), np.uint8), other)
+    with pytest.raises(SettingError, match="8 x 8 px"):
+        run(other, GCC)
+
+
+def test_no_images_at_all_are_refused(folder: Path) -> None:
+    with pytest.raises(SettingError, match="no images"):
+        run(folder, replace(GCC, images=0, noise=0))
+
+
+def test_a_folder_that_is_no_dataset_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError):
+        run(folder, replace(GCC, dataset=tmp_path))

@@ -1,0 +1,166 @@
+"""Robots in rerun's viewer while they fly: pictures, heights, speeds, distances."""
+
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from dmrl import topics
+from dmrl.errors import SettingError
+from dmrl.formats.sample import Sample
+from dmrl.live.feed import Received
+from dmrl.viewer.entity import escaped
+from dmrl.viewer.layouts import BACKGROUND, TIMELINE
+from dmrl.viewer.window import open_window
+
+PLOT_EVERY_NS = 100_000_000
+"""Curves get a point ten times a second: more cannot be seen and costs the recorder."""
+HISTORY_S = 30.0
+
+Fields = Mapping[str, Any]
+
+
+def _speed(fields: Fields) -> float:
+    return float(np.hypot(fields["vx_mps"], fields["vy_mps"]))
+
+
+CURVES: dict[str, tuple[str, Callable[[Fields], float]]] = {
+    topics.HEIGHT: ("height, m", lambda fields: float(fields["height_m"])),
+    topics.VELOCITY: ("speed, m/s", _speed),
+    topics.RANGE: ("distance, m", lambda fields: float(fields["range_m"])),
+}
+"""Title and value of what is drawn as a curve, by pattern of the topic."""
+
+
+def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
+    """Pictures on the left, curves of all robots on the right.
+
+    Parameters
+    ----------
+    robots
+        All of them.
+    cameras
+        Those with a camera.
+    """
+    pictures = [
+        rrb.Spatial2DView(
+            origin=escaped(topics.camera_image(robot)), name=robot, background=BACKGROUND
+        )
+        for robot in cameras
+    ]
+    window = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-HISTORY_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    curves = [
+        rrb.TimeSeriesView(
+            name=title,
+            contents=[
+                f"{escaped(pattern.format(robot=robot, peer='*').split('/*')[0])}/**"
+                for robot in robots
+            ],
+            time_ranges=window,
+        )
+        for pattern, (title, _) in CURVES.items()
+    ]
+    columns = [rrb.Vertical(*pictures), rrb.Vertical(*curves)] if pictures else curves
+    return rrb.Blueprint(
+        rrb.Horizontal(*columns),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+class LiveView:
+    """Shows samples as they come.
+
+    Parameters
+    ----------
+    stream
+        Where they are logged.
+    """
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._drawn_ns: dict[str, int] = {}
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+
+    def show(self, received: Received) -> None:
+        """Log one sample, if it is drawn."""
+        sample = received.sample
+        if topics.names(topics.CAMERA_IMAGE, sample.topic):
+            kind = sample.fields["format"]
+            self._log(
+                sample, rr.EncodedImage(contents=sample.fields["data"], media_type=f"image/{kind}")
+            )
+            return
+        for pattern, (_, value) in CURVES.items():
+            if topics.names(pattern, sample.topic):
+                if sample.time_ns - self._drawn_ns.get(sample.topic, 0) >= PLOT_EVERY_NS:
+                    self._drawn_ns[sample.topic] = sample.time_ns
+                    self._log(sample, rr.Scalars(value(sample.fields)))
+                return
+
+    def _log(self, sample: Sample, drawn: rr.AsComponents) -> None:
+        self._stream.set_time(TIMELINE, timestamp=np.datetime64(sample.time_ns, "ns"))
+        self._stream.log(escaped(sample.topic), drawn)
+
+
+class LiveWindow:
+    """A window of rerun's viewer that shows samples; open inside the block.
+
+    Parameters
+    ----------
+    robots
+        All of them.
+    cameras
+        Those with a camera.
+    headless
+        Without a window, for tests.
+
+    Raises
+    ------
+    SettingError
+        If there is no screen for a window.
+    """
+
+    def __init__(
+        self, robots: Sequence[str], cameras: Sequence[str], *, headless: bool = False
+    ) -> None:
+        self._layout, self._headless = layout(robots, cameras), headless
+        self._process: subprocess.Popen[bytes] | None = None
+        self.url = ""
+
+    def __enter__(self) -> Self:
+        self._process, self.url = open_window(headless=self._headless)
+        time.sleep(1.0)
+        if self._process.poll() is not None:
+            raise SettingError("no screen for a window. Record without --view, look afterwards")
+        self._stream = rr.RecordingStream("dmrl-live")
+        self._stream.connect_grpc(self.url, default_blueprint=self._layout)
+        self.show = LiveView(self._stream).show
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with suppress(RuntimeError):  # the user may have closed the window
+            self._stream.flush(timeout_sec=2.0)
+        self._stream.disconnect()
+        if self._headless and self._process is not None:
+            self._process.kill()
+            self._process.wait()
