@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.estimation.estimate import OK, Estimate, estimate_ekf, estimate_pairs
+from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+from dmrl.estimation.gate import OK
 from dmrl.estimation.pair import Pair, Track, resample, usable_ranges
 from dmrl.estimation.score import Figures, Judged, figures, overall
 from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
@@ -58,7 +59,7 @@ def judged(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Judged:
 
 
 def monte_carlo(
-    noise: str, trajectory: str, seeds: range
+    noise: str, trajectory: str, seeds: range, methods: tuple[str, ...]
 ) -> dict[str, tuple[list[Figures], float]]:
     """Figures of every flight, and CPU seconds of one, by method."""
     flown = [
@@ -66,13 +67,14 @@ def monte_carlo(
         for seed in seeds
     ]
     pairs = [pair_of(flight, "cf1", "cf2") for flight in flown]
+    solve = {
+        "batch": lambda: [here for here, _ in estimate_pairs(pairs)],
+        "published": lambda: estimate_ekf(pairs, EKF),
+    }
     out = {}
-    for name, solve in (
-        ("batch", lambda: [here for here, _ in estimate_pairs(pairs)]),
-        ("published", lambda: estimate_ekf(pairs, EKF)),
-    ):
+    for name in methods:
         begun = time.process_time()
-        estimates = solve()
+        estimates = solve[name]()
         cost_s = (time.process_time() - begun) / len(seeds)
         both = zip(flown, estimates, strict=True)
         found = [figures(judged(f, "cf1", "cf2", e), SETTLE_S) for f, e in both]
@@ -104,7 +106,7 @@ def cost(robots: int, duration_s: float, flights: int) -> float:
 
 def costs(stem: Path | None) -> None:
     """Print, and draw, the cost against length and robots."""
-    lengths = [(s, cost(2, s, 10)) for s in (25.0, 50.0, 100.0, 200.0, 400.0)]
+    lengths = [(s, cost(2, s, 3)) for s in (25.0, 50.0, 100.0, 200.0, 400.0)]
     swarms = [(n * (n - 1), cost(n, 100.0, 1)) for n in (2, 3, 5, 7, 10)]
     for what, rows in (("seconds of flight, 2 pairs", lengths), ("pairs, 100 s", swarms)):
         print(f"\n{what:>28}   cpu-s")
@@ -124,6 +126,23 @@ def costs(stem: Path | None) -> None:
         figure.savefig(stem.with_suffix(".png"), dpi=150)
 
 
+def tables(given: argparse.Namespace) -> None:
+    """Print the figures of every noise preset and trajectory asked for, and of all together."""
+    print(f"{given.flights} flights of 100 s each; RMSE, 95 % and coverage after {SETTLE_S:g} s")
+    print("kept: status OK; good: kept samples within 0.3 m; the second coverage: of kept samples")
+    print(HEAD)
+    kept: dict[str, list[Figures]] = {}
+    seeds = range(given.first_seed, given.first_seed + given.flights)
+    methods = ("batch",) if given.no_published else ("batch", "published")
+    for noise in [given.noise] if given.noise else PRESETS:
+        for trajectory in [given.only] if given.only else TRAJECTORIES:
+            for method, (found, cost_s) in monte_carlo(noise, trajectory, seeds, methods).items():
+                print(line(noise, trajectory, method, found, cost_s), flush=True)
+                kept.setdefault(method, []).extend(found)
+    for method, found in kept.items():
+        print(line("all", "all", method, found, float("nan")))
+
+
 def main() -> None:
     """Print every table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -131,21 +150,13 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", choices=list(TRAJECTORIES))
     parser.add_argument("--noise", choices=[n for n in NOISE if n != "ideal"])
+    parser.add_argument("--no-published", action="store_true", help="the batch solve alone")
     parser.add_argument("--no-costs", action="store_true")
+    parser.add_argument("--costs-only", action="store_true")
     parser.add_argument("--plot", type=Path)
     given = parser.parse_args()
-    print(f"{given.flights} flights of 100 s each; RMSE, 95 % and coverage after {SETTLE_S:g} s")
-    print("kept: status OK; good: kept samples within 0.3 m; the second coverage: of kept samples")
-    print(HEAD)
-    kept: dict[str, list[Figures]] = {}
-    seeds = range(given.first_seed, given.first_seed + given.flights)
-    for noise in [given.noise] if given.noise else PRESETS:
-        for trajectory in [given.only] if given.only else TRAJECTORIES:
-            for method, (found, cost_s) in monte_carlo(noise, trajectory, seeds).items():
-                print(line(noise, trajectory, method, found, cost_s), flush=True)
-                kept.setdefault(method, []).extend(found)
-    for method, found in kept.items():
-        print(line("all", "all", method, found, float("nan")))
+    if not given.costs_only:
+        tables(given)
     if not given.no_costs:
         costs(given.plot)
 

@@ -4,7 +4,7 @@
     python benchmarks/bench_render.py speed --model crazyflie-published.blend --backgrounds DIR
     python benchmarks/bench_render.py memory [--images 3000]
 
-CPU seconds are those of all processes together, start-up included.
+CPU seconds are those of all processes together, start-up included where not said otherwise.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from dmrl.rendering.sketch import Pose
 from dmrl.stages.render import camera_of, run, settings_of
 
 PUBLISHED_WAY = Path(__file__).parent / "published_way.py"
+SAMPLES, FEW = 16, 4
 MM_PER_UNIT = 0.002  # the published model, at twice life size as the authors rendered it
 
 
@@ -226,8 +228,11 @@ def _resident_mb() -> float:
     return total * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def speed(model: Path, backgrounds: Path, images: int) -> dict[str, dict[str, float]]:
-    """The published way, and ours with its model and with our own, in one run.
+def speed(model: Path, backgrounds: Path, images: int, rounds: int) -> dict[str, object]:
+    """The published way, and ours with its model and with our own, turn by turn in one run.
+
+    Every way is timed with few and with many images; the difference is what an image costs
+    without the start. What else runs on the machine then disturbs all ways alike.
 
     Parameters
     ----------
@@ -236,21 +241,40 @@ def speed(model: Path, backgrounds: Path, images: int) -> dict[str, dict[str, fl
     backgrounds
         Folder of photos.
     images
-        How many of ours; the published way gets a twentieth, its start-up taken off.
+        How many of ours in a round; the published way gets a tenth.
+    rounds
+        How often; the least and the median are told.
     """
-    few, many = (published_way(model, backgrounds, n, 16) for n in (4, 4 + images // 20))
-    spent_s = [few["cpu_s_per_image"] * 4, many["cpu_s_per_image"] * (4 + images // 20)]
     as_published = {"model": model, "scale": MM_PER_UNIT, "model_up": "y"}
-    return {
-        "published way, 16 samples": {
-            "cpu_s_per_image": (spent_s[1] - spent_s[0]) / (images // 20),
-        },
-        "ours, published model": ours(
-            "synthetic_paper", images, 2, backgrounds=backgrounds, **as_published
+    one = {"backgrounds": backgrounds, "robots_max": 1}
+    ways: dict[str, tuple[Callable[[int], dict[str, float]], int]] = {
+        "published way": (lambda n: published_way(model, backgrounds, n, SAMPLES), images // 10),
+        "ours, published model": (
+            lambda n: ours("synthetic_paper", n, 2, **one, **as_published),
+            images,
         ),
-        "ours, default model": ours("synthetic_paper", images, 2, backgrounds=backgrounds),
-        "ours, himax": ours("synthetic_large", images, 2, backgrounds=backgrounds, robots_max=1),
+        "ours, default model": (lambda n: ours("synthetic_paper", n, 2, **one), images),
+        "ours, himax": (lambda n: ours("synthetic_large", n, 2, **one), images),
     }
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
+    for _ in range(rounds):
+        for name, (way, many) in ways.items():
+            few, all_of_them = way(FEW), way(FEW + many)
+            spent_s = [r["cpu_s_per_image"] * n for r, n in ((few, FEW), (all_of_them, FEW + many))]
+            without_start = {"cpu_s_without_start": (spent_s[1] - spent_s[0]) / many}
+            found[name].append({**all_of_them, **without_start})
+    result: dict[str, object] = {"samples": SAMPLES, "load": os.getloadavg()}
+    for name, rates in found.items():
+        result[name] = {
+            key: {"least": min(values), "median": float(np.median(values)), "most": max(values)}
+            for key in rates[0]
+            if (values := [rate[key] for rate in rates])
+        }
+        result[f"published way / {name}"] = [
+            theirs["cpu_s_without_start"] / rate["cpu_s_without_start"]
+            for theirs, rate in zip(found["published way"], rates, strict=True)
+        ]
+    return result
 
 
 def main() -> None:
@@ -258,6 +282,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=("reprojection", "speed", "memory"))
     parser.add_argument("--images", type=int, default=500)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--model", type=Path)
     parser.add_argument("--backgrounds", type=Path)
     asked = parser.parse_args()
@@ -268,7 +293,7 @@ def main() -> None:
     else:
         if asked.model is None or asked.backgrounds is None:
             sys.exit("speed needs --model crazyflie-published.blend and --backgrounds DIR")
-        result = speed(asked.model, asked.backgrounds, asked.images)
+        result = speed(asked.model, asked.backgrounds, asked.images, asked.rounds)
     print(json.dumps(result, indent=2))
 
 

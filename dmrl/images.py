@@ -14,6 +14,7 @@ from PIL import Image
 from dmrl.errors import SourceError
 
 Rgb = NDArray[np.uint8]
+Grey = NDArray[np.uint8]
 
 FORMATS = ("PNG", "JPEG", "PPM", "BMP")
 # What Pillow raises on broken pictures, whichever decoder meets them.

@@ -4,12 +4,18 @@ There is no generated ``_pb2.py``: it would pin the protobuf runtime. ``schemas/
 definitions with their units and frames; ``make schemas`` rebuilds the set.
 """
 
+import re
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
 from google.protobuf.descriptor import Descriptor, FileDescriptor
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pb2 import (
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
@@ -58,25 +64,89 @@ def descriptor(name: str) -> Descriptor:
     raise KeyError(name)
 
 
+@dataclass(frozen=True, slots=True)
+class LogType:
+    """A message type made for one block of log variables, whatever they are.
+
+    Its full name is ``dmrl.log.<name>``, its fields are the variables with ``_`` for every
+    sign that protobuf does not take; the JSON names keep the variables' own.
+
+    Parameters
+    ----------
+    name
+        Of the event or block.
+    variables
+        Names and types, the latter in the letters of ``struct``: ``b B h H i I q e f d``.
+    """
+
+    name: str
+    variables: tuple[tuple[str, str], ...]
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Field of each variable, no two the same."""
+        found: list[str] = []
+        names = [variable for variable, _ in self.variables]
+        for variable in names:
+            name = _identifier(variable)
+            while name in found or (name in names and name != variable):
+                name += "_"
+            found.append(name)
+        return tuple(found)
+
+
+LOG_PACKAGE = "dmrl.log"
+_F = FieldDescriptorProto
+_OF_CODE = dict.fromkeys("BHI", _F.TYPE_UINT32) | dict.fromkeys("bhi", _F.TYPE_SINT32)
+_OF_CODE |= {"q": _F.TYPE_SINT64, "e": _F.TYPE_FLOAT, "f": _F.TYPE_FLOAT, "d": _F.TYPE_DOUBLE}
+
+
+def _identifier(text: str) -> str:
+    name = re.sub(r"[^A-Za-z0-9_]", "_", text)
+    return name if name[:1].isalpha() else f"v_{name}"
+
+
+def _log_descriptor(kind: LogType) -> Descriptor:
+    name = _identifier(kind.name)
+    file = FileDescriptorProto(
+        name=f"{LOG_PACKAGE}/{name}.proto", package=LOG_PACKAGE, syntax="proto3"
+    )
+    body = file.message_type.add(name=name)
+    for number, ((variable, code), field) in enumerate(
+        zip(kind.variables, kind.fields, strict=True), 1
+    ):
+        body.field.add(
+            name=field,
+            json_name=variable,
+            number=number,
+            type=_OF_CODE[code],
+            label=_F.LABEL_OPTIONAL,
+        )
+    pool = DescriptorPool()
+    pool.AddSerializedFile(file.SerializeToString())
+    return pool.FindMessageTypeByName(f"{LOG_PACKAGE}.{name}")
+
+
 @cache
-def message(name: str) -> Any:
+def message(name: str | LogType) -> Any:
     """Class of a message: ``message("Height")(height_m=0.4)``.
 
     Parameters
     ----------
     name
-        Short or full name; dmrl.v1 is looked in first, then foxglove.
+        Short or full name, looked for in dmrl.v1 first, then in foxglove; or the variables
+        of a log.
 
     Raises
     ------
     KeyError
         If there is no such message.
     """
-    return GetMessageClass(descriptor(name))
+    return GetMessageClass(_log_descriptor(name) if isinstance(name, LogType) else descriptor(name))
 
 
 @cache
-def schema_bytes(name: str) -> bytes:
+def schema_bytes(name: str | Descriptor) -> bytes:
     """Serialized FileDescriptorSet of a message and all it imports, as MCAP wants it."""
     found: dict[str, FileDescriptor] = {}
 
@@ -85,7 +155,7 @@ def schema_bytes(name: str) -> bytes:
             visit(dependency)
         found.setdefault(file.name, file)
 
-    visit(descriptor(name).file)
+    visit((descriptor(name) if isinstance(name, str) else name).file)
     out = FileDescriptorSet()
     for file in found.values():
         file.CopyToProto(out.file.add())

@@ -17,7 +17,7 @@ class Topic:
     pattern
         Topic with ``{robot}`` and ``{peer}`` left open.
     message
-        Full name of its message.
+        Full name of its message; a final ``*`` stands for any ending.
     frame
         Frame its values are in.
     units
@@ -35,6 +35,12 @@ class Topic:
     rate: str
     written_by: str
 
+    def carries(self, message: str) -> bool:
+        """Whether a message of this full name may be on the topic."""
+        if self.message.endswith("*"):
+            return message.startswith(self.message[:-1])
+        return message == self.message
+
 
 CAMERA_IMAGE = "/{robot}/camera/image"
 CALIBRATION = "/{robot}/camera/calibration"
@@ -50,6 +56,9 @@ GRID = "/{robot}/detections/grid"
 TRACKS = "/{robot}/tracks"
 MASKS = "/{robot}/camera/masks"
 DEPTHS = "/{robot}/camera/depth"
+POSE = "/{robot}/pose"
+TRUE_POSE = "/{robot}/pose/truth"
+LOG = "/{robot}/log/{event}"
 TRANSFORMS = "/tf"
 
 TOPICS = (
@@ -90,7 +99,10 @@ TOPICS = (
         "20 Hz",
         "convert, render, fly",
     ),
-    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "fly, render"),
+    Topic(POSE, "foxglove.PoseInFrame", "world", "m", "100 Hz", "convert"),
+    Topic(TRUE_POSE, "foxglove.PoseInFrame", "world", "m", "100 Hz", "convert"),
+    Topic(LOG, "dmrl.log.*", "-", "as logged", "as logged", "convert"),
+    Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "convert, fly, render"),
 )
 
 
@@ -164,13 +176,28 @@ def truth(robot: str, peer: str) -> str:
     return TRUTH.format(robot=robot, peer=peer)
 
 
+def pose(robot: str) -> str:
+    """Topic of where a robot estimates itself to be."""
+    return POSE.format(robot=robot)
+
+
+def true_pose(robot: str) -> str:
+    """Topic of where a robot truly is."""
+    return TRUE_POSE.format(robot=robot)
+
+
+def log(robot: str, event: str) -> str:
+    """Topic of a robot's log variables, as they were logged."""
+    return LOG.format(robot=robot, event=event)
+
+
 @cache
 def _expression(pattern: str) -> re.Pattern[str]:
     return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(pattern)))
 
 
 def names(pattern: str, topic: str) -> dict[str, str] | None:
-    """What ``{robot}`` and ``{peer}`` of a pattern are in a topic, or None.
+    """What ``{robot}``, ``{peer}`` and ``{event}`` of a pattern are in a topic, or None.
 
     Examples
     --------

@@ -5,15 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.estimation.banded import Normal, log_determinant, normal, solve
-from dmrl.estimation.linear import OWN_SCALE, PEER_SCALE, Linear, linearise, step_variance
+from dmrl.estimation.linear import (
+    METRIC,
+    OWN_SCALE,
+    PEER_SCALE,
+    Linear,
+    linearise,
+    step_variance,
+)
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
 
 ITERATIONS = 25
 TOLERANCE = 1e-5
 """Relative change of the cost at which the iteration ends."""
-METRIC = 4
-"""Residuals of a step that the velocity scales divide."""
 WEAK: Array = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
 """Information on every keyframe, in inverse squares of its units: next to none."""
 
@@ -79,7 +84,7 @@ def evidence(problem: Problem, noise: Noise, solution: Solution) -> float:
     equations = equations_of(problem, noise, linear, solution.constants)
     spread = np.log(step_variance(problem, noise)).sum() / 2
     gains = 1 / (1 + solution.constants[[OWN_SCALE, PEER_SCALE]])
-    spread += METRIC * len(problem.steps_s) * np.log((gains**2).mean()) / 2
+    spread += len(METRIC) * len(problem.steps_s) * np.log((gains**2).mean()) / 2
     spread += len(problem.range_m) * np.log(noise.range_std_m)
     spread += np.log(noise.prior_std()).sum()
     return -solution.cost - float(spread) - log_determinant(equations) / 2

@@ -3,8 +3,8 @@
 A robot's motion tells where its peer is: turn the whole solution, and the ranges no longer
 fit the motion. Gauss-Newton takes the measured motion for the true one, so the noise in the
 log of a robot that stands still seems to fix the bearing as well as a flight would. The
-covariance is therefore taken not at the solution but at a calmed copy of it: averaged over a
-second or so, with the observer's motion, and the peer's relative to it, shrunk where they are
+covariance is therefore taken not at the solution but at a calmed copy of it: averaged over
+most of a second, with the observer's motion, and the peer's relative to it, shrunk where they are
 no more than their noise. A static observer or parallel flight then leaves the bearing open.
 """
 
@@ -20,8 +20,10 @@ from dmrl.estimation.motion import Increments, rotation
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import Noise, Problem
 
-CALM_S = 1.5
+CALM_S = 0.8
 """Moving average: what is faster than robots fly is noise."""
+RESTLESS_S = 1.5
+"""The same, where it is asked whether a robot moves at all."""
 WINDOW_S = 10.0
 """Over which motion is held against its noise."""
 NOISE_FACTOR = 1.8
@@ -133,7 +135,9 @@ def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
     energies = []
     for path in (own, path_of(problem.peer)[1], relative):
         velocity = np.diff(path, axis=0) / step_s
-        slow = uniform_filter1d(velocity, max(1, round(CALM_S / step_s)), axis=0, mode="nearest")
+        slow = uniform_filter1d(
+            velocity, max(1, round(RESTLESS_S / step_s)), axis=0, mode="nearest"
+        )
         energies.append(float((slow**2).sum(axis=1).mean()))
     return energies[0], energies[1], energies[2]
 

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dmrl.estimation import ekf, keyframe_filter
 from dmrl.estimation.batch import Solution, evidence, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
-from dmrl.estimation.hypotheses import KEPT, START_STD, candidates
+from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, Statuses, statuses
+from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, mirrored, spread_of
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK
 from dmrl.estimation.motion import rotation
@@ -18,41 +18,30 @@ from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
 
 KEY_HZ = 10.0
 """Keyframes per second."""
-OK, UNCONVERGED, AMBIGUOUS = range(3)
-"""Values of ``status``; the same as in ``dmrl.v1.Status``."""
-
-GATE_M = 0.17
-"""Largest sigma, along the worst direction, of a position that is OK."""
-INFLATION = 0.9
+INFLATION = 0.96
 """Sigmas of the batch solve are multiplied by this, and where biases are larger than the
-default's by the fourth root of how much: the 95 % ellipse then holds 95 to 98 % in view."""
+default's by some more: the 95 % ellipse then holds 92 to 98 % in view."""
 SMOOTHER_INFLATION = 1.5
-OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
-"""Sigma over distance beyond which a bearing is open rather than imprecise; and the median
-over a flight beyond which the motion of the whole flight leaves it open."""
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
-NEAR_M = 0.5
-"""Distances are taken as at least this: nearer, no one flies and any sigma is an angle."""
-RIVAL_COST = 25.0
-"""A solution elsewhere whose cost is within this of the best is a rival."""
-RIVAL_M = 0.3
-"""How far elsewhere."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
 GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
 """Noise against the default's, weighed by how likely each makes the flight."""
-CAUTION = 1.25
-"""The sensors are taken for this much worse than is likeliest."""
-CONSTANTS = (0.55, 0.75, 3.5), (0.6, 1.1, 3.5)
-"""Grades of noise, and those of what is constant over a flight. A flight shows a bias once at
-most, so that only low noise, the mark of sensors that were calibrated, speaks for a small one."""
+TAKEN = (
+    (0.41, 0.55, 0.65, 0.80, 2.80),
+    (0.45, 0.60, 1.00, 1.00, 3.50),
+    (0.40, 0.45, 1.20, 1.20, 3.50),
+)
+"""The likeliest grade, the grade that velocities are taken for, and that of what is constant.
+The likeliest is a fifth too low and scatters by a tenth, so that the flights that look best
+would be believed too much: sensors are taken for the default's unless they are clearly better.
+A flight shows a bias once at most: only low noise, the mark of sensors that were calibrated,
+speaks for a small one."""
 
 SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
 """Order of the globals seen from the peer."""
-
-Statuses = NDArray[np.int8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +125,7 @@ def estimate_pairs(
     noise
         What the sensors are like. None: found from the flight.
     gate_m
-        Largest sigma, along the worst direction, of a position that is OK, metres.
+        A position that is off by more than this is a bad one, metres.
     """
     problems = [problem(pair, KEY_HZ) for pair in pairs]
     out: dict[int, tuple[Estimate, Estimate]] = {}
@@ -151,20 +140,18 @@ def estimate_pairs(
                 made = _from_smoother(flight, noise or Noise(), *starts, covariances[:, mine])
             else:
                 made = _from_batch(flight, noise, *starts)
-            out[number] = _both(flight, *made, gate_m)
+            out[number] = _both(flight, made, gate_m)
     return [out[number] for number in range(len(pairs))]
 
 
-def _both(
-    flight: Problem, estimate: Estimate, rivals: list[Array], gate_m: float
-) -> tuple[Estimate, Estimate]:
+def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:
     """Estimates seen from either robot, with their statuses."""
     silent = np.append(flight.gap_s, 0.0) + np.append(0.0, flight.gap_s) > 0
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
     floor = silent * np.int8(UNCONVERGED)
-    here = np.maximum(_status(estimate, rivals, gate_m), floor)
-    there = np.maximum(_status(back, [from_peer(rival) for rival in rivals], gate_m), floor)
+    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m), floor)
+    there = np.maximum(statuses(back.state, back.covariance, gate_m), floor)
     if own < STILL or relative < ALIKE:
         here[:] = AMBIGUOUS
     if peer < STILL or relative < ALIKE:
@@ -194,7 +181,7 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
         for k, n in enumerate(numbers):
             none, constants = np.zeros(length, np.int8), np.zeros(len(GLOBALS))
             made = Estimate(pairs[n].time_s, state[:, k], spread[:, k], none, constants, Noise())
-            out[n] = replace(made, status=_status(made, [], gate_m))
+            out[n] = replace(made, status=statuses(made.state, made.covariance, gate_m))
     return [out[n] for n in range(len(pairs))]
 
 
@@ -209,39 +196,39 @@ def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Arra
 
 def _from_smoother(
     flight: Problem, noise: Noise, score: Array, tracks: Array, covariances: Array
-) -> tuple[Estimate, list[Array]]:
+) -> Estimate:
     order = np.argsort(-score)
     best = int(order[0])
-    rivals = [int(n) for n in order[1:] if score[best] - score[n] < RIVAL_COST]
-    estimate = Estimate(
+    apart = spread_of(-score[order], tracks.swapaxes(0, 1)[order])
+    return Estimate(
         flight.key_s,
         tracks[:, best],
-        covariances[:, best] * SMOOTHER_INFLATION**2,
+        covariances[:, best] * SMOOTHER_INFLATION**2 + apart,
         np.zeros(len(tracks), np.int8),
         np.zeros(len(GLOBALS)),
         noise,
     )
-    return estimate, [tracks[:, n] for n in rivals]
 
 
-def _from_batch(
-    flight: Problem, noise: Noise | None, score: Array, tracks: Array
-) -> tuple[Estimate, list[Array]]:
+def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Array) -> Estimate:
     first = noise or Noise()
     # Even starts that look alike half-way may pass the peer on different sides: all are solved
     # that are not hopeless.
     starts = tracks.swapaxes(0, 1)[score > score.max() - HOPELESS]
-    solutions = sorted((solve_batch(flight, first, s) for s in starts), key=lambda s: s.cost)
+    solutions = [solve_batch(flight, first, s) for s in starts]
+    best = min(solutions, key=lambda s: s.cost)
+    solutions += [solve_batch(flight, first, s) for s in mirrored(best.state, KEY_HZ)]
+    solutions.sort(key=lambda s: s.cost)
     best = solutions[0]
-    rivals = [s.state[:, :3] for s in solutions[1:] if s.cost - best.cost < RIVAL_COST]
+    costs, states = zip(*((s.cost, s.state[:, :3]) for s in solutions), strict=True)
+    apart = spread_of(np.array(costs), np.stack(states))
     found = first if noise else noise_of(flight, first, best)
     if not noise:
         best = solve_batch(flight, found, best.state)
-    worse = max(1.0, found.bias_std_m / Noise().bias_std_m) ** 0.5
-    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse
+    worse = max(1.0, found.bias_std_m / Noise().bias_std_m) ** 0.75
+    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
     none = np.zeros(len(tracks), np.int8)
-    estimate = Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
-    return estimate, rivals
+    return Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
 
 
 def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
@@ -271,20 +258,10 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
     near = range(middle - 1, middle + 2)
     bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in near]), [tried[n] for n in near], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
-    grade = CAUTION * float(np.clip(peak, GRADES[0], GRADES[-1]))
-    return noise.graded(grade, float(np.interp(grade, *CONSTANTS)))
-
-
-def _status(estimate: Estimate, rivals: list[Array], gate_m: float) -> Statuses:
-    """(K,) from the covariance, and from other solutions that are as good."""
-    sigma_m = np.sqrt(np.linalg.eigvalsh(estimate.covariance[:, :2, :2])[:, -1])
-    status = np.where(sigma_m < gate_m, OK, UNCONVERGED).astype(np.int8)
-    bearing_rad = sigma_m / np.maximum(np.hypot(*estimate.state[:, :2].T), NEAR_M)
-    whole = not np.median(bearing_rad) < OPEN_FLIGHT_RAD
-    status[whole | ~(bearing_rad < OPEN_RAD)] = AMBIGUOUS
-    for rival in rivals:
-        status[np.hypot(*(rival - estimate.state)[:, :2].T) > RIVAL_M] = AMBIGUOUS
-    return status
+    likeliest, velocity, constants = TAKEN
+    return noise.graded(
+        float(np.interp(peak, likeliest, velocity)), float(np.interp(peak, likeliest, constants))
+    )
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:

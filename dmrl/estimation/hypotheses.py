@@ -1,10 +1,13 @@
 """Where a pair may have started: many guesses on the range circle, told apart by likelihood."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from dmrl.estimation import keyframe_filter
-from dmrl.estimation.keyframe_filter import Inputs
+from dmrl.estimation.keyframe_filter import QUARTER, Inputs
 from dmrl.estimation.pair import Array
 
 BEARINGS, HEADINGS = 12, 8
@@ -16,7 +19,16 @@ KEPT = 6
 START_STD: Array = np.array([0.35, 0.35, 0.45])
 """Half the distance to the next start, roughly: m, m, rad."""
 APART_M, APART_RAD = 0.4, 0.5
-"""Solutions nearer than both are one."""
+"""Starts nearer than both are one."""
+SAME_M = 0.05
+"""Solutions that are nowhere further apart are one."""
+PASS_M = 0.35
+"""Two passes nearer than this leave open on which side the peer was in between."""
+MIRRORED = 4
+"""Stretches between passes that are tried on the other side, the shortest."""
+COST_UNIT = 4.0
+"""Costs of solutions differ by this much for no good reason: the robust loss and the noise are
+not quite the sensors'. A solution that costs this much more counts 1 / e of the better one."""
 
 
 def starts(range_m: float, height_m: float) -> Array:
@@ -93,3 +105,48 @@ def alike(one: Array, other: Array) -> bool:
     """Whether two states are the same solution."""
     turn = np.angle(np.exp(1j * (one[2] - other[2])))
     return bool(np.hypot(*(one - other)[:2]) < APART_M and abs(turn) < APART_RAD)
+
+
+def spread_of(cost: Array, states: Array) -> Array:
+    """(K, 3, 3) covariance that the choice between several solutions adds to the best one's.
+
+    Parameters
+    ----------
+    cost
+        (S,) of each, lowest first: half the sum of squares, or less the log likelihood.
+    states
+        (S, K, 3) x, y (m), psi (rad).
+    """
+    kept: list[int] = []
+    for number, state in enumerate(states):
+        ways = [np.hypot(*(state - states[other])[:, :2].T).max() for other in kept]
+        if all(way > SAME_M for way in ways):
+            kept.append(number)
+    share = np.exp((cost[0] - cost[kept]) / COST_UNIT)
+    apart = states[kept] - states[0]
+    apart[:, :, 2] = np.angle(np.exp(1j * apart[:, :, 2]))
+    return np.asarray(np.einsum("s,ski,skj->kij", share / share.sum(), apart, apart))
+
+
+def mirrored(state: Array, rate_hz: float) -> list[Array]:
+    """Copies of a solution with the peer on the other side between two close passes.
+
+    Parameters
+    ----------
+    state
+        (K, 5) x, y (m), psi (rad), wx, wy (m/s).
+    rate_hz
+        Keyframes per second.
+    """
+    distance, second = np.hypot(*state[:, :2].T), round(rate_hz)
+    least = minimum_filter1d(distance, 2 * second + 1)
+    passes = np.flatnonzero((distance == least) & (distance < PASS_M))
+    between = sorted(pairwise(passes.tolist()), key=lambda ends: ends[1] - ends[0])
+    out = []
+    for start, end in between[:MIRRORED]:
+        way = state[min(end + second // 2, len(state) - 1), :2] - state[end - second // 2, :2]
+        aside = QUARTER @ way / max(float(np.hypot(*way)), 1e-6)
+        copy = state.copy()
+        copy[start:end, :2] -= 2 * np.outer(copy[start:end, :2] @ aside, aside)
+        out.append(copy)
+    return out

@@ -19,6 +19,8 @@ from dmrl.estimation.problem import GLOBALS, Noise, Problem
 
 BIAS, SCALE, OWN_GYRO, PEER_GYRO, OWN_SCALE, PEER_SCALE = range(6)
 SIZE = 5
+METRIC = [0, 1, 3, 4]
+"""Residuals of a step that the velocity scales divide."""
 OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
 
 
@@ -67,52 +69,104 @@ def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) ->
     return Linear(*steps, *_ranges(problem, noise, state, constants))
 
 
-def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> tuple[Array, ...]:
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """What the steps between keyframes do under a solution. S = K - 1 steps.
+
+    ``own_gain`` and ``peer_gain`` are 1 / (1 + scale) of either velocity; ``own`` and ``peer``
+    (S, 2) the corrected shifts and ``own_turn``, ``peer_turn`` (S,) turns; ``heading`` and
+    ``turned`` (S, 2, 2) rotate by the peer's heading and by the observer's turn; ``ahead`` and
+    ``error_ahead`` (S, 2) are the next keyframe's position and velocity error seen from this one;
+    ``half_s`` and ``kept`` (S, 1) half the step's time and what it leaves of a velocity error.
+    """
+
+    own_gain: float
+    peer_gain: float
+    own: Array
+    peer: Array
+    own_turn: Array
+    peer_turn: Array
+    heading: Array
+    turned: Array
+    ahead: Array
+    error_ahead: Array
+    half_s: Array
+    kept: Array
+
+
+def _moves(problem: Problem, noise: Noise, state: Array, constants: Array) -> _Steps:
     steps_s = problem.steps_s
     own_gain, peer_gain = 1 / (1 + constants[[OWN_SCALE, PEER_SCALE]])
-    own = own_gain * (problem.own.shift_m - problem.own.drift_s @ constants[OWN_VELOCITY])
     clock = problem.peer_by_clock * constants[CLOCK]
     biased = problem.peer.drift_s @ constants[PEER_VELOCITY]
     heading = rotation(state[:-1, 2])
-    peer = _apply(heading, peer_gain * (problem.peer.shift_m + clock - biased))
     own_turn = problem.own.turn_rad - constants[OWN_GYRO] * steps_s
-    peer_turn = problem.peer.turn_rad - constants[PEER_GYRO] * steps_s
     turned = rotation(own_turn)
-    ahead = _apply(turned, state[1:, :2])
+    return _Steps(
+        own_gain,
+        peer_gain,
+        own=own_gain * (problem.own.shift_m - problem.own.drift_s @ constants[OWN_VELOCITY]),
+        peer=_apply(heading, peer_gain * (problem.peer.shift_m + clock - biased)),
+        own_turn=own_turn,
+        peer_turn=problem.peer.turn_rad - constants[PEER_GYRO] * steps_s,
+        heading=heading,
+        turned=turned,
+        ahead=_apply(turned, state[1:, :2]),
+        error_ahead=_apply(turned, state[1:, 3:]),
+        half_s=steps_s[:, None] / 2,
+        kept=np.exp(-steps_s / noise.velocity_tau_s)[:, None],
+    )
 
-    share = np.sqrt((own_gain**2 + peer_gain**2) / 2)
+
+def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> tuple[Array, ...]:
+    moves = _moves(problem, noise, state, constants)
+    share = np.sqrt((moves.own_gain**2 + moves.peer_gain**2) / 2)
     weight = 1 / np.sqrt(step_variance(problem, noise))
-    weight[:, [0, 1, 3, 4]] /= share
-    half_s, kept = steps_s[:, None] / 2, np.exp(-steps_s / noise.velocity_tau_s)[:, None]
-    error, error_ahead = state[:-1, 3:], _apply(turned, state[1:, 3:])
-    shift = ahead - state[:-1, :2] - peer + own - half_s * (error + error_ahead)
-    turn = state[1:, 2] - state[:-1, 2] - peer_turn + own_turn
-    residual = weight * np.column_stack([shift, turn, error_ahead - kept * error])
-
-    by_start = np.zeros((len(steps_s), SIZE, SIZE))
-    by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0])
-    by_start[:, :2, 2] = -peer @ QUARTER.T
-    by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -half_s, -kept
-    by_end = np.zeros_like(by_start)
-    by_end[:, :2, :2] = by_end[:, 3:, 3:] = turned
-    by_end[:, :2, 3:] = -half_s[:, None] * turned
-    by_end[:, 2, 2] = 1.0
-    by_globals = np.zeros((len(steps_s), SIZE, len(GLOBALS)))
-    moved = ahead - half_s * error_ahead
-    by_globals[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER.T)
-    by_globals[:, 3:, OWN_GYRO] = -steps_s[:, None] * (error_ahead @ QUARTER.T)
-    by_globals[:, 2, OWN_GYRO], by_globals[:, 2, PEER_GYRO] = -steps_s, steps_s
-    by_globals[:, :2, OWN_SCALE], by_globals[:, :2, PEER_SCALE] = -own_gain * own, peer_gain * peer
-    by_globals[:, :2, OWN_VELOCITY] = -own_gain * problem.own.drift_s
-    by_globals[:, :2, PEER_VELOCITY] = peer_gain * (heading @ problem.peer.drift_s)
-    by_globals[:, :2, CLOCK] = -peer_gain * _apply(heading, problem.peer_by_clock)
+    weight[:, METRIC] /= share
+    residual = weight * _residual(moves, state)
+    by_start, by_end = _by_states(moves)
+    by_globals = _by_globals(moves, problem)
     for jacobian in (by_start, by_end, by_globals):
         jacobian *= weight[:, :, None]
     # The division by the share depends on the scales too.
-    metric = [0, 1, 3, 4]
-    by_globals[:, metric, OWN_SCALE] += residual[:, metric] * own_gain**3 / (2 * share**2)
-    by_globals[:, metric, PEER_SCALE] += residual[:, metric] * peer_gain**3 / (2 * share**2)
+    for column, gain in ((OWN_SCALE, moves.own_gain), (PEER_SCALE, moves.peer_gain)):
+        by_globals[:, METRIC, column] += residual[:, METRIC] * gain**3 / (2 * share**2)
     return residual, by_start, by_end, by_globals
+
+
+def _residual(moves: _Steps, state: Array) -> Array:
+    error = state[:-1, 3:]
+    shift = moves.ahead - state[:-1, :2] - moves.peer + moves.own
+    shift = shift - moves.half_s * (error + moves.error_ahead)
+    turn = state[1:, 2] - state[:-1, 2] - moves.peer_turn + moves.own_turn
+    return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error])
+
+
+def _by_states(moves: _Steps) -> tuple[Array, Array]:
+    by_start = np.zeros((len(moves.own), SIZE, SIZE))
+    by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0])
+    by_start[:, :2, 2] = -moves.peer @ QUARTER.T
+    by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -moves.half_s, -moves.kept
+    by_end = np.zeros_like(by_start)
+    by_end[:, :2, :2] = by_end[:, 3:, 3:] = moves.turned
+    by_end[:, :2, 3:] = -moves.half_s[:, None] * moves.turned
+    by_end[:, 2, 2] = 1.0
+    return by_start, by_end
+
+
+def _by_globals(moves: _Steps, problem: Problem) -> Array:
+    out = np.zeros((len(moves.own), SIZE, len(GLOBALS)))
+    steps_s, heading = problem.steps_s, moves.heading
+    moved = moves.ahead - moves.half_s * moves.error_ahead
+    out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER.T)
+    out[:, 3:, OWN_GYRO] = -steps_s[:, None] * (moves.error_ahead @ QUARTER.T)
+    out[:, 2, OWN_GYRO], out[:, 2, PEER_GYRO] = -steps_s, steps_s
+    out[:, :2, OWN_SCALE] = -moves.own_gain * moves.own
+    out[:, :2, PEER_SCALE] = moves.peer_gain * moves.peer
+    out[:, :2, OWN_VELOCITY] = -moves.own_gain * problem.own.drift_s
+    out[:, :2, PEER_VELOCITY] = moves.peer_gain * (heading @ problem.peer.drift_s)
+    out[:, :2, CLOCK] = -moves.peer_gain * _apply(heading, problem.peer_by_clock)
+    return out
 
 
 def step_variance(problem: Problem, noise: Noise) -> Array:

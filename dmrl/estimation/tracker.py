@@ -17,6 +17,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
+from dmrl.estimation.view import Motion, View
 from dmrl.geometry import Array, Camera, horizontal_from_pixels, inside, pixels_from_horizontal
 
 P, V, BIAS = slice(0, 3), slice(3, 6), 6
@@ -66,45 +67,6 @@ class Tuning:
     confirm_odds: float = 1e6
     lost_odds: float = 1e4
     lost_std_m: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """What the observer did between two images.
-
-    Parameters
-    ----------
-    dt_s
-        Seconds.
-    shift_m
-        (3,) how far it moved over ground, along the axes of its horizontal frame before.
-    turn_rad
-        How far it turned, positive to the left.
-    """
-
-    dt_s: float
-    shift_m: Array
-    turn_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """One image's detections and the attitude they were taken with.
-
-    Parameters
-    ----------
-    uv
-        (N, 2) pixels.
-    depth_m
-        (N,) metres.
-    roll_rad, pitch_rad
-        Attitude of the observer.
-    """
-
-    uv: Array
-    depth_m: Array
-    roll_rad: float
-    pitch_rad: float
 
 
 class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types

@@ -23,9 +23,8 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats import flight_sample, image_folder
-from dmrl.formats.camera_toml import read_camera
 from dmrl.formats.flight_sample import LOG_COLUMNS, in_order, nanoseconds
-from dmrl.formats.sample import Content, Sample
+from dmrl.formats.sample import Content, Format, Options, Sample
 from dmrl.geometry import Array
 from dmrl.progress import say
 
@@ -85,7 +84,7 @@ def _header(path: Path) -> list[str]:
         return []
 
 
-def content(source: Path) -> Content:
+def content(source: Path, _options: Options | None = None) -> Content:
     """Samples of a flight, in time order. Says on stderr what is odd but can be used.
 
     Parameters
@@ -210,7 +209,7 @@ def _pictures(folder: Path) -> Iterator[Iterator[Sample]]:
                 f"{path} is not named by its time in nanoseconds, {image_folder.TIME_DIGITS} "
                 "digits or more. Rename it"
             )
-    own = folder / image_folder.CALIBRATION
-    camera = read_camera(own) if own.is_file() else None
-    options = image_folder.Options(robot=folder.name, camera=camera)
-    yield image_folder.content(folder, options).samples
+    yield image_folder.content(folder, Options(robot=folder.name)).samples
+
+
+FORMAT = Format("csv", "a folder of flight logs", recognises, content)

@@ -1,6 +1,6 @@
 """A folder of pictures, with labels in a CSV file where there are any.
 
-Pictures: ``.png .jpg .jpeg .ppm .bmp``, in the order of their names. When every name is a
+Pictures: ``.png .jpg .jpeg .ppm .pgm .bmp``, in the order of their names. When every name is a
 number of 12 digits or more, the numbers are times in nanoseconds; otherwise the pictures
 get nominal times, evenly spaced from 0.
 
@@ -11,53 +11,43 @@ with an empty peer says that no peer is in view. A picture without a row is not 
 * ``left_px, top_px, right_px, bottom_px, visible_share, source, split, sigma_u_px,
   sigma_v_px, sigma_depth_m`` may be. ``source`` is "hand" where it is empty.
 
+Or ``label.txt`` as the published firmware's tools write it, ``imgNNNNN.ppm roll pitch x y z d``
+a line: see ``aideck``. Labels of it need a camera.
+
 Pixels are those of the stored picture, pixel-edge coordinates. ``calibration.toml`` in the
 folder is the camera that took the pictures as they are stored (keys: see ``Camera``).
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 from dmrl import images
+from dmrl.bayer import rgb_of
 from dmrl.errors import SettingError, SourceError
+from dmrl.formats import aideck
+from dmrl.formats.camera_toml import read_camera
 from dmrl.formats.crop import Crop
 from dmrl.formats.label_table import LabelRow, read_labels
-from dmrl.formats.sample import Content, Sample, calibration, image, intervals, labels
-from dmrl.geometry import Camera
+from dmrl.formats.sample import (
+    Content,
+    Format,
+    Options,
+    Sample,
+    calibration,
+    image,
+    intervals,
+    labels,
+)
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
 LABELS = "labels.csv"
+AIDECK_LABELS = "label.txt"
 CALIBRATION = "calibration.toml"
 TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
 NS_PER_S = 1_000_000_000
 TIME_MAX_NS = 2**63 - 1
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How a folder of pictures becomes samples.
-
-    Parameters
-    ----------
-    robot
-        Robot that carries the camera.
-    rate_hz
-        Pictures per second where their names are not times.
-    labels
-        CSV file; None: labels.csv in the folder, if there.
-    camera
-        Camera that took the pictures as they are stored; None: not known.
-    size_px
-        Width and height to crop and scale to; None: pictures stay as they are.
-    """
-
-    robot: str = "cf1"
-    rate_hz: float = 10.0
-    labels: Path | None = None
-    camera: Camera | None = None
-    size_px: tuple[int, int] | None = None
 
 
 def recognises(source: Path) -> bool:
@@ -77,7 +67,7 @@ def content(source: Path, options: Options) -> Content:
     source
         The folder.
     options
-        See ``Options``.
+        All but ``names`` count.
 
     Raises
     ------
@@ -87,13 +77,17 @@ def content(source: Path, options: Options) -> Content:
     SettingError
         If the camera is not of the pictures' size.
     """
+    own = source / CALIBRATION
+    if options.camera is None and own.is_file():
+        options = replace(options, camera=read_camera(own))
     pictures = list_pictures(source, options.rate_hz)
     path = options.labels or source / LABELS
     known = {picture.name for _, picture in pictures}
     rows = read_labels(path, known) if options.labels or path.is_file() else {}
     splits = {name: found[0].split for name, found in rows.items()}
+    states = _aideck_labels(source / AIDECK_LABELS, known)
     return Content(
-        samples=_samples(pictures, rows, options),
+        samples=_samples(pictures, rows, states, options),
         total=len(pictures) + len(rows) + (options.camera is not None),
         split=intervals((time_ns, splits.get(p.name)) for time_ns, p in pictures),
     )
@@ -135,23 +129,62 @@ def _time_ns(path: Path) -> int | None:
     return int(path.stem)
 
 
+def _aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[float]]:
+    """Six numbers by picture, from ``label.txt`` where there is one."""
+    found: dict[str, list[float]] = {}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    except (OSError, UnicodeDecodeError) as e:
+        raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None
+    for number, line in enumerate(lines, 1):
+        name, *words = line.replace(",", " ").split() or [""]
+        if not name:
+            continue
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != len(aideck.VARIABLES):
+            wanted = " ".join(aideck.VARIABLES)
+            raise SourceError(f"{path}:{number}: not a picture and {wanted}. Mend the line")
+        if (name := name.rsplit("/", 1)[-1]) not in files:
+            raise SourceError(f"{path}:{number}: no picture {name}. Add it, or delete the line")
+        found[name] = values
+    return found
+
+
 def _samples(
-    pictures: list[tuple[int, Path]], rows: dict[str, list[LabelRow]], options: Options
+    pictures: list[tuple[int, Path]],
+    rows: dict[str, list[LabelRow]],
+    states: dict[str, list[float]],
+    options: Options,
 ) -> Iterator[Sample]:
     for k, (time_ns, path) in enumerate(pictures):
         data = path.read_bytes()
-        rgb = images.decode(data, path)
+        rgb = _colours(data, path) if options.raw else images.decode(data, path)
         crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
         if options.camera is not None and k == 0:
             yield calibration(time_ns, options.robot, crop.camera(options.camera))
         if crop.changes:
             data, kind = images.encode_png(crop.pixels(rgb)), "png"
-        elif (kind := images.size(data)[2]) not in ("png", "jpeg"):
+        elif options.raw or (kind := images.size(data)[2]) not in ("png", "jpeg"):
             data, kind = images.encode_png(rgb), "png"
         yield image(time_ns, options.robot, data, kind)
         if path.name in rows:
             peers = [crop.label(row) for row in rows[path.name] if row.peer]
             yield labels(time_ns, options.robot, [row.fields() for row in peers])
+        if path.name in states:
+            known = options.camera if path.name not in rows else None
+            camera = crop.camera(known) if known else None
+            peer = options.names.get("0", "cf2")
+            yield from aideck.samples(time_ns, options.robot, peer, states[path.name], camera)
+
+
+def _colours(data: bytes, path: Path) -> images.Rgb:
+    rgb = images.decode(data, path)
+    if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
+        raise SourceError(f"{path} has colours already, so it is not raw. Leave out --raw")
+    return rgb_of(rgb[..., 0].copy())
 
 
 def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
@@ -162,3 +195,6 @@ def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
             f"{camera.height_px}. Give the calibration of the pictures as they are stored"
         )
     return Crop(width_px, height_px, *(options.size_px or (width_px, height_px)))
+
+
+FORMAT = Format("images", "a folder of pictures", recognises, content)

@@ -25,7 +25,16 @@ import numpy as np
 
 from dmrl import images, topics
 from dmrl.errors import SourceError
-from dmrl.formats.sample import Content, Sample, calibration, image, intervals, labels
+from dmrl.formats.sample import (
+    Content,
+    Format,
+    Options,
+    Sample,
+    calibration,
+    image,
+    intervals,
+    labels,
+)
 from dmrl.geometry import PUBLISHED_RENDER, Array, camera_from_horizontal, project
 
 FOLDERS = ("synImgs", "synImgsMulti")
@@ -218,21 +227,22 @@ def attitude_zyx(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
     return float(np.arctan2(sr, cr * cp)), float(np.arcsin(cr * sp))
 
 
-def content(source: Path, robot: str = "cf1") -> Content:
+def content(source: Path, options: Options | None = None) -> Content:
     """Samples of the set: every picture with its true and its published labels.
 
     Parameters
     ----------
     source
         A folder with ``synImgs/`` or ``synImgsMulti/``, or that folder itself.
-    robot
-        Name of the robot that carries the camera. It sees cf2, cf3, ..., without itself.
+    options
+        ``robot`` carries the camera. It sees cf2, cf3, ..., without itself.
 
     Raises
     ------
     SourceError
         If a file is missing or malformed: names file and line.
     """
+    robot = (options or Options()).robot
     items = read(source)
     return Content(
         samples=_samples(items, robot),
@@ -294,3 +304,6 @@ def _peers(item: LocanetImage, names: list[str]) -> list[dict[str, Any]]:
                 value = {"u_px": u, "v_px": v, "depth_m": depth, "source": source}
                 found.append({"peer": name, **value, **box})
     return found
+
+
+FORMAT = Format("locanet", "a folder of the published synthetic set", recognises, content)

@@ -8,7 +8,10 @@ capture and are far better than a drone's. Ranges stand as measured, some 0.35 m
 """
 
 import re
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,10 +20,25 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats import flight_sample
 from dmrl.formats.flight_sample import from_poses, in_order, nanoseconds
-from dmrl.formats.sample import Content, Sample
+from dmrl.formats.sample import Content, Format, Options, Sample
 from dmrl.geometry import Array
 
 RATE_HZ = 10.0
+# What zipfile, zlib and NumPy raise on damaged archives.
+BROKEN = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    EOFError,
+    SyntaxError,
+    RuntimeError,
+    MemoryError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 POSE = re.compile(r"optitrack_turtle(\d+)_pose_np")
 RANGE = re.compile(r"uwb_range_(\d+)_(\d+)_np")
 
@@ -29,12 +47,15 @@ def recognises(source: Path) -> bool:
     """Whether a file is an ``.npz`` with ranges and poses of these names."""
     if source.suffix != ".npz" or not zipfile.is_zipfile(source):
         return False
-    with zipfile.ZipFile(source) as archive:
-        names = [name.removesuffix(".npy") for name in archive.namelist()]
+    try:
+        with zipfile.ZipFile(source) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+    except BROKEN:
+        return False
     return any(map(POSE.fullmatch, names)) and any(map(RANGE.fullmatch, names))
 
 
-def content(source: Path) -> Content:
+def content(source: Path, _options: Options | None = None) -> Content:
     """Samples of the file, robots named turtle1, turtle3, ...
 
     Parameters
@@ -74,8 +95,9 @@ def _arrays(source: Path) -> dict[str, Array]:
     try:
         with np.load(source, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name], float) for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as e:
-        raise SourceError(f"{source} cannot be read: {e}. Fetch it again") from e
+    except BROKEN as e:
+        why = " ".join(str(e).split())
+        raise SourceError(f"{source} cannot be read: {why}. Fetch it again") from e
 
 
 def _pose(arrays: dict[str, Array], number: str) -> tuple[Array, Array, Array]:
@@ -99,3 +121,6 @@ def _ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
     return flight_sample.ranges(
         f"turtle{int(one)}", f"turtle{int(other)}", time_ns[kept], range_m[kept]
     )
+
+
+FORMAT = Format("uwb-tiers", "ranges with motion capture", recognises, content)

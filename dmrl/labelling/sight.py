@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.estimation.camera_pose import Flight, PeerPath
-from dmrl.estimation.tracker import Motion, View
+from dmrl.estimation.view import Motion, View
 from dmrl.geometry import Array, Camera
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Summary, read_table

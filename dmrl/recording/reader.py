@@ -58,7 +58,7 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
         found |= hits
     for topic in sorted(found):
         row = row_of(topic)
-        if row is not None and topics[topic].schema != row.message:
+        if row is not None and not row.carries(topics[topic].schema):
             raise RecordingError(
                 f"{path}: {topic} carries {topics[topic].schema or 'no schema'}, not "
                 f"{row.message}. Convert the recording: dmrl convert --help"

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from google.protobuf.descriptor import Descriptor
 from mcap.writer import CompressionType, Writer
 
 from dmrl.errors import RecordingError
@@ -149,7 +150,7 @@ class RecordingWriter:
         """
         channel = self._known.get(topic)
         if channel is None or channel.schema_name != message.DESCRIPTOR.full_name:
-            channel = self._known[topic] = self._channel_for(topic, message.DESCRIPTOR.full_name)
+            channel = self._known[topic] = self._channel_for(topic, message.DESCRIPTOR)
         publish_ns = time_ns if publish_ns is None else publish_ns
         self.write_raw(RawMessage(time_ns, publish_ns, channel, message.SerializeToString()))
 
@@ -180,13 +181,14 @@ class RecordingWriter:
         """Close the open chunk, so that a killed process keeps it."""
         self._writer.flush()
 
-    def _channel_for(self, topic: str, schema_name: str) -> Channel:
+    def _channel_for(self, topic: str, kind: Descriptor) -> Channel:
+        schema_name = str(kind.full_name)
         row = row_of(topic)
-        if row is not None and row.message != schema_name:
+        if row is not None and not row.carries(schema_name):
             raise RecordingError(
                 f"{topic} carries {row.message}, not {schema_name}. Use its own topic"
             )
-        return Channel(topic, schema_name, schema_bytes(schema_name))
+        return Channel(topic, schema_name, schema_bytes(kind))
 
     def _register(self, channel: Channel) -> int:
         key = (channel.schema_name, channel.schema_data)

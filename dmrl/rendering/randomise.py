@@ -212,7 +212,9 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
     backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
     gain = _factor(rng, settings.robot_gain) * float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
-    return Look(backdrop, _light(settings, rng, name, turn), _sensor(settings, rng), gain, seed)
+    return Look(
+        backdrop, _light(settings, rng, name, turn), random_sensor(settings, rng), gain, seed
+    )
 
 
 def _light(
@@ -231,7 +233,8 @@ def _light(
     )
 
 
-def _sensor(settings: Settings, rng: Generator) -> Sensor:
+def random_sensor(settings: Settings, rng: Generator) -> Sensor:
+    """A camera's response, from the ranges of the settings."""
     warmth = _factor(rng, settings.warmth) ** 0.5
     return Sensor(
         brightness=_between(rng, settings.brightness),

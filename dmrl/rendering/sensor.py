@@ -62,7 +62,7 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
         Where the noise comes from.
     """
     target = sensor.brightness**sensor.contrast_gamma
-    mean = max(float(light.reshape(-1, 3).mean(axis=0) @ LUMINANCE), 1e-6)
+    mean = max(float((light @ LUMINANCE).mean()), 1e-6)
     gain = np.array(sensor.balance, np.float32) * np.float32(target / mean)
     height, width, _ = light.shape
     values = blur(_mixed(light, sensor.saturation), sensor.defocus_px)

@@ -17,7 +17,7 @@ from dmrl.rendering.sketch import Pose
 
 Part = tuple[slice, slice]
 """Rows and columns of a picture."""
-PAD_PX = 2
+PAD_PX = 1
 NEAREST_M = 0.01
 
 

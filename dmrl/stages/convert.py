@@ -1,23 +1,23 @@
-"""``dmrl convert``: foreign files and folders to a recording.
+"""``dmrl convert``: foreign files and folders to a recording, and recordings to files.
 
-A new format is one file in ``dmrl/formats`` and one row in ``KINDS``.
+A new format is one file in ``dmrl/formats`` and one row in ``dmrl.formats.known``.
 """
 
 import json
 import re
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from difflib import get_close_matches
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl.errors import SettingError, SourceError
-from dmrl.formats import flight_csv, image_folder, locanet, uwb_tiers
+from dmrl.errors import SettingError
+from dmrl.export.ros2 import write_bag
+from dmrl.export.tables import write_tables
 from dmrl.formats.camera_toml import read_camera
-from dmrl.formats.sample import Content
+from dmrl.formats.known import format_of
+from dmrl.formats.sample import Content, Options
 from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
@@ -38,114 +38,51 @@ class Settings:
     Parameters
     ----------
     source_kind
-        What SOURCE is: locanet, csv, uwb-tiers or images. Guessed where it can be.
+        What SOURCE is, as docs/sources.md names it. Guessed where it can be.
     robot
-        Robot that carries the camera.
+        Robot that carries the camera, or whose log it is.
+    names
+        Names of robots by those that the source has for them: 0=cf2,turtle_cap=turtle1. The
+        numbers in logs are else cf0, cf1, ...
     rate_hz
-        images: pictures per second, where their names are not times in nanoseconds.
+        Pictures per second, where the source has no times.
     labels
         images: CSV file with labels. Without it, labels.csv in the folder, if there.
     camera
-        images: camera that took the pictures as they are stored: aideck, published, or a
-        TOML file. Without it, calibration.toml in the folder, if there.
+        Camera that took the pictures as they are stored: aideck, published, or a TOML file.
+        Without it, calibration.toml in the folder, if there.
     width_px
         images: crop to the middle and scale to this width. Needs the height too.
     height_px
         images: crop to the middle and scale to this height. Needs the width too.
+    raw
+        images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
+    to
+        The other way: SOURCE is a recording, OUT a folder of tables (csv, parquet) or a ROS 2
+        bag (ros2).
     """
 
     source_kind: Annotated[str | None, Parameter(name="--from")] = None
     robot: str = "cf1"
+    names: str | None = None
     rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 10.0
     labels: Path | None = None
     camera: Path | None = None
     width_px: Positive | None = None
     height_px: Positive | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """One row of the table of formats: how to know it, how to read it."""
-
-    recognises: Callable[[Path], bool]
-    content: Callable[[Path, Settings], Content]
-
-
-def _locanet(source: Path, settings: Settings) -> Content:
-    return locanet.content(source, settings.robot)
-
-
-def _images(source: Path, settings: Settings) -> Content:
-    size_px = (settings.width_px, settings.height_px)
-    if (size_px[0] is None) != (size_px[1] is None):
-        raise SettingError("--width-px and --height-px go together. Give both, or neither")
-    options = image_folder.Options(
-        robot=settings.robot,
-        rate_hz=settings.rate_hz,
-        labels=settings.labels,
-        camera=_camera(source, settings.camera),
-        size_px=None if size_px[0] is None or size_px[1] is None else (size_px[0], size_px[1]),
-    )
-    content = image_folder.content(source, options)
-    read = (path for path in (settings.labels, settings.camera) if path and path.is_file())
-    return replace(content, inputs=tuple(read))
-
-
-def _camera(source: Path, name: Path | None) -> Camera | None:
-    if name is None:
-        own = source / image_folder.CALIBRATION
-        return read_camera(own) if own.is_file() else None
-    return CAMERAS.get(str(name)) or read_camera(name)
-
-
-# Looked at in this order: the published set is a folder of pictures too.
-KINDS = {
-    "locanet": Kind(locanet.recognises, _locanet),
-    "csv": Kind(flight_csv.recognises, lambda source, _: flight_csv.content(source)),
-    "uwb-tiers": Kind(uwb_tiers.recognises, lambda source, _: uwb_tiers.content(source)),
-    "images": Kind(image_folder.recognises, _images),
-}
-
-
-def kind_of(source: Path, name: str | None) -> Kind:
-    """The row of ``KINDS`` for a source.
-
-    Parameters
-    ----------
-    source
-        A file or folder.
-    name
-        Its kind; None: guess.
-
-    Raises
-    ------
-    SourceError
-        If there is no such source or kind, or none fits: lists the kinds.
-    """
-    known = ", ".join(KINDS)
-    if not source.exists():
-        raise SourceError(f"no file or folder {source}. Name one to convert")
-    if name is None:
-        for kind in KINDS.values():
-            if kind.recognises(source):
-                return kind
-        raise SourceError(f"{source} looks like no kind that is known. Say --from: {known}")
-    if name not in KINDS:
-        near = get_close_matches(name, KINDS, n=1)
-        hint = f"Did you mean {near[0]}? " if near else ""
-        raise SourceError(f"--from {name}: no such kind. {hint}Kinds: {known}")
-    return KINDS[name]
+    raw: Annotated[bool, Parameter(negative=())] = False
+    to: Literal["csv", "parquet", "ros2"] | None = None
 
 
 def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
-    """Messages per topic of the recording written to ``out``.
+    """Messages per topic of the recording, or rows of the tables, written to ``out``.
 
     Parameters
     ----------
     source
-        A foreign file or folder.
+        A foreign file or folder; with ``settings.to``, a recording.
     out
-        Recording to write. Must not exist.
+        Recording, or folder, to write. Must not exist.
     settings
         See `Settings`.
 
@@ -159,26 +96,64 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
         If ``out`` exists or cannot be written.
     """
     refuse_existing(out)
-    _check(settings)
-    content = kind_of(source, settings.source_kind).content(source, settings)
-    made = provenance("convert", settings, (source, *content.inputs), libraries=("pillow", "numpy"))
-    counts: Counter[str] = Counter()
+    if settings.to == "ros2":
+        return write_bag(source, out)
+    if settings.to is not None:
+        return write_tables(source, out, settings.to)
+    options = _options(settings)
+    content = format_of(source, settings.source_kind).content(source, options)
+    read = [path for path in (settings.labels, settings.camera) if path and path.is_file()]
+    made = provenance("convert", settings, (source, *read), libraries=("pillow", "numpy"))
     with RecordingWriter(out, made) as sink:
-        if content.split:
-            split = {name: json.dumps(times) for name, times in content.split.items()}
-            sink.add_metadata(SPLIT_METADATA, split)
-        for sample in track(content.samples, "Converting", content.total):
-            sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
-            counts[sample.topic] += 1
+        return _write(content, sink)
+
+
+def _write(content: Content, sink: RecordingWriter) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    if content.split:
+        split = {name: json.dumps(times) for name, times in content.split.items()}
+        sink.add_metadata(SPLIT_METADATA, split)
+    for sample in track(content.samples, "Converting", content.total):
+        sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
+        counts[sample.topic] += 1
     return dict(sorted(counts.items()))
 
 
-def _check(settings: Settings) -> None:
+def _options(settings: Settings) -> Options:
     if not ROBOT.fullmatch(settings.robot):
         raise SettingError(f"--robot {settings.robot!r} cannot stand in a topic. Try: cf1")
-    sizes = [size for size in (settings.width_px, settings.height_px) if size is not None]
-    if settings.rate_hz <= 0 or min(sizes, default=1) < 1:
+    width_px, height_px = settings.width_px, settings.height_px
+    if (
+        settings.rate_hz <= 0
+        or min(width_px or 1, height_px or 1) < 1
+        or 0 in (width_px, height_px)
+    ):
         raise SettingError("--rate-hz, --width-px and --height-px must be over 0. Raise them")
+    if (width_px is None) != (height_px is None):
+        raise SettingError("--width-px and --height-px go together. Give both, or neither")
+    return Options(
+        robot=settings.robot,
+        names=_names(settings.names),
+        rate_hz=settings.rate_hz,
+        labels=settings.labels,
+        camera=_camera(settings.camera),
+        size_px=None if width_px is None or height_px is None else (width_px, height_px),
+        raw=settings.raw,
+    )
+
+
+def _names(text: str | None) -> dict[str, str]:
+    found = {}
+    for part in text.split(",") if text else []:
+        old, _, new = part.strip().partition("=")
+        if not (old and ROBOT.fullmatch(new)):
+            raise SettingError(f"--names {part.strip()!r} is not OLD=NEW. Try: 0=cf2,1=cf3")
+        found[old] = new
+    return found
+
+
+def _camera(name: Path | None) -> Camera | None:
+    return None if name is None else CAMERAS.get(str(name)) or read_camera(name)
 
 
 DEFAULTS = Settings()
@@ -192,15 +167,14 @@ def command(
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Convert SOURCE, a foreign file or folder, into a recording.
+    """Convert a foreign file or folder into a recording, or a recording into files.
 
     Parameters
     ----------
     source
-        A folder of the published synthetic set, a folder of flight logs, ranges with motion
-        capture, or a folder of pictures.
+        A foreign file or folder: pictures, flight logs, dumps of a camera deck, ROS bags.
     out
-        Recording to write. Must not exist.
+        Recording to write; with --to, a folder. Must not exist.
     as_json
         Print one JSON document in place of the table.
     """
@@ -208,4 +182,4 @@ def command(
     if as_json:
         print_json({"recording": str(out), "messages": counts})
         return
-    print_table(str(out), ("topic", "messages"), list(counts.items()))
+    print_table(str(out), ("topic", "rows" if settings.to else "messages"), list(counts.items()))

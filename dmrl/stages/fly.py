@@ -1,7 +1,8 @@
 """``dmrl fly``: a simulated flight of several robots, as a recording."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import permutations
 from pathlib import Path
@@ -21,12 +22,16 @@ from dmrl.geometry import AIDECK, Array
 from dmrl.images import encode_jpeg
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.progress import track
-from dmrl.recording import RecordingWriter, provenance
-from dmrl.rendering.onboard import Body, Renderer, in_front, pose_of, sketched
+from dmrl.progress import say, track
+from dmrl.recording import Provenance, RecordingWriter, provenance
+from dmrl.rendering import aloft, renderer
+from dmrl.rendering.environment import ensure
+from dmrl.rendering.onboard import Body, Renderer, sketched, view
+from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch import Sketch
 from dmrl.tables import print_json, print_table
 
+CameraRenderer = Literal["sketch", "blender"]
 Preset = Literal["ideal", "calibrated", "realistic", "harsh", "published"]
 
 START_NS = 1_000_000_000
@@ -57,6 +62,9 @@ class Settings:
         Robots start with a yaw within plus and minus this; cf1 with 0.
     camera
         Render what the robots' cameras saw, with exact labels.
+    camera_renderer
+        sketch: drawn by code, each picture before another background. blender: as dmrl render
+        does, with one place for the flight; sets Blender up if it is not.
     cameras_max
         The first robots, so many at most, carry a camera.
     camera_rate_hz
@@ -70,11 +78,12 @@ class Settings:
     seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0
     yaw_spread_rad: float = 3.141592653589793
     camera: bool = False
+    camera_renderer: CameraRenderer = "sketch"
     cameras_max: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 20
     camera_rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=100))] = 5.0
 
 
-def run(out: Path, settings: Settings, *, renderer: Renderer = sketched) -> dict[str, int]:
+def run(out: Path, settings: Settings) -> dict[str, int]:
     """Messages per pattern of topics of the recording written to ``out``.
 
     Parameters
@@ -83,8 +92,6 @@ def run(out: Path, settings: Settings, *, renderer: Renderer = sketched) -> dict
         Recording to write. Must not exist.
     settings
         See `Settings`.
-    renderer
-        What draws the pictures.
 
     Raises
     ------
@@ -92,6 +99,8 @@ def run(out: Path, settings: Settings, *, renderer: Renderer = sketched) -> dict
         If a setting is out of range.
     OutputError
         If ``out`` exists or cannot be written.
+    BlenderError
+        If Blender is wanted and cannot be set up, or does not start.
     """
     refuse_existing(out)
     _check(settings)
@@ -99,16 +108,29 @@ def run(out: Path, settings: Settings, *, renderer: Renderer = sketched) -> dict
         settings.robots, settings.duration_s, settings.trajectory, settings.yaw_spread_rad
     )
     flight = simulate(scenario, NOISE[settings.noise], settings.seed)
-    streams = [*_measured(flight), *_true(flight)]
-    if settings.camera:
-        streams += _pictures(flight, settings, renderer)
     made = provenance("fly", settings, seed=settings.seed, libraries=("numpy", "pillow"))
+    streams = [*_measured(flight), *_true(flight)]
     counts: Counter[str] = Counter()
-    with RecordingWriter(out, made) as sink:
+    with ExitStack() as stack:
+        if settings.camera:
+            draw, made = _renderer(settings, made, stack)
+            streams += _pictures(flight, settings, draw)
+        sink = stack.enter_context(RecordingWriter(out, made))
         for sample in track(in_order(streams), "Flying", _total(flight, settings)):
             sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
             counts[_pattern(sample.topic)] += 1
     return dict(sorted(counts.items()))
+
+
+def _renderer(
+    settings: Settings, made: Provenance, stack: ExitStack
+) -> tuple[Renderer, Provenance]:
+    """What draws the pictures, closed with the stack, and the provenance with its version."""
+    if settings.camera_renderer == "sketch":
+        return sketched, made
+    blender = stack.enter_context(renderer.Renderer(ensure(say), renderer.Model()))
+    made = replace(made, libraries={**made.libraries, "blender": blender.version})
+    return aloft.Flight(blender, settings.seed), made
 
 
 def _check(settings: Settings) -> None:
@@ -179,33 +201,33 @@ def _body(truth: Truth, true_time_s: float) -> Body:
     )
 
 
-def _pictures(flight: Flight, settings: Settings, renderer: Renderer) -> Iterator[Iterator[Sample]]:
+def _pictures(flight: Flight, settings: Settings, draw: Renderer) -> Iterator[Iterator[Sample]]:
     for k, robot in enumerate(list(flight.truth)[: settings.cameras_max]):
-        yield _camera(flight, robot, k, settings, renderer)
+        yield _camera(flight, robot, k, settings, draw)
 
 
 def _camera(
-    flight: Flight, robot: str, number: int, settings: Settings, renderer: Renderer
+    flight: Flight, robot: str, number: int, settings: Settings, draw: Renderer
 ) -> Iterator[Sample]:
     """The calibration of one robot's camera, then its pictures, each with its labels."""
     period_s = 1.0 / settings.camera_rate_hz
     time_s = np.arange(period_s / 2, settings.duration_s, period_s)
     yield calibration(START_NS, robot, CAMERA)
-    for k, time_ns in enumerate(_stamps(flight.clocks[robot], time_s).tolist()):
-        here = _body(flight.truth[robot], float(time_s[k]))
-        others = {name: _body(t, float(time_s[k])) for name, t in flight.truth.items()}
-        poses = {
-            name: pose
-            for name, peer in others.items()
-            if name != robot and in_front(pose := pose_of(peer, here))
-        }
-        rng = np.random.default_rng((settings.seed, number, k))
-        picture = renderer(CAMERA, list(poses.values()), rng)
+
+    def bodies(moment_s: float) -> dict[str, Body]:
+        return {name: _body(truth, moment_s) for name, truth in flight.truth.items()}
+
+    views = [
+        view(bodies, robot, moment_s, (settings.seed, number, k))
+        for k, moment_s in enumerate(time_s.tolist())
+    ]
+    stamps = _stamps(flight.clocks[robot], time_s).tolist()
+    for time_ns, seen, picture in zip(stamps, views, draw(CAMERA, views), strict=True):
         yield image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
-        yield labels(time_ns, robot, list(_labels(list(poses), picture)))
+        yield labels(time_ns, robot, list(_labels(list(seen.poses), picture)))
 
 
-def _labels(peers: list[str], picture: Sketch) -> Iterator[dict[str, Any]]:
+def _labels(peers: Sequence[str], picture: Sketch | Shot) -> Iterator[dict[str, Any]]:
     for k, peer in enumerate(peers):
         box = picture.box_px[k]
         yield {
@@ -237,6 +259,9 @@ class Flags:
         Another seed gives another flight. Without it, the recipe's.
     camera
         Render what every camera saw. Without it, as the recipe says.
+    camera_renderer
+        sketch: quick drawings. blender: rendered as by dmrl render; sets Blender up, once, if
+        it is not. Without it, the recipe's.
     camera_rate_hz
         Pictures per second and robot. Without it, the recipe's.
     """
@@ -247,6 +272,7 @@ class Flags:
     noise: Preset | None = None
     seed: int | None = None
     camera: bool | None = None
+    camera_renderer: CameraRenderer | None = None
     camera_rate_hz: float | None = None
 
     def over(self, settings: Settings) -> Settings:

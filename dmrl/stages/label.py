@@ -27,7 +27,8 @@ from dmrl.recording import (
 from dmrl.tables import print_json, print_table
 
 try:
-    from dmrl.estimation.estimate import GATE_M, Estimate, estimate_ekf, estimate_pairs
+    from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+    from dmrl.estimation.gate import GATE_M
     from dmrl.estimation.pair import Pair
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import read_logs
@@ -57,7 +58,8 @@ class Settings:
     preset
         ekf: its noise, as published for simulation or in the firmware.
     gate_m
-        Largest sigma of a position that is labelled OK, metres.
+        A position that is off by more than this is a bad one, metres. About one in a hundred of
+        those that are OK is bad.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
     range_offset_m

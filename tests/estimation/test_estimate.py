@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from dmrl import messages
-from dmrl.estimation import estimate as room
+from dmrl.estimation import gate as room
 from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs, from_peer, swapped
 from dmrl.estimation.pair import Pair, Track
+from dmrl.estimation.problem import Noise
 from dmrl.flight import Trajectory
 
 from .flights import flown, pair_of, truth_at
@@ -105,7 +106,7 @@ def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() 
         np.stack([np.eye(3), 3 * np.eye(3)]),
         none,
         np.zeros(11),
-        room.Noise(),
+        Noise(),
     )
     xy, covariance, status = estimate.at(np.array([0.5, 2.0]))
     assert xy.tolist() == [[0.5, 1.0], [1.0, 2.0]]

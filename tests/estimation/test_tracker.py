@@ -5,7 +5,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from dmrl.estimation.identity import Identity
-from dmrl.estimation.tracker import Motion, Tracker, Tuning, View
+from dmrl.estimation.tracker import Tracker, Tuning
+from dmrl.estimation.view import Motion, View
 from dmrl.geometry import AIDECK, Array, horizontal_from_pixels, inside, pixels_from_horizontal
 
 TUNING = Tuning()

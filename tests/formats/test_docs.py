@@ -1,17 +1,22 @@
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from dmrl.errors import SourceError
 from dmrl.formats.image_folder import SUFFIXES
+from dmrl.formats.known import FORMATS
 from dmrl.formats.label_table import COLUMNS
+from dmrl.formats.sample import Options
 from dmrl.geometry import Camera
-from dmrl.stages.convert import CAMERAS, KINDS
+from dmrl.stages.convert import CAMERAS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "sources.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FORMATS)
 def test_every_kind_is_documented(kind: str) -> None:
     assert f"## `{kind}`" in TEXT
 
@@ -21,3 +26,26 @@ def test_every_column_key_and_suffix_is_documented() -> None:
     assert [name for name in (*COLUMNS, *keys) if f"`{name}`" not in TEXT] == []
     assert all(name in TEXT for name in CAMERAS)
     assert " ".join(SUFFIXES) in TEXT
+
+
+def test_the_worked_example_of_a_format_reads_what_it_says(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "add-a-format.md").read_text(encoding="utf-8")
+    code = page.split("```python\n")[1].split("```")[0]
+    example: dict[str, Any] = {}
+    exec(compile(code, "add-a-format.md", "exec"), example)
+    rows = np.array([(0.5, 1.5, 0.0), (1.0, 1.6, 2.5)], example["RECORD"])
+    path = tmp_path / "flight.ulg2"
+    path.write_bytes(b"UL2" + rows.tobytes() + b"cut")
+    form = example["FORMAT"]
+    assert form.recognises(path)
+    found = [
+        (s.time_ns, s.topic, *s.fields.values()) for s in form.content(path, Options()).samples
+    ]
+    assert found == [
+        (500_000_000, "/cf1/height", 1.5),
+        (1_000_000_000, "/cf1/height", pytest.approx(1.6)),
+        (1_000_000_000, "/cf1/range/cf3", 2.5),
+    ]
+    path.write_bytes(b"UL2")
+    with pytest.raises(SourceError, match="has no whole record"):
+        form.content(path, Options())

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmrl.bayer import rgb_of
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import image_folder
-from dmrl.formats.image_folder import Options
-from dmrl.formats.sample import Sample
+from dmrl.formats.sample import Options, Sample
 from dmrl.geometry import AIDECK, project
 from dmrl.images import decode, encode_jpeg, encode_png
 
@@ -193,3 +193,44 @@ def test_real_frames_convert(data: Path) -> None:
     paths = sorted((data / "aideck-frames").glob("*.ppm"))
     for path, sample in zip(paths, found, strict=True):
         np.testing.assert_array_equal(decode(sample.fields["data"]), decode(path.read_bytes()))
+
+
+def test_the_firmware_s_text_beside_pictures_becomes_messages_and_labels(folder: Path) -> None:
+    lines = ["deck/a.png 1.5 -2.0 1.0 0.2 -0.1 1.03", "c.ppm,0,0,2,0,0,2", ""]
+    (folder / "label.txt").write_text("\n".join(lines))
+    camera = replace(AIDECK, width_px=64, height_px=48, cx_px=32, cy_px=24, fx_px=40, fy_px=40)
+    found = samples(folder, "PeerPosition")
+    assert [[s.fields[axis] for axis in "xyz"] for s in found] == [[1, 0.2, -0.1], [2, 0, 0]]
+    attitude = samples(folder, "Attitude")[0].fields
+    assert attitude["pitch_rad"] == pytest.approx(np.radians(2.0))  # logged nose up
+    assert samples(folder, "PeerLabels") == []  # no camera
+    first, last = samples(folder, "PeerLabels", Options(camera=camera))
+    assert last.fields["peers"][0]["u_px"] == pytest.approx(32)
+    assert first.fields["peers"][0]["source"] == "estimate"
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("a.png 1 2 3", r"label\.txt:1: not a picture and roll pitch x y z d"),
+        ("d.png 1 2 3 4 5 6", r"label\.txt:1: no picture d\.png"),
+    ],
+)
+def test_a_wrong_line_of_the_firmware_s_text_is_named(folder: Path, line: str, text: str) -> None:
+    (folder / "label.txt").write_text(line + "\n")
+    with pytest.raises(SourceError, match=text):
+        samples(folder, "PeerPosition")
+
+
+def test_raw_pictures_get_their_colours(tmp_path: Path) -> None:
+    raw = np.random.default_rng(3).integers(0, 256, (24, 32), np.uint8)
+    (tmp_path / "a.pgm").write_bytes(b"P5\n32 24\n255\n" + raw.tobytes())
+    (grey,) = samples(tmp_path, "CompressedImage")
+    np.testing.assert_array_equal(decode(grey.fields["data"])[..., 0], raw)
+    (colour,) = samples(tmp_path, "CompressedImage", Options(raw=True))
+    np.testing.assert_array_equal(decode(colour.fields["data"]), rgb_of(raw))
+
+
+def test_coloured_pictures_are_not_raw(folder: Path) -> None:
+    with pytest.raises(SourceError, match=r"has colours already.* Leave out --raw"):
+        samples(folder, "CompressedImage", Options(raw=True))

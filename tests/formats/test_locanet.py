@@ -7,6 +7,7 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats import locanet
+from dmrl.formats.sample import Options
 from dmrl.geometry import PUBLISHED_RENDER, Array, camera_from_horizontal, project
 from dmrl.images import encode_jpeg
 
@@ -65,7 +66,11 @@ def test_true_and_published_labels_stand_side_by_side(folder: Path) -> None:
 
 
 def test_the_robot_does_not_see_itself(folder: Path) -> None:
-    peers = {s.topic for s in locanet.content(folder, "cf2").samples if s.message == "PeerPosition"}
+    peers = {
+        s.topic
+        for s in locanet.content(folder, Options(robot="cf2")).samples
+        if s.message == "PeerPosition"
+    }
     assert peers == {"/cf2/peer/cf3/truth"}
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.geometry import AIDECK, project
-from dmrl.rendering.onboard import NEAREST_M, Body, in_front, pose_of, sketched
+from dmrl.rendering.onboard import NEAREST_M, Body, View, in_front, pose_of, sketched, view
 
 CAMERA = replace(AIDECK, distortion=())
 
@@ -48,8 +48,21 @@ def test_only_peers_ahead_are_drawn() -> None:
 
 def test_a_sketch_shows_the_peer_where_it_is() -> None:
     pose = pose_of(body(0.5, 0.05, -0.1), body(0, 0, 0))
-    picture = sketched(CAMERA, [pose], np.random.default_rng(0))
+    seen = View(body(0, 0, 0), {"cf2": pose}, {"cf2": np.zeros(3)}, np.zeros(2), (0, 0, 0))
+    (picture,) = sketched(CAMERA, [seen])
     uv, _ = project(pose.xyz_camera[None], CAMERA.image_from_optical)
     assert picture.uv_px == pytest.approx(uv)
     left, top, right, bottom = picture.box_px[0]
     assert left < uv[0, 0] < right and top < uv[0, 1] < bottom
+
+
+def test_a_view_tells_how_peers_and_the_scene_move() -> None:
+    def bodies(time_s: float) -> dict[str, Body]:
+        here = body(0, 0, 0, yaw=0.5 * time_s, pitch=0.2 * time_s)
+        return {"cf1": here, "cf2": body(2, time_s, 0), "cf3": body(-2, 0, 0)}
+
+    seen = view(bodies, "cf1", 0.0, (0, 0, 0))
+    assert list(seen.poses) == ["cf2"]
+    # It moves left at 1 m/s; the nose, to the left and down, lets it move right and up.
+    assert seen.velocity_mps["cf2"] == pytest.approx((0, 1 - 2 * 0.5, 2 * 0.2), abs=1e-4)
+    assert seen.turning_rps == pytest.approx((0.5, -0.2), abs=1e-4)

@@ -9,8 +9,11 @@ import pytest
 from dmrl.errors import DmrlError, OutputError, SettingError, SourceError
 from dmrl.geometry import AIDECK
 from dmrl.images import decode, encode_png
-from dmrl.recording import SPLIT_METADATA, read, summary
+from dmrl.recording import SPLIT_METADATA, check, read, read_table, summary
+from dmrl.stages import fly, label
 from dmrl.stages.convert import Settings, run
+
+from ..formats import plain_usd
 
 
 @pytest.fixture
@@ -100,12 +103,12 @@ def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None
         (
             Settings(source_kind="image"),
             SourceError,
-            "Did you mean images.* Kinds: locanet, csv, uwb-tiers, images",
+            "Did you mean images.* Kinds: locanet, csv, .*, images",
         ),
         (
-            Settings(source_kind="rosbag"),
+            Settings(source_kind="floppy"),
             SourceError,
-            "no such kind. Kinds: locanet, csv, uwb-tiers, images",
+            "no such kind. Kinds: locanet, csv, .*, images",
         ),
         (Settings(source_kind="locanet"), SourceError, r"no posLabel\.txt"),
         (Settings(width_px=320), SettingError, "--width-px and --height-px go together"),
@@ -114,6 +117,8 @@ def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None
         (Settings(robot="a/b"), SettingError, "'a/b' cannot stand in a topic"),
         (Settings(camera=Path("aidek")), SourceError, "no calibration aidek. Name a TOML file"),
         (Settings(camera=Path("aideck")), SettingError, "is 64x48 px, its camera 320x224"),
+        (Settings(names="cf2"), SettingError, "--names 'cf2' is not OLD=NEW. Try: 0=cf2,1=cf3"),
+        (Settings(names="0=a/b"), SettingError, "is not OLD=NEW"),
         (Settings(labels=Path("no.csv")), SourceError, "no label file no.csv"),
     ],
 )
@@ -135,11 +140,13 @@ def test_a_picture_that_breaks_half_way_leaves_nothing(pictures: Path, tmp_path:
 
 def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
     with pytest.raises(
-        SourceError, match=r"looks like no kind .* Say --from: locanet, csv, uwb-tiers, images"
+        SourceError, match=r"looks like no kind .* Say --from: locanet, csv, .*, images"
     ):
         run(tmp_path, tmp_path / "out.mcap", Settings())
     with pytest.raises(SourceError, match="no file or folder"):
         run(tmp_path / "none", tmp_path / "out.mcap", Settings())
+    with pytest.raises(SourceError, match="neither a file nor a folder"):
+        run(Path("/dev/null"), tmp_path / "out.mcap", Settings())
 
 
 def test_recordings_are_never_overwritten(pictures: Path, tmp_path: Path) -> None:
@@ -166,3 +173,75 @@ def test_the_command_prints_counts_and_exits_by_kind_of_error(
     assert (again.returncode, again.stdout) == (1, "")
     assert again.stderr.startswith("dmrl: ") and again.stderr.count("\n") == 1
     assert dmrl(str(pictures), str(out), "--rate-hz", "0").returncode == 2
+
+
+def test_an_empty_file_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "log00").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"log00 is empty, 0 bytes\. Name another file"):
+        run(tmp_path / "log00", tmp_path / "out.mcap", Settings())
+    assert list(tmp_path.glob("out*")) == []
+
+
+def test_flights_logged_on_micro_sd_can_be_labelled(tmp_path: Path) -> None:
+    """A simulated flight, written as the firmware would log it: take-off frame, degrees."""
+    flight = tmp_path / "flight.mcap"
+    fly.run(flight, fly.Settings(duration_s=30.0, noise="calibrated"))
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for robot, number in (("cf1", 2), ("cf2", 1)):
+        (logs / robot).write_bytes(_as_logged(flight, robot, number))
+    made, labelled = tmp_path / "made.mcap", tmp_path / "labelled.mcap"
+    run(logs, made, Settings())
+    # The log says again what the flight said, in other units and frames.
+    for topic, fields in (
+        ("/cf1/attitude", ("roll_rad", "pitch_rad")),
+        ("/cf2/velocity", ("vx_mps", "vy_mps")),
+    ):
+        told, known = read_table(made, topic), read_table(flight, topic)
+        for field in fields:
+            np.testing.assert_allclose(told[field], known[field], atol=2e-6)
+    result = label.run(made, labelled, label.Settings())
+    assert {(pair.observer, pair.peer) for pair in result.pairs} == {("cf1", "cf2"), ("cf2", "cf1")}
+    assert all(pair.positions > 500 for pair in result.pairs)
+    assert result.warnings == []
+    assert check(made) == []
+
+
+def _as_logged(flight: Path, robot: str, peer: int) -> bytes:
+    attitude, velocity = (read_table(flight, f"/{robot}/{t}") for t in ("attitude", "velocity"))
+    height = read_table(flight, f"/{robot}/height")
+    ranges = read_table(flight, f"/{robot}/range/cf{peer}")
+    yaw = attitude["yaw_rad"].to_numpy()
+    vx, vy = velocity["vx_mps"].to_numpy(), velocity["vy_mps"].to_numpy()
+    names = ("roll", "pitch", "yaw", "vx", "vy", "z")
+    events = {
+        1: ("fixedFrequency", [*((f"stateEstimate.{n}", "f") for n in names), ("gyro.z", "f")]),
+        2: ("estDistance", [("id", "B"), ("distance", "f")]),
+    }
+    columns = (
+        np.degrees(attitude["roll_rad"]),
+        -np.degrees(attitude["pitch_rad"]),
+        np.degrees(yaw),
+        np.cos(yaw) * vx - np.sin(yaw) * vy,
+        np.sin(yaw) * vx + np.cos(yaw) * vy,
+        height["height_m"],
+        np.degrees(attitude["yaw_rate_radps"]),
+    )
+    rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
+    records = [
+        (1, time // 1000, row)
+        for time, row in zip(attitude["log_time"].to_pylist(), rows, strict=True)
+    ]
+    records += [
+        (2, time // 1000, (peer, value))
+        for time, value in zip(
+            ranges["log_time"].to_pylist(), ranges["range_m"].to_pylist(), strict=True
+        )
+    ]
+    return plain_usd.encode(events, sorted(records, key=lambda r: r[1]))
+
+
+def test_a_recording_is_not_a_source(pictures: Path, tmp_path: Path) -> None:
+    run(pictures, tmp_path / "a.mcap", Settings())
+    with pytest.raises(SourceError, match=r"is a recording already\. Say --to: csv, parquet, ros2"):
+        run(tmp_path / "a.mcap", tmp_path / "b.mcap", Settings())

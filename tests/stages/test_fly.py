@@ -1,4 +1,5 @@
 import csv
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from dmrl import recipe as recipes
 from dmrl.errors import OutputError, RecipeError, SettingError
 from dmrl.flight import NOISE, Scenario, simulate
 from dmrl.formats.flight_sample import LOG_COLUMNS
+from dmrl.images import decode
 from dmrl.recording import check, read, read_table, summary
 from dmrl.stages import convert, fly
 from dmrl.stages.fly import Flags, Settings
@@ -157,3 +159,27 @@ def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
         fly.run(out, SHORT)
     assert out.read_text() == "mine"
     assert list(tmp_path.iterdir()) == [out]
+
+
+def test_blender_renders_what_is_labelled_in_one_place(blender: Path, tmp_path: Path) -> None:
+    drawn = Settings(2, 3.0, seed=0, camera=True, camera_rate_hz=1.0)
+    rendered = replace(drawn, camera_renderer="blender", cameras_max=1)
+    paths = [tmp_path / f"{name}.mcap" for name in ("drawn", "rendered", "again")]
+    for path, settings in zip(paths, (drawn, rendered, rendered), strict=True):
+        fly.run(path, settings)
+    assert paths[1].read_bytes() == paths[2].read_bytes()
+    expected, found = (
+        [stamped.message.peers for stamped in read(path, "/cf1/labels")] for path in paths[:2]
+    )
+    assert len(found) == 3
+    for one, other in zip(found, expected, strict=True):
+        (label,), (sketched,) = one, other
+        assert (label.u_px, label.v_px) == pytest.approx((sketched.u_px, sketched.v_px), abs=1e-3)
+        assert label.depth_m == pytest.approx(sketched.depth_m)
+        if len(label.box_px):
+            left, top, right, bottom = label.box_px
+            assert left < label.u_px < right and top < label.v_px < bottom
+    assert sum(len(peers[0].box_px) > 0 for peers in found) >= 2
+    images = [decode(s.message.data).astype(float) for s in read(paths[1], "/cf1/camera/image")]
+    # The same place: neighbours in time are alike, as backgrounds drawn anew are not.
+    assert np.corrcoef(images[0].ravel(), images[1].ravel())[0, 1] > 0.7

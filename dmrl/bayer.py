@@ -1,0 +1,42 @@
+"""Raw pictures of colour sensors made into RGB. The only home of OpenCV."""
+
+import numpy as np
+
+from dmrl.errors import MissingExtra
+from dmrl.images import Grey, Rgb
+
+
+def rgb_of(raw: Grey) -> Rgb:
+    """Colours of a raw picture, bilinear, as OpenCV makes them.
+
+    The AI-deck's sensor is RGGB: red at the first pixel, blue one down and one to the right.
+    Its firmware's own conversion of published frames is this one, to within 1 of 255.
+
+    Parameters
+    ----------
+    raw
+        (H, W), uint8, at least 2 x 2.
+
+    Returns
+    -------
+    Rgb
+        (H, W, 3), uint8.
+
+    Raises
+    ------
+    MissingExtra
+        If OpenCV is not installed.
+    """
+    try:
+        import cv2  # noqa: PLC0415
+    except ModuleNotFoundError as e:
+        raise MissingExtra("opencv-python-headless", "bayer", "a raw picture") from e
+    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB), np.uint8)
+
+
+def mosaic(rgb: Rgb) -> Grey:
+    """What an RGGB sensor keeps of a picture: one colour per pixel, (H, W) uint8."""
+    raw = rgb[..., 1].copy()
+    raw[::2, ::2] = rgb[::2, ::2, 0]
+    raw[1::2, 1::2] = rgb[1::2, 1::2, 2]
+    return raw

@@ -1,0 +1,250 @@
+"""Clocks that differ by an offset and a drift, found from what two of them both saw.
+
+Two robots that range to each other measure one distance, each by its own clock; a camera and
+a gyroscope see one turn. The two series, laid over each other, tell how the clocks differ:
+roughly by cross-correlation, then by Gauss-Newton with Huber's weights.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.05
+SMOOTH_S = 0.15
+"""Standard deviation of the Gaussian that both series are smoothed with."""
+SLOW_S = 20.0
+"""Slower than this tells little of an offset: removed before the rough search."""
+GAP_S = 1.0
+OVERLAP_S = 20.0
+ITERATIONS = 30
+HUBER = 1.5
+TOGETHER = 2 * np.sqrt(np.pi) * SMOOTH_S / STEP_S
+DRIFT_STD = 30e-6
+"""Standard deviation of the drift of two quartz clocks, before anything is seen."""
+CONVINCING = 0.5
+"""Least correlation of the two series that is taken for the same thing seen twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """What to do to one clock's times to make them the other's.
+
+    Parameters
+    ----------
+    offset_s
+        Added at ``at_s``.
+    drift
+        Added per second from ``at_s`` on: 20e-6 is 20 ppm.
+    at_s
+        Middle of the time that both saw, on the clock that is corrected.
+    sigma_s
+        Standard deviation of the offset at ``at_s``.
+    sigma_drift
+        Standard deviation of the drift.
+    correlation
+        Of the two series, aligned; 1 is perfect.
+    """
+
+    offset_s: float
+    drift: float = 0.0
+    at_s: float = 0.0
+    sigma_s: float = 0.0
+    sigma_drift: float = 0.0
+    correlation: float = 1.0
+
+    def corrected(self, time_s: Array) -> Array:
+        """(N,) times on the other clock."""
+        return np.asarray(time_s + self.offset_s + self.drift * (time_s - self.at_s))
+
+    def after(self, first: "Clock") -> "Clock":
+        """The clock that corrects by ``first`` and then by this one."""
+        at = first.at_s
+        middle = float(first.corrected(np.array([at]))[0])
+        offset = float(self.corrected(np.array([middle]))[0]) - at
+        return Clock(
+            offset,
+            (1 + first.drift) * (1 + self.drift) - 1,
+            at,
+            float(np.hypot(first.sigma_s, self.sigma_s)),
+            float(np.hypot(first.sigma_drift, self.sigma_drift)),
+            min(first.correlation, self.correlation),
+        )
+
+    def inverse(self) -> "Clock":
+        """The clock that undoes this one."""
+        drift = 1 / (1 + self.drift) - 1
+        return Clock(
+            -self.offset_s,
+            drift,
+            self.at_s + self.offset_s,
+            self.sigma_s,
+            self.sigma_drift,
+            self.correlation,
+        )
+
+
+def estimate_clock(
+    reference_s: Array, reference: Array, time_s: Array, values: Array
+) -> Clock | None:
+    """How to correct the times of a series to those of another that saw the same.
+
+    Parameters
+    ----------
+    reference_s, reference
+        (N,) times on the right clock, increasing, and values.
+    time_s, values
+        (M,) the same on the clock to correct. Its values may be biased and scaled.
+
+    Returns
+    -------
+    Clock | None
+        None where the two share too little, or do not look like one thing seen twice.
+    """
+    if min(len(reference_s), len(time_s)) < 10:
+        return None
+    one = _Series.of(reference_s, reference)
+    other = _Series.of(time_s, values)
+    if one is None or other is None:
+        return None
+    lag_s = _rough(one, other)
+    return None if lag_s is None else _refined(one, other, lag_s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Series:
+    """A smoothed series on a grid of ``STEP_S``, with where it is known."""
+
+    start_s: float
+    values: Array
+    known: NDArray[np.bool_]
+
+    @property
+    def time_s(self) -> Array:
+        return np.asarray(self.start_s + STEP_S * np.arange(len(self.values)))
+
+    @classmethod
+    def of(cls, time_s: Array, values: Array) -> "_Series | None":
+        count = int((time_s[-1] - time_s[0]) / STEP_S) + 1
+        if count * STEP_S < OVERLAP_S:
+            return None
+        grid = time_s[0] + STEP_S * np.arange(count)
+        # The median of three is deaf to single outliers, which ranges have.
+        inner = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
+        clean = np.concatenate([values[:1], inner, values[-1:]])
+        after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
+        known = time_s[after] - time_s[after - 1] < GAP_S
+        return cls(float(time_s[0]), _smooth(np.interp(grid, time_s, clean), SMOOTH_S), known)
+
+
+def _smooth(values: Array, std_s: float) -> Array:
+    reach = int(4 * std_s / STEP_S)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * STEP_S / std_s) ** 2)
+    padded = np.pad(values, reach, mode="edge")
+    return np.convolve(padded, kernel / kernel.sum(), mode="valid")
+
+
+def _rough(one: _Series, other: _Series) -> float | None:
+    """Seconds to add to the other's times, to a step; None: nothing fits."""
+    a, b = (np.where(s.known, s.values - _slow(s.values), 0.0) for s in (one, other))
+    size = 1 << int(np.ceil(np.log2(len(a) + len(b))))
+
+    def correlated(x: Array, y: Array) -> Array:
+        return np.asarray(np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size))
+
+    shared = correlated(one.known.astype(float), other.known.astype(float))
+    energy = correlated(a**2, other.known.astype(float)) * correlated(one.known.astype(float), b**2)
+    score = correlated(a, b) / np.sqrt(np.maximum(energy, 1e-12))
+    score[shared * STEP_S < OVERLAP_S] = -1
+    best = int(np.argmax(score))
+    if score[best] < CONVINCING / 2:
+        return None
+    lag = best if best < size // 2 else best - size
+    return one.start_s - other.start_s + lag * STEP_S
+
+
+def _slow(values: Array) -> Array:
+    """A running mean, cheap for its length."""
+    width = min(int(SLOW_S / STEP_S), len(values)) | 1
+    padded = np.pad(values, width // 2, mode="edge")
+    total = np.cumsum(np.concatenate([[0.0], padded]))
+    return np.asarray(total[width:] - total[:-width])[: len(values)] / width
+
+
+def _refined(one: _Series, other: _Series, lag_s: float) -> Clock | None:
+    time_s, grid_s = other.time_s, one.time_s
+    slope = np.gradient(one.values, STEP_S)
+    share = other.known & (time_s + lag_s > grid_s[0]) & (time_s + lag_s < grid_s[-1])
+    time_s, wanted = time_s[share], other.values[share]
+    if len(time_s) * STEP_S < OVERLAP_S:
+        return None
+    at_s = float(time_s.mean())
+    from_middle = time_s - at_s
+    offset_s, drift = lag_s, 0.0
+    for _ in range(ITERATIONS):
+        then = time_s + offset_s + drift * from_middle
+        seen = np.interp(then, grid_s, one.values)
+        known = np.interp(then, grid_s, one.known) > 0.5
+        rate = np.interp(then, grid_s, slope)
+        # Offset and drift of the clock, scale and bias of the values.
+        jacobian = np.stack([rate, rate * from_middle, seen, np.ones(len(seen))], axis=1)[known]
+        scale_bias = np.linalg.lstsq(jacobian[:, 2:], wanted[known], rcond=None)[0]
+        residual = wanted[known] - jacobian[:, 2:] @ scale_bias
+        spread = 1.4826 * np.median(np.abs(residual)) + 1e-12
+        weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-12))
+        full = jacobian * (scale_bias[0], scale_bias[0], 1.0, 1.0)
+        # Smoothing ties neighbours together: so many of them count as one.
+        variance = float((weight * residual**2).mean()) * TOGETHER
+        normal = full.T @ (weight[:, None] * full)
+        gradient = full.T @ (weight * residual)
+        normal[1, 1] += variance / DRIFT_STD**2
+        gradient[1] -= variance / DRIFT_STD**2 * drift
+        if np.linalg.cond(normal) > 1e15:
+            return None
+        step = np.linalg.solve(normal, gradient)
+        offset_s, drift = offset_s + step[0], drift + step[1]
+        if abs(step[0]) < 1e-7 and abs(step[1]) < 1e-10:
+            break
+    correlation = float(np.corrcoef(seen[known], wanted[known])[0, 1])
+    if not correlation >= CONVINCING:
+        return None
+    covariance = np.linalg.inv(normal) * variance
+    return Clock(
+        float(offset_s),
+        float(drift),
+        at_s,
+        float(np.sqrt(covariance[0, 0])),
+        float(np.sqrt(covariance[1, 1])),
+        correlation,
+    )
+
+
+def connected(pairs: dict[tuple[str, str], Clock], reference: str) -> dict[str, Clock]:
+    """Clocks of all robots that pairs tie to a reference, by the surest links.
+
+    Parameters
+    ----------
+    pairs
+        By (reference, robot): how to correct the robot's times to the reference's.
+    reference
+        Whose times stay.
+
+    Returns
+    -------
+    dict
+        By robot, with the reference itself; robots that nothing ties to it are not there.
+    """
+    links = pairs | {(b, a): clock.inverse() for (a, b), clock in pairs.items()}
+    found = {reference: Clock(0.0)}
+    while True:
+        ready = [
+            (clock.sigma_s + found[a].sigma_s, a, b)
+            for (a, b), clock in links.items()
+            if a in found and b not in found
+        ]
+        if not ready:
+            return found
+        _, a, b = min(ready)
+        found[b] = found[a].after(links[a, b])

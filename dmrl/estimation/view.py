@@ -1,0 +1,44 @@
+"""What an observer sees and how it moves: the input of the tracker, without its filter."""
+
+from dataclasses import dataclass
+
+from dmrl.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What the observer did between two images.
+
+    Parameters
+    ----------
+    dt_s
+        Seconds.
+    shift_m
+        (3,) how far it moved over ground, along the axes of its horizontal frame before.
+    turn_rad
+        How far it turned, positive to the left.
+    """
+
+    dt_s: float
+    shift_m: Array
+    turn_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One image's detections and the attitude they were taken with.
+
+    Parameters
+    ----------
+    uv
+        (N, 2) pixels.
+    depth_m
+        (N,) metres.
+    roll_rad, pitch_rad
+        Attitude of the observer.
+    """
+
+    uv: Array
+    depth_m: Array
+    roll_rad: float
+    pitch_rad: float

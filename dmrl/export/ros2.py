@@ -1,0 +1,245 @@
+"""A recording as a rosbag2 folder, messages in CDR, types in the bag.
+
+Pictures, calibrations, poses and transforms become messages that every ROS 2 has. All others
+become ``dmrl_msgs/msg/<Name>`` with the fields of dmrl's own, which are made up here from their
+protobuf types; ``dmrl convert`` reads all of them back. Bag times are log times.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+
+from dmrl.errors import MissingExtra, RecordingError
+from dmrl.formats.ros_messages import HALF_PX, OWN
+from dmrl.output import partial_folder
+from dmrl.progress import track
+from dmrl.recording import Stamped, read, summary
+
+F = FieldDescriptor
+SCALARS = {
+    F.TYPE_DOUBLE: "float64",
+    F.TYPE_FLOAT: "float32",
+    F.TYPE_UINT32: "uint32",
+    F.TYPE_SINT32: "int32",
+    F.TYPE_INT32: "int32",
+    F.TYPE_SINT64: "int64",
+    F.TYPE_INT64: "int64",
+    F.TYPE_UINT64: "uint64",
+    F.TYPE_FIXED32: "uint32",
+    F.TYPE_FIXED64: "uint64",
+    F.TYPE_ENUM: "int32",
+    F.TYPE_BOOL: "bool",
+    F.TYPE_STRING: "string",
+    F.TYPE_BYTES: "uint8[]",
+}
+NUMPY = {"float64": "f8", "float32": "f4", "uint32": "u4", "int32": "i4", "int64": "i8"}
+NUMPY |= {"uint64": "u8", "bool": "?"}
+
+
+def write_bag(recording: Path, out: Path) -> dict[str, int]:
+    """Messages per topic of the bag written to the folder ``out``.
+
+    Parameters
+    ----------
+    recording
+        A complete recording.
+    out
+        Folder to write. Must not exist.
+
+    Raises
+    ------
+    MissingExtra
+        If rosbags is not installed.
+    RecordingError
+        If the recording cannot be read.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415
+    except ModuleNotFoundError as e:
+        raise MissingExtra("rosbags", "ros", "convert --to ros2") from e
+    found = summary(recording)
+    types = _Types()
+    counts = dict.fromkeys(found.topics, 0)
+    connections: dict[str, Any] = {}
+    with partial_folder(out) as folder:
+        writer = Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+        with writer:
+            for sample in track(read(recording), "Writing a bag", found.count):
+                kind, message = types.converted(sample)
+                if sample.topic not in connections:
+                    connections[sample.topic] = writer.add_connection(
+                        sample.topic, kind, typestore=types.store
+                    )
+                elif connections[sample.topic].msgtype != kind:
+                    raise RecordingError(
+                        f"{recording}: {sample.topic} mixes message types. Split it: dmrl trim "
+                        "--help"
+                    )
+                data = types.store.serialize_cdr(message, kind)
+                writer.write(connections[sample.topic], sample.time_ns, data)
+                counts[sample.topic] += 1
+        for path in (folder / "bag").iterdir():
+            path.rename(folder / path.name)
+        (folder / "bag").rmdir()
+    return counts
+
+
+class _Types:
+    """Types of ROS 2 for those of a recording, made up where there is none."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        self._names: dict[Descriptor, str] = {}
+        self._fields: dict[Descriptor, dict[str, FieldDescriptor]] = {}
+
+    def converted(self, sample: Stamped) -> tuple[str, Any]:
+        """Name and message of a sample."""
+        kind = sample.message.DESCRIPTOR
+        standard = STANDARD.get(kind.full_name)
+        if standard is not None:
+            name, make = standard
+            return name, make(self.store.types, sample.message, sample.time_ns)
+        return self._name(kind), self._message(sample.message)
+
+    def _name(self, kind: Descriptor) -> str:
+        """Name of a type, after it and those it holds are registered."""
+        from rosbags.typesys import get_types_from_msg  # noqa: PLC0415
+
+        if kind in self._names:
+            return self._names[kind]
+        names = {f.name: _field_name(f.name) for f in kind.fields}
+        if len(set(names.values())) < len(names):  # they differ in case only
+            names = {f.name: f"{_field_name(f.name)}_{f.number}" for f in kind.fields}
+        lines = [f"{self._type(field)} {names[field.name]}" for field in kind.fields]
+        name = base = OWN + _type_name(kind)
+        while name in self._names.values():
+            name = f"{base}{len(self._names)}"
+        self.store.register(get_types_from_msg("\n".join(lines) + "\n", name))
+        self._names[kind] = name
+        self._fields[kind] = {names[field.name]: field for field in kind.fields}
+        return name
+
+    def _type(self, field: FieldDescriptor) -> str:
+        if field.message_type is not None:
+            own = self._name(field.message_type).replace("/msg/", "/")
+        else:
+            own = SCALARS[field.type]
+        return f"{own}[]" if field.is_repeated else own
+
+    def _message(self, message: Any) -> Any:
+        kind = message.DESCRIPTOR
+        make = self.store.types[self._name(kind)]
+        values = {
+            name: self._value(field, getattr(message, field.name))
+            for name, field in self._fields[kind].items()
+        }
+        # A message without fields has one that nobody sees, as ROS 2 wants it.
+        return make(**values) if values else make(structure_needs_at_least_one_member=0)
+
+    def _value(self, field: FieldDescriptor, value: Any) -> Any:
+        if field.is_repeated:
+            if field.type == F.TYPE_MESSAGE:
+                return [self._message(item) for item in value]
+            code = NUMPY.get(SCALARS[field.type])
+            return np.array(list(value), code) if code else list(value)
+        if field.type == F.TYPE_MESSAGE:
+            return self._message(value)
+        return np.frombuffer(value, np.uint8) if field.type == F.TYPE_BYTES else value
+
+
+def _field_name(name: str) -> str:
+    """As ROS 2 wants it: lower case, no two underscores in a row, none at the end."""
+    return "_".join(part for part in name.lower().split("_") if part)
+
+
+def _type_name(kind: Descriptor) -> str:
+    words = kind.name.replace("-", "_").split("_")
+    name = "".join(word[:1].upper() + word[1:] for word in words)
+    return f"Log{name}" if kind.full_name.startswith("dmrl.log.") else name
+
+
+def _header(types: Any, time_ns: int, frame: str) -> Any:
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanos)
+    return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+
+
+def _stamp_ns(message: Any) -> int:
+    return int(message.timestamp.seconds * 1_000_000_000 + message.timestamp.nanos)
+
+
+def _vector(types: Any, name: str, value: Any) -> Any:
+    return types[f"geometry_msgs/msg/{name}"](x=value.x, y=value.y, z=value.z)
+
+
+def _quaternion(types: Any, q: Any) -> Any:
+    return types["geometry_msgs/msg/Quaternion"](x=q.x, y=q.y, z=q.z, w=q.w)
+
+
+def _compressed(types: Any, message: Any, time_ns: int) -> Any:
+    return types["sensor_msgs/msg/CompressedImage"](
+        header=_header(types, time_ns, message.frame_id),
+        format=message.format,
+        data=np.frombuffer(message.data, np.uint8),
+    )
+
+
+def _camera_info(types: Any, message: Any, time_ns: int) -> Any:
+    k, p = np.array(message.K), np.array(message.P)
+    k[[2, 5]] -= HALF_PX
+    p[[2, 6]] -= HALF_PX
+    roi = types["sensor_msgs/msg/RegionOfInterest"](
+        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return types["sensor_msgs/msg/CameraInfo"](
+        header=_header(types, time_ns, message.frame_id),
+        height=message.height,
+        width=message.width,
+        distortion_model=message.distortion_model,
+        d=np.array(message.D, float),
+        k=k,
+        r=np.array(message.R, float),
+        p=p,
+        binning_x=0,
+        binning_y=0,
+        roi=roi,
+    )
+
+
+def _pose(types: Any, message: Any, time_ns: int) -> Any:
+    pose = types["geometry_msgs/msg/Pose"](
+        position=_vector(types, "Point", message.pose.position),
+        orientation=_quaternion(types, message.pose.orientation),
+    )
+    header = _header(types, time_ns, message.frame_id)
+    return types["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
+
+
+def _transforms(types: Any, message: Any, time_ns: int) -> Any:
+    frames = [
+        types["geometry_msgs/msg/TransformStamped"](
+            header=_header(types, _stamp_ns(frame) or time_ns, frame.parent_frame_id),
+            child_frame_id=frame.child_frame_id,
+            transform=types["geometry_msgs/msg/Transform"](
+                translation=_vector(types, "Vector3", frame.translation),
+                rotation=_quaternion(types, frame.rotation),
+            ),
+        )
+        for frame in message.transforms
+    ]
+    return types["tf2_msgs/msg/TFMessage"](transforms=frames)
+
+
+STANDARD: dict[str, tuple[str, Callable[[Any, Any, int], Any]]] = {
+    "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed),
+    "foxglove.CameraCalibration": ("sensor_msgs/msg/CameraInfo", _camera_info),
+    "foxglove.PoseInFrame": ("geometry_msgs/msg/PoseStamped", _pose),
+    "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", _transforms),
+}

@@ -1,0 +1,139 @@
+"""Every topic of a recording as a table, CSV or Parquet, and its pictures as files.
+
+``/cf1/attitude`` becomes ``cf1.attitude.csv``. The first columns are ``log_time`` and
+``publish_time``, nanoseconds. A field of a sub-message is ``pose.position.x``. Of a list of
+sub-messages, such as the peers of ``PeerLabels``, each is a row; a message without any has one
+row with empty cells. Pictures lie in ``cf1.camera.image/<log_time>.png``, and ``data`` names them.
+In CSV, lists are JSON and other bytes base64; in Parquet both stay what they are.
+"""
+
+import base64
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from dmrl.errors import MissingExtra
+from dmrl.output import partial_folder
+from dmrl.progress import track
+from dmrl.recording import columns, read_table, summary
+
+Kind = Literal["csv", "parquet"]
+TIME_DIGITS = 12  # as a folder of pictures wants its names
+
+
+def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
+    """Rows per topic of the tables written to the folder ``out``.
+
+    Parameters
+    ----------
+    recording
+        A complete recording.
+    out
+        Folder to write. Must not exist.
+    kind
+        "csv" or "parquet".
+
+    Raises
+    ------
+    MissingExtra
+        If pandas, which writes CSV, is not installed.
+    RecordingError
+        If the recording cannot be read, or a topic is not protobuf.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    if kind == "csv" and find_spec("pandas") is None:
+        raise MissingExtra("pandas", "table", "convert --to csv")
+    found = summary(recording)
+    counts = {}
+    with partial_folder(out) as folder:
+        for topic, info in track(found.topics.items(), "Writing tables"):
+            name = topic.strip("/").replace("/", ".")
+            if info.schema == "foxglove.CompressedImage":
+                table = _pictures(recording, topic, folder / name)
+            else:
+                table = read_table(recording, topic)
+            table = _flat(table)
+            _write(table, folder / f"{name}.{kind}", kind)
+            counts[topic] = table.num_rows
+    return counts
+
+
+def _pictures(recording: Path, topic: str, folder: Path) -> pa.Table:
+    """Pictures to files; the table names them in place of their bytes."""
+    folder.mkdir()
+    batches = []
+    for batch in columns(recording, topic):
+        times, kinds = batch["log_time"].to_pylist(), batch["format"].to_pylist()
+        names = [f"{t:0{TIME_DIGITS}d}.{_suffix(k)}" for t, k in zip(times, kinds, strict=True)]
+        for name, data in zip(names, batch["data"], strict=True):
+            (folder / name).write_bytes(data.as_buffer())
+        at = batch.schema.get_field_index("data")
+        paths = pa.array([f"{folder.name}/{name}" for name in names], pa.string())
+        batches.append(batch.set_column(at, "data", paths))
+    if not batches:
+        return read_table(recording, topic)
+    return pa.Table.from_batches(batches)
+
+
+def _suffix(kind: str) -> str:
+    return kind if kind in ("png", "jpeg", "webp") else "bin"
+
+
+def _flat(table: pa.Table) -> pa.Table:
+    """Lists of structs as rows, structs as columns, until there are none."""
+    while True:
+        lists = [f.name for f in table.schema if _holds_structs(f.type)]
+        if lists:
+            table = _rows(table, lists[0])
+        elif any(pa.types.is_struct(field.type) for field in table.schema):
+            table = table.flatten()
+        else:
+            return table
+
+
+def _holds_structs(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_list(kind) and pa.types.is_struct(kind.value_type))
+
+
+def _rows(table: pa.Table, name: str) -> pa.Table:
+    """One row per item of a list, and one, empty, of a list without items."""
+    column = table[name].combine_chunks()
+    empty = pc.equal(pc.list_value_length(column), 0)
+    filled = pc.if_else(empty, pa.scalar([None], column.type), column)
+    at = table.schema.get_field_index(name)
+    taken = table.remove_column(at).take(pc.list_parent_indices(filled))
+    return taken.append_column(name, pc.list_flatten(filled))
+
+
+def _write(table: pa.Table, path: Path, kind: Kind) -> None:
+    if kind == "parquet":
+        pq.write_table(table, path)
+        return
+    frame = table.to_pandas(types_mapper=_nullable)
+    for field in table.schema:
+        if pa.types.is_list(field.type):
+            frame[field.name] = [_json(v) for v in table[field.name].to_pylist()]
+        elif pa.types.is_binary(field.type):
+            frame[field.name] = [_base64(v) for v in table[field.name].to_pylist()]
+    frame.to_csv(path, index=False)
+
+
+def _nullable(kind: pa.DataType) -> Any:
+    """Types of pandas that hold an empty cell beside whole numbers and nested values."""
+    import pandas as pd  # noqa: PLC0415
+
+    return pd.ArrowDtype(kind)
+
+
+def _json(value: list[Any] | None) -> str | None:
+    return None if value is None else json.dumps(value)
+
+
+def _base64(value: bytes | None) -> str | None:
+    return None if value is None else base64.b64encode(value).decode()

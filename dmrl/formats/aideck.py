@@ -1,0 +1,77 @@
+"""What the published firmware says of a picture: its attitude and where the peer is.
+
+Six numbers: roll and pitch in degrees with the Crazyflie's signs (pitch positive nose up), x,
+y, z of the peer in the horizontal frame and its UWB distance d, metres. They stand in a dump
+of the flash and, as ``imgNNNNN.ppm roll pitch x y z d``, in a text beside pictures.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.formats.sample import Sample, labels
+from dmrl.geometry import Camera, pixels_from_horizontal
+from dmrl.messages import LogType
+
+VARIABLES = ("roll", "pitch", "x", "y", "z", "d")
+LOG = LogType("aideck", tuple((name, "f") for name in VARIABLES))
+NEAREST_M = 0.05
+FARTHEST_M = 60.0
+
+
+def is_plausible(values: Sequence[float]) -> bool:
+    """Whether six numbers can be what they should be: finite, and of a drone that flies."""
+    roll, pitch, *rest = values
+    return all(map(math.isfinite, values)) and (
+        max(abs(roll), abs(pitch)) <= 180.0 and max(map(abs, rest)) <= FARTHEST_M
+    )
+
+
+def samples(
+    time_ns: int, robot: str, peer: str, values: Sequence[float], camera: Camera | None
+) -> Iterator[Sample]:
+    """The six numbers as logged, and as messages; with a camera, a label as well.
+
+    Parameters
+    ----------
+    time_ns
+        Of the picture.
+    robot
+        That carries the camera.
+    peer
+        That is seen.
+    values
+        Roll, pitch, x, y, z, d. Only logged if they are not plausible.
+    camera
+        Of the stored picture; None: not known.
+    """
+    fields = dict(zip(VARIABLES, values, strict=True))
+    yield Sample(time_ns, topics.log(robot, LOG.name), LOG, fields)
+    if not is_plausible(values):
+        return
+    roll, pitch = math.radians(values[0]), -math.radians(values[1])
+    xyz = dict(zip("xyz", values[2:5], strict=True))
+    yield Sample(
+        time_ns, topics.attitude(robot), "Attitude", {"roll_rad": roll, "pitch_rad": pitch}
+    )
+    place = {"frame_id": f"{robot}/horizontal", **xyz}
+    yield Sample(time_ns, topics.position(robot, peer), "PeerPosition", place)
+    if values[5] > 0:
+        yield Sample(time_ns, topics.uwb_range(robot, peer), "UwbRange", {"range_m": values[5]})
+    if camera is not None:
+        yield labels(time_ns, robot, _seen(peer, values[2:5], roll, pitch, camera))
+
+
+def _seen(
+    peer: str, xyz: Sequence[float], roll: float, pitch: float, camera: Camera
+) -> list[dict[str, object]]:
+    """The label, from the firmware's own estimate; none where the peer is out of view."""
+    uv, depth_m, _ = pixels_from_horizontal(
+        np.array([xyz]), np.array([roll]), np.array([pitch]), camera
+    )
+    (u, v), depth = uv[0].tolist(), float(depth_m[0])
+    if not (depth > NEAREST_M and 0 <= u < camera.width_px and 0 <= v < camera.height_px):
+        return []
+    return [{"peer": peer, "u_px": u, "v_px": v, "depth_m": depth, "source": "estimate"}]

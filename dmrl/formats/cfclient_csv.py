@@ -1,0 +1,113 @@
+"""Log blocks as the Crazyflie client writes them: CSV, ``Timestamp`` in milliseconds first.
+
+One file per log block, ``<block>-<date>T<time>.csv``. A single file is a robot's log; so is a
+folder of such files. In a folder of folders, each of them is a robot, named after it.
+"""
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.errors import SourceError
+from dmrl.formats import crazyflie_log
+from dmrl.formats.counters import unwrap
+from dmrl.formats.flight_sample import in_order
+from dmrl.formats.log_block import Block
+from dmrl.formats.sample import Content, Format, Options
+from dmrl.progress import say
+
+TIME = "Timestamp"
+NS_PER_MS = 1_000_000
+TIME_BITS = 24  # milliseconds in a log packet
+STAMP = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
+
+
+def recognises(source: Path) -> bool:
+    """Whether it is a CSV file that begins with ``Timestamp``, or holds one."""
+    return bool(_robots(source, "cf1"))
+
+
+def _robots(source: Path, robot: str) -> dict[str, list[Path]]:
+    """Files of each robot."""
+    if source.is_file():
+        return {robot: [source]} if _is_log(source) else {}
+    if own := sorted(path for path in source.glob("*.csv") if _is_log(path)):
+        return {robot: own}
+    folders = [path for path in sorted(source.iterdir()) if path.is_dir()]
+    below = {folder.name: sorted(filter(_is_log, folder.glob("*.csv"))) for folder in folders}
+    return {name: paths for name, paths in below.items() if paths}
+
+
+def _is_log(path: Path) -> bool:
+    if path.suffix != ".csv":
+        return False
+    with path.open("rb") as stream:
+        return stream.read(len(TIME) + 1) == f"{TIME},".encode()
+
+
+def content(source: Path, options: Options) -> Content:
+    """Samples of the log blocks.
+
+    Parameters
+    ----------
+    source
+        A file, a robot's folder, or a folder with one folder per robot.
+    options
+        ``robot`` and ``names``.
+
+    Raises
+    ------
+    SourceError
+        If there is no such file, or a line of one is not as its header: names the line.
+    """
+    robots = _robots(source, options.robot)
+    if not robots:
+        raise SourceError(f"no CSV file that begins with {TIME} in {source}. Name another source")
+    streams: list[crazyflie_log.Stream] = []
+    for robot, paths in robots.items():
+        blocks = [read_block(path) for path in paths]
+        streams += crazyflie_log.streams(robot, blocks, options.names, source)
+    return Content(in_order(streams))
+
+
+def read_block(path: Path) -> Block:
+    """One file. A last line that was cut short is left out, with a line that says so.
+
+    Raises
+    ------
+    SourceError
+        If the file is no such CSV file, or has no row.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as e:
+        raise SourceError(f"{path} cannot be read as text: {e}. Name another file") from None
+    lines = text.splitlines()
+    names = next(csv.reader(lines[:1]), [])
+    if names[:1] != [TIME] or len(set(names)) < len(names) or not all(names):
+        raise SourceError(f"{path}:1: not {TIME} and names of variables. Name another file")
+    rows = [_row(line, len(names)) for line in lines[1:]]
+    if rows and rows[-1] is None and not text.endswith("\n"):
+        say(f"{path}: its last line is cut short; left out")
+        rows.pop()
+    if None in rows:
+        raise SourceError(f"{path}:{rows.index(None) + 2}: not {len(names)} numbers. Mend the line")
+    if not rows:
+        raise SourceError(f"{path} has no rows. Name another file")
+    values = np.array(rows, float).T
+    time_ns = unwrap(values[0], TIME_BITS) * NS_PER_MS
+    columns = dict(zip(names[1:], values[1:], strict=True))
+    return Block(STAMP.sub("", path.stem), time_ns, columns)
+
+
+def _row(line: str, width: int) -> list[float] | None:
+    try:
+        row = [float(cell) for cell in line.split(",")]
+    except ValueError:
+        return None
+    return row if len(row) == width and np.isfinite(row[0]) else None
+
+
+FORMAT = Format("cfclient", "log blocks of the Crazyflie client", recognises, content)

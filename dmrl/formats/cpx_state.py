@@ -1,0 +1,108 @@
+"""The robot's state as the nanocockpit firmware packs it beside each image."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+STATE_FORMAT = "I9hi3h"
+"""``struct`` format: robot's time (ms), position (mm), velocity (mm/s), acceleration (mm/s^2),
+compressed quaternion, turning rates (mrad/s)."""
+
+MAGNITUDE = (1 << 9) - 1
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What a robot last told its camera about itself.
+
+    Parameters
+    ----------
+    robot_ms
+        Time of the state on the robot's clock, unwrapped.
+    received_us
+        Time on the camera's clock when it came, unwrapped.
+    position_m, velocity_mps, acceleration_mps2
+        World frame of the robot's estimator.
+    quaternion_xyzw
+        Attitude, world from body.
+    turning_radps
+        About the body's x, y, z.
+    """
+
+    robot_ms: int
+    received_us: int
+    position_m: Vector = (0.0, 0.0, 0.0)
+    velocity_mps: Vector = (0.0, 0.0, 0.0)
+    acceleration_mps2: Vector = (0.0, 0.0, 0.0)
+    quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    turning_radps: Vector = (0.0, 0.0, 0.0)
+
+
+def unpack_state(values: Sequence[int], robot_ms: int, received_us: int) -> State:
+    """The state whose packed values these are (``STATE_FORMAT``; more may follow).
+
+    Parameters
+    ----------
+    values
+        As ``struct`` gave them.
+    robot_ms, received_us
+        Its two times, unwrapped.
+    """
+    metres = [value / 1000 for value in values[1:10]]
+    turning = [value / 1000 for value in values[11:14]]
+    return State(
+        robot_ms,
+        received_us,
+        (metres[0], metres[1], metres[2]),
+        (metres[3], metres[4], metres[5]),
+        (metres[6], metres[7], metres[8]),
+        quaternion(values[10]),
+        (turning[0], turning[1], turning[2]),
+    )
+
+
+def pack_state(state: State) -> tuple[int, ...]:
+    """The values of ``STATE_FORMAT``."""
+    vectors = (*state.position_m, *state.velocity_mps, *state.acceleration_mps2)
+    return (
+        state.robot_ms % (1 << 32),
+        *(_milli(value) for value in vectors),
+        compressed(state.quaternion_xyzw),
+        *(_milli(value) for value in state.turning_radps),
+    )
+
+
+def _milli(value: float) -> int:
+    return int(np.clip(round(value * 1000), -32768, 32767))
+
+
+def quaternion(packed: int) -> Quaternion:
+    """x, y, z, w of 32 bits: which part is largest, then sign and 9 bits of the others.
+
+    The Crazyflie's ``quatcompress.h``: the largest part is positive and follows from the rest.
+    """
+    packed &= 0xFFFFFFFF
+    largest = packed >> 30
+    parts = [0.0] * 4
+    for k in (3, 2, 1, 0):
+        if k != largest:
+            magnitude = (packed & MAGNITUDE) / MAGNITUDE * np.sqrt(0.5)
+            parts[k] = float(-magnitude if packed & (MAGNITUDE + 1) else magnitude)
+            packed >>= 10
+    parts[largest] = float(np.sqrt(max(1 - sum(part * part for part in parts), 0.0)))
+    return parts[0], parts[1], parts[2], parts[3]
+
+
+def compressed(xyzw: Quaternion) -> int:
+    """A unit quaternion in 32 bits, signed, as `quaternion` reads it."""
+    largest = int(np.argmax(np.abs(xyzw)))
+    packed = largest
+    for k, part in enumerate(xyzw):
+        if k != largest:
+            negative = (part < 0) != (xyzw[largest] < 0)
+            magnitude = int(MAGNITUDE * abs(part) / np.sqrt(0.5) + 0.5)
+            packed = packed << 10 | negative << 9 | min(magnitude, MAGNITUDE)
+    return packed - (1 << 32) if packed >> 31 else packed

@@ -1,0 +1,93 @@
+"""Variables that were logged together, and rotations as logs have them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.formats.flight_sample import Times
+from dmrl.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Variables that were logged together.
+
+    Parameters
+    ----------
+    name
+        Of the event or log block.
+    time_ns
+        (N,) nanoseconds.
+    columns
+        (N,) for each variable, by name, in the type it was logged in.
+    """
+
+    name: str
+    time_ns: Times
+    columns: Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Values over time: (N,) nanoseconds and (N, C) float64."""
+
+    time_ns: Times
+    values: Array
+
+    def at(self, time_ns: Times) -> Array:
+        """(M, C) values at other times, linear between, held before and after."""
+        return np.stack([np.interp(time_ns, self.time_ns, v) for v in self.values.T], axis=1)
+
+
+def series(blocks: Sequence[Block], names: Sequence[str]) -> Series | None:
+    """The first block's columns that has all these names, rows with finite values only."""
+    for block in blocks:
+        if all(name in block.columns for name in names):
+            values = np.stack([block.columns[name].astype(float) for name in names], axis=1)
+            good = np.isfinite(values).all(axis=1)
+            return Series(block.time_ns[good], values[good]) if good.any() else None
+    return None
+
+
+def unpacked_quaternion(packed: NDArray[np.int64]) -> Array:
+    """(N, 4) x, y, z, w of the firmware's 32-bit quaternions.
+
+    Two bits name the largest component, left out and positive; the others follow in order,
+    ten bits each: sign, and nine of magnitude in units of sqrt(1/2).
+    """
+    packed = packed & 0xFFFFFFFF
+    largest = packed >> 30
+    out = np.zeros((len(packed), 4))
+    left = packed.copy()
+    for k in (3, 2, 1, 0):
+        use = largest != k
+        value = (left & 0x1FF) / 511 * np.sqrt(0.5) * np.where(left & 0x200, -1.0, 1.0)
+        out[use, k] = value[use]
+        left = np.where(use, left >> 10, left)
+    rest = np.sqrt(np.clip(1 - (out**2).sum(axis=1), 0, None))
+    out[np.arange(len(out)), largest] = rest
+    return out
+
+
+def euler_zyx(quaternion: Array) -> Array:
+    """(N, 3) roll, pitch, yaw of Rz(yaw) Ry(pitch) Rx(roll) from (N, 4) x, y, z, w."""
+    x, y, z, w = quaternion.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.stack([roll, pitch, yaw], axis=1)
+
+
+def quaternion_zyx(angles: Array) -> Array:
+    """(N, 4) x, y, z, w from (N, 3) roll, pitch, yaw; the inverse of ``euler_zyx``."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles / 2).T, np.sin(angles / 2).T
+    xyzw = (
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+        cy * cp * cr + sy * sp * sr,
+    )
+    return np.stack(xyzw, axis=1)

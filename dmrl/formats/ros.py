@@ -1,0 +1,210 @@
+"""ROS bags: rosbag2 (folders, ``.db3``, ``.mcap``) and ROS 1 (``.bag``). The home of rosbags.
+
+What is taken, by the message's type; all else is left out, with a line that names it:
+
+* ``sensor_msgs/Image`` (8 bits), ``CompressedImage`` (PNG, JPEG) and ``CameraInfo``;
+* ``nav_msgs/Odometry``: attitude, velocity (in the body's frame), height, pose;
+* ``sensor_msgs/Imu`` and ``geometry_msgs/TwistStamped``, for a robot without odometry;
+* ``geometry_msgs/PoseStamped``: a true pose where the topic names motion capture, else a pose;
+* ``sensor_msgs/Range`` on ``.../<robot>/<peer>/...`` or ``/<robot>/range/<peer>``: UWB;
+* ``dmrl_msgs/*``, as ``dmrl convert --to ros2`` writes them, on the topics of dmrl.
+
+Times are those of the headers, and the bag's where they are empty.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dmrl.errors import DmrlError, MissingExtra, SourceError
+from dmrl.formats.ros_messages import HANDLERS, OWN, Placed, own
+from dmrl.formats.sample import Content, Format, Options, Sample
+from dmrl.progress import say
+
+SUFFIXES = (".db3", ".bag", ".mcap")
+CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
+PAIR = re.compile(r"/(?P<robot>[^/]+)/(?:range/)?(?P<peer>[^/]+)(?:/(?:distance|range|uwb))?$")
+# Parts of a topic that say what it is, not whose.
+GENERIC = re.compile(
+    r"odom\w*|odometry|pose\w*|imu\w*|data|raw|twist|velocity|image\w*|color|colour|camera\w*|rgb|"
+    r"compressed|info|camera_info|filtered|local|vrpn_client_node|mavros|state|truth|calibration",
+    re.IGNORECASE,
+)
+
+
+def recognises(source: Path) -> bool:
+    """Whether it is a ROS 1 bag, a rosbag2 folder, or the storage of one."""
+    if source.is_dir():
+        return (source / "metadata.yaml").is_file()
+    if source.suffix not in SUFFIXES:
+        return False
+    with source.open("rb") as stream:
+        head = stream.read(64)
+    if source.suffix == ".mcap":
+        return b"ros2" in head
+    return head.startswith((b"SQLite format 3", b"#ROSBAG V2"))
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What becomes of one topic of a bag."""
+
+    topic: str
+    kind: str
+    count: int
+    robot: str
+    peer: str = ""
+
+
+def content(source: Path, options: Options) -> Content:
+    """Samples of a bag, in the bag's order.
+
+    Parameters
+    ----------
+    source
+        The bag.
+    options
+        ``names`` gives robots their names: those in topics are else kept. ``robot`` is the
+        one of topics that name none.
+
+    Raises
+    ------
+    SourceError
+        If the bag cannot be read, or holds nothing that is known.
+    MissingExtra
+        If rosbags is not installed.
+    """
+    lines, unknown = plan(_topics(source), options)
+    if not lines:
+        known = ", ".join(sorted({*HANDLERS}))
+        raise SourceError(f"{source} has no topic that is known: {known}. Name another bag")
+    if unknown:
+        say(f"{source}: left out: {', '.join(sorted(unknown))}")
+    return Content(_samples(source, lines), sum(line.count for line in lines.values()))
+
+
+def plan(
+    held: list[tuple[str, str, int]], options: Options
+) -> tuple[dict[tuple[str, str], Line], list[str]]:
+    """What becomes of each topic, and the topics that are left out.
+
+    Parameters
+    ----------
+    held
+        Topic, type and number of messages.
+    options
+        See ``content``.
+    """
+    lines: dict[tuple[str, str], Line] = {}
+    unknown = []
+    for topic, kind, count in held:
+        line = _line(topic, kind, count, options)
+        if line is None or not count:
+            unknown += [topic] if count else []
+        else:
+            lines[topic, kind] = line
+    # One source of a kind per robot: two, interleaved, would contradict each other.
+    best: dict[tuple[str, str, str, bool], Line] = {}
+    for line in lines.values():
+        key = (line.kind, line.robot, line.peer, bool(CAPTURE.search(line.topic)))
+        if not line.kind.startswith(OWN) and (key not in best or best[key].count < line.count):
+            best[key] = line
+    kept = {
+        key: line
+        for key, line in lines.items()
+        if line.kind.startswith(OWN) or line in best.values()
+    }
+    return kept, unknown + [line.topic for key, line in lines.items() if key not in kept]
+
+
+def _line(topic: str, kind: str, count: int, options: Options) -> Line | None:
+    def name(part: str) -> str:
+        part = options.names.get(part, part)
+        return re.sub(r"[^A-Za-z0-9_-]", "_", part)
+
+    if kind.startswith(OWN):
+        return Line(topic, kind, count, "")
+    if kind not in HANDLERS:
+        return None
+    if kind == "sensor_msgs/msg/Range":
+        match = PAIR.search(topic)
+        if match is None:
+            return None
+        return Line(topic, kind, count, name(match["robot"]), name(match["peer"]))
+    own = [part for part in topic.split("/") if part and not GENERIC.fullmatch(part)]
+    return Line(topic, kind, count, name(own[-1]) if own else options.robot)
+
+
+def _reader(source: Path) -> Any:
+    try:
+        from rosbags.highlevel import AnyReader  # noqa: PLC0415
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ModuleNotFoundError as e:
+        raise MissingExtra("rosbags", "ros", "a ROS bag") from e
+    return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+
+
+def _topics(source: Path) -> list[tuple[str, str, int]]:
+    """Topic, type and number of messages of all connections of a bag."""
+    found: Counter[tuple[str, str]] = Counter()
+    for connection in _guarded(source, lambda reader: iter(reader.connections)):
+        found[connection.topic, connection.msgtype] += connection.msgcount
+    return [(topic, kind, count) for (topic, kind), count in found.items()]
+
+
+def _guarded(source: Path, of: Any) -> Iterator[Any]:
+    """What ``of(reader)`` gives, with any error of rosbags as one line.
+
+    rosbags lets through what sqlite, YAML, struct and its decompressors raise on damaged
+    bags, so there is no list of errors to name here.
+    """
+    reader = _reader(source)
+    try:
+        with reader:
+            yield from of(reader)
+    except DmrlError:
+        raise
+    except Exception as e:
+        why = " ".join(str(e).split())[:200] or type(e).__name__
+        raise SourceError(f"{source} cannot be read as a ROS bag: {why}. Restore it") from e
+
+
+def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sample]:
+    calibrated: set[str] = set()
+    moving = {line.robot for line in lines.values() if line.kind == "nav_msgs/msg/Odometry"}
+
+    def messages(reader: Any) -> Iterator[Any]:
+        wanted = [c for c in reader.connections if (c.topic, c.msgtype) in lines]
+        for connection, bag_ns, data in reader.messages(connections=wanted):
+            line = lines[connection.topic, connection.msgtype]
+            yield line, bag_ns, reader.deserialize(data, connection.msgtype)
+
+    for line, bag_ns, decoded in _guarded(source, messages):
+        where = Placed(
+            source, line.robot, line.peer, bool(CAPTURE.search(line.topic)), line.robot in moving
+        )
+        for sample in _of(line, decoded, _time_ns(decoded, bag_ns), where):
+            if sample.message == "CameraCalibration":
+                if sample.topic in calibrated:
+                    continue
+                calibrated.add(sample.topic)
+            yield sample
+
+
+def _time_ns(message: Any, bag_ns: int) -> int:
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    time_ns = stamp.sec * 1_000_000_000 + stamp.nanosec if stamp is not None else 0
+    return int(time_ns if time_ns > 0 else max(bag_ns, 0))
+
+
+def _of(line: Line, message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    if not line.kind.startswith(OWN):
+        yield from HANDLERS[line.kind](message, time_ns, where)
+    elif (sample := own(message, line.topic, time_ns)) is not None:
+        yield sample
+
+
+FORMAT = Format("rosbag2", "a ROS bag", recognises, content)

@@ -1,0 +1,232 @@
+"""Messages of ROS as samples: one function per type, by its name."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmrl import images, topics
+from dmrl.bayer import rgb_of
+from dmrl.errors import SourceError
+from dmrl.formats.log_block import euler_zyx
+from dmrl.formats.sample import Sample, image
+from dmrl.geometry import Array
+from dmrl.messages import LogType, descriptor
+
+HALF_PX = 0.5  # ROS has the first pixel's centre at 0, dmrl its edge
+RANGE_MAX_M = 60.0
+OWN = "dmrl_msgs/msg/"
+SIDE_MAX_PX = 10_000
+LETTERS = {"uint32": "I", "int32": "i", "float32": "f", "float64": "d"}
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Where a message belongs.
+
+    Parameters
+    ----------
+    source
+        The bag, for errors.
+    robot, peer
+        Whose it is, and to whom it ranges.
+    captured
+        It comes from motion capture.
+    odometry
+        The robot has odometry, which says all that other messages say.
+    """
+
+    source: Path
+    robot: str
+    peer: str = ""
+    captured: bool = False
+    odometry: bool = False
+
+
+def _picture(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    rgb = _rgb(message, where.source)
+    yield image(time_ns, where.robot, images.encode_png(rgb), "png")
+
+
+def _rgb(message: Any, source: Path) -> images.Rgb:
+    channels = {"mono8": 1, "8UC1": 1, "bayer_rggb8": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3}
+    channels |= {"rgba8": 4, "bgra8": 4}
+    height, width, step = message.height, message.width, message.step
+    count = channels.get(message.encoding)
+    if count is None:
+        known = ", ".join(channels)
+        raise SourceError(f"{source}: pictures of encoding {message.encoding!r}. Known: {known}")
+    if not (4 <= height <= SIDE_MAX_PX and width * count <= step <= len(message.data) // height):
+        raise SourceError(f"{source}: a picture is not {width} x {height} pixels. Restore the bag")
+    rows = message.data[: height * step].reshape(height, step)[:, : width * count]
+    pixels = rows.reshape(height, width, count)
+    if message.encoding == "bayer_rggb8":
+        return rgb_of(np.ascontiguousarray(pixels[..., 0]))
+    if message.encoding.startswith("bgr"):
+        pixels = pixels[..., [2, 1, 0]]
+    return np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (height, width, 3)))
+
+
+def _compressed(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    data = message.data.tobytes()
+    kind = images.size(data, f"a picture in {where.source}")[2]
+    if kind not in ("png", "jpeg"):
+        raise SourceError(f"{where.source}: pictures are {kind}. Save them as PNG or JPEG")
+    yield image(time_ns, where.robot, data, kind)
+
+
+def _camera_info(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    k = np.array(message.k if hasattr(message, "k") else message.K, float)
+    p = np.array(message.p if hasattr(message, "p") else message.P, float)
+    d = message.d if hasattr(message, "d") else message.D
+    k[[2, 5]] += HALF_PX
+    p[[2, 6]] += HALF_PX
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    fields = {
+        "timestamp": {"seconds": seconds, "nanos": nanos},
+        "frame_id": f"{where.robot}/optical",
+        "width": message.width,
+        "height": message.height,
+        "distortion_model": message.distortion_model,
+        "D": np.asarray(d, float).tolist(),
+        "K": k.tolist(),
+        "R": np.asarray(message.r if hasattr(message, "r") else message.R, float).tolist(),
+        "P": p.tolist(),
+    }
+    yield Sample(time_ns, topics.calibration(where.robot), "CameraCalibration", fields)
+
+
+def _xyz(vector: Any) -> Array:
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def _angles(q: Any) -> Array | None:
+    """Roll, pitch, yaw; None where the quaternion is not one."""
+    values = np.array([q.x, q.y, q.z, q.w])
+    norm = float(np.linalg.norm(values))
+    return euler_zyx(values[None] / norm)[0] if abs(norm - 1) < 0.1 else None
+
+
+def _attitude(robot: str, time_ns: int, angles: Array, turning: Array) -> Sample:
+    roll, pitch, yaw = angles.tolist()
+    rate = (turning[1] * math.sin(roll) + turning[2] * math.cos(roll)) / math.cos(pitch)
+    fields = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw, "yaw_rate_radps": float(rate)}
+    return Sample(time_ns, topics.attitude(robot), "Attitude", fields)
+
+
+def _velocity(robot: str, time_ns: int, body: Array, angles: Array) -> Sample:
+    """A velocity in the body's frame, levelled."""
+    roll, pitch, _ = angles.tolist()
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    level = np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]]) @ body
+    fields = dict(zip(("vx_mps", "vy_mps", "vz_mps"), level.tolist(), strict=True))
+    return Sample(time_ns, topics.velocity(robot), "Velocity", fields)
+
+
+def pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sample:
+    """A geometry_msgs pose in the world frame."""
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    turn = {name: float(getattr(orientation, name)) for name in "xyzw"}
+    place = {name: float(getattr(position, name)) for name in "xyz"}
+    fields = {
+        "timestamp": {"seconds": seconds, "nanos": nanos},
+        "frame_id": "world",
+        "pose": {"position": place, "orientation": turn},
+    }
+    return Sample(time_ns, topic, "PoseInFrame", fields)
+
+
+def _odometry(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    held, twist = message.pose.pose, message.twist.twist
+    yield pose(topics.pose(where.robot), time_ns, held.position, held.orientation)
+    height = {"height_m": float(held.position.z)}
+    yield Sample(time_ns, topics.height(where.robot), "Height", height)
+    angles = _angles(held.orientation)
+    if angles is not None:
+        yield _attitude(where.robot, time_ns, angles, _xyz(twist.angular))
+        yield _velocity(where.robot, time_ns, _xyz(twist.linear), angles)
+
+
+def _imu(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    angles = _angles(message.orientation)
+    if angles is not None and not where.odometry:
+        yield _attitude(where.robot, time_ns, angles, _xyz(message.angular_velocity))
+
+
+def _twist(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    if not where.odometry:
+        yield _velocity(where.robot, time_ns, _xyz(message.twist.linear), np.zeros(3))
+
+
+def _pose_stamped(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    topic = topics.true_pose(where.robot) if where.captured else topics.pose(where.robot)
+    yield pose(topic, time_ns, message.pose.position, message.pose.orientation)
+
+
+def _range(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    value = float(message.range)
+    if 0 < value < RANGE_MAX_M:
+        topic = topics.uwb_range(where.robot, where.peer)
+        yield Sample(time_ns, topic, "UwbRange", {"range_m": value})
+
+
+def _transforms(message: Any, time_ns: int, _where: Placed) -> Iterator[Sample]:
+    frames = []
+    for entry in message.transforms:
+        stamp, held = entry.header.stamp, entry.transform
+        time_ns = stamp.sec * 1_000_000_000 + stamp.nanosec or time_ns
+        frames.append(
+            {
+                "timestamp": {"seconds": stamp.sec, "nanos": stamp.nanosec},
+                "parent_frame_id": entry.header.frame_id,
+                "child_frame_id": entry.child_frame_id,
+                "translation": {n: float(getattr(held.translation, n)) for n in "xyz"},
+                "rotation": {n: float(getattr(held.rotation, n)) for n in "xyzw"},
+            }
+        )
+    yield Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": frames})
+
+
+def own(message: Any, topic: str, time_ns: int) -> Sample | None:
+    """A message of dmrl as it was exported; None for one of another version."""
+    name = message.__msgtype__.removeprefix(OWN)
+    if topics.names(topics.LOG, topic):
+        # rosbags keeps the types of fields in their annotations only, so values tell them.
+        fields = {k: v for k, v in vars(message).items() if isinstance(v, (int, float))}
+        kind = LogType(
+            name.removeprefix("Log"),
+            tuple((k, "d" if isinstance(v, float) else "q") for k, v in fields.items()),
+        )
+        return Sample(time_ns, topic, kind, fields)
+    try:
+        known = {field.name for field in descriptor(name).fields}
+    except KeyError:
+        return None
+    return Sample(time_ns, topic, name, {k: v for k, v in _plain(message).items() if k in known})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tobytes() if value.dtype == np.uint8 else value.tolist()
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if hasattr(value, "__msgtype__"):
+        names = (name for name in vars(value) if not name.startswith("__"))
+        return {name: _plain(getattr(value, name)) for name in names}
+    return value
+
+
+HANDLERS: dict[str, Callable[[Any, int, Placed], Iterator[Sample]]] = {
+    "sensor_msgs/msg/Image": _picture,
+    "sensor_msgs/msg/CompressedImage": _compressed,
+    "sensor_msgs/msg/CameraInfo": _camera_info,
+    "nav_msgs/msg/Odometry": _odometry,
+    "sensor_msgs/msg/Imu": _imu,
+    "geometry_msgs/msg/TwistStamped": _twist,
+    "geometry_msgs/msg/PoseStamped": _pose_stamped,
+    "sensor_msgs/msg/Range": _range,
+    "tf2_msgs/msg/TFMessage": _transforms,
+}

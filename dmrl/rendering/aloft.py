@@ -1,0 +1,113 @@
+"""What flying cameras see, rendered: one place for a flight, robots that keep their looks.
+
+A flight happens in one panorama under one sun, which turn with the camera; every robot has its
+colours and every camera its sensor for all of the flight.
+"""
+
+from collections.abc import Iterable, Iterator
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from dmrl.geometry import Array, Camera
+from dmrl.rendering.backdrops import panorama_view, smeared
+from dmrl.rendering.lens import Picture
+from dmrl.rendering.onboard import View
+from dmrl.rendering.randomise import HIGHLIGHTS, random_paint, random_sensor
+from dmrl.rendering.renderer import Renderer, Scene
+from dmrl.rendering.sensor import blur
+from dmrl.rendering.settings import PRESETS, Settings
+from dmrl.rendering.shot import Light, Look, Robot, Shot
+
+GAIN = 0.6
+"""Light of robots over that of the panorama; they fly where lamps are above and behind."""
+MIDDLE = 0.3
+
+
+def himax() -> Settings:
+    """Ranges of the AI-deck's camera."""
+    keys: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in PRESETS["himax"].items()
+    }
+    return Settings(**keys)
+
+
+class Flight:
+    """Pictures along one flight.
+
+    Parameters
+    ----------
+    renderer
+        Renders them.
+    seed
+        Of the flight: chooses the place, colours and cameras.
+    """
+
+    def __init__(self, renderer: Renderer, seed: int) -> None:
+        self._renderer, self._seed = renderer, seed
+        self._settings = himax()
+        rng = np.random.default_rng((seed, 0))
+        self._place = renderer.lights[int(rng.integers(len(renderer.lights)))]
+        self._panorama = renderer.panorama(self._place)
+        self._turn_rad = float(rng.uniform(-np.pi, np.pi))
+        self._level = _level(self._panorama)
+        towards = rng.normal((0.0, 0.0, 1.2), 1.0)
+        self._sun_world = towards / np.linalg.norm(towards)
+        self._sun: dict[str, Any] = {
+            "strength": float(rng.uniform(*self._settings.light_strength)),
+            "sun_strength": float(rng.uniform(*self._settings.sun_strength)),
+            "sun_colour": (1.0, 1.0, 1.0),
+            "sun_angle_rad": float(rng.uniform(0.05, 0.6)),
+        }
+        self._paint = cache(self._paint_of)
+
+    def __call__(self, camera: Camera, views: Iterable[View]) -> Iterator[Shot]:
+        """Shots of the views of one robot, in their order."""
+        return self._renderer.shots(self._scene(camera, view) for view in views)
+
+    def _paint_of(self, name: str) -> dict[str, Any]:
+        """Colours of a robot, and the first angle and speed of its rotors."""
+        rng = np.random.default_rng((self._seed, 1, *name.encode()))
+        wear = float(rng.uniform(*self._settings.wear))
+        return random_paint(rng, wear, self._settings.colour_spread)
+
+    def _scene(self, camera: Camera, view: View) -> Scene:
+        seed, number, _ = view.key
+        ranges = self._settings
+        rng = np.random.default_rng((seed, 2, number))  # the same for all of a camera's pictures
+        sensor = random_sensor(ranges, rng)
+        soft_px = float(rng.uniform(*ranges.background_blur_px))
+        shutter_s = float(rng.uniform(*ranges.shutter_s))
+        rng = np.random.default_rng(view.key)
+        here = view.here
+        turn = (here.roll_rad, here.pitch_rad, here.yaw_rad + self._turn_rad)
+        backdrop = blur(panorama_view(self._panorama, camera, turn), soft_px)
+        move_px = view.turning_rps * (camera.fx_px, camera.fy_px) * shutter_s
+        backdrop = smeared(np.minimum(backdrop, HIGHLIGHTS * self._level), move_px.tolist())
+        towards = here.body_from_world @ self._sun_world
+        light = Light(name=self._place, turn_rad=turn, sun_camera=towards, **self._sun)
+        gain = GAIN * self._level / MIDDLE
+        look = Look(backdrop, light, sensor, gain, int(rng.integers(2**31)))
+        robots = [
+            Robot(pose, self._turned(name, rng, shutter_s), view.velocity_mps[name] * shutter_s)
+            for name, pose in view.poses.items()
+        ]
+        return camera, robots, look
+
+    def _turned(self, name: str, rng: np.random.Generator, shutter_s: float) -> dict[str, Any]:
+        """Paint of a robot with its rotors where they are in one picture."""
+        turns = float(rng.uniform(*self._settings.rotor_speed_rps)) * shutter_s
+        first = float(rng.uniform(0, np.pi))
+        return self._paint(name) | {
+            "rotor_first_rad": first,
+            "rotor_sweep_rad": 2 * np.pi * turns,
+        }
+
+
+def _level(panorama: Picture) -> float:
+    """Usual light of a panorama about the horizon, its lamps cut off."""
+    rows = len(panorama)
+    band: Array = panorama[rows // 3 : 2 * rows // 3].astype(float)
+    return max(float(np.minimum(band, HIGHLIGHTS * band.mean()).mean()), 1e-3)

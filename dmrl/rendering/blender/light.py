@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+#
+# Copyright (C) 2026 The dmrl developers
+#
+# This program is free software: you can redistribute it and/or modify it under the terms of
+# the GNU General Public License as published by the Free Software Foundation, either version
+# 3 of the License, or (at your option) any later version. It is distributed in the hope that
+# it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
+# MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
+"""The light of panoramas, on robots and as backgrounds."""
+
+import math
+
+import bpy
+import numpy as np
+from nodes import calc, node
+
+LIGHT_SIZE_PX = (32, 16)
+MEAN_LIGHT = 0.5
+LIGHT_CAP = 8.0
+
+
+class Sky:
+    """One world for all panoramas, one above the other in one picture.
+
+    A world for each would be loaded anew at every change, which takes longer than a robot.
+    """
+
+    def __init__(self, scene, lights):
+        columns, rows = LIGHT_SIZE_PX
+        atlas = bpy.data.images.new("light", columns, rows * len(lights), float_buffer=True)
+        atlas.pixels.foreach_set(np.concatenate([small(name) for name in lights]).ravel())
+        self.numbers = {name: k for k, name in enumerate(lights)}
+        scene.world = world = bpy.data.worlds.new("world")
+        world.use_nodes = True
+        # Coarse and capped, it is met often enough by chance: the rays aimed at light go to
+        # the sun alone, and no map of the sky is made for every image.
+        world.cycles.sampling_method = "NONE"
+        tree = world.node_tree
+        self.background = tree.nodes["Background"]
+        place = tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"]
+        self.turn = node(tree, "Mapping", place)
+        x, y, z = node(tree, "SeparateXYZ", self.turn.outputs[0]).outputs
+        turn = calc(tree, "DIVIDE", calc(tree, "ARCTAN2", y, x), -2 * math.pi)
+        height = calc(tree, "DIVIDE", calc(tree, "ARCSINE", z), math.pi)
+        # Half a row from the edges, where the next panorama would shine in.
+        height = calc(tree, "MULTIPLY", calc(tree, "ADD", height, 0.5), (rows - 1) / rows)
+        height = calc(tree, "ADD", height, 0.5 / rows)
+        self.number = node(tree, "Math", height, 0.0, operation="ADD")
+        up = calc(tree, "DIVIDE", self.number.outputs[0], len(lights))
+        where = node(tree, "CombineXYZ", calc(tree, "ADD", turn, 0.5), up, 0.0)
+        picture = node(tree, "TexImage", where.outputs[0], image=atlas)
+        tree.links.new(picture.outputs["Color"], self.background.inputs["Color"])
+
+    def shine(self, name, turn_rad, strength):
+        """Show one panorama, turned by XYZ angles."""
+        self.number.inputs[1].default_value = self.numbers[name]
+        self.turn.inputs["Rotation"].default_value = turn_rad
+        self.background.inputs["Strength"].default_value = strength
+
+
+def small(name):
+    """(rows, columns, 4) a panorama's light by large parts, of mean MEAN_LIGHT.
+
+    Small hard lights would make fireflies; the sun of the scene is there for them.
+    """
+    columns, rows = LIGHT_SIZE_PX
+    wide = panorama(name)[::-1]
+    height, width, _ = wide.shape
+    down, across = height // rows, width // columns
+    if not (down and across):
+        raise ValueError(f"{name} is smaller than {columns}x{rows} pixels")
+    part = wide[: down * rows, : across * columns]
+    small = part.reshape(rows, down, columns, across, 3).mean(axis=(1, 3))
+    small *= MEAN_LIGHT / max(small.mean(), 1e-9)
+    small = np.minimum(small, LIGHT_CAP * MEAN_LIGHT)
+    return np.dstack([small, np.ones((rows, columns, 1))]).astype(np.float32)
+
+
+def panorama(name):
+    """(H, W, 3) linear light of a picture, all around, top row first."""
+    image = bpy.data.images.load(name)
+    width, height = image.size
+    pixels = np.empty(4 * width * height, np.float32)
+    image.pixels.foreach_get(pixels)
+    bpy.data.images.remove(image)
+    return pixels.reshape(height, width, 4)[::-1, :, :3]

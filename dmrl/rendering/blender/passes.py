@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+#
+# Copyright (C) 2026 The dmrl developers
+#
+# This program is free software: you can redistribute it and/or modify it under the terms of
+# the GNU General Public License as published by the Free Software Foundation, either version
+# 3 of the License, or (at your option) any later version. It is distributed in the hope that
+# it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
+# MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
+"""The pixels of a render: from memory, or through files where Blender does not hand them over."""
+
+import tempfile
+from pathlib import Path
+
+import bpy
+import numpy as np
+from cycles import CyclesRender
+
+CHANNELS = {"Combined": 4, "Depth": 1}
+
+_render = CyclesRender.render
+_taken = {}
+
+
+def _render_and_take(engine, depsgraph):
+    """Cycles' own render, after which the passes are read where they lie in memory."""
+    _render(engine, depsgraph)
+    try:
+        _take(engine.get_result())
+    except AttributeError:  # this Blender has no such door
+        _taken.clear()
+
+
+def _take(result):
+    for one in result.layers[0].passes:
+        if one.name in CHANNELS:
+            buffer = np.empty(result.resolution_x * result.resolution_y * one.channels, np.float32)
+            one.rect.foreach_get(buffer)
+            shape = (result.resolution_y, result.resolution_x, one.channels)
+            _taken[one.name] = buffer.reshape(shape)[::-1]
+
+
+class Passes:
+    """How a scene is rendered and its pixels are had.
+
+    Reading them from memory is not in Blender's documentation; a release without it costs
+    time, not pictures.
+    """
+
+    def __init__(self, scene):
+        self.scene = scene
+        self.folder = None
+        CyclesRender.render = _render_and_take
+
+    def render(self):
+        """(H, W, 4) premultiplied light and opacity, and (H, W) depth, top row first."""
+        if self.folder is None:
+            _taken.clear()
+            bpy.ops.render.render()
+            if len(_taken) == len(CHANNELS):
+                return {"light": _taken["Combined"], "depth": _taken["Depth"][..., 0]}
+            self._use_files()
+        bpy.ops.render.render()
+        light, depth = (_read(self._path(name)) for name in CHANNELS)
+        return {"light": light, "depth": depth[..., 0].copy()}
+
+    def _use_files(self):
+        """Let the compositor write the passes of every render."""
+        CyclesRender.render = _render
+        self.folder = tempfile.TemporaryDirectory(prefix="dmrl-")
+        self.scene.render.use_compositing = self.scene.use_nodes = True
+        tree = self.scene.node_tree
+        tree.nodes.clear()
+        layers = tree.nodes.new("CompositorNodeRLayers")
+        for name, socket in zip(CHANNELS, ("Image", "Depth"), strict=True):
+            writer = tree.nodes.new("CompositorNodeOutputFile")
+            writer.base_path = self.folder.name
+            writer.format.file_format, writer.format.color_depth = "OPEN_EXR", "32"
+            writer.format.color_mode = "RGBA"
+            writer.file_slots[0].path = name
+            tree.links.new(layers.outputs[socket], writer.inputs[0])
+
+    def _path(self, name):
+        return Path(self.folder.name) / f"{name}{self.scene.frame_current:04d}.exr"
+
+
+def _read(path):
+    image = bpy.data.images.load(str(path))
+    try:
+        width, height = image.size
+        pixels = np.empty(4 * width * height, np.float32)
+        image.pixels.foreach_get(pixels)
+    finally:
+        bpy.data.images.remove(image)
+        path.unlink()
+    return pixels.reshape(height, width, 4)[::-1]

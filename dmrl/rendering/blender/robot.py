@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+#
+# Copyright (C) 2026 The dmrl developers
+#
+# This program is free software: you can redistribute it and/or modify it under the terms of
+# the GNU General Public License as published by the Free Software Foundation, either version
+# 3 of the License, or (at your option) any later version. It is distributed in the hope that
+# it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
+# MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
+"""The robot: drawn by dmrl, or the user's model."""
+
+import math
+
+import bpy
+import numpy as np
+from nodes import calc, node, of_object
+
+
+def drawn(head, arrays):
+    """The robot that dmrl draws: vertices in metres, triangles, a material each."""
+    mesh = bpy.data.meshes.new("robot")
+    mesh.from_pydata(arrays["vertices"].tolist(), [], arrays["faces"].tolist())
+    mesh.polygons.foreach_set("material_index", arrays["material"].astype(np.int32))
+    polar = mesh.attributes.new("rotor", "FLOAT_VECTOR", "POINT")
+    polar.data.foreach_set("vector", arrays["rotor"].astype(np.float32).ravel())
+    for k, name in enumerate(head["materials"]):
+        material = bpy.data.materials.new(name)
+        _paint(material, k)
+        if name == "rotor":
+            _show_blades(material, head)
+        mesh.materials.append(material)
+    mesh.update()
+    return mesh
+
+
+def loaded(path, scale, up):
+    """The user's model, as one mesh about the middle of its bounding box."""
+    meshes = _meshes(path)
+    robot = bpy.data.meshes.new("robot")
+    corners, faces, indices, start = [], [], [], 0
+    for mesh, matrix in meshes:
+        mesh.calc_loop_triangles()
+        points = np.array([matrix @ v.co for v in mesh.vertices]).reshape(-1, 3)
+        base = len(robot.materials)
+        for material in mesh.materials or [None]:
+            robot.materials.append(material)
+        corners.append(points)
+        faces += [[start + v for v in t.vertices] for t in mesh.loop_triangles]
+        indices += [base + t.material_index for t in mesh.loop_triangles]
+        start += len(points)
+    if not faces:
+        raise ValueError("it has no surface")
+    points = np.concatenate(corners) * scale
+    if up == "y":
+        points = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
+    points -= (points.min(axis=0) + points.max(axis=0)) / 2
+    robot.from_pydata(points.tolist(), [], faces)
+    robot.polygons.foreach_set("material_index", np.array(indices, np.int32))
+    robot.update()
+    return robot
+
+
+def _paint(material, number):
+    """Colour and roughness from the robot's properties, so that no shader is built anew."""
+    material.use_nodes = True
+    material.cycles.emission_sampling = "NONE"
+    tree = material.node_tree
+    surface = tree.nodes["Principled BSDF"]
+    colour = of_object(tree, f"colour_{number}").outputs["Color"]
+    finish = node(tree, "SeparateXYZ", of_object(tree, f"finish_{number}").outputs["Vector"])
+    tree.links.new(colour, surface.inputs["Base Color"])
+    tree.links.new(colour, surface.inputs["Emission Color"])
+    tree.links.new(finish.outputs[0], surface.inputs["Roughness"])
+    tree.links.new(finish.outputs[1], surface.inputs["Metallic"])
+    tree.links.new(finish.outputs[2], surface.inputs["Emission Strength"])
+
+
+def _show_blades(material, head):
+    """Opacity of the discs: the share of the exposure in which a blade covers a point.
+
+    "rotor" of a point is its place on the disc, x and y in metres, and the rotor's number;
+    the robot has the first angle of rotor 0 and how far all turn while the shutter is open.
+    """
+    tree = material.node_tree
+    place = node(tree, "Attribute", attribute_name="rotor", attribute_type="GEOMETRY")
+    x, y, number = node(tree, "SeparateXYZ", place.outputs["Vector"]).outputs
+    first = of_object(tree, "rotor_first_rad").outputs["Fac"]
+    sweep = of_object(tree, "rotor_sweep_rad").outputs["Fac"]
+    # Half a turn of two blades covers all there is to cover.
+    sweep = calc(tree, "MINIMUM", calc(tree, "MAXIMUM", sweep, 0.02), math.pi)
+    first = calc(tree, "ADD", first, calc(tree, "MULTIPLY", number, head["between_rotors_rad"]))
+    angle = calc(tree, "SUBTRACT", calc(tree, "ARCTAN2", y, x), first)
+    after = calc(tree, "FLOORED_MODULO", angle, math.pi)
+    radius = node(tree, "VectorMath", place.outputs["Vector"], (1, 1, 0), operation="MULTIPLY")
+    radius = node(tree, "VectorMath", radius.outputs[0], operation="LENGTH").outputs["Value"]
+    half = calc(tree, "MAXIMUM", radius, 0.002)
+    half = calc(tree, "DIVIDE", head["blade_half_width_m"], half)
+    total = None
+    for blade in (after, calc(tree, "SUBTRACT", after, math.pi)):
+        end = calc(tree, "MINIMUM", calc(tree, "ADD", blade, half), sweep)
+        begin = calc(tree, "MAXIMUM", calc(tree, "SUBTRACT", blade, half), 0.0)
+        share = calc(tree, "MAXIMUM", calc(tree, "SUBTRACT", end, begin), 0.0)
+        total = share if total is None else calc(tree, "ADD", total, share)
+    opacity = calc(tree, "MINIMUM", calc(tree, "DIVIDE", total, sweep), 1.0)
+    tree.links.new(opacity, tree.nodes["Principled BSDF"].inputs["Alpha"])
+
+
+def _meshes(path):
+    """Mesh and placement of every object of a file; of a .blend, without roots' own places.
+
+    Importers turn y up into z up by the roots' rotation, so there it counts.
+    """
+    before = set(bpy.data.objects)
+    kind = path.suffix.lower()
+    if kind == ".blend":
+        with bpy.data.libraries.load(str(path)) as (source, wanted):
+            wanted.objects = source.objects
+    elif kind in (".glb", ".gltf"):
+        bpy.ops.import_scene.gltf(filepath=str(path))
+    elif kind == ".obj":
+        bpy.ops.wm.obj_import(filepath=str(path))
+    else:
+        bpy.ops.wm.stl_import(filepath=str(path))
+    found = [thing for thing in bpy.data.objects if thing not in before]
+    bpy.context.view_layer.update()
+    meshes = []
+    for thing in found:
+        if thing.type == "MESH":
+            place = thing.matrix_world
+            if kind == ".blend":
+                root = thing
+                while root.parent is not None:
+                    root = root.parent
+                place = root.matrix_world.inverted() @ place
+            meshes.append((thing.data, place.copy()))
+    for thing in found:
+        bpy.data.objects.remove(thing)
+    return meshes

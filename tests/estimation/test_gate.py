@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+
+from dmrl.estimation import gate
+from dmrl.estimation.gate import AMBIGUOUS, OK, UNCONVERGED, probability_beyond, within_budget
+from dmrl.estimation.gate import statuses as statuses_of
+from dmrl.estimation.pair import Array
+
+
+def spread(*sigmas_m: float) -> Array:
+    """(K, 3, 3) covariances that are alike in both directions."""
+    return np.stack([np.diag([sigma**2, sigma**2, 0.01]) for sigma in sigmas_m])
+
+
+def test_the_probability_of_a_round_error_is_rayleighs() -> None:
+    found = probability_beyond(spread(0.1, 0.3)[:, :2, :2], 0.3)
+    assert found == pytest.approx(np.exp([-4.5, -0.5]))
+
+
+def test_the_probability_of_a_long_error_is_that_of_samples() -> None:
+    covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
+    errors = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 200_000)
+    share = (np.hypot(*errors.T) > 0.3).mean()
+    assert probability_beyond(covariance[None], 0.3)[0] == pytest.approx(share, rel=0.02)
+
+
+def test_a_flight_keeps_its_best_until_the_budget_is_spent() -> None:
+    probability = np.array([0.1, 0.0, 0.06, 0.05, 0.0])
+    kept = within_budget(probability)
+    assert probability[kept].mean() <= gate.EXPECTED_SHARE
+    worse = np.sort(probability[~kept])[:1]
+    assert np.append(probability[kept], worse).mean() > gate.EXPECTED_SHARE
+
+
+def test_no_budget_pays_for_a_position_that_may_be_anywhere() -> None:
+    probability = np.append(np.zeros(1000), 0.5)
+    assert within_budget(probability).tolist() == [True] * 1000 + [False]
+    assert not within_budget(np.full(10, 0.5)).any()
+
+
+def test_a_bearing_that_is_open_is_ambiguous_and_a_blurred_one_unconverged() -> None:
+    far = np.tile([4.0, 0.0, 0.0], (5, 1))
+    assert (statuses_of(far, spread(*[0.1] * 5), 0.3) == OK).all()
+    assert (statuses_of(far, spread(*[0.5] * 5), 0.3) == UNCONVERGED).all()
+    assert (statuses_of(far / 4, spread(*[0.5] * 5), 0.3) == AMBIGUOUS).all()

@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+from dmrl.estimation.hypotheses import COST_UNIT, mirrored, spread_of
+
+HERE = np.zeros((4, 3))
+THERE = np.tile([1.0, 0.0, 0.0], (4, 1))
+
+
+def test_solutions_of_equal_cost_spread_by_half_their_distance_squared() -> None:
+    found = spread_of(np.zeros(2), np.stack([HERE, THERE]))
+    assert found[:, 0, 0] == pytest.approx(0.5)
+    assert found[:, 1:, 1:] == pytest.approx(0.0)
+
+
+def test_a_solution_counts_once_however_many_starts_lead_to_it() -> None:
+    alike = np.stack([HERE, THERE, THERE + 0.01, HERE + 0.01])
+    assert spread_of(np.zeros(4), alike)[0, 0, 0] == pytest.approx(0.5)
+
+
+def test_a_costly_solution_hardly_counts() -> None:
+    found = spread_of(np.array([0.0, 10 * COST_UNIT]), np.stack([HERE, THERE]))
+    assert found.max() < 1e-3
+
+
+def test_headings_differ_by_less_than_half_a_turn() -> None:
+    turn = np.array([0.0, 0.0, 2 * np.pi])
+    around, far = HERE + turn, THERE + turn
+    assert spread_of(np.zeros(2), np.stack([HERE, far]))[:, 2, 2] == pytest.approx(0.0)
+    assert spread_of(np.zeros(2), np.stack([HERE, around])).max() == pytest.approx(0.0)
+
+
+def test_between_two_close_passes_the_peer_is_put_on_the_other_side() -> None:
+    time_s = np.arange(0, 20, 0.1)
+    state = np.zeros((len(time_s), 5))
+    # Passes at 5 s and 15 s, 0.1 m off.
+    state[:, 0], state[:, 1] = np.cos(np.pi * time_s / 10), 0.1
+    (copy,) = mirrored(state, 10.0)
+    turned = np.flatnonzero((copy != state).any(axis=1))
+    assert time_s[turned].min() == pytest.approx(5.0, abs=1.5)
+    assert time_s[turned].max() == pytest.approx(15.0, abs=1.5)
+    assert np.hypot(*copy[:, :2].T) == pytest.approx(np.hypot(*state[:, :2].T))
+
+
+def test_without_close_passes_nothing_is_mirrored() -> None:
+    far = np.tile([2.0, 0.0, 0.0, 0.0, 0.0], (200, 1))
+    assert mirrored(far, 10.0) == []

@@ -1,0 +1,80 @@
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dmrl.errors import OutputError
+from dmrl.export.tables import write_tables
+from dmrl.images import encode_png
+from dmrl.messages import message
+from dmrl.recording import RecordingWriter, provenance
+
+PNG = encode_png(np.full((4, 4, 3), 7, np.uint8))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """A picture, labels with two peers, one and none, a pose and a map."""
+    path = tmp_path / "in.mcap"
+    peers = [{"peer": "cf2", "u_px": 1.5, "box_px": [1, 2, 3, 4]}, {"peer": "cf3", "u_px": 2.5}]
+    with RecordingWriter(path, provenance("test")) as sink:
+        for k in range(3):
+            labels = message("PeerLabels")(peers=peers[: 2 - k])
+            sink.write(10 * k, "/cf1/labels", labels, publish_ns=10 * k + 1)
+        picture = message("CompressedImage")(data=PNG, format="png")
+        sink.write(5, "/cf1/camera/image", picture)
+        pose = message("PoseInFrame")(frame_id="world", pose={"position": {"x": 0.1}})
+        sink.write(7, "/cf1/pose", pose)
+        sink.write(9, "/cf1/detections/grid", message("GridMap")(rows=1, data=b"\0\1"))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_tables_hold_what_the_recording_holds(recording: Path, tmp_path: Path, kind: str) -> None:
+    out = tmp_path / "out"
+    counts = write_tables(recording, out, kind)  # type: ignore[arg-type]
+    assert counts == {
+        "/cf1/camera/image": 1,
+        "/cf1/detections/grid": 1,
+        "/cf1/labels": 4,
+        "/cf1/pose": 1,
+    }
+
+    def table(name: str) -> pd.DataFrame:
+        path = out / f"{name}.{kind}"
+        return pd.read_csv(path) if kind == "csv" else pd.read_parquet(path)
+
+    labels = table("cf1.labels")
+    assert labels["log_time"].tolist() == [0, 0, 10, 20]
+    assert labels["publish_time"].tolist() == [1, 1, 11, 21]
+    assert labels["peers.peer"].tolist()[:3] == ["cf2", "cf3", "cf2"]
+    assert pd.isna(labels["peers.peer"][3])  # nobody is in view
+    assert labels["peers.u_px"].tolist()[:3] == [1.5, 2.5, 1.5]
+    box = labels["peers.box_px"][0]
+    assert (json.loads(box) if kind == "csv" else box.tolist()) == [1, 2, 3, 4]
+    pose = table("cf1.pose")
+    assert (pose["frame_id"][0], pose["pose.position.x"][0]) == ("world", 0.1)
+    (name,) = table("cf1.camera.image")["data"]
+    assert (out / name).read_bytes() == PNG
+    data = table("cf1.detections.grid")["data"][0]
+    assert (base64.b64decode(data) if kind == "csv" else data) == b"\0\1"
+
+
+def test_numbers_come_back_to_the_bit(tmp_path: Path) -> None:
+    path, values = tmp_path / "in.mcap", np.random.default_rng(0).normal(size=50)
+    with RecordingWriter(path, provenance("test")) as sink:
+        for k, value in enumerate(values.tolist()):
+            sink.write(2**60 + k, "/cf1/height", message("Height")(height_m=value))
+    write_tables(path, tmp_path / "out", "csv")
+    table = pd.read_csv(tmp_path / "out" / "cf1.height.csv")
+    assert (table["height_m"] == values).all()
+    assert table["log_time"][49] == 2**60 + 49
+
+
+def test_a_folder_is_never_overwritten(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with pytest.raises(OutputError, match="never overwritten"):
+        write_tables(recording, tmp_path / "out", "csv")

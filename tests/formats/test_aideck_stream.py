@@ -1,0 +1,73 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.bayer import rgb_of
+from dmrl.errors import SourceError
+from dmrl.formats import aideck_stream
+from dmrl.formats.cpx import Image
+from dmrl.formats.cpx_pack import pack_image
+from dmrl.formats.cpx_state import State
+from dmrl.formats.known import format_of
+from dmrl.formats.sample import Options, Sample
+from dmrl.images import decode, encode_jpeg
+
+from . import foreign
+
+
+def samples(path: Path, data: bytes, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Samples by topic of a stream of these bytes."""
+    path.write_bytes(data)
+    found: dict[str, list[Sample]] = {}
+    for sample in aideck_stream.content(path, options or Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+def test_raw_pictures_get_their_colours_and_nominal_times(tmp_path: Path) -> None:
+    raw = foreign.pictures(3)
+    data = b"".join(pack_image(Image(32, 24, "raw", p.tobytes())) for p in raw)
+    found = samples(tmp_path / "a.cpx", data, Options(rate_hz=20))["/cf1/camera/image"]
+    assert [s.time_ns for s in found] == [0, 50_000_000, 100_000_000]
+    for sample, pixels in zip(found, raw, strict=True):
+        np.testing.assert_array_equal(decode(sample.fields["data"]), rgb_of(pixels))
+    assert format_of(tmp_path / "a.cpx").name == "aideck-stream"
+
+
+def test_jpegs_keep_their_bytes(tmp_path: Path) -> None:
+    jpeg = encode_jpeg(np.full((24, 32, 3), 90, np.uint8))
+    found = samples(tmp_path / "a.cpx", pack_image(Image(32, 24, "jpeg", jpeg)))
+    (image,) = found["/cf1/camera/image"]
+    assert (image.fields["format"], image.fields["data"]) == ("jpeg", jpeg)
+
+
+def test_the_camera_s_clock_and_the_robot_s_state_are_used(tmp_path: Path) -> None:
+    start = 2**32 - 75_000  # wraps between the second picture and the third
+    data = b""
+    for k, raw in enumerate(foreign.pictures(4)):
+        time = start + 50_000 * k
+        state = State(1000 + 50 * k, time - 4_000, (0.1 * k, 0.0, 0.7), (0.0, 0.5, 0.0))
+        data += pack_image(Image(32, 24, "raw", raw.tobytes(), time, k, state), "streamer")
+    found = samples(tmp_path / "a.cpx", data)
+    assert np.diff([s.time_ns for s in found["/cf1/camera/image"]]).tolist() == [50_000_000] * 3
+    heights = found["/cf1/height"]
+    assert [s.fields["height_m"] for s in heights] == pytest.approx([0.7] * 4)
+    assert heights[0].time_ns == found["/cf1/camera/image"][0].time_ns - 4_000_000
+    assert found["/cf1/velocity"][0].fields["vy_mps"] == pytest.approx(0.5)
+    assert found["/cf1/log/cpx_state"][2].fields["stateEstimate_x"] == pytest.approx(0.2)
+
+
+def test_a_stream_that_was_cut_gives_what_is_whole_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
+    found = samples(tmp_path / "a.cpx", one * 2 + one[:12] + one * 2)
+    assert len(found["/cf1/camera/image"]) >= 3
+    assert "pictures are broken" in capsys.readouterr().err
+
+
+def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="holds no whole picture of a CPX stream"):
+        samples(tmp_path / "a.cpx", b"\0" * 1000)
+    assert not aideck_stream.recognises(tmp_path / "a.cpx")

@@ -1,0 +1,96 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats import cfclient_csv
+from dmrl.formats.known import format_of
+from dmrl.formats.sample import Options, Sample
+
+
+@pytest.fixture
+def swarm(tmp_path: Path) -> Path:
+    """Two robots, two log blocks each, as the client names its files."""
+    for robot in ("cf1", "cf2"):
+        folder = tmp_path / robot
+        folder.mkdir()
+        state = [
+            "Timestamp,stateEstimate.vx,stateEstimate.vy,stateEstimate.z,stateEstimate.roll,"
+            "stateEstimate.pitch,stateEstimate.yaw"
+        ]
+        state += [
+            f"{2**24 - 20 + 10 * k if k < 2 else 10 * k - 20},1.0,0.0,0.5,10,20,90"
+            for k in range(10)
+        ]
+        (folder / "state-20221011T10-33-31.csv").write_text("\n".join(state) + "\n")
+        ranges = [
+            "Timestamp,gyro.z,ranging.distance2",
+            *(f"{2**24 - 15 + 10 * k},57.29578,{1 + k}.5" for k in range(2)),
+        ]
+        (folder / "range-20221011T10-33-32.csv").write_text("\n".join(ranges) + "\n")
+    return tmp_path
+
+
+def samples(source: Path) -> dict[str, list[Sample]]:
+    """Samples by topic."""
+    found: dict[str, list[Sample]] = {}
+    for sample in cfclient_csv.content(source, Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+def test_a_folder_of_folders_is_a_swarm(swarm: Path) -> None:
+    assert format_of(swarm).name == "cfclient"
+    found = samples(swarm)
+    assert {topic: len(v) for topic, v in found.items() if topic.startswith("/cf1")} == {
+        "/cf1/attitude": 10,
+        "/cf1/velocity": 10,
+        "/cf1/height": 10,
+        "/cf1/range/cf2": 2,
+        "/cf1/log/state": 10,
+        "/cf1/log/range": 2,
+    }
+    assert "/cf2/range/cf2" not in found  # nobody ranges to himself
+
+
+def test_units_signs_and_the_clock_s_wrap(swarm: Path) -> None:
+    found = samples(swarm / "cf1")
+    attitude = found["/cf1/attitude"]
+    assert np.diff([s.time_ns for s in attitude]).tolist() == [10_000_000] * 9
+    assert attitude[0].fields == pytest.approx(
+        {
+            "roll_rad": np.radians(10),
+            "pitch_rad": -np.radians(20),
+            "yaw_rad": np.pi / 2,
+            "yaw_rate_radps": 1.0,  # of the other block
+        },
+        rel=1e-6,
+    )
+    # One metre a second along x of take-off is to the right of a robot that looks along y.
+    fields = found["/cf1/velocity"][0].fields
+    assert (fields["vx_mps"], fields["vy_mps"]) == pytest.approx((0, -1), abs=1e-9)
+    assert [s.fields["range_m"] for s in found["/cf1/range/cf2"]] == [1.5, 2.5]
+
+
+def test_a_last_line_that_was_cut_is_left_out_and_said(
+    swarm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = swarm / "cf1" / "state-20221011T10-33-31.csv"
+    path.write_text(path.read_text()[:-8])
+    assert len(samples(path)["/cf1/attitude"]) == 9
+    assert "its last line is cut short" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("Timestamp,a\n", "has no rows"),
+        ("Timestamp,a\n1,2\n3\n4,5\n", r":3: not 2 numbers"),
+        ("Timestamp,a,a\n1,2,3\n", ":1: not Timestamp and names"),
+    ],
+)
+def test_what_is_no_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(SourceError, match=message):
+        samples(tmp_path / "a.csv")

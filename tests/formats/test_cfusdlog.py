@@ -1,0 +1,275 @@
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats import cfusdlog
+from dmrl.formats.sample import Options, Sample
+
+from . import foreign, plain_usd
+
+LOGS = ("log05", "jana00_brushed_flights", "eckart00_brushless_flights")
+# Records of each event, counted by an independent decoder.
+COUNTS = {
+    "log05": {
+        "estTDOA": 2044,
+        "estGyroscope": 11457,
+        "estAcceleration": 11457,
+        "estBarometer": 573,
+        "lhPosition": 1562,
+    },
+    "jana00_brushed_flights": {"fixedFrequency": 4643, "estPose": 511},
+    "eckart00_brushless_flights": {"fixedFrequency": 4634, "estPose": 926},
+}
+
+
+def samples(path: Path, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Samples by topic."""
+    found: dict[str, list[Sample]] = {}
+    for sample in cfusdlog.content(path, options or Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+def same(log: cfusdlog.Log, data: bytes) -> None:
+    """The log holds what the value-by-value decoder finds, bit for bit."""
+    wanted = plain_usd.decode(data)
+    unit = {1: 1_000_000, 2: 1000}[log.version]
+    assert [b.name for b in log.blocks] == [name for name, v in wanted.items() if v["timestamp"]]
+    for block in log.blocks:
+        values = wanted[block.name]
+        assert (block.time_ns == np.array(values.pop("timestamp")) * unit).all()
+        assert list(block.columns) == list(values)
+        for name, column in block.columns.items():
+            np.testing.assert_array_equal(column, np.array(values[name], column.dtype))
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_real_logs_equal_an_independent_decode(data: Path, name: str) -> None:
+    raw = (data / "crazyflie-usd" / name).read_bytes()
+    assert zlib.crc32(raw[:-4]) == struct.unpack("<I", raw[-4:])[0]
+    log = cfusdlog.decode(raw)
+    assert log.warnings == ()
+    assert {b.name: len(b.time_ns) for b in log.blocks} == COUNTS[name]
+    same(log, raw)
+
+
+def test_rates_of_a_real_log_are_those_that_were_set(data: Path) -> None:
+    raw = (data / "crazyflie-usd" / "eckart00_brushless_flights").read_bytes()
+    rates = {
+        b.name: (len(b.time_ns) - 1) / ((b.time_ns[-1] - b.time_ns[0]) * 1e-9)
+        for b in cfusdlog.decode(raw).blocks
+    }
+    assert rates["fixedFrequency"] == pytest.approx(505, abs=1)
+    assert rates["estPose"] == pytest.approx(101, abs=1)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_both_versions_are_read(version: int) -> None:
+    raw = foreign.usd_log(version)
+    log = cfusdlog.decode(raw)
+    assert (log.version, log.warnings) == (version, ())
+    same(log, raw)
+
+
+def test_every_type_of_variable_is_read() -> None:
+    values = {"b": -5, "B": 250, "h": -300, "H": 60000, "i": -(2**31), "I": 2**32 - 1}
+    numbers = (*values.values(), 0.5, 1.25)
+    codes = [*values, "e", "f"]
+    raw = plain_usd.encode({1: ("all", [(f"v.{c}", c) for c in codes])}, [(1, 7, numbers)])
+    (block,) = cfusdlog.decode(raw).blocks
+    assert tuple(column[0] for column in block.columns.values()) == numbers
+
+
+@pytest.mark.parametrize("name", ["synthetic", *LOGS])
+def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    if name == "synthetic":
+        raw = foreign.usd_log()
+    else:
+        raw = (request.getfixturevalue("data") / "crazyflie-usd" / name).read_bytes()
+    body = cfusdlog._header(raw, name)[2]
+    whole = cfusdlog.decode(raw)
+    sizes = {b.name: 10 + sum(c.itemsize for c in b.columns.values()) for b in whole.blocks}
+    times = np.concatenate([b.time_ns for b in whole.blocks])
+    size = np.concatenate([np.full(len(b.time_ns), sizes[b.name]) for b in whole.blocks])
+    assert body + size.sum() + 4 == len(raw)
+    for length in np.random.default_rng(7).integers(body, len(raw) - 4, 50).tolist():
+        log = cfusdlog.decode(raw[:length], name)
+        assert "no valid CRC" in log.warnings[0]
+        got = sum(len(b.time_ns) * sizes[b.name] for b in log.blocks)
+        # What is left is less than one record.
+        assert 0 <= length - body - got < size.max()
+        for cut in log.blocks:
+            full = next(b for b in whole.blocks if b.name == cut.name)
+            assert (cut.time_ns == full.time_ns[: len(cut.time_ns)]).all()
+    assert len(times)
+
+
+def test_an_empty_log_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "log00").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"log00 is empty.* Name another log") as e:
+        cfusdlog.content(tmp_path / "log00", Options())
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "text"),
+    [
+        (lambda raw: b"\xbd" + raw[1:], "no micro-SD log of version 1 or 2"),
+        (lambda raw: raw[:1] + b"\3" + raw[2:], "no micro-SD log of version 1 or 2"),
+        (lambda raw: raw[:40], "damaged in its header, or ends there"),
+        (lambda raw: raw.replace(b"estDistance\0", b"fixedFrequency\0"), "the same name"),
+        (lambda raw: raw.replace(b"gyro.x(f)", b"gyro.x(q)"), "without name or known type"),
+    ],
+)
+def test_a_damaged_header_is_one_line(damage: object, text: str) -> None:
+    with pytest.raises(SourceError, match=text):
+        cfusdlog.decode(damage(foreign.usd_log()), "log07")  # type: ignore[operator]
+
+
+def test_an_id_that_is_unknown_ends_the_log_with_a_warning() -> None:
+    raw = foreign.usd_log()
+    log = cfusdlog.decode(raw[:-4] + b"\x55\x55" + b"\0" * 30)
+    assert [len(b.time_ns) for b in log.blocks] == [100, 20, 20]
+    assert "32 bytes from byte" in log.warnings[1]
+
+
+def test_bytes_that_look_like_ids_are_no_records() -> None:
+    events = {7: ("a", [("x", "H"), ("y", "H")]), 9: ("b", [("z", "I")])}
+    rows = [(7, 7 * 65536 + 9, (7, 9)) if k % 3 else (9, 7, (9 * 65536 + 7,)) for k in range(300)]
+    raw = plain_usd.encode(events, rows)
+    same(cfusdlog.decode(raw), raw)
+
+
+def test_milliseconds_that_wrap_go_on() -> None:
+    rows = [(1, (2**32 - 2 + k) % 2**32, (k,)) for k in range(5)]
+    (block,) = cfusdlog.decode(plain_usd.encode({1: ("a", [("x", "H")])}, rows, 1)).blocks
+    assert np.diff(block.time_ns).tolist() == [1_000_000] * 4
+
+
+def test_units_and_signs_are_those_of_dmrl(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    path.write_bytes(foreign.usd_log())
+    found = samples(path, Options(robot="cf7", names={"2": "cf9"}))
+    assert {topic: len(v) for topic, v in found.items()} == {
+        "/cf7/attitude": 100,
+        "/cf7/velocity": 100,
+        "/cf7/height": 100,
+        "/cf7/pose": 100,
+        "/cf7/pose/truth": 20,
+        "/cf7/range/cf3": 20,
+        "/cf7/range/cf9": 100,
+        "/cf7/log/fixedFrequency": 100,
+        "/cf7/log/estPose": 20,
+        "/cf7/log/estDistance": 20,
+        "/tf": 20,
+    }
+    last = found["/cf7/velocity"][-1]
+    yaw = 0.99  # the quaternion turned by sin(yaw / 2) = sin(0.005 k)
+    assert last.time_ns == (1000 + 20 * 99) * 1_000_000
+    assert last.fields["vx_mps"] == pytest.approx(0.5 * np.cos(yaw), abs=1e-6)
+    assert last.fields["vy_mps"] == pytest.approx(-0.5 * np.sin(yaw), abs=1e-6)
+    attitude = found["/cf7/attitude"][-1].fields
+    assert attitude["yaw_rad"] == pytest.approx(yaw, abs=1e-6)
+    assert attitude["yaw_rate_radps"] == pytest.approx(0.5, abs=1e-5)
+    # Millimetres in an integer; metres in a float.
+    assert found["/cf7/range/cf9"][0].fields == {"range_m": 1.5}
+    assert found["/cf7/range/cf3"][0].fields == {"range_m": 2.5}
+    assert found["/cf7/log/fixedFrequency"][3].fields["pm_vbatMV"] == 3900
+
+
+@pytest.mark.parametrize("logged", ["roll", "pitch"])
+def test_the_sign_of_each_angle_alone(tmp_path: Path, logged: str) -> None:
+    names = ("roll", "pitch", "yaw")
+    events = {1: ("state", [(f"stateEstimate.{name}", "f") for name in names])}
+    values = tuple(10.0 if name == logged else 0.0 for name in names)
+    path = tmp_path / "log"
+    path.write_bytes(plain_usd.encode(events, [(1, 1000, values), (1, 2000, values)]))
+    fields = samples(path)["/cf1/attitude"][0].fields
+    # The Crazyflie logs pitch positive nose up, dmrl has it positive nose down.
+    assert fields["roll_rad"] == pytest.approx(np.radians(values[0]))
+    assert fields["pitch_rad"] == pytest.approx(-np.radians(values[1]))
+
+
+def test_angles_and_quaternion_of_one_attitude_agree(tmp_path: Path) -> None:
+    roll, pitch, yaw = 0.2, -0.3, 2.0
+    cr, cp, cy = np.cos([roll / 2, pitch / 2, yaw / 2])
+    sr, sp, sy = np.sin([roll / 2, pitch / 2, yaw / 2])
+    quaternion = (
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+        cy * cp * cr + sy * sp * sr,
+    )
+    names = ("qx", "qy", "qz", "qw")
+    events = {1: ("state", [(f"stateEstimate.{name}", "f") for name in names])}
+    path = tmp_path / "log"
+    path.write_bytes(plain_usd.encode(events, [(1, 1000, quaternion)]))
+    fields = samples(path)["/cf1/attitude"][0].fields
+    assert [fields[f"{n}_rad"] for n in ("roll", "pitch", "yaw")] == pytest.approx(
+        [roll, pitch, yaw], abs=1e-6
+    )
+
+
+def test_the_gyroscope_of_a_real_flight_is_the_slope_of_its_attitude(data: Path) -> None:
+    found = samples(data / "crazyflie-usd" / "eckart00_brushless_flights")["/cf1/attitude"]
+    time = np.array([s.time_ns for s in found]) * 1e-9
+    yaw = np.array([s.fields["yaw_rad"] for s in found])
+    rate = np.array([s.fields["yaw_rate_radps"] for s in found])
+    turned = np.concatenate([[0], np.cumsum(np.diff(time) * (rate[1:] + rate[:-1]) / 2)])
+    assert np.abs(turned - (yaw - yaw[0])).max() < 0.05
+
+
+def test_the_state_of_a_real_flight_is_where_motion_capture_saw_it(data: Path) -> None:
+    found = samples(data / "crazyflie-usd" / "eckart00_brushless_flights")
+
+    def track(topic: str) -> tuple[np.ndarray, np.ndarray]:
+        places = [s.fields["pose"]["position"] for s in found[topic]]
+        times = np.array([s.time_ns for s in found[topic]], float)
+        return times, np.array([[p[axis] for axis in "xyz"] for p in places])
+
+    time, state = track("/cf1/pose")
+    true_time, truth = track("/cf1/pose/truth")
+    at = np.stack([np.interp(true_time, time, axis) for axis in state.T], axis=1)
+    error = np.linalg.norm(at - truth, axis=1)
+    assert np.ptp(truth, axis=0).max() > 0.5  # it flies
+    assert np.median(error) < 0.02 and error.max() < 0.15
+
+
+def test_a_folder_is_a_robot_per_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("cf1", "cf2"):
+        (tmp_path / name).write_bytes(foreign.usd_log())
+    (tmp_path / "cf3").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("first flight")
+    assert cfusdlog.recognises(tmp_path)
+    found = samples(tmp_path)
+    assert {"/cf1/attitude", "/cf2/attitude"} <= found.keys()
+    err = capsys.readouterr().err
+    assert "cf3 is empty; left out" in err and "notes.txt is no micro-SD log" in err
+
+
+def test_attitude_before_the_estimator_starts_is_left_out(tmp_path: Path) -> None:
+    names = ("qx", "qy", "qz", "qw")
+    events = {1: ("state", [(f"stateEstimate.{name}", "f") for name in names])}
+    rows = [(1, 1000, (0.0, 0.0, 0.0, 0.0)), (1, 2000, (0.0, 0.0, 0.0, 1.0))]
+    path = tmp_path / "log"
+    path.write_bytes(plain_usd.encode(events, rows))
+    found = samples(path)
+    assert (len(found["/cf1/attitude"]), len(found["/cf1/log/state"])) == (1, 2)
+
+
+def test_impossible_ranges_are_left_out_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    events = {1: ("range", [("ranging.distance2", "H")])}
+    rows = [(1, 1000 * k, (value,)) for k, value in enumerate((0, 1500, 1500, 65535, 2000))]
+    path = tmp_path / "log"
+    path.write_bytes(plain_usd.encode(events, rows))
+    got = [(s.time_ns, s.fields["range_m"]) for s in samples(path)["/cf1/range/cf2"]]
+    assert got == [(1_000_000, 1.5), (4_000_000, 2.0)]  # what did not change is not new
+    assert "1 ranges to cf2 left out" in capsys.readouterr().err

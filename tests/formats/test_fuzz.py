@@ -1,0 +1,186 @@
+"""Damaged sources of every binary format: one line or a part of it, and nothing worse."""
+
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import DmrlError
+from dmrl.formats.known import FORMATS
+from dmrl.formats.sample import Options
+from dmrl.messages import message
+
+from . import foreign
+
+HANG_S = 20
+MEMORY_BYTES = 500_000_000
+
+
+def _usd(version: int) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        path = folder / "log"
+        path.write_bytes(foreign.usd_log(version))
+        return path, path
+
+    return make
+
+
+def _flash(folder: Path) -> tuple[Path, Path]:
+    path = folder / "flash.bin"
+    raw = foreign.pictures(2, 224, 320)
+    path.write_bytes(foreign.flash_dump(raw, [[1, 2, 1, 0, 0, 1]] * 2))
+    return path, path
+
+
+def _stream(folder: Path) -> tuple[Path, Path]:
+    path = folder / "flight.cpx"
+    path.write_bytes(foreign.stream())
+    return path, path
+
+
+def _bag(storage: str) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        bag = foreign.ros2_bag(folder / "bag", storage)
+        return bag, next(path for path in bag.iterdir() if path.suffix in (".db3", ".mcap"))
+
+    return make
+
+
+def _bag1(folder: Path) -> tuple[Path, Path]:
+    path = foreign.ros1_bag(folder / "flight.bag")
+    return path, path
+
+
+def _picture(name: str) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        path = folder / name
+        path.write_bytes(foreign.coloured()[name])
+        return folder, path
+
+    return make
+
+
+def _nanocockpit(folder: Path) -> tuple[Path, Path]:
+    source = foreign.nanocockpit(folder / "cockpit")
+    return source, source / "camera_raw" / "00002.png"
+
+
+def _ranges(folder: Path) -> tuple[Path, Path]:
+    path = folder / "ranges.npz"
+    time = np.arange(20)
+    pose = {f"optitrack_turtle0{n}_pose_np": np.stack([time * 0.01, time * n], 1) for n in (1, 2)}
+    turn = {f"optitrack_turtle0{n}_orientation_np": time * 0.1 for n in (1, 2)}
+    np.savez(path, **pose, **turn, uwb_range_1_2_np=time * 1.0)
+    return path, path
+
+
+# Format, and a maker of a source with the one file of it that is damaged.
+SOURCES = {
+    "cfusdlog 1": ("cfusdlog", _usd(1)),
+    "cfusdlog 2": ("cfusdlog", _usd(2)),
+    "hyperflash": ("hyperflash", _flash),
+    "aideck-stream": ("aideck-stream", _stream),
+    "rosbag2 db3": ("rosbag2", _bag("sqlite3")),
+    "rosbag2 mcap": ("rosbag2", _bag("mcap")),
+    "ROS 1 bag": ("rosbag2", _bag1),
+    "PNG": ("images", _picture("a.png")),
+    "JPEG": ("images", _picture("b.jpg")),
+    "PPM": ("images", _picture("c.ppm")),
+    "nanocockpit": ("nanocockpit", _nanocockpit),
+    "npz": ("uwb-tiers", _ranges),
+}
+
+
+def mutated(data: bytes, rng: np.random.Generator) -> bytes:
+    """The same with one kind of damage: flipped, overwritten, cut, doubled, inserted bytes."""
+    out = bytearray(data)
+    # Headers are small: half of the damage is near the front.
+    reach = len(out) if rng.random() < 0.5 else min(len(out), 400)
+    at = int(rng.integers(reach))
+    size = int(rng.integers(1, 64))
+    kind = int(rng.integers(7))
+    if kind == 0:
+        for place in rng.integers(reach, size=int(rng.integers(1, 9))):
+            out[int(place)] ^= 1 << int(rng.integers(8))
+    elif kind == 1:
+        out[at : at + size] = rng.integers(0, 256, size, np.uint8).tobytes()
+    elif kind == 2:
+        del out[at:]
+    elif kind == 3:
+        del out[at : at + size]
+    elif kind == 4:
+        out[at:at] = out[at : at + size]
+    elif kind == 5:
+        out[at:at] = rng.integers(0, 256, size, np.uint8).tobytes()
+    else:
+        extremes = (b"\0" * 4, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0")
+        out[at : at + 4] = extremes[int(rng.integers(len(extremes)))]
+    return bytes(out)
+
+
+def convert(name: str, source: Path) -> int:
+    """Messages of a source. DmrlError is the one error that may come."""
+    count = 0
+    for sample in FORMATS[name].content(source, Options()).samples:
+        message(sample.message)(**sample.fields).SerializeToString()
+        count += 1
+    return count
+
+
+def run(which: str, count: int, folder: Path) -> None:
+    """Damage a source ``count`` times; prints how often it failed and what it took at most."""
+    import signal  # noqa: PLC0415
+
+    name, make = SOURCES[which]
+    source, path = make(folder)
+    whole = path.read_bytes()
+    assert convert(name, source) > 0
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    rng = np.random.default_rng(len(which))
+    failed = 0
+    for k in range(count):
+        path.write_bytes(mutated(whole, rng))
+        signal.alarm(HANG_S)  # ends this process
+        try:
+            convert(name, source)
+        except DmrlError as e:
+            failed += 1
+            assert "\n" not in str(e), str(e)
+        except BaseException as e:
+            raise AssertionError(f"mutation {k} of {which}: {type(e).__name__}: {e}") from e
+        finally:
+            signal.alarm(0)
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+    assert grown < MEMORY_BYTES, f"{grown / 1e6:.0f} MB"
+    sys.stdout.write(f"{which}: {failed} of {count} refused, {grown / 1e6:.0f} MB\n")
+
+
+def _in_a_process(which: str, count: int, folder: Path) -> str:
+    code = (
+        "import runpy, sys; sys.path.insert(0, sys.argv[4]); from pathlib import Path; "
+        "from formats.test_fuzz import run; run(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))"
+    )
+    tests = str(Path(__file__).parents[1])
+    done = subprocess.run(
+        [sys.executable, "-c", code, which, str(count), str(folder), tests],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "Traceback" not in done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("which", SOURCES)
+def test_damaged_sources_give_one_line_or_a_part(which: str, tmp_path: Path) -> None:
+    run(which, 25, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", SOURCES)
+def test_two_thousand_damages_are_survived(which: str, tmp_path: Path) -> None:
+    assert "of 2000 refused" in _in_a_process(which, 2000, tmp_path)

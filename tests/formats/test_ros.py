@@ -1,0 +1,90 @@
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.bayer import rgb_of
+from dmrl.errors import SourceError
+from dmrl.formats import ros
+from dmrl.formats.known import format_of
+from dmrl.formats.sample import Options, Sample
+from dmrl.images import decode
+
+from . import foreign
+
+
+def bag(kind: str, folder: Path) -> Path:
+    """One bag of each kind."""
+    if kind == "ros1":
+        return foreign.ros1_bag(folder / "flight.bag")
+    return foreign.ros2_bag(folder / "flight", kind)
+
+
+def samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Samples by topic."""
+    found: dict[str, list[Sample]] = {}
+    for sample in ros.content(source, options or Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap", "ros1"])
+def test_bags_of_every_kind_give_the_same(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = bag(kind, tmp_path)
+    assert format_of(source).name == "rosbag2"
+    found = samples(source)
+    assert {topic: len(v) for topic, v in found.items()} == dict.fromkeys(
+        [
+            "/cf1/attitude",
+            "/cf1/camera/image",
+            "/cf1/height",
+            "/cf1/pose",
+            "/cf1/pose/truth",
+            "/cf1/range/cf2",
+            "/cf1/velocity",
+        ],
+        5,
+    )
+    assert [s.time_ns for s in found["/cf1/height"]] == [10**12 + k * 10**8 for k in range(5)]
+    assert [s.fields["range_m"] for s in found["/cf1/range/cf2"]] == [1.5, 2.5, 3.5, 4.5, 5.5]
+    assert found["/cf1/velocity"][0].fields["vx_mps"] == 1.0
+    assert found["/cf1/attitude"][0].fields["yaw_rate_radps"] == pytest.approx(0.2)
+    pixels = decode(found["/cf1/camera/image"][0].fields["data"])
+    np.testing.assert_array_equal(pixels, rgb_of(foreign.pictures(1)[0]))
+    assert "left out: /chatter" in capsys.readouterr().err
+
+
+def test_robots_are_named_as_the_user_wants(tmp_path: Path) -> None:
+    found = samples(bag("sqlite3", tmp_path), Options(names={"cf1": "a", "cf2": "b"}))
+    assert "/a/range/b" in found and "/a/attitude" in found
+
+
+def test_a_bag_without_anything_known_is_one_line(tmp_path: Path) -> None:
+    lines, unknown = ros.plan([("/chatter", "std_msgs/msg/String", 3)], Options())
+    assert (lines, unknown) == ({}, ["/chatter"])
+    path = tmp_path / "a.db3"
+    path.write_bytes(b"SQLite format 3\0" + b"\0" * 100)
+    with pytest.raises(SourceError, match="cannot be read as a ROS bag") as e:
+        samples(path)
+    assert "\n" not in str(e.value)
+
+
+def test_of_two_odometries_of_a_robot_the_longer_counts() -> None:
+    kind = "nav_msgs/msg/Odometry"
+    lines, unknown = ros.plan([("/cf1/odom", kind, 5), ("/vio/cf1/odom", kind, 50)], Options())
+    assert [line.topic for line in lines.values()] == ["/vio/cf1/odom"]
+    assert unknown == ["/cf1/odom"]
+
+
+def test_a_real_bag_of_ranges_odometry_and_motion_capture(data: Path) -> None:
+    counts = Counter(
+        sample.topic
+        for sample in ros.content(data / "uwb-tiers" / "shortbag.db3", Options()).samples
+    )
+    assert counts["/n_2/range/n_5"] == 252
+    assert counts["/turtlebot3_cap/pose/truth"] == 1032
+    assert counts["/turtle03/velocity"] == counts["/turtle03/attitude"] == 340
+    assert sum(counts.values()) == 16204

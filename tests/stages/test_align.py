@@ -1,0 +1,95 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import RecordingError, SettingError
+from dmrl.messages import message
+from dmrl.recording import RecordingWriter, check, provenance, read, read_table, summary
+from dmrl.stages.align import METADATA, Settings, run
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """A minute of two robots; cf2's clock is 80 ms ahead, 20 ppm fast, and 30 s late."""
+    path, rng = tmp_path / "in.mcap", np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.03, 0.05, 1500))
+    measured = 3 + 0.5 * np.sin(time) + 0.4 * np.sin(1.7 * time) + rng.normal(0, 0.05, len(time))
+    with RecordingWriter(path, provenance("test")) as sink:
+        for moment, value in zip((time + 30).tolist(), measured.tolist(), strict=True):
+            other = moment - 30 + 0.080 + 20e-6 * (moment - 60)
+            ranged = message("UwbRange")(range_m=value)
+            sink.write(round(moment * 1e9), "/cf1/range/cf2", ranged)
+            sink.write(round(other * 1e9), "/cf2/range/cf1", ranged)
+            sink.write(round(other * 1e9), "/cf2/height", message("Height")(height_m=moment))
+        picture = message("CompressedImage")(timestamp={"seconds": 1})
+        sink.write(10**9, "/cf2/camera/image", picture)
+        frame = {"parent_frame_id": "world", "child_frame_id": "cf2/horizontal"}
+        sink.write(10**9, "/tf", message("FrameTransforms")(transforms=[frame]))
+    return path
+
+
+def test_all_of_a_robot_is_set_by_the_other_s_clock(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    clocks = run(recording, out, Settings())
+    assert clocks["cf2"].offset_s == pytest.approx(29.92, abs=0.002)
+    assert clocks["cf2"].drift == pytest.approx(-20e-6, abs=5e-6)
+    heights = read_table(out, "/cf2/height")
+    error = heights["log_time"].to_numpy() * 1e-9 - heights["height_m"].to_numpy()
+    assert np.abs(error).max() < 0.001
+    (image,) = read(out, "/cf2/camera/image")
+    stamp = image.message.timestamp
+    assert stamp.seconds * 10**9 + stamp.nanos == image.time_ns
+    (frames,) = read(out, "/tf")
+    assert frames.time_ns == image.time_ns
+    before = read_table(recording, "/cf1/range/cf2")["log_time"]
+    assert read_table(out, "/cf1/range/cf2")["log_time"].equals(before)
+    (told,) = summary(out).metadata[METADATA]
+    assert told.keys() == {"cf1", "cf2"}
+    assert not [f for f in check(out) if f.level == "error" and "image" not in f.topic]
+
+
+def test_a_robot_that_would_begin_before_zero_takes_all_with_it(
+    recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.mcap"
+    run(recording, out, Settings(reference="cf2"))
+    assert summary(out).start_ns >= 0
+    ranges = [
+        read_table(out, t)["log_time"].to_numpy() for t in ("/cf1/range/cf2", "/cf2/range/cf1")
+    ]
+    assert np.abs(ranges[0] - ranges[1]).max() < 1_000_000
+
+
+def test_what_cannot_be_aligned_is_one_line(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"--reference cf9: no such robot .* Known: cf1"):
+        run(recording, tmp_path / "out.mcap", Settings(reference="cf9"))
+    alone = tmp_path / "alone.mcap"
+    with RecordingWriter(alone, provenance("test")) as sink:
+        for k in range(30):
+            sink.write(k * 10**9, "/cf1/range/cf2", message("UwbRange")(range_m=1.0))
+    with pytest.raises(RecordingError, match="no robot saw what cf1 saw"):
+        run(alone, tmp_path / "out.mcap", Settings())
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_pictures_stamped_on_arrival_get_even_times(tmp_path: Path) -> None:
+    path, out, rng = tmp_path / "in.mcap", tmp_path / "out.mcap", np.random.default_rng(1)
+    sent = 10**10 + np.arange(400) * 50_000_000
+    arrival = sent + rng.exponential(2e6, 400).astype(int)
+    with RecordingWriter(path, provenance("test")) as sink:
+        for moment in arrival.tolist():
+            sink.write(moment, "/cf1/camera/image", message("CompressedImage")(data=b"x"))
+    assert run(path, out, Settings(steady_cameras=True)) == {}
+    table = read_table(out, "/cf1/camera/image", fields=[])
+    assert np.abs(table["log_time"].to_numpy() - sent).max() < 100_000
+    assert table["publish_time"].to_pylist() == arrival.tolist()
+
+
+def test_labelled_pictures_keep_their_times(tmp_path: Path) -> None:
+    path = tmp_path / "in.mcap"
+    with RecordingWriter(path, provenance("test")) as sink:
+        sink.write(1, "/cf1/camera/image", message("CompressedImage")(data=b"x"))
+        sink.write(1, "/cf1/labels", message("PeerLabels")())
+    with pytest.raises(SettingError, match=r"has labels already\. Align before that"):
+        run(path, tmp_path / "out.mcap", Settings(steady_cameras=True))
