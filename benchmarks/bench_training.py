@@ -1,26 +1,32 @@
-"""Loader alone, and training with loading against the same step on data already in memory.
+"""Loading, augmentation and training steps: images per cpu-second, and what waits for what.
 
-    python benchmarks/bench_training.py [IMAGES] [--batch-size 5] [--threads 2]
+    python benchmarks/bench_training.py [IMAGES] [--recipe published_best] [--threads 1]
 
-The two ways of training take turns, a few steps each, on the same network and optimizer, so
-that other load on the machine falls on both. The images come from a dataset on disk, a fresh
-epoch each time; "in memory" reuses one gathered batch.
+The ways of training take turns, a few steps each, so that other load on the machine falls on
+all: dmrl's network on fresh augmented batches and on one batch already in memory, that network
+with torch's own backward pass of depthwise layers, in float32, and the published network.
 """
 
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator
-from itertools import islice
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from dmrl import recipe
 from dmrl.dataset import open_dataset
+from dmrl.examples import examples_of
 from dmrl.images import encode_png
-from dmrl.learn.batches import Batch, Examples, shuffled
-from dmrl.learn.fit import FitSettings, new_network, train_step
+from dmrl.learn.augment import Augmenter
+from dmrl.learn.batches import Batch, Examples, gathered, order
+from dmrl.learn.depthwise import Depthwise
+from dmrl.learn.fit import new_network
+from dmrl.learn.settings import FitSettings
+from dmrl.learn.step import new_optimizer, train_step
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
@@ -28,7 +34,7 @@ from dmrl.tables import print_table
 from dmrl.topics import camera_image, labels
 
 HEIGHT_PX, WIDTH_PX = 224, 320
-STEPS, TURNS = 10, 30
+STEPS, TURNS = 3, 8
 
 
 def build(folder: Path, count: int) -> Examples:
@@ -38,82 +44,86 @@ def build(folder: Path, count: int) -> Examples:
         for k in range(count):
             data = encode_png((ramp + k % 50).astype(np.uint8))
             picture = message("CompressedImage")(data=data, format="png")
-            peer = {"peer": "cf2", "u_px": k % 320, "v_px": 112, "depth_m": 1, "source": "truth"}
+            u_px = 40 + k % 240
+            peer = {"peer": "cf2", "u_px": u_px, "v_px": 112, "depth_m": 1, "source": "truth"}
+            peer["box_px"] = [u_px - 20, 102, u_px + 20, 122]
             sink.write(k * 10**8, camera_image("cf1"), picture)
             sink.write(k * 10**8, labels("cf1"), message("PeerLabels")(peers=[peer]))
     run([folder / "flight.mcap"], folder / "dataset", Settings(split="none"))
-    split = open_dataset(folder / "dataset").split("train")
-    return Examples(split.pixels, split.confidence, split.depth)
+    return examples_of(open_dataset(folder / "dataset").split("train"))
 
 
-def loader_rate(examples: Examples, batch_size: int) -> float:
-    """Images per cpu-second, gathered into batches, after a first pass."""
-    rates = []
-    for epoch in range(6):
-        begun = time.process_time()
-        for _ in shuffled(examples, batch_size, seed=0, epoch=epoch):
-            pass
-        rates.append(len(examples) / (time.process_time() - begun))
-    return float(np.median(rates[1:]))
-
-
-def endless(examples: Examples, batch_size: int) -> Iterator[Batch]:
-    """Whole batches, epoch after epoch."""
-    epoch = 0
+def endless(examples: Examples, settings: FitSettings) -> Iterator[Batch]:
+    """Whole augmented batches, epoch after epoch."""
+    augmenter, size, epoch = Augmenter(examples, settings.augmentation, seed=0), 0, 0
+    size = settings.batch_size
     while True:
-        for batch in shuffled(examples, batch_size, seed=0, epoch=epoch):
-            if len(batch.images) == batch_size:
-                yield batch
+        chosen = order(len(examples), seed=0, epoch=epoch)
+        for index in range(len(chosen) // size):
+            part = chosen[index * size : (index + 1) * size]
+            yield augmenter.batch(part, epoch=epoch, index=index)
         epoch += 1
 
 
-def step_times(examples: Examples, batch_size: int) -> tuple[float, float, float]:
-    """CPU seconds per step with loading and in memory, and the ratio, taken in turns.
+def ways(examples: Examples, settings: FitSettings) -> dict[str, Callable[[], object]]:
+    """What is measured, by name: functions that do one step."""
+    fresh = endless(examples, settings)
+    ready = next(fresh)
+    chosen = order(len(examples), seed=0, epoch=0)[: settings.batch_size]
 
-    The ratio is the median of the turns' ratios, so that a slow turn weighs on both sides.
-    """
-    settings = FitSettings(batch_size=batch_size, device="cpu")
-    network = new_network(settings, examples).train()
-    optimizer = torch.optim.Adam(network.parameters())
-    loading = endless(examples, batch_size)
-    ready = Batch(*(tensor.clone() for tensor in next(loading)))
-    spent: dict[str, list[float]] = {"loading": [], "ready": []}
-    for turn in range(TURNS + 1):
-        for name in sorted(spent, reverse=bool(turn % 2)):
-            batches = islice(loading, STEPS) if name == "loading" else iter([ready] * STEPS)
-            begun = time.process_time()
-            for batch in batches:
-                train_step(network, optimizer, batch, settings, 1e-4)
-            spent[name].append((time.process_time() - begun) / STEPS)
-    # The first turn warms up.
-    loaded, in_memory = (np.array(spent[name][1:]) for name in ("loading", "ready"))
-    return (
-        float(np.median(loaded)),
-        float(np.median(in_memory)),
-        float(np.median(in_memory / loaded)),
-    )
+    def stepper(change: dict[str, object], batches: Iterator[Batch] | None = None) -> object:
+        mine = replace(settings, **change)  # type: ignore[arg-type]
+        network = new_network(mine, examples).train()
+        optimizer = new_optimizer(network, mine)
+
+        def step() -> None:
+            batch = ready if batches is None else next(batches)
+            train_step(network, optimizer, batch, mine, 1e-4)
+
+        return network, step
+
+    def torchs_own() -> Callable[[], object]:
+        network, step = stepper({})  # type: ignore[misc]
+        for layer in network.modules():
+            if isinstance(layer, Depthwise):
+                layer.forward = super(Depthwise, layer).forward  # type: ignore[method-assign]
+        return step
+
+    return {
+        "loading alone": lambda: gathered(examples, chosen),
+        "loading and augmentation": lambda: next(fresh),
+        "training, augmentation in turn": stepper({}, fresh)[1],  # type: ignore[index]
+        "training in memory": stepper({})[1],  # type: ignore[index]
+        "the same, torch's backward pass": torchs_own(),
+        "the same, float32": stepper({"precision": "float32"})[1],  # type: ignore[index]
+        "locanet in memory": stepper({"architecture": "locanet"})[1],  # type: ignore[index]
+    }
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("images", type=int, nargs="?", default=512)
-    parser.add_argument("--batch-size", type=int, default=5)
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("images", type=int, nargs="?", default=128)
+    parser.add_argument("--recipe", default="published_best")
+    parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    settings = replace(recipe.load(args.recipe, "train", FitSettings), device="cpu")
+    spent: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as name:
-        examples = build(Path(name), args.images)
-        rate = loader_rate(examples, args.batch_size)
-        loaded, ready, ratio = step_times(examples, args.batch_size)
-    rows = [
-        ("loader alone, images per cpu-second", round(rate)),
-        ("training with loading, images per cpu-second", round(args.batch_size / loaded, 1)),
-        ("training in memory, images per cpu-second", round(args.batch_size / ready, 1)),
-        ("with loading / in memory", round(ratio, 3)),
-    ]
-    title = f"{args.images} images, batches of {args.batch_size}, {args.threads} threads"
-    print_table(title, ("what", "value"), rows)
+        measured = ways(build(Path(name), args.images), settings)
+        for turn in range(TURNS + 1):
+            for title in sorted(measured, reverse=bool(turn % 2)):
+                begun = time.process_time()
+                for _ in range(STEPS):
+                    measured[title]()
+                seconds = (time.process_time() - begun) / STEPS
+                if turn:  # the first turn warms up
+                    spent.setdefault(title, []).append(seconds)
+    rates = {t: settings.batch_size / float(np.median(spent[t])) for t in measured}
+    rows = [(title, round(rate)) for title, rate in rates.items()]
+    what = f"{args.recipe}, batches of {settings.batch_size}, {args.threads} threads"
+    print_table(what, ("what", "images per cpu-second"), rows)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ class FitSettings:
         together.
     threshold
         Confidence from which the model's detections are to be believed, 0 to 1. Without it,
-        that of the best F1 on the images held out, or 0.33 where none are.
+        that of the best F1 on the images held out, or 0.33 where these hold fewer than 10 robots.
     flip_share
         Share of windows mirrored left to right, 0 to 1.
     zoom

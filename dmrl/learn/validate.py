@@ -15,6 +15,8 @@ from dmrl.learn.step import losses
 
 WATCHED = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
 """Figures of ``metrics`` that are watched during a training."""
+LEAST_LABELS = 10
+"""Labels below which a threshold would hang on chance."""
 EVERYWHERE = (0.0, np.inf)
 
 
@@ -67,13 +69,13 @@ def labels(examples: Examples) -> Points:
 
 
 def best_threshold(scored: Scored) -> float | None:
-    """Confidence that gives the best F1, detections right within 16 px; None without labels.
+    """Confidence that gives the best F1, detections right within 16 px; None with few labels.
 
     Halfway between the last detection that pays and the next below it, so that the choice does
     not hang on one detection's last digits.
     """
     right: NDArray[np.bool_] = scored.right_16_px >= 0
-    if not len(scored.labels) or not right.any():
+    if len(scored.labels) < LEAST_LABELS or not right.any():
         return None
     descending = np.argsort(-scored.detections.confidence, kind="stable")
     confidence = scored.detections.confidence[descending]
