@@ -1,9 +1,31 @@
 """Raw pictures of colour sensors made into RGB. The only home of OpenCV."""
 
+from types import ModuleType
+
 import numpy as np
 
 from dmrl.errors import MissingExtra
 from dmrl.images import Grey, Rgb
+
+
+def load_opencv(extra: str = "bayer", what: str = "a raw picture") -> ModuleType:
+    """Have OpenCV ready.
+
+    Parameters
+    ----------
+    extra, what
+        What the user is told to install, and what for.
+
+    Raises
+    ------
+    MissingExtra
+        If it is not installed.
+    """
+    try:
+        import cv2  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError as e:
+        raise MissingExtra("opencv-python-headless", extra, what) from e
+    return cv2
 
 
 def rgb_of(raw: Grey) -> Rgb:
@@ -27,10 +49,7 @@ def rgb_of(raw: Grey) -> Rgb:
     MissingExtra
         If OpenCV is not installed.
     """
-    try:
-        import cv2  # noqa: PLC0415
-    except ModuleNotFoundError as e:
-        raise MissingExtra("opencv-python-headless", "bayer", "a raw picture") from e
+    cv2 = load_opencv()
     return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB), np.uint8)
 
 

@@ -106,34 +106,3 @@ def crop_and_scale(
     # Bicubic with Pillow's support scaling averages when it shrinks: no aliasing.
     scaled = image.resize((width_px, height_px), Image.Resampling.BICUBIC, box=box_px)
     return np.asarray(scaled)
-
-
-def mosaic(rgb: Rgb) -> NDArray[np.uint8]:
-    """(H, W) what red, green / green, blue filters before the pixels leave of (H, W, 3)."""
-    raw = rgb[..., 1].copy()
-    raw[::2, ::2] = rgb[::2, ::2, 0]
-    raw[1::2, 1::2] = rgb[1::2, 1::2, 2]
-    return raw
-
-
-def demosaic(raw: NDArray[np.uint8]) -> Rgb:
-    """(H, W, 3) from a mosaic of red, green / green, blue pixels, H and W at least 2.
-
-    Each colour is the mean of its nearest pixels, rounded to the nearest, as OpenCV's
-    ``COLOR_BayerBG2RGB`` has it but for the border, where the mosaic is mirrored.
-    """
-    padded = np.pad(raw, 1, mode="reflect").astype(np.uint16)
-    up, down, left, right = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
-    beside, above = left + right, up + down
-    corners = padded[:-2, :-2] + padded[:-2, 2:] + padded[2:, :-2] + padded[2:, 2:]
-    out = np.empty((*raw.shape, 3), np.uint8)
-    for channel, row, col in ((0, 0, 0), (2, 1, 1)):
-        own, far = np.s_[row::2, col::2], np.s_[1 - row :: 2, 1 - col :: 2]
-        same_row, same_col = np.s_[row::2, 1 - col :: 2], np.s_[1 - row :: 2, col::2]
-        out[(*own, channel)] = raw[own]
-        out[(*far, channel)] = (corners[far] + 2) >> 2
-        out[(*same_row, channel)] = (beside[same_row] + 1) >> 1
-        out[(*same_col, channel)] = (above[same_col] + 1) >> 1
-        out[(*own, 1)] = (beside[own] + above[own] + 2) >> 2
-        out[(*same_row, 1)] = raw[same_row]
-    return out

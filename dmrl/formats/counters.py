@@ -1,7 +1,10 @@
 """Counters that wrap, and times of arrival that jitter, made into times.
 
-Arrays in, arrays out: recordings of files and live recorders use the same.
+Each in two forms: ``unwrap`` and ``dejitter`` for all of a file at once, which know what comes
+after; ``Unwrapped`` and ``SteadySender`` for one value after the other, as they arrive.
 """
+
+from collections import deque
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +44,42 @@ def unwrap(values: ArrayLike, bits: int) -> Ints:
     half = 1 << (bits - 1)
     steps = (np.diff(counts) + half) % (1 << bits) - half
     return np.concatenate([counts[:1], counts[:1] + np.cumsum(steps)])
+
+
+class Unwrapped:
+    """A counter of few bits as one that does not wrap.
+
+    Parameters
+    ----------
+    bits
+        Of the counter.
+    forward
+        True: it never steps back, so that up to 2**bits - 1 may be missing. False: the
+        nearest value counts, before or after.
+    """
+
+    def __init__(self, bits: int, *, forward: bool = False) -> None:
+        self._period = 1 << bits
+        self._back = 0 if forward else self._period // 2
+        self._last: int | None = None
+
+    def __call__(self, value: int) -> int:
+        """The counter's value with its wraps added.
+
+        Examples
+        --------
+        >>> unwrapped = Unwrapped(8)
+        >>> [unwrapped(value) for value in (254, 255, 1, 0)]
+        [254, 255, 257, 256]
+        """
+        self._last = self.near(value)
+        return self._last
+
+    def near(self, value: int) -> int:
+        """The same, but the value is not remembered, and may have bits more than the counter."""
+        if self._last is None:
+            return value
+        return self._last + (value - self._last + self._back) % self._period - self._back
 
 
 def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:
@@ -115,3 +154,41 @@ def _lower_hull(x: NDArray[np.float64], y: NDArray[np.float64]) -> list[int]:
             hull.pop()
         hull.append(k)
     return hull
+
+
+class SteadySender:
+    """Times of a sender without a clock that sends at an even pace.
+
+    When the next sample is due follows early arrivals at once and late ones slowly, as only
+    lateness has other reasons than the sender. A pause of some samples' length starts anew.
+    """
+
+    MEMORY = 64
+    """Arrivals from which the pace is known."""
+    LEAST = 8
+    """Arrivals before which they stand as they are."""
+    LATE = 0.02
+    """Share of its lateness by which a late arrival puts off the next."""
+    PAUSE = 4.0
+    """Lateness, in paces, that is no jitter."""
+
+    def __init__(self) -> None:
+        self._arrivals: deque[int] = deque(maxlen=self.MEMORY)
+        self._due_ns = 0.0
+
+    def __call__(self, arrival_ns: int) -> int:
+        """When what arrived now was sent; never later than now."""
+        self._arrivals.append(arrival_ns)
+        if len(self._arrivals) < self.LEAST:
+            self._due_ns = arrival_ns
+            return arrival_ns
+        pace_ns = (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
+        self._due_ns += pace_ns
+        late_ns = arrival_ns - self._due_ns
+        if late_ns > self.PAUSE * pace_ns:
+            self._arrivals.clear()
+            self._arrivals.append(arrival_ns)
+            self._due_ns = arrival_ns
+        else:
+            self._due_ns += late_ns if late_ns < 0 else self.LATE * late_ns
+        return min(round(self._due_ns), arrival_ns)

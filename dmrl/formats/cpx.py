@@ -16,7 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from dmrl.formats.cpx_packets import APP, STREAMER, Packet, PacketReader, Unwrapped
+from dmrl.formats.counters import Unwrapped
+from dmrl.formats.cpx_packets import APP, STREAMER, Packet, PacketReader
 from dmrl.formats.cpx_state import STATE_FORMAT, State, unpack_state
 
 Layout = Literal["plain", "stamped", "streamer"]

@@ -1,4 +1,4 @@
-"""CPX packets, the AI-deck's, out of a stream's bytes and back; counters that wrap.
+"""CPX packets, the AI-deck's, out of a stream's bytes and back.
 
 A packet is ``u16 length | u8 dst:3 src:3 last:1 | u8 function:6 version:2 | data``. Over TCP,
 Bitcraze's firmware counts the two bytes of routing in the length; the nanocockpit firmware
@@ -29,42 +29,6 @@ class Packet:
     function: int
     data: bytes
     last: bool = True
-
-
-class Unwrapped:
-    """A counter of few bits as one that does not wrap.
-
-    Parameters
-    ----------
-    bits
-        Of the counter.
-    forward
-        True: it never steps back, so that up to 2**bits - 1 may be missing. False: the
-        nearest value counts, before or after.
-    """
-
-    def __init__(self, bits: int, *, forward: bool = False) -> None:
-        self._period = 1 << bits
-        self._back = 0 if forward else self._period // 2
-        self._last: int | None = None
-
-    def __call__(self, value: int) -> int:
-        """The counter's value with its wraps added.
-
-        Examples
-        --------
-        >>> unwrapped = Unwrapped(8)
-        >>> [unwrapped(value) for value in (254, 255, 1, 0)]
-        [254, 255, 257, 256]
-        """
-        self._last = self.near(value)
-        return self._last
-
-    def near(self, value: int) -> int:
-        """The same, but the value is not remembered, and may have bits more than the counter."""
-        if self._last is None:
-            return value
-        return self._last + (value - self._last + self._back) % self._period - self._back
 
 
 class PacketReader:

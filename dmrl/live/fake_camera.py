@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from dmrl import images
+from dmrl import bayer, images
 from dmrl.errors import SettingError
 from dmrl.formats.cpx import Image
 from dmrl.formats.cpx_pack import pack_image
@@ -150,7 +150,7 @@ class FakeCamera(threading.Thread):
             return Image(width_px, height_px, "jpeg", data)
         robot_us = round(1000 * self._faults.clock_ms(time_s))
         time_us = robot_us + CAMERA_BOOT_US
-        data, layout = images.mosaic(rgb).tobytes(), self._sends
+        data, layout = bayer.mosaic(rgb).tobytes(), self._sends
         state = self._state(robot_us) if layout == "streamer" else None
         return Image(width_px, height_px, "raw", data, time_us, self._number, state)
 

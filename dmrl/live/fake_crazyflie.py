@@ -109,6 +109,11 @@ class FakeCrazyflie(threading.Thread):
         """Where it listens."""
         return int(self._socket.getsockname()[1])
 
+    @property
+    def listened(self) -> bool:
+        """Whether any of its blocks is started."""
+        return any(block.period_ms for block in list(self._blocks.values()))
+
     def stop(self) -> None:
         """Ask it to end; `join` waits for that."""
         self._stop_wanted.set()

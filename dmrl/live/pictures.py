@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from dmrl import images
+from dmrl import bayer, images
 from dmrl.errors import SourceError
 from dmrl.formats.cpx import Image
 from dmrl.geometry import AIDECK
@@ -53,7 +53,7 @@ def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[byt
     pixels = np.frombuffer(image.data, np.uint8).reshape(image.height_px, image.width_px)
     if whole:
         pixels = _cut(pixels)
-    return _stored(images.demosaic(pixels) if colours == "colour" else pixels, stored), stored
+    return _stored(bayer.rgb_of(pixels) if colours == "colour" else pixels, stored), stored
 
 
 def _stored(pixels: images.Rgb, stored: Stored) -> bytes:

@@ -3,6 +3,7 @@
 import re
 import signal
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from dmrl.recording import read, read_table, summary
 from dmrl.tables import print_table
 
 LOOPBACK = "127.0.0.1"
+LINGER_S = 3.0
+"""For so long at most the drones answer after the flight, while somebody still listens."""
 DIES = re.compile(r"(?P<robot>[\w-]+)=(?P<first>\d+(\.\d+)?)(:(?P<last>\d+(\.\d+)?))?")
 COLUMNS = ("from", "sent", "dropped")
 
@@ -69,6 +72,10 @@ class Fleet:
     drones: tuple[FakeCrazyflie, ...]
     cameras: tuple[FakeCamera, ...]
     clock: FlightClock
+
+    def listened(self) -> bool:
+        """Whether any drone's log is still asked for."""
+        return any(drone.listened for drone in self.drones)
 
     def sent(self) -> list[tuple[str, int, int]]:
         """Who sent how much and dropped how much: a row of `COLUMNS` each."""
@@ -230,6 +237,10 @@ def run(flight: Path, uris: Sequence[str], cameras: Sequence[int], settings: Set
             say(f"listening at {', '.join(places)}; takes off when its log is asked for")
             while not ended.wait(0.1) and not flying.clock.landed:
                 pass
+            # A link whose other end vanishes loses what it has not yet taken.
+            linger_s = time.monotonic() + LINGER_S
+            while flying.listened() and time.monotonic() < linger_s and not ended.wait(0.1):
+                pass
         finally:
             signal.signal(signal.SIGINT, previous)
     return flying
@@ -247,7 +258,8 @@ def command(
 ) -> None:
     """Send a simulated flight as Crazyflies and AI-decks do, to try record with.
 
-    It takes off when the first log is asked for, and ends when the flight does.
+    It takes off when the first log is asked for, and ends when the flight does, or up to 3 s
+    later while somebody still listens.
 
     Parameters
     ----------

@@ -12,6 +12,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
+from dmrl.bayer import load_opencv
 from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.formats.camera_toml import read_camera
 from dmrl.geometry import Camera
@@ -103,11 +104,13 @@ def run(
     OutputError
         If ``out`` exists or cannot be written.
     MissingExtra
-        If cflib is not installed.
+        If cflib is not installed, or OpenCV, which colours are made with.
     """
     refuse_existing(out)
     _refuse_unfinished(out)
     load_cflib()
+    if settings.pixels == "colour" and any(robot.camera for robot in robots):
+        load_opencv("record", "the colours of a camera")
     _check(robots)
     cameras = {r.name: read_camera(r.calibration) if r.calibration else None for r in robots}
     feed, now = Feed(), HostTime()

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
-from dmrl.formats.counters import dejitter, unwrap
+from dmrl.formats.counters import SteadySender, Unwrapped, dejitter, unwrap
+
+MS = 1_000_000
 
 
 @pytest.mark.parametrize("bits", [8, 24, 32])
@@ -32,3 +34,43 @@ def test_where_holes_and_jitter_cannot_be_told_apart_arrivals_stand() -> None:
     arrival = np.cumsum(np.random.default_rng(2).exponential(5e7, 500)).astype(np.int64)
     assert (dejitter(arrival) == arrival).all()
     assert dejitter([5, 9]).tolist() == [5, 9]
+
+
+def test_counters_unwrap_forward_or_to_the_nearest() -> None:
+    frames = Unwrapped(8, forward=True)
+    assert [frames(value) for value in (250, 255, 0, 254, 253)] == [250, 255, 256, 510, 765]
+    times = Unwrapped(32)
+    assert [times(value) for value in (4294967290, 5, 4294967295)] == [
+        4294967290,
+        4294967301,
+        4294967295,
+    ]
+
+
+def test_a_counter_is_asked_for_values_of_more_bits_without_being_changed() -> None:
+    times = Unwrapped(24)
+    times(5)
+    assert times.near((7 << 24) + 8) == 8
+    assert times.near((1 << 24) - 2) == -2
+    assert times(6) == 6
+
+
+def test_arrivals_of_a_steady_sender_are_evened_out_and_never_in_the_future() -> None:
+    rng = np.random.default_rng(3)
+    sender, errors_ms, raw_ms, last = SteadySender(), [], [], 0
+    for k in range(1000):
+        true_ns = 50 * MS * k
+        last = arrival = max(true_ns + round(rng.exponential(15) * MS), last)
+        sent = sender(arrival)
+        assert sent <= arrival
+        errors_ms.append((sent - true_ns) / MS)
+        raw_ms.append((arrival - true_ns) / MS)
+    assert np.std(errors_ms[100:]) < 0.4 * np.std(raw_ms[100:])
+
+
+def test_after_a_pause_arrivals_stand_as_they_are() -> None:
+    sender = SteadySender()
+    for k in range(20):
+        sender(50 * MS * k)
+    assert sender(5000 * MS) == 5000 * MS
+    assert sender(5050 * MS) == 5050 * MS

@@ -12,7 +12,6 @@ from dmrl.formats.cpx_packets import (
     HOST,
     Packet,
     PacketReader,
-    Unwrapped,
     pack_packet,
 )
 from dmrl.formats.cpx_state import State, compressed, quaternion
@@ -127,25 +126,6 @@ def test_console_text_and_other_functions_are_passed_over() -> None:
     text = pack_packet(Packet(GAP8, HOST, 2, b"Starting camera task"))
     got, reader = read(text + pack_image(image) + text)
     assert (got, reader.broken, reader.skipped_bytes) == ([image], 0, 0)
-
-
-def test_counters_unwrap_forward_or_to_the_nearest() -> None:
-    frames = Unwrapped(8, forward=True)
-    assert [frames(value) for value in (250, 255, 0, 254, 253)] == [250, 255, 256, 510, 765]
-    times = Unwrapped(32)
-    assert [times(value) for value in (4294967290, 5, 4294967295)] == [
-        4294967290,
-        4294967301,
-        4294967295,
-    ]
-
-
-def test_a_counter_is_asked_for_values_of_more_bits_without_being_changed() -> None:
-    times = Unwrapped(24)
-    times(5)
-    assert times.near((7 << 24) + 8) == 8
-    assert times.near((1 << 24) - 2) == -2
-    assert times(6) == 6
 
 
 def test_quaternions_come_back_to_a_quarter_of_a_degree() -> None:

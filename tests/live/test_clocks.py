@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.live.clocks import SenderClock, SteadySender
+from dmrl.live.clocks import SenderClock
 
 MS = 1_000_000
 BASE_NS = 1_700_000_000_000_000_000
@@ -39,24 +39,3 @@ def test_a_clock_of_another_pace_is_left_alone() -> None:
         clock.hear(40 * MS * k, BASE_NS + 10 * MS * k)
     assert clock.host_ns(40 * MS) - clock.host_ns(0) == 40 * MS
     assert abs(clock.host_ns(0) - BASE_NS) < 4_000 * MS
-
-
-def test_arrivals_of_a_steady_sender_are_evened_out_and_never_in_the_future() -> None:
-    rng = np.random.default_rng(3)
-    sender, errors_ms, raw_ms, last = SteadySender(), [], [], 0
-    for k in range(1000):
-        true_ns = 50 * MS * k
-        last = arrival = max(true_ns + round(rng.exponential(15) * MS), last)
-        sent = sender(arrival)
-        assert sent <= arrival
-        errors_ms.append((sent - true_ns) / MS)
-        raw_ms.append((arrival - true_ns) / MS)
-    assert np.std(errors_ms[100:]) < 0.4 * np.std(raw_ms[100:])
-
-
-def test_after_a_pause_arrivals_stand_as_they_are() -> None:
-    sender = SteadySender()
-    for k in range(20):
-        sender(50 * MS * k)
-    assert sender(5000 * MS) == 5000 * MS
-    assert sender(5050 * MS) == 5050 * MS

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl import images
+from dmrl import bayer, images
 from dmrl.errors import SourceError
 from dmrl.formats.cpx import Image
 from dmrl.live.fake_camera import whole_sensor
@@ -13,21 +13,8 @@ SMOOTH = np.clip(
 ).astype(np.uint8)
 
 
-def test_a_mosaic_is_filled_in_as_opencv_does() -> None:
-    cv2 = pytest.importorskip("cv2")
-    raw = RNG.integers(0, 256, (60, 80), np.uint8)
-    expected = cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB)
-    assert (images.demosaic(raw) == expected)[1:-1, 1:-1].all()
-
-
-@pytest.mark.parametrize("shape", [(2, 2), (5, 7), (244, 324)])
-def test_what_a_pixel_measured_stays_as_it_was(shape: tuple[int, int]) -> None:
-    raw = RNG.integers(0, 256, shape, np.uint8)
-    assert (images.mosaic(images.demosaic(raw)) == raw).all()
-
-
 def test_the_whole_sensor_is_cut_to_what_the_calibration_is_of() -> None:
-    raw = images.mosaic(whole_sensor(SMOOTH))
+    raw = bayer.mosaic(whole_sensor(SMOOTH))
     data, kind = encoded(Image(324, 244, "raw", raw.tobytes()), "colour")
     assert kind == "png"
     difference = np.abs(images.decode(data).astype(int) - SMOOTH)

@@ -242,3 +242,13 @@ def test_a_fleet_that_cannot_be_is_refused(
         fake_drone.fleet(flight, uris, cameras, fake_drone.Settings(**settings)),
     ):
         pass
+
+
+def test_without_opencv_colours_are_refused_before_the_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with_camera = [Robot("cf1", "udp://127.0.0.1:1", ("127.0.0.1", 2))]
+    with pytest.raises(MissingExtra, match=re.escape("pip install 'dmrl[record]'")):
+        record.run(tmp_path / "out.mcap", with_camera, record.Settings())
+    assert not list(tmp_path.iterdir())
