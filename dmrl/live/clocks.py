@@ -49,6 +49,11 @@ class SenderClock:
         # (second of the sender's clock, least difference in it)
         self._least: deque[tuple[int, int]] = deque(maxlen=self.WINDOW_S)
 
+    @property
+    def heard(self) -> bool:
+        """Whether anything is known of the sender's clock."""
+        return self._first_ns is not None
+
     def hear(self, sender_ns: int, arrival_ns: int) -> None:
         """Take note of a sample.
 

@@ -120,7 +120,8 @@ class Link(threading.Thread):
             With all bits, or with those of the log's time stamps only.
         """
         flight = self._flight
-        if flight is None or not flight.clock.settled:
+        # Not yet settled is still nearer than the time an image arrives by WiFi.
+        if flight is None or not flight.clock.heard:
             return None
         whole_ms = math.floor(robot_ms)
         near_ms = flight.unwrapped.near(whole_ms) + (robot_ms - whole_ms)
