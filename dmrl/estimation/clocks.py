@@ -46,6 +46,8 @@ class Clock:
         Standard deviation of the drift.
     correlation
         Of the two series, aligned; 1 is perfect.
+    by
+        What both saw.
     """
 
     offset_s: float
@@ -54,6 +56,7 @@ class Clock:
     sigma_s: float = 0.0
     sigma_drift: float = 0.0
     correlation: float = 1.0
+    by: str = ""
 
     def corrected(self, time_s: Array) -> Array:
         """(N,) times on the other clock."""
@@ -71,6 +74,7 @@ class Clock:
             float(np.hypot(first.sigma_s, self.sigma_s)),
             float(np.hypot(first.sigma_drift, self.sigma_drift)),
             min(first.correlation, self.correlation),
+            ", ".join(dict.fromkeys(by for by in (first.by, self.by) if by)),
         )
 
     def inverse(self) -> "Clock":
@@ -83,6 +87,7 @@ class Clock:
             self.sigma_s,
             self.sigma_drift,
             self.correlation,
+            self.by,
         )
 
 

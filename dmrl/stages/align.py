@@ -1,18 +1,17 @@
 """``dmrl align``: robots that logged on clocks of their own, on one clock."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from cyclopts import Parameter
 
 from dmrl import topics
+from dmrl.alignment import camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.errors import RecordingError, SettingError
-from dmrl.estimation.clocks import Array, Clock, connected
-from dmrl.estimation.exchanges import estimate_from_exchanges
+from dmrl.estimation.clocks import Clock, connected
 from dmrl.formats.counters import dejitter
 from dmrl.messages import message
 from dmrl.output import refuse_existing
@@ -31,6 +30,8 @@ from dmrl.recording import (
 from dmrl.tables import print_json, print_table
 
 METADATA = "dmrl.clocks"
+MOCAP = "mocap"
+"""Stands where a robot's name does."""
 STAMPED = ("CompressedImage", "CameraCalibration", "PoseInFrame")
 
 
@@ -41,12 +42,20 @@ class Settings:
     Parameters
     ----------
     reference
-        The robot whose times stay. Without it, the first by name.
+        The robot whose times stay, or mocap. Without it, the first by name.
+    mocap
+        The poses on /tf and /<robot>/pose/truth are of a motion capture with a clock of its
+        own: robots are tied to it by what both saw of their yaw rate, tilt, speed or height.
+    cameras
+        Cameras have clocks of their own: each is set by the turns that its images and its
+        robot's attitude both show.
     steady_cameras
         Pictures that were stamped when they arrived get the even times of a steady camera.
     """
 
     reference: str | None = None
+    mocap: Annotated[bool, Parameter(negative=())] = False
+    cameras: Annotated[bool, Parameter(negative=())] = False
     steady_cameras: Annotated[bool, Parameter(negative=())] = False
 
 
@@ -56,7 +65,7 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
     Parameters
     ----------
     recording
-        With ranges of robots to each other, both ways.
+        With ranges of robots to each other, both ways, or what the settings name.
     out
         Recording to write. Must not exist.
     settings
@@ -65,14 +74,14 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
     Returns
     -------
     dict
-        By robot, how its times were corrected.
+        By robot, camera (``cf1/camera``) and ``mocap``, how its times were corrected.
 
     Raises
     ------
     RecordingError
-        If the recording cannot be read, or no two robots ranged to each other.
+        If the recording cannot be read, or no two clocks can be tied to each other.
     SettingError
-        If there is no such robot, or the recording has a split, which is by time.
+        If there is no such robot, or the recording has a split or labels, which are by time.
     OutputError
         If ``out`` exists.
     """
@@ -81,69 +90,93 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
     if splits(held):
         raise SettingError(f"{recording} has a split by time already. Align before that")
     steady = _steady(recording, held) if settings.steady_cameras else {}
-    clocks = {} if steady and not _links(held) else _clocks(recording, held, settings)
+    clocks = {}
+    if ranging(held) or settings.mocap or not (settings.cameras or settings.steady_cameras):
+        clocks = _robots(recording, held, settings)
+    if settings.cameras:
+        clocks |= _cameras(recording, held, clocks, steady)
     _write(recording, held, out, clocks, steady, settings)
     return clocks
 
 
-def _links(held: Summary) -> set[tuple[str, str]]:
-    return {(n["robot"], n["peer"]) for t in held.topics if (n := topics.names(topics.RANGE, t))}
-
-
-def _clocks(recording: Path, held: Summary, settings: Settings) -> dict[str, Clock]:
-    """Of every robot that ranges tie to the reference."""
-    links = _links(held)
-    robots = sorted({name for link in links for name in link})
-    reference = settings.reference or (robots[0] if robots else "")
+def _robots(recording: Path, held: Summary, settings: Settings) -> dict[str, Clock]:
+    """Of every robot that ranges or motion capture tie to the reference."""
+    pairs = range_clocks(recording, held)
+    robots = {name for link in ranging(held) for name in link}
+    if settings.mocap:
+        seen = mocap_clocks(recording, held)
+        if not seen:
+            raise RecordingError(
+                f"{recording} has no poses of robots on /tf or /<robot>/pose/truth. "
+                "Leave out --mocap"
+            )
+        pairs |= {(MOCAP, robot): clock for robot, clock in seen.items() if clock is not None}
+        robots |= {MOCAP, *seen}
+    reference = settings.reference or min(robots - {MOCAP}, default="")
+    if not robots:
+        raise RecordingError(
+            f"{recording}: no robot ranged to another. --mocap and --cameras set clocks by other "
+            "signals"
+        )
     if reference not in robots:
-        known = ", ".join(robots) or "none"
+        known = ", ".join(sorted(robots))
         raise SettingError(f"--reference {reference}: no such robot with ranges. Known: {known}")
-    pairs = {}
-    for one, other in combinations(robots, 2):
-        if (one, other) in links and (other, one) in links:
-            clock = _clock(recording, held, one, other)
-            if clock is not None:
-                pairs[one, other] = clock
     clocks = connected(pairs, reference)
-    if len(clocks) == 1:
+    if len(clocks) == 1 and not (settings.cameras or settings.steady_cameras):
         raise RecordingError(
             f"{recording}: no robot saw what {reference} saw, for 20 s at least. Ranges of both "
-            "to each other are wanted"
+            "to each other are wanted, or motion capture (--mocap)"
         )
-    for robot in robots:
-        if robot not in clocks:
-            say(f"{recording}: nothing ties the clock of {robot} to that of {reference}; it stays")
+    for robot in sorted(robots - clocks.keys()):
+        say(f"{recording}: nothing ties the clock of {robot} to that of {reference}; it stays")
     return clocks
+
+
+def _cameras(
+    recording: Path,
+    held: Summary,
+    clocks: Mapping[str, Clock],
+    steady: Mapping[str, Mapping[int, int]],
+) -> dict[str, Clock]:
+    """Of every camera whose images show the turns of its robot."""
+    found = {}
+    for topic, robot in _pictured(recording, held).items():
+        clock = camera_clock(recording, held, robot, steady.get(topic, {}))
+        if clock is None:
+            say(
+                f"{recording}: images and attitude of {robot} show no common turn, for 20 s at "
+                "least; its camera's times stay with the robot's"
+            )
+            continue
+        found[f"{robot}/camera"] = clocks.get(robot, Clock(0.0)).after(clock)
+    if not found and len(clocks) < 2 and not steady:
+        raise RecordingError(
+            f"{recording}: no camera saw its robot turn. Fly before a background with texture, "
+            "and turn now and then"
+        )
+    return found
+
+
+def _pictured(recording: Path, held: Summary) -> dict[str, str]:
+    """Robot by topic of images; none may have results that know their times."""
+    found = {t: n["robot"] for t in held.topics if (n := topics.names(topics.CAMERA_IMAGE, t))}
+    for topic, robot in found.items():
+        for made in (topics.LABELS, topics.DETECTIONS, topics.TRACKS):
+            if made.format(robot=robot) in held.topics:
+                what = made.rpartition("/")[2]
+                raise SettingError(f"{recording}: {topic} has {what} already. Align before that")
+    return found
 
 
 def _steady(recording: Path, held: Summary) -> dict[str, dict[int, int]]:
     """New times by old ones of every topic of pictures that were stamped when they arrived."""
     found = {}
-    for topic in held.topics:
-        parts = topics.names(topics.CAMERA_IMAGE, topic)
-        if parts is None:
-            continue
-        if topics.labels(parts["robot"]) in held.topics:
-            raise SettingError(f"{recording}: {topic} has labels already. Align before that")
+    for topic in _pictured(recording, held):
         table = read_table(recording, topic, fields=[])
         arrival = table["log_time"].to_numpy()
         if (arrival == table["publish_time"].to_numpy()).all():
             found[topic] = dict(zip(arrival.tolist(), dejitter(arrival).tolist(), strict=True))
     return found
-
-
-def _clock(recording: Path, held: Summary, one: str, other: str) -> Clock | None:
-    here = _ranges(recording, held, topics.uwb_range(one, other))
-    there = _ranges(recording, held, topics.uwb_range(other, one))
-    return estimate_from_exchanges(*here, *there)
-
-
-def _ranges(recording: Path, held: Summary, topic: str) -> tuple[Array, Array]:
-    table = read_table(recording, topic, fields=["range_m"])
-    time_s = (table["log_time"].to_numpy() - held.start_ns) * 1e-9
-    values = table["range_m"].to_numpy()
-    good = np.isfinite(values) & np.concatenate([[True], np.diff(time_s) > 0])[: len(values)]
-    return time_s[good], values[good]
 
 
 def _write(
@@ -167,12 +200,12 @@ def _write(
         sink.add_metadata(METADATA, told)
         for raw in copied:
             even_ns = steady.get(raw.topic, {}).get(raw.time_ns, raw.time_ns)
-            clock = clocks.get(_robot(raw))
+            clock = _clock_of(raw, clocks)
             shift_ns = later_ns + (_shift_ns(even_ns, clock, held.start_ns) if clock else 0)
             sink.write_raw(_at(raw, even_ns + shift_ns, max(raw.publish_ns + shift_ns, 0)))
 
 
-def _told(clock: Clock, start_ns: int) -> dict[str, float]:
+def _told(clock: Clock, start_ns: int) -> dict[str, float | str]:
     return {
         "offset_s": clock.offset_s,
         "drift": clock.drift,
@@ -180,6 +213,7 @@ def _told(clock: Clock, start_ns: int) -> dict[str, float]:
         "sigma_s": clock.sigma_s,
         "sigma_drift": clock.sigma_drift,
         "correlation": clock.correlation,
+        "by": clock.by,
     }
 
 
@@ -192,6 +226,16 @@ def _shift_ns(time_ns: int, clock: Clock, start_ns: int) -> int:
     """What a time lacks on the reference's clock. As a float it is exact enough: times are not."""
     elapsed_s = (time_ns - start_ns) * 1e-9
     return round((clock.offset_s + clock.drift * (elapsed_s - clock.at_s)) * 1e9)
+
+
+def _clock_of(raw: RawMessage, clocks: Mapping[str, Clock]) -> Clock | None:
+    """What corrects a message's times: its robot's clock, its camera's, or motion capture's."""
+    robot = _robot(raw)
+    if raw.topic.startswith(f"/{robot}/camera/") and f"{robot}/camera" in clocks:
+        return clocks[f"{robot}/camera"]
+    if MOCAP in clocks and (raw.topic == topics.TRANSFORMS or raw.topic.endswith("/truth")):
+        return clocks[MOCAP]
+    return clocks.get(robot)
 
 
 def _robot(raw: RawMessage) -> str:
@@ -224,7 +268,7 @@ def command(
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Set the clocks of robots by each other, from the ranges that both of a pair logged.
+    """Set clocks by each other: from ranges that both of a pair logged, images, motion capture.
 
     Parameters
     ----------
@@ -249,8 +293,9 @@ def command(
             f"{c.sigma_s * 1e3:.3f}",
             f"{c.sigma_drift * 1e6:.3f}",
             f"{c.correlation:.3f}",
+            c.by,
         )
         for robot, c in sorted(clocks.items())
     ]
-    head = ("robot", "offset, ms", "drift, ppm", "sigma, ms", "sigma, ppm", "correlation")
+    head = ("clock", "offset, ms", "drift, ppm", "sigma, ms", "sigma, ppm", "correlation", "by")
     print_table(str(out), head, rows)

@@ -1,0 +1,220 @@
+"""Clocks from a recording: by ranges, a camera's by its robot's turns, by motion capture.
+
+Several signals may tell how two clocks differ, and each flight has others that say much. All
+are tried, and the surest counts.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl import images, topics
+from dmrl.estimation.clocks import Clock, estimate_clock
+from dmrl.estimation.exchanges import estimate_from_exchanges
+from dmrl.estimation.image_motion import rates, shift, small
+from dmrl.geometry import Array
+from dmrl.progress import track
+from dmrl.recording import Summary, read, read_table
+
+Signals = dict[str, tuple[Array, Array]]
+"""By name: times (N,), seconds since the recording's start, increasing, and values (N,)."""
+
+MOCAP_STEP_S = 0.02
+"""Differences of poses that are nearer to each other than this are noise."""
+
+
+def range_clocks(recording: Path, held: Summary) -> dict[tuple[str, str], Clock]:
+    """By pair: how to correct the times of the second to those of the first.
+
+    Parameters
+    ----------
+    recording, held
+        With ranges of robots to each other, both ways.
+    """
+    links = ranging(held)
+    pairs = {}
+    for one, other in combinations(sorted({name for link in links for name in link}), 2):
+        if (one, other) in links and (other, one) in links:
+            here, there = (
+                _increasing(*_columns(recording, held, topics.uwb_range(*link), "range_m"))
+                for link in ((one, other), (other, one))
+            )
+            clock = estimate_from_exchanges(*here, *there)
+            if clock is not None:
+                pairs[one, other] = replace(clock, by="ranges")
+    return pairs
+
+
+def ranging(held: Summary) -> set[tuple[str, str]]:
+    """Who ranges to whom."""
+    return {(n["robot"], n["peer"]) for t in held.topics if (n := topics.names(topics.RANGE, t))}
+
+
+def camera_clock(
+    recording: Path, held: Summary, robot: str, even_ns: Mapping[int, int]
+) -> Clock | None:
+    """How to correct the times of a robot's camera to those of its attitude.
+
+    Parameters
+    ----------
+    recording, held
+        With images and attitude of the robot.
+    robot
+        Its name.
+    even_ns
+        Times of images that count in place of those in the recording.
+
+    Returns
+    -------
+    Clock | None
+        None where images and attitude show no common turn.
+
+    Raises
+    ------
+    SourceError
+        If an image cannot be decoded.
+    """
+    topic = topics.camera_image(robot)
+    if topics.attitude(robot) not in held.topics:
+        return None
+    times, moved, before = [], [], None
+    count = held.topics[topic].count
+    for stamped in track(read(recording, topic), f"Turns of {robot}'s camera", count):
+        at = f"{topic} at {stamped.time_ns} ns in {recording}"
+        after = small(images.decode(stamped.message.data, at))
+        if before is not None:
+            moved.append(shift(before, after) or (np.nan, np.nan))
+        times.append(even_ns.get(stamped.time_ns, stamped.time_ns))
+        before = after
+    if len(times) < 2:
+        return None
+    middle, speed = rates(_seconds(np.array(times), held), np.array(moved))
+    # A camera that turns left sees the scene move right; nose down, up.
+    seen = {"yaw rate": (middle, speed[:, 0]), "pitch rate": (middle, -speed[:, 1])}
+    return _surest(_turns(recording, held, robot), seen)
+
+
+def mocap_clocks(recording: Path, held: Summary) -> dict[str, Clock | None]:
+    """How to correct the times of robots to those of motion capture.
+
+    Parameters
+    ----------
+    recording, held
+        With poses of robots on ``/tf`` (frames ``<robot>`` or ``<robot>/horizontal``) or
+        ``/<robot>/pose/truth``, and their attitude, velocity or height.
+
+    Returns
+    -------
+    dict
+        By robot that motion capture has poses of; None where the two do not agree.
+    """
+    return {
+        robot: _surest(_of_pose(*poses), _own(recording, held, robot))
+        for robot, poses in sorted(_poses(recording, held).items())
+    }
+
+
+def _surest(reference: Signals, other: Signals) -> Clock | None:
+    found = []
+    for name in sorted(reference.keys() & other.keys()):
+        clock = estimate_clock(*reference[name], *other[name])
+        if clock is not None:
+            found.append(replace(clock, by=name))
+    return min(found, key=lambda clock: clock.sigma_s, default=None)
+
+
+def _seconds(time_ns: NDArray[np.int64], held: Summary) -> Array:
+    return np.asarray((time_ns - held.start_ns) * 1e-9)
+
+
+def _increasing(time_s: Array, values: Array) -> tuple[Array, Array]:
+    good = np.isfinite(values) & np.concatenate([[True], np.diff(time_s) > 0])[: len(values)]
+    return time_s[good], values[good]
+
+
+def _columns(recording: Path, held: Summary, topic: str, *names: str) -> list[Array]:
+    """Times and fields of a topic."""
+    table = read_table(recording, topic, fields=list(names))
+    values = [np.asarray(table[name].to_numpy(), float) for name in names]
+    return [_seconds(table["log_time"].to_numpy(), held), *values]
+
+
+def _turns(recording: Path, held: Summary, robot: str) -> Signals:
+    names = ("pitch_rad", "yaw_rate_radps")
+    time_s, pitch, yaw_rate = _columns(recording, held, topics.attitude(robot), *names)
+    slow_s, pitch = _increasing(time_s, pitch)
+    signals = {"yaw rate": _increasing(time_s, yaw_rate)}
+    if len(slow_s) > 1:
+        signals["pitch rate"] = slow_s, np.gradient(pitch, slow_s)
+    return signals
+
+
+def _own(recording: Path, held: Summary, robot: str) -> Signals:
+    """What a robot measured of itself that motion capture sees as well."""
+    signals = {}
+    if topics.attitude(robot) in held.topics:
+        names = ("roll_rad", "pitch_rad", "yaw_rate_radps")
+        time_s, *values = _columns(recording, held, topics.attitude(robot), *names)
+        for name, column in zip(("roll", "pitch", "yaw rate"), values, strict=True):
+            signals[name] = _increasing(time_s, column)
+    if topics.velocity(robot) in held.topics:
+        time_s, vx, vy = _columns(recording, held, topics.velocity(robot), "vx_mps", "vy_mps")
+        signals["speed"] = _increasing(time_s, np.hypot(vx, vy))
+    if topics.height(robot) in held.topics:
+        time_s, height = _columns(recording, held, topics.height(robot), "height_m")
+        signals["height"] = _increasing(time_s, height)
+    return signals
+
+
+def _of_pose(time_s: Array, rows: Array) -> Signals:
+    """The same from poses (N, 7): x, y, z, and a quaternion x, y, z, w."""
+    keep = [0]
+    for k, moment in enumerate(time_s.tolist()):
+        if moment - time_s[keep[-1]] >= MOCAP_STEP_S:
+            keep.append(k)
+    time_s, rows = time_s[keep], rows[keep]
+    if len(keep) < 2:
+        return {}
+    x, y, z, w = rows[:, 3:].T
+    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    middle, step = (time_s[1:] + time_s[:-1]) / 2, np.diff(time_s)
+    return {
+        "roll": (time_s, np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
+        "pitch": (time_s, np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))),
+        "yaw rate": (middle, np.diff(yaw) / step),
+        "speed": (middle, np.hypot(*np.diff(rows[:, :2], axis=0).T) / step),
+        "height": (time_s, rows[:, 2]),
+    }
+
+
+def _poses(recording: Path, held: Summary) -> dict[str, tuple[Array, Array]]:
+    """Of each robot that motion capture sees: times, and (N, 7) poses."""
+    rows: dict[str, dict[int, list[float]]] = {}
+    true = {t: n["robot"] for t in held.topics if (n := topics.names(topics.TRUE_POSE, t))}
+    for topic, robot in true.items():
+        for stamped in read(recording, topic):
+            pose = stamped.message.pose
+            rows.setdefault(robot, {})[stamped.time_ns] = _row(pose.position, pose.orientation)
+    if topics.TRANSFORMS in held.topics:
+        for stamped in read(recording, topics.TRANSFORMS):
+            for frame in stamped.message.transforms:
+                robot, _, part = frame.child_frame_id.partition("/")
+                if part in ("", "horizontal") and robot not in true.values():
+                    row = _row(frame.translation, frame.rotation)
+                    rows.setdefault(robot, {})[stamped.time_ns] = row
+    found = {}
+    for robot, by_time in rows.items():
+        values = np.array(list(by_time.values()))
+        good = np.isfinite(values).all(axis=1)
+        if good.any():
+            found[robot] = _seconds(np.array(list(by_time)), held)[good], values[good]
+    return found
+
+
+def _row(place: object, turn: object) -> list[float]:
+    names = [(place, n) for n in "xyz"] + [(turn, n) for n in "xyzw"]
+    return [float(getattr(part, name)) for part, name in names]

@@ -1,0 +1,142 @@
+"""``dmrl align`` by what cameras and motion capture saw."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import RecordingError, SettingError
+from dmrl.images import encode_jpeg
+from dmrl.messages import message
+from dmrl.recording import RecordingWriter, provenance, read_raw, read_table, summary
+from dmrl.stages import fly
+from dmrl.stages.align import METADATA, Settings, run
+
+Wrong = Callable[[float], float]
+OFFSET_S, DRIFT = 0.080, 20e-6
+WIDTH_PX, HEIGHT_PX, FOCAL_PX = 160, 112, 92.0
+
+
+def wrong_in(duration_s: float) -> Wrong:
+    """A clock that is 80 ms ahead in the middle, and 20 ppm fast."""
+    return lambda time_s: time_s + OFFSET_S + DRIFT * (time_s - duration_s / 2)
+
+
+def worst_s(before: Path, after: Path, topic: str) -> float:
+    """How far the times of a topic are from those of the recording before it was spoilt."""
+    old, new = (read_table(p, topic, fields=[])["log_time"].to_numpy() for p in (before, after))
+    return float(np.abs(old - new).max() * 1e-9)
+
+
+def panorama() -> np.ndarray:
+    """All around, with things of all sizes, (224, 1024) grey."""
+    rng, scene = np.random.default_rng(5), np.zeros((224, 1024))
+    for size in (4, 8, 16, 32):
+        coarse = rng.normal(size=(224 // size, 1024 // size))
+        scene += np.kron(coarse, np.ones((size, size)))
+    return np.asarray(128 + 30 * scene)
+
+
+def looked_around(path: Path, duration_s: float, wrong: Wrong, rate_hz: float) -> None:
+    """A drone that turns; its camera, dim in the corners and noisy, has a clock of its own."""
+    rng, scene = np.random.default_rng(1), panorama()
+    waves = [(rng.uniform(0.1, 0.3), rng.uniform(0.3, 3), rng.uniform(0, 6)) for _ in range(6)]
+    row, col = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
+    dim = 1 - 0.4 * np.hypot(row / HEIGHT_PX - 0.5, col / WIDTH_PX - 0.5) ** 2
+
+    def yaw(time_s: float) -> float:
+        return sum(a * np.sin(w * time_s + p) for a, w, p in waves)
+
+    def rate(time_s: float) -> float:
+        return sum(a * w * np.cos(w * time_s + p) for a, w, p in waves)
+
+    with RecordingWriter(path, provenance("test")) as sink:
+        for time_s in np.arange(1, duration_s + 1, 0.01).tolist():
+            noisy = rate(time_s) + rng.normal(0, 0.02)
+            sink.write(
+                round(time_s * 1e9),
+                "/cf1/attitude",
+                message("Attitude")(yaw_rate_radps=noisy, pitch_rad=rng.normal(0, 0.001)),
+            )
+        for time_s in np.arange(1, duration_s + 1, 1 / rate_hz).tolist():
+            left = 512 - WIDTH_PX // 2 - FOCAL_PX * yaw(time_s)
+            columns = left + np.arange(WIDTH_PX)
+            first = np.floor(columns).astype(int)
+            part = columns - first
+            seen = scene[56 : 56 + HEIGHT_PX]
+            view = seen[:, first % 1024] * (1 - part) + seen[:, (first + 1) % 1024] * part
+            grey = np.clip(view * dim + rng.normal(0, 6, view.shape), 0, 255).astype(np.uint8)
+            data = encode_jpeg(np.stack([grey] * 3, axis=2), 80)
+            picture = message("CompressedImage")(data=data, format="jpeg")
+            sink.write(round(wrong(time_s) * 1e9), "/cf1/camera/image", picture)
+
+
+def camera_error_s(folder: Path, duration_s: float) -> float:
+    spoilt, out = folder / "in.mcap", folder / "out.mcap"
+    looked_around(spoilt, duration_s, wrong_in(duration_s), 20.0)
+    clocks = run(spoilt, out, Settings(cameras=True))
+    assert list(clocks) == ["cf1/camera"]
+    assert clocks["cf1/camera"].by == "yaw rate"
+    assert worst_s(spoilt, out, "/cf1/attitude") == 0
+    times = read_table(out, "/cf1/camera/image", fields=[])["log_time"].to_numpy()
+    true = 1e9 * (1 + np.arange(len(times)) / 20.0)
+    (told,) = summary(out).metadata[METADATA]
+    assert '"by": "yaw rate"' in told["cf1/camera"]
+    return float(np.abs(times - true).max() * 1e-9)
+
+
+def test_a_camera_is_set_by_the_turns_it_saw(tmp_path: Path) -> None:
+    assert camera_error_s(tmp_path, 40.0) < 0.005
+
+
+@pytest.mark.slow
+def test_a_camera_is_set_to_5_ms_over_5_minutes(tmp_path: Path) -> None:
+    assert camera_error_s(tmp_path, 300.0) < 0.005
+
+
+def mocap_errors_s(folder: Path, duration_s: float, noise: fly.Preset) -> list[float]:
+    """By robot, after its log got a wrong clock and was set by motion capture's again."""
+    true, spoilt, out = folder / "true.mcap", folder / "in.mcap", folder / "out.mcap"
+    fly.run(true, fly.Settings(duration_s=duration_s, noise=noise, trajectory="random", seed=4))
+    wrong = wrong_in(duration_s)
+    with RecordingWriter(spoilt, provenance("test")) as sink:
+        for raw in read_raw(true):
+            is_log = raw.topic.split("/")[-1] in ("attitude", "velocity", "height")
+            if is_log or raw.topic == "/tf":
+                time_ns = round(wrong(raw.time_ns * 1e-9) * 1e9) if is_log else raw.time_ns
+                sink.write_raw(replace(raw, time_ns=time_ns))
+    clocks = run(spoilt, out, Settings(mocap=True, reference="mocap"))
+    assert clocks.keys() == {"mocap", "cf1", "cf2"}
+    assert worst_s(true, out, "/tf") == 0
+    return [worst_s(true, out, f"/{robot}/attitude") for robot in ("cf1", "cf2")]
+
+
+def test_robots_are_set_by_motion_capture(tmp_path: Path) -> None:
+    assert max(mocap_errors_s(tmp_path, 40.0, "calibrated")) < 0.005
+
+
+@pytest.mark.slow
+def test_robots_are_set_to_5_ms_over_5_minutes_by_motion_capture(tmp_path: Path) -> None:
+    assert max(mocap_errors_s(tmp_path, 300.0, "realistic")) < 0.005
+
+
+def test_what_neither_camera_nor_motion_capture_can_tell_is_one_line(tmp_path: Path) -> None:
+    path, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
+    fly.run(path, fly.Settings(duration_s=2.0, camera=True, camera_rate_hz=2.0))
+    with pytest.raises(SettingError, match=r"has labels already\. Align before that"):
+        run(path, out, Settings(cameras=True))
+    still = tmp_path / "still.mcap"
+    with RecordingWriter(still, provenance("test")) as sink:
+        data = encode_jpeg(np.zeros((48, 64, 3), np.uint8))
+        for k in range(60):
+            sink.write(k * 10**9, "/cf1/attitude", message("Attitude")())
+            sink.write(k * 10**9, "/cf1/camera/image", message("CompressedImage")(data=data))
+    with pytest.raises(RecordingError, match="no camera saw its robot turn"):
+        run(still, out, Settings(cameras=True))
+    with pytest.raises(RecordingError, match=r"no poses of robots .* Leave out --mocap"):
+        run(still, out, Settings(mocap=True))
+    with pytest.raises(RecordingError, match="no robot ranged to another"):
+        run(still, out, Settings())
+    assert not out.exists()
