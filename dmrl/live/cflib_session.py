@@ -7,6 +7,7 @@ import logging
 import socket
 import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 from dmrl.errors import MissingExtra, SettingError
@@ -103,7 +104,8 @@ class Session:
         self._opened_s = time.monotonic()
         link = getattr(self._drone.link, "socket", None)
         if isinstance(link, socket.socket):
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER_BYTES)
+            with suppress(OSError):  # closed again already: `lost` says so
+                link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER_BYTES)
 
     def silent_s(self) -> float:
         """For how long nothing came."""

@@ -1,6 +1,7 @@
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -108,6 +109,26 @@ def assert_as_flown(flight: Path, out: Path, robot: str) -> float:
         assert abs(number - round(number)) < 0.01 * PICTURES_HZ
         assert np.abs(decode(stamped.message.data) - pictures[round(number)]).mean() < 8
     return start_ns
+
+
+def test_drones_stay_until_they_are_heard_out(flight: Path, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_port:
+        any_port.bind(("127.0.0.1", 0))
+        uri = f"udp://127.0.0.1:{any_port.getsockname()[1]}"
+    ended, results = threading.Event(), []
+
+    def listen() -> None:
+        out = tmp_path / "out.mcap"
+        results.append(record.run(out, [Robot("cf1", uri)], record.Settings(), ended=ended))
+
+    recorder = threading.Thread(target=listen)
+    recorder.start()
+    fleet = fake_drone.run(flight, [uri], [], fake_drone.Settings())
+    assert fleet.clock.now_s() >= fleet.clock.end_s + fake_drone.LINGER_S  # nobody said goodbye
+    ended.set()
+    recorder.join()
+    (drone,) = fleet.drones
+    assert results[0].healths[0].received == drone.sent > 500
 
 
 def test_dropped_packets_are_counted_and_a_dead_drone_stops_nobody(
