@@ -1,11 +1,10 @@
 """``dmrl record``: what robots in flight send, as a recording."""
 
-import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -13,16 +12,15 @@ from typing import Annotated
 from cyclopts import Parameter, validators
 
 from dmrl.bayer import load_opencv
-from dmrl.errors import OutputError, RecordingError, SettingError
-from dmrl.formats.camera_toml import read_camera
-from dmrl.geometry import Camera
+from dmrl.errors import OutputError, RecordingError
 from dmrl.live.camera import CameraClient
-from dmrl.live.cflib_session import check_uri, load_cflib
+from dmrl.live.cflib_session import load_cflib
 from dmrl.live.clocks import HostTime
 from dmrl.live.crazyflie import Link
 from dmrl.live.feed import Feed, Health, Received
+from dmrl.live.links import cameras_of, check, end_all, ended_by_signal, links_of, nothing_came
 from dmrl.live.pictures import Colours, Stored
-from dmrl.live.robots import Robot, peers_of, robot_of
+from dmrl.live.robots import Robot, robot_of
 from dmrl.live.table import LiveTable
 from dmrl.messages import message
 from dmrl.output import partial_of, refuse_existing
@@ -32,7 +30,6 @@ from dmrl.tables import print_json, print_table
 FLUSH_S = 1.0
 """What a killed process loses at most."""
 TAKE_S = 0.1
-ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +108,10 @@ def run(
     load_cflib()
     if settings.pixels == "colour" and any(robot.camera for robot in robots):
         load_opencv("record", "the colours of a camera")
-    _check(robots)
-    cameras = {r.name: read_camera(r.calibration) if r.calibration else None for r in robots}
+    check(robots)
     feed, now = Feed(), HostTime()
-    links = {r.name: _link(r, robots, settings, feed, now) for r in robots}
-    clients = [
-        _client(r, links[r.name], cameras[r.name], settings, feed, now) for r in robots if r.camera
-    ]
+    links = links_of(robots, settings.peer, settings.rate_hz, feed, now)
+    clients = cameras_of(robots, links, (settings.pixels, settings.images), feed, now)
     threads: list[Link | CameraClient] = [*links.values(), *clients]
     table = LiveTable(list(links.values()), [client.health for client in clients])
     made = provenance("record", _as_settings(robots, settings), libraries=("cflib", "numpy"))
@@ -128,7 +122,7 @@ def run(
         counts = _record(sink, feed, table, threads, (settings.duration_s, ended), show)
     if not counts:
         out.unlink()
-        raise RecordingError(_nothing(out, [*links.values()]))
+        raise RecordingError(nothing_came(out, [*links.values()]))
     passed_s = max(time.monotonic() - began_s, 1e-9)
     healths = [thread.health for thread in threads]
     return Result(counts, healths, (time.process_time() - used_s) / passed_s)
@@ -141,16 +135,6 @@ def _refuse_unfinished(out: Path) -> None:
             f"{unfinished} is of a session that was cut off. Bring it back with dmrl recover "
             f"{unfinished} OTHER.mcap, or remove it"
         )
-
-
-def _check(robots: Sequence[Robot]) -> None:
-    if not robots:
-        raise SettingError("nobody to record. Name robots: --robot cf1=URI")
-    for what, values in (("name", [r.name for r in robots]), ("address", [r.uri for r in robots])):
-        if twice := [value for value, count in Counter(values).items() if count > 1]:
-            raise SettingError(f"two robots with the {what} {twice[0]}. Give each its own")
-    for robot in robots:
-        check_uri(robot.uri)
 
 
 def _as_settings(robots: Sequence[Robot], settings: Settings) -> "_Recorded":
@@ -176,35 +160,6 @@ class _Recorded:
     pixels: str
     images: str
     peer: tuple[str, ...]
-
-
-def _link(
-    robot: Robot, robots: Sequence[Robot], settings: Settings, feed: Feed, now: HostTime
-) -> Link:
-    peers = peers_of(robot.name, [r.name for r in robots], settings.peer)
-    period_ms = 10 * max(round(100 / settings.rate_hz), 1)
-    return Link(robot.name, robot.uri, peers, period_ms, feed, now)
-
-
-def _client(
-    robot: Robot,
-    link: Link,
-    camera: Camera | None,
-    settings: Settings,
-    feed: Feed,
-    now: HostTime,
-) -> CameraClient:
-    assert robot.camera is not None
-    return CameraClient(
-        robot.name,
-        *robot.camera,
-        feed,
-        now,
-        colours=settings.pixels,
-        stored=settings.images,
-        camera=camera,
-        robot_time=link.robot_time,
-    )
 
 
 def _record(
@@ -239,28 +194,14 @@ def _record(
 
     with ExitStack() as running:
         running.enter_context(table)
-        running.callback(_end, threads)
+        running.callback(end_all, threads)
         for thread in threads:
             thread.start()
-        running.enter_context(_ended_by_signal(ended))
+        running.enter_context(ended_by_signal(ended))
         _until(duration_s, ended, take, lambda: _every_second(sink, table, counts))
     while take(0.0):
         pass
     return dict(sorted(counts.items()))
-
-
-@contextmanager
-def _ended_by_signal(ended: threading.Event) -> Iterator[None]:
-    """Set when the user wants an end: an exception amid a write would spoil the file."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in ENDING}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _until(
@@ -280,19 +221,6 @@ def _until(
 def _every_second(sink: RecordingWriter, table: LiveTable, counts: Mapping[str, int]) -> None:
     sink.flush()
     table.update(sum(counts.values()))
-
-
-def _end(threads: Sequence[Link | CameraClient]) -> None:
-    for thread in threads:
-        thread.stop()
-    for thread in threads:
-        if thread.is_alive():
-            thread.join(timeout=10.0)
-
-
-def _nothing(out: Path, links: Sequence[Link]) -> str:
-    states = ", ".join(f"{link.robot} at {link.uri}: {link.health.state}" for link in links)
-    return f"nothing came for {out} ({states}). Is the drone on, and the address right?"
 
 
 DEFAULTS = Settings()

@@ -1,0 +1,125 @@
+"""Links and cameras of the robots that are recorded: made, ended, and what to say of them."""
+
+import signal
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from dmrl.errors import SettingError
+from dmrl.formats.camera_toml import read_camera
+from dmrl.live.camera import CameraClient
+from dmrl.live.cflib_session import check_uri
+from dmrl.live.clocks import HostTime
+from dmrl.live.crazyflie import Link
+from dmrl.live.feed import Feed
+from dmrl.live.pictures import Colours, Stored
+from dmrl.live.robots import Robot, peers_of
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+def check(robots: Sequence[Robot]) -> None:
+    """Nothing, if these robots can be recorded together.
+
+    Raises
+    ------
+    SettingError
+        If there are none, two share a name or an address, or an address cannot be one.
+    """
+    if not robots:
+        raise SettingError("nobody to record. Name robots: --robot cf1=URI")
+    for what, values in (("name", [r.name for r in robots]), ("address", [r.uri for r in robots])):
+        if twice := [value for value, count in Counter(values).items() if count > 1]:
+            raise SettingError(f"two robots with the {what} {twice[0]}. Give each its own")
+    for robot in robots:
+        check_uri(robot.uri)
+
+
+def links_of(
+    robots: Sequence[Robot], peer: Sequence[str], rate_hz: float, feed: Feed, now: HostTime
+) -> dict[str, Link]:
+    """A link to each robot, by name, not yet started.
+
+    Parameters
+    ----------
+    robots
+        Who is recorded.
+    peer
+        ``N=NAME`` for distances that are not to robot cf<N>.
+    rate_hz
+        Log packets per second and block.
+    feed, now
+        As of `Link`.
+    """
+    names, period_ms = [robot.name for robot in robots], 10 * max(round(100 / rate_hz), 1)
+    return {
+        r.name: Link(r.name, r.uri, peers_of(r.name, names, peer), period_ms, feed, now)
+        for r in robots
+    }
+
+
+def cameras_of(
+    robots: Sequence[Robot],
+    links: dict[str, Link],
+    form: tuple[Colours, Stored],
+    feed: Feed,
+    now: HostTime,
+) -> list[CameraClient]:
+    """A client of each robot's camera, for those that have one, not yet started.
+
+    Parameters
+    ----------
+    robots
+        Who is recorded.
+    links
+        Theirs, which know the robots' clocks.
+    form
+        Colours of the cameras, and how images are stored.
+    feed, now
+        As of `CameraClient`.
+    """
+    calibrations = {r.name: read_camera(r.calibration) if r.calibration else None for r in robots}
+    return [
+        CameraClient(
+            robot.name,
+            *robot.camera,
+            feed,
+            now,
+            colours=form[0],
+            stored=form[1],
+            camera=calibrations[robot.name],
+            robot_time=links[robot.name].robot_time,
+        )
+        for robot in robots
+        if robot.camera
+    ]
+
+
+@contextmanager
+def ended_by_signal(ended: threading.Event) -> Iterator[None]:
+    """Set when the user wants an end: an exception amid a write would spoil the file."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def end_all(threads: Sequence[Link | CameraClient]) -> None:
+    """Have all end, and wait for that."""
+    for thread in threads:
+        thread.stop()
+    for thread in threads:
+        if thread.is_alive():
+            thread.join(timeout=10.0)
+
+
+def nothing_came(out: object, links: Sequence[Link]) -> str:
+    """What to say when nothing came."""
+    states = ", ".join(f"{link.robot} at {link.uri}: {link.health.state}" for link in links)
+    return f"nothing came for {out} ({states}). Is the drone on, and the address right?"
