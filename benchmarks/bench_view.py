@@ -116,10 +116,10 @@ def first_picture(path: Path, layout: str) -> dict[str, float]:
 
     The clock starts with the process: imports count. What is drawn is looked for every 0.1 s.
     """
-    show = session.prepare([path], Settings(layout=layout))  # type: ignore[arg-type]
     port = process.free_port(process.LOOPBACK)
     where = ("--headless", "--window-size", window.PICTURE_SIZE, "--port", str(port))
     with process.running(process.command(process.LOOPBACK, *where)) as viewer:
+        show = session.prepare([path], Settings(layout=layout))  # type: ignore[arg-type]
         assert process.listens(viewer, process.LOOPBACK, port)
         sender = threading.Thread(target=process.stream_to, args=(show, viewer, port))
         sender.start()

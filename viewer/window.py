@@ -47,9 +47,10 @@ def view(paths: Sequence[Path], settings: Settings) -> None:
     SettingError
         If there is no screen, or nothing lies in the time asked for.
     """
-    show = prepare(paths, settings)
     port = free_port(LOOPBACK)
+    # The viewer wakes up while the recording's index is read.
     with running(command(LOOPBACK, "--port", str(port))) as viewer:
+        show = prepare(paths, settings)
         try:
             if listens(viewer, LOOPBACK, port):
                 stream_to(show, viewer, port)

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +14,9 @@ from dmrl.geometry import Camera
 from dmrl.labelling.labels import SOURCE, Look, Positions, image_labels
 from dmrl.labelling.logs import Logs
 from dmrl.messages import message
-from dmrl.recording import Summary, read, read_table
+from dmrl.recording import Summary, Timed, read, read_table
 
 Times = NDArray[np.int64]
-
-
-class Timed(NamedTuple):
-    """A message to write at a log time."""
-
-    time_ns: int
-    topic: str
-    message: Any
 
 
 def image_times(recording: Path, held: Summary, robot: str) -> Times:

@@ -21,6 +21,7 @@ from dmrl.recording.reader import (
 )
 from dmrl.recording.recover import Recovery, recover
 from dmrl.recording.resume import Interrupted, interrupted
+from dmrl.recording.rewrite import Timed, rewrite
 from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "Recovery",
     "Stamped",
     "Summary",
+    "Timed",
     "TopicInfo",
     "check",
     "columns",
@@ -49,6 +51,7 @@ __all__ = [
     "read_raw",
     "read_table",
     "recover",
+    "rewrite",
     "splits",
     "stretches",
     "summary",

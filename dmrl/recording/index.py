@@ -1,12 +1,14 @@
 """What a recording holds, from its summary, without reading its messages."""
 
+import os
 import struct
+import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
@@ -62,6 +64,11 @@ class Summary:
     def count(self) -> int:
         """Number of messages."""
         return sum(topic.count for topic in self.topics.values())
+
+
+SETTLED_NS, MOST_REMEMBERED = 1_000_000_000, 8
+_MADE: dict[tuple[Path, str], tuple[tuple[int, int, int], Any]] = {}
+Made = TypeVar("Made")
 
 
 @contextmanager
@@ -125,7 +132,27 @@ def _check_ends(path: Path, stream: BinaryIO) -> None:
 
 def mcap_summary(path: Path, stream: BinaryIO) -> McapSummary | None:
     """The summary section of an opened recording, or None where it has none."""
-    return _summary_of(SeekingReader(stream))
+    return _remembered("raw", path, stream, lambda: _summary_of(SeekingReader(stream)))
+
+
+def _remembered(what: str, path: Path, stream: BinaryIO, make: Callable[[], Made]) -> Made:
+    """What was made of a file, without making it again as long as it is the same file.
+
+    A file that was written in the last second is read again: its time stamp might not tell
+    it from one that is written after it.
+    """
+    status = os.fstat(stream.fileno())
+    stamp = status.st_ino, status.st_size, status.st_mtime_ns
+    key = path, what
+    if key in _MADE and _MADE[key][0] == stamp:
+        made: Made = _MADE[key][1]
+        return made
+    made = make()
+    if time.time_ns() - status.st_mtime_ns > SETTLED_NS:
+        while len(_MADE) >= MOST_REMEMBERED:
+            del _MADE[next(iter(_MADE))]
+        _MADE[key] = stamp, made
+    return made
 
 
 def _summary_of(reader: SeekingReader) -> McapSummary | None:
@@ -175,30 +202,34 @@ def summary(path: Path) -> Summary:
         If the file is absent, not MCAP, cut short or damaged.
     """
     with opened(path) as stream:
-        # One reader: each reads the summary again.
-        reader = SeekingReader(stream)
-        found = _summary_of(reader)
-        if found is None:
-            return _scanned(path, stream)
-        metadata: dict[str, list[dict[str, str]]] = {}
-        for record in reader.iter_metadata():
-            metadata.setdefault(record.name, []).append(dict(record.metadata))
-        attachments = {a.name: a.data for a in reader.iter_attachments()}
-        statistics = found.statistics
-        counts = statistics.channel_message_counts if statistics else {}
-        topics: dict[str, TopicInfo] = {}
-        for number in sorted(found.channels):
-            channel = channel_of(number, found.channels, found.schemas)
-            before = topics[channel.topic].count if channel.topic in topics else 0
-            topics[channel.topic] = TopicInfo(channel.schema_name, before + counts.get(number, 0))
-        return Summary(
-            topics=dict(sorted(topics.items())),
-            start_ns=statistics.message_start_time if statistics else 0,
-            end_ns=statistics.message_end_time if statistics else 0,
-            metadata=metadata,
-            attachments=attachments,
-            provenance=_provenance(path, metadata),
-        )
+        return _remembered("summary", path, stream, lambda: _summary(path, stream))
+
+
+def _summary(path: Path, stream: BinaryIO) -> Summary:
+    # One reader: each reads the summary again.
+    reader = SeekingReader(stream)
+    found = _summary_of(reader)
+    if found is None:
+        return _scanned(path, stream)
+    metadata: dict[str, list[dict[str, str]]] = {}
+    for record in reader.iter_metadata():
+        metadata.setdefault(record.name, []).append(dict(record.metadata))
+    attachments = {a.name: a.data for a in reader.iter_attachments()}
+    statistics = found.statistics
+    counts = statistics.channel_message_counts if statistics else {}
+    topics: dict[str, TopicInfo] = {}
+    for number in sorted(found.channels):
+        channel = channel_of(number, found.channels, found.schemas)
+        before = topics[channel.topic].count if channel.topic in topics else 0
+        topics[channel.topic] = TopicInfo(channel.schema_name, before + counts.get(number, 0))
+    return Summary(
+        topics=dict(sorted(topics.items())),
+        start_ns=statistics.message_start_time if statistics else 0,
+        end_ns=statistics.message_end_time if statistics else 0,
+        metadata=metadata,
+        attachments=attachments,
+        provenance=_provenance(path, metadata),
+    )
 
 
 def _scanned(path: Path, stream: BinaryIO) -> Summary:

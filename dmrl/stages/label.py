@@ -1,10 +1,9 @@
 """``dmrl label``: where every robot's peers are, from ranges and odometry, as labels."""
 
-import heapq
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from cyclopts import Parameter, validators
@@ -15,15 +14,7 @@ from dmrl.errors import MissingExtra, RecordingError, SettingError
 from dmrl.formats.camera_toml import read_camera
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
-from dmrl.recording import (
-    RawMessage,
-    RecordingWriter,
-    Summary,
-    copy_extras,
-    provenance,
-    read_raw,
-    summary,
-)
+from dmrl.recording import provenance, rewrite, summary
 from dmrl.tables import print_json, print_table
 
 try:
@@ -33,7 +24,7 @@ try:
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import read_logs
     from dmrl.labelling.report import PairReport, pair_report
-    from dmrl.labelling.write import Timed, image_times, label_messages, position_messages
+    from dmrl.labelling.write import image_times, label_messages, position_messages
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl label") from e
 
@@ -137,7 +128,11 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
         made = list(label_messages(recording, held, logs, robot, mine, look))
         labels += sum(peer.source == SOURCE for m in made for peer in m.message.peers)
         fresh.append(iter(made))
-    _write(recording, held, out, fresh, images, settings)
+    replaced = [topics.labels(robot) for robot, times in images.items() if len(times)]
+    replaced += [topic for topic in held.topics if topics.names(topics.POSITION, topic)]
+    inputs = [recording, *settings.camera.values()]
+    origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
+    rewrite(recording, out, origin, without=replaced, fresh=fresh)
     return Result(reports, labels, logs.warnings)
 
 
@@ -178,35 +173,6 @@ def _positions(start_ns: int, pair: Pair, estimate: Estimate, images_ns: Times) 
     covariance[:, :2, :2] = spread
     covariance[:, 2, 2] = estimate.noise.height_std_m**2
     return Positions(time_ns, np.column_stack([xy, z]), covariance, status)
-
-
-def _write(
-    recording: Path,
-    held: Summary,
-    out: Path,
-    fresh: list[Iterator[Timed]],
-    images: Mapping[str, Times],
-    settings: Settings,
-) -> None:
-    """All messages in time order, ours in place of those they replace."""
-    replaced = {topics.labels(robot) for robot, times in images.items() if len(times)}
-    kept = [
-        topic
-        for topic in held.topics
-        if topic not in replaced and not topics.names(topics.POSITION, topic)
-    ]
-    total = sum(held.topics[topic].count for topic in kept)
-    copied: Iterable[RawMessage] = track(read_raw(recording, *kept), "Writing", total)
-    inputs = [recording, *settings.camera.values()]
-    made = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
-    streams: list[Iterable[Any]] = [copied, *fresh]
-    with RecordingWriter(out, made) as sink:
-        copy_extras(held, sink)
-        for item in heapq.merge(*streams, key=lambda m: m.time_ns):
-            if isinstance(item, Timed):
-                sink.write(*item)
-            else:
-                sink.write_raw(item)
 
 
 DEFAULTS = Settings()

@@ -1,7 +1,5 @@
 """``dmrl track``: detections over time to 3D tracks of peers."""
 
-import heapq
-from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,21 +13,14 @@ from dmrl.formats.camera_toml import read_camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
-from dmrl.recording import (
-    RecordingWriter,
-    Summary,
-    copy_extras,
-    provenance,
-    read_raw,
-    summary,
-)
+from dmrl.recording import Summary, Timed, provenance, rewrite, summary
 from dmrl.tables import print_json, print_table
 
 try:
     from dmrl.estimation.identity import Identity
     from dmrl.estimation.tracker import Track, Tracker, Tuning
     from dmrl.labelling.sight import Sight, read_sight
-    from dmrl.labelling.write import Timed, camera_of
+    from dmrl.labelling.write import camera_of
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 
@@ -122,7 +113,11 @@ def run(recording: Path, out: Path, settings: Settings) -> list[RobotReport]:
     if unknown := set(settings.camera) - set(robots):
         raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(robots)}")
     followed = {robot: _follow(recording, held, robot, settings) for robot in robots}
-    _write(recording, held, out, [found for found, _ in followed.values()], settings)
+    replaced = [topic for topic in held.topics if topics.names(topics.TRACKS, topic)]
+    inputs = [recording, *settings.camera.values()]
+    made = provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
+    fresh = [found for found, _ in followed.values()]
+    rewrite(recording, out, made, without=replaced, fresh=fresh)
     return [report for _, report in followed.values()]
 
 
@@ -169,25 +164,6 @@ def _message(sight: Sight, k: int, tracks: list[Track], names: dict[int, str]) -
         )
     made = message("Tracks")(frame_id=f"{sight.robot}/horizontal", tracks=entries)
     return Timed(int(sight.logged_ns[k]), topics.tracks(sight.robot), made)
-
-
-def _write(
-    recording: Path, held: Summary, out: Path, fresh: list[list[Timed]], settings: Settings
-) -> None:
-    """All messages in time order, ours in place of those they replace."""
-    kept = [topic for topic in held.topics if not topics.names(topics.TRACKS, topic)]
-    total = sum(held.topics[topic].count for topic in kept)
-    copied: Iterator[Any] = iter(track(read_raw(recording, *kept), "Writing", total))
-    inputs = [recording, *settings.camera.values()]
-    made = provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
-    streams: list[Iterable[Any]] = [copied, *fresh]
-    with RecordingWriter(out, made) as sink:
-        copy_extras(held, sink)
-        for item in heapq.merge(*streams, key=lambda m: m.time_ns):
-            if isinstance(item, Timed):
-                sink.write(*item)
-            else:
-                sink.write_raw(item)
 
 
 DEFAULTS = Settings()

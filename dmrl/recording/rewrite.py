@@ -1,0 +1,62 @@
+"""A recording written again, with some topics in place of those it had."""
+
+import heapq
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dmrl.progress import track
+from dmrl.recording.extras import copy_extras
+from dmrl.recording.index import summary
+from dmrl.recording.provenance import Provenance
+from dmrl.recording.reader import read_raw
+from dmrl.recording.writer import RecordingWriter
+
+
+class Timed(NamedTuple):
+    """A message to write at a log time."""
+
+    time_ns: int
+    topic: str
+    message: Any
+
+
+def rewrite(
+    recording: Path,
+    out: Path,
+    made: Provenance,
+    *,
+    without: Collection[str],
+    fresh: Iterable[Iterable[Timed]],
+) -> None:
+    """Copy a recording bit for bit, but for some topics, with new messages among the rest.
+
+    Parameters
+    ----------
+    recording, out
+        Recording to read and recording to write.
+    made
+        Provenance of ``out``.
+    without
+        Topics that are left out.
+    fresh
+        Streams of new messages, each in time order.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    held = summary(recording)
+    kept = [topic for topic in held.topics if topic not in without]
+    total = sum(held.topics[topic].count for topic in kept)
+    streams: list[Iterable[Any]] = [track(read_raw(recording, *kept), "Writing", total), *fresh]
+    with RecordingWriter(out, made) as sink:
+        copy_extras(held, sink)
+        for item in heapq.merge(*streams, key=lambda m: m.time_ns):
+            if isinstance(item, Timed):
+                sink.write(*item)
+            else:
+                sink.write_raw(item)
