@@ -26,7 +26,7 @@ COMMANDS = {
     "record": "Record the logs and cameras of Crazyflies in flight, until Ctrl-C.",
     "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
     "calibrate": "Calibrate a camera: intrinsics from a chessboard, mount and delay from a flight.",
-    "align": "Set the clocks of robots by each other, from the ranges that both of a pair logged.",
+    "align": "Set clocks by each other: from ranges of pairs, images, or motion capture.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
     "card": "Write a dataset's card and figures again.",

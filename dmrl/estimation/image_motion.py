@@ -11,8 +11,8 @@ Array = NDArray[np.float64]
 
 WIDTH_PX = 80
 """Pictures are shrunk to about this width: noise goes, and turns remain."""
-LEAST_PEAK = 0.06
-"""A lower peak of the correlation, 1 at most, is chance."""
+CHANCE = 7.0
+"""Peaks of two pictures of noise are lower than this over the root of their pixels."""
 LONGEST_S = 0.5
 """Pictures further apart than this are not compared."""
 
@@ -61,7 +61,7 @@ def shift(before: Array, after: Array) -> tuple[float, float] | None:
     cross /= np.maximum(size, 0.01 * size.mean() + 1e-12)
     peaks = np.fft.irfft2(cross, s=before.shape)
     row, col = np.unravel_index(int(peaks.argmax()), peaks.shape)
-    if peaks[row, col] < LEAST_PEAK:
+    if peaks[row, col] < CHANCE / np.sqrt(peaks.size):
         return None
     around = np.arange(-1, 2)
     right = col + _vertex(peaks[row, (col + around) % width])

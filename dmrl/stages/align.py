@@ -44,11 +44,9 @@ class Settings:
     reference
         The robot whose times stay, or mocap. Without it, the first by name.
     mocap
-        The poses on /tf and /<robot>/pose/truth are of a motion capture with a clock of its
-        own: robots are tied to it by what both saw of their yaw rate, tilt, speed or height.
+        Poses on /tf and /<robot>/pose/truth have motion capture's clock: tie robots to it.
     cameras
-        Cameras have clocks of their own: each is set by the turns that its images and its
-        robot's attitude both show.
+        Cameras have clocks of their own: set each by the turns it and its robot both saw.
     steady_cameras
         Pictures that were stamped when they arrived get the even times of a steady camera.
     """
@@ -268,7 +266,7 @@ def command(
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Set clocks by each other: from ranges that both of a pair logged, images, motion capture.
+    """Set clocks by each other: from ranges of pairs, images, or motion capture.
 
     Parameters
     ----------
