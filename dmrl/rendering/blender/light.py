@@ -36,6 +36,7 @@ class Sky:
         # Coarse and capped, it is met often enough by chance: the rays aimed at light go to
         # the sun alone, and no map of the sky is made for every image.
         world.cycles.sampling_method = "NONE"
+        world.cycles_visibility.camera = False  # the film is clear there: no need to look
         tree = world.node_tree
         self.background = tree.nodes["Background"]
         place = tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"]

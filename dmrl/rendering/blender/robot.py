@@ -73,6 +73,9 @@ def _paint(material, number):
     tree.links.new(finish.outputs[0], surface.inputs["Roughness"])
     tree.links.new(finish.outputs[1], surface.inputs["Metallic"])
     tree.links.new(finish.outputs[2], surface.inputs["Emission Strength"])
+    # Nothing here is brushed metal: without this, the direction of brushing would be worked out
+    # for every ray.
+    tree.links.new(node(tree, "CombineXYZ").outputs[0], surface.inputs["Tangent"])
 
 
 def _show_blades(material, head):
@@ -102,7 +105,11 @@ def _show_blades(material, head):
         share = calc(tree, "MAXIMUM", calc(tree, "SUBTRACT", end, begin), 0.0)
         total = share if total is None else calc(tree, "ADD", total, share)
     opacity = calc(tree, "MINIMUM", calc(tree, "DIVIDE", total, sweep), 1.0)
-    tree.links.new(opacity, tree.nodes["Principled BSDF"].inputs["Alpha"])
+    # A mixture, since the side that has no share in it is not worked out; of alpha, it is.
+    clear = node(tree, "BsdfTransparent").outputs[0]
+    blade = tree.nodes["Principled BSDF"].outputs[0]
+    mixture = node(tree, "MixShader", opacity, clear, blade).outputs[0]
+    tree.links.new(mixture, tree.nodes["Material Output"].inputs["Surface"])
 
 
 def _meshes(path):

@@ -18,7 +18,10 @@ import os
 import sys
 from pathlib import Path
 
-import bpy
+from core import one_core
+
+with one_core():
+    import bpy
 import numpy as np
 from light import Sky, panorama
 from mathutils import Matrix
