@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.random import Generator
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry import Array, Camera
 from dmrl.images import Rgb, crop_and_scale, decode, size
-from dmrl.rendering.lens import Picture, sample, undistort
+from dmrl.rendering.lens import Picture, between, undistort
 
 PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm")
 KEPT = 64
@@ -124,21 +124,23 @@ def panorama_view(
     turn_rad
         Roll and pitch of the camera, and the panorama's turn about the vertical.
     """
-    rays = _rays(camera) @ _panorama_from_camera(turn_rad).T
+    x, y, z = _panorama_from_camera(turn_rad).astype(np.float32) @ _rays(camera)
     height, width, _ = panorama.shape
-    u = (0.5 - np.arctan2(rays[..., 1], rays[..., 0]) / (2 * np.pi)) * width
-    v = (0.5 - np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1])) / np.pi) * height
-    round_about = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
-    v = np.clip(v, 0.5, height - 0.5)
-    return sample(round_about, np.stack([u + 1, v], axis=-1).astype(np.float32))
+    u = (0.5 - np.arctan2(y, x) / np.float32(2 * np.pi)) * width - 0.5
+    v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.float32(np.pi)) * height - 0.5
+    places = np.stack([u, np.clip(v, 0, height - 1.001)], axis=-1)
+    shape = (camera.height_px, camera.width_px, 2)
+    return between(panorama, places.reshape(shape), around=True)
 
 
-def _rays(camera: Camera) -> Array:
+@cache
+def _rays(camera: Camera) -> Picture:
+    """(3, H * W) what each pixel sees, camera frame."""
     v, u = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     right = (u - camera.cx_px) / camera.fx_px
     down = (v - camera.cy_px) / camera.fy_px
-    xy = undistort(np.stack([right, down], axis=-1), camera.distortion)
-    return np.stack([np.ones_like(u), -xy[..., 0], -xy[..., 1]], axis=-1)
+    x, y = np.moveaxis(undistort(np.stack([right, down], axis=-1), camera.distortion), 2, 0)
+    return np.stack([np.ones_like(u), -x, -y]).reshape(3, -1).astype(np.float32)
 
 
 def _panorama_from_camera(turn_rad: tuple[float, float, float]) -> Array:

@@ -122,12 +122,37 @@ def sample(picture: Picture, places_px: Picture) -> Picture:
     height, width, channels = picture.shape
     padded = np.zeros((height + 2, width + 2, channels), np.float32)
     padded[1:-1, 1:-1] = picture
-    place = np.clip(places_px + 0.5, 0, (width + 0.999, height + 0.999))
-    corner = place.astype(np.int32)
-    share_u, share_v = np.moveaxis((place - corner)[..., None], 2, 0).astype(np.float32)
-    flat, stride = padded.reshape(-1, channels), width + 2
-    index = corner[..., 1] * stride + corner[..., 0]
-    top = flat[index] * (1 - share_u) + flat[index + 1] * share_u
-    below = np.minimum(index + stride, len(flat) - 2)
-    low = flat[below] * (1 - share_u) + flat[below + 1] * share_u
-    return np.asarray(top * (1 - share_v) + low * share_v, np.float32)
+    return between(padded, np.clip(places_px + 0.5, 0, (width + 0.999, height + 0.999)))
+
+
+def between(picture: Picture, places_px: Picture, *, around: bool = False) -> Picture:
+    """(H, W, C) picture at places between its pixels' centres, bilinear.
+
+    Parameters
+    ----------
+    picture
+        (h, w, C).
+    places_px
+        (H, W, 2) from the centre of the first pixel, right and down, above the last row.
+    around
+        Whether the first column follows the last; else places are left of the last column.
+    """
+    _, width, channels = picture.shape
+    corner = np.floor(places_px).astype(np.intp)
+    share = np.subtract(places_px, corner, dtype=np.float32)
+    share_u, share_v = share[..., :1], share[..., 1:]
+    column, row = corner[..., 0], corner[..., 1] * width
+    left, right = (column % width, (column + 1) % width) if around else (column, column + 1)
+    flat = picture.reshape(-1, channels)
+    above = _mixed(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
+    row += width
+    below = _mixed(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
+    return _mixed(above, below, share_v)
+
+
+def _mixed(first: Picture, second: Picture, share: Picture) -> Picture:
+    """The first, into which a share of the second is mixed, in its place in memory."""
+    second -= first
+    second *= share
+    first += second
+    return first

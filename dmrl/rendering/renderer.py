@@ -23,7 +23,7 @@ from dmrl.rendering.shot import Layer, Look, Robot, Shot, requests
 
 MODEL_KINDS = (".blend", ".glb", ".gltf", ".obj", ".stl")
 SMALLEST_M, LARGEST_M = 0.01, 3.0
-SAMPLES = 16
+SAMPLES = 8
 BOUNCES = 2
 
 Scene = tuple[Camera, Sequence[Robot], Look]

@@ -142,7 +142,7 @@ class Settings:
     images: int = 1000
     seed: int = 0
     workers: int = 0
-    samples: int = 16
+    samples: int = 8
     camera: Literal["aideck", "published"] = "aideck"
     distorted: bool = True
     model: Path | None = None
