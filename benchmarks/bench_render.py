@@ -1,6 +1,7 @@
-"""Figures of dmrl render: reprojection, cost against the published way, memory.
+"""Figures of dmrl render: reprojection, grain, cost against the published way, memory.
 
     python benchmarks/bench_render.py reprojection [--images 500]
+    python benchmarks/bench_render.py grain --images 24
     python benchmarks/bench_render.py speed --model crazyflie-published.blend --backgrounds DIR
     python benchmarks/bench_render.py memory [--images 3000]
 
@@ -26,14 +27,17 @@ from dmrl.geometry import Array, Camera, project
 from dmrl.progress import say
 from dmrl.rendering import crazyflie
 from dmrl.rendering.environment import ensure
-from dmrl.rendering.lens import image_from_pinhole
+from dmrl.rendering.lens import Picture, image_from_pinhole
 from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch import Pose
 from dmrl.stages.render import camera_of, run, settings_of
 
 PUBLISHED_WAY = Path(__file__).parent / "published_way.py"
 SAMPLES, FEW = 16, 4
+MANY_SAMPLES = 512
 MM_PER_UNIT = 0.002  # the published model, at twice life size as the authors rendered it
 
 
@@ -77,7 +81,7 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
         world = World(
             settings, camera, renderer.radius_m, tuple(renderer.lights), renderer.panorama, None
         )
-        world = replace(world, panorama=lambda name: np.full((8, 16, 3), 0.3, np.float32))
+        world = replace(world, panorama=_grey)
         scenes = [draw_scene(world, k) for k in range(images)]
         shots = renderer.shots((camera, scene.robots, scene.look) for scene in scenes)
         for scene, shot in zip(scenes, shots, strict=True):
@@ -102,6 +106,55 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
         },
         "median_middle_px": float(np.median(np.abs(middles))),
     }
+
+
+def grain(recipe: str, images: int) -> dict[str, float]:
+    """What light paths leave of noise on robots, and the sensor's own, grey levels of 256.
+
+    Root mean squares, over pixels that a robot covers wholly, of the difference from a picture
+    of many paths; the sensor is noiseless but where its noise is told.
+
+    Parameters
+    ----------
+    recipe
+        Name of a recipe.
+    images
+        How many.
+    """
+    settings = settings_of(recipe, images=images, robots_max=1, empty_share=0.0)
+    camera = camera_of(settings)
+    shots: dict[str, list[Shot]] = {}
+    for samples in (MANY_SAMPLES, 4, 8, 16):
+        model = Model(None, settings.scale)
+        with Renderer(ensure(say), model, workers=1, samples=samples) as renderer:
+            world = World(settings, camera, renderer.radius_m, tuple(renderer.lights), _grey, None)
+            drawn = [draw_scene(world, k) for k in range(images)]
+            calm = [replace(d.look, sensor=_noiseless(d.look.sensor)) for d in drawn]
+            scenes = [(camera, d.robots, look) for d, look in zip(drawn, calm, strict=True)]
+            shots[f"paths_{samples}"] = list(renderer.shots(scenes))
+            if samples == MANY_SAMPLES:
+                noisy = [(camera, d.robots, d.look) for d in drawn]
+                shots["sensor"] = list(renderer.shots(noisy))
+    exact = shots.pop(f"paths_{MANY_SAMPLES}")
+    return {name: _difference(found, exact) for name, found in shots.items()}
+
+
+def _grey(name: str) -> Picture:
+    """(8, 16, 3) a panorama of nothing."""
+    return np.full((8, 16, 3), 0.3, np.float32)
+
+
+def _noiseless(sensor: Sensor) -> Sensor:
+    return replace(sensor, shot_noise=0.0, read_noise=0.0)
+
+
+def _difference(found: list[Shot], exact: list[Shot]) -> float:
+    """Root mean square where a robot covers pixels wholly."""
+    apart = [
+        (one.rgb.astype(float) - other.rgb)[(other.opacity == 255).any(axis=0)].ravel()
+        for one, other in zip(found, exact, strict=True)
+    ]
+    return float(np.sqrt(np.mean(np.concatenate(apart) ** 2)))
 
 
 def _children_s() -> float:
@@ -134,7 +187,7 @@ def published_way(model: Path, backgrounds: Path, images: int, samples: int) -> 
         camera_of(settings),
         0.1,
         ("none",),
-        lambda name: np.full((8, 16, 3), 0.3, np.float32),
+        _grey,
         None,
     )
     photos = sorted(backgrounds.glob("*.jpg"))
@@ -231,6 +284,8 @@ def _resident_mb() -> float:
 def speed(model: Path, backgrounds: Path, images: int, rounds: int) -> dict[str, object]:
     """The published way, and ours with its model and with our own, turn by turn in one run.
 
+    The first two take equal samples; what is called by a recipe's name is as that recipe says.
+
     Every way is timed with few and with many images; the difference is what an image costs
     without the start. What else runs on the machine then disturbs all ways alike.
 
@@ -250,20 +305,28 @@ def speed(model: Path, backgrounds: Path, images: int, rounds: int) -> dict[str,
     ways: dict[str, tuple[Callable[[int], dict[str, float]], int]] = {
         "published way": (lambda n: published_way(model, backgrounds, n, SAMPLES), images // 10),
         "ours, published model": (
-            lambda n: ours("synthetic_paper", n, 2, **one, **as_published),
+            lambda n: ours("synthetic_paper", n, 2, samples=SAMPLES, **one, **as_published),
             images,
         ),
-        "ours, default model": (lambda n: ours("synthetic_paper", n, 2, **one), images),
-        "ours, himax": (lambda n: ours("synthetic_large", n, 2, **one), images),
+        "ours, default model": (
+            lambda n: ours("synthetic_paper", n, 2, samples=SAMPLES, **one),
+            images,
+        ),
+        "synthetic_paper": (lambda n: ours("synthetic_paper", n, 2, **one), images),
+        "synthetic_large": (lambda n: ours("synthetic_large", n, 2, **one), images),
     }
     found: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
     for _ in range(rounds):
         for name, (way, many) in ways.items():
             few, all_of_them = way(FEW), way(FEW + many)
             spent_s = [r["cpu_s_per_image"] * n for r, n in ((few, FEW), (all_of_them, FEW + many))]
-            without_start = {"cpu_s_without_start": (spent_s[1] - spent_s[0]) / many}
+            took_s = [n / r["images_per_s"] for r, n in ((few, FEW), (all_of_them, FEW + many))]
+            without_start = {
+                "cpu_s_without_start": (spent_s[1] - spent_s[0]) / many,
+                "images_per_s_without_start": many / (took_s[1] - took_s[0]),
+            }
             found[name].append({**all_of_them, **without_start})
-    result: dict[str, object] = {"samples": SAMPLES, "load": os.getloadavg()}
+    result: dict[str, object] = {"equal_samples": SAMPLES, "load": os.getloadavg()}
     for name, rates in found.items():
         result[name] = {
             key: {"least": min(values), "median": float(np.median(values)), "most": max(values)}
@@ -280,7 +343,7 @@ def speed(model: Path, backgrounds: Path, images: int, rounds: int) -> dict[str,
 def main() -> None:
     """Print the figures that were asked for, as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("reprojection", "speed", "memory"))
+    parser.add_argument("what", choices=("reprojection", "grain", "speed", "memory"))
     parser.add_argument("--images", type=int, default=500)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--model", type=Path)
@@ -288,6 +351,8 @@ def main() -> None:
     asked = parser.parse_args()
     if asked.what == "reprojection":
         result: object = {p: reprojection(p, asked.images) for p in ("published", "himax")}
+    elif asked.what == "grain":
+        result = {r: grain(r, asked.images) for r in ("synthetic_paper", "synthetic_large")}
     elif asked.what == "memory":
         result = memory(asked.images)
     else:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dmrl.geometry import AIDECK
-from dmrl.rendering.lens import canvas_of, image_from_pinhole, pinhole_from_image, sample
+from dmrl.rendering.lens import between, canvas_of, image_from_pinhole, pinhole_from_image, sample
 
 
 def test_undistorting_takes_distortion_back() -> None:
@@ -38,3 +38,10 @@ def test_the_canvas_holds_all_that_the_image_shows() -> None:
     straight = canvas_of(replace(AIDECK, distortion=()))
     assert straight.places_px is None
     assert straight.inside.all()
+
+
+def test_the_first_column_follows_the_last_around_a_panorama() -> None:
+    picture = np.arange(12, dtype=np.float32).reshape(2, 6, 1)
+    places = np.array([[[5.5, 0.0], [-0.5, 0.0], [5.5, 0.5]]], np.float32)
+    found = between(picture, places, around=True)[0, :, 0]
+    assert found.tolist() == [2.5, 2.5, 5.5]

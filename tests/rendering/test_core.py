@@ -1,0 +1,23 @@
+"""Cores that a worker shows to Blender's libraries while they are loaded."""
+
+import os
+
+import pytest
+
+from dmrl.rendering.blender.core import one_core
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+def test_one_core_is_seen_inside_and_all_of_them_afterwards() -> None:
+    before = os.sched_getaffinity(0)
+    with pytest.raises(ImportError), one_core():
+        assert len(os.sched_getaffinity(0)) == 1
+        raise ImportError("no bpy")
+    assert os.sched_getaffinity(0) == before
+
+
+def test_nothing_happens_where_cores_cannot_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_setaffinity", raising=False)
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    with one_core():
+        pass
