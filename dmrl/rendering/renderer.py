@@ -104,8 +104,7 @@ class Renderer:
     ) -> None:
         _check_model(model)
         self.lights = [str(p) for p in (shipped_lights(python) if lights is None else lights)]
-        cores = len(os.sched_getaffinity(0))
-        self._pool = Pool(_start(python, model, self.lights, samples), workers or cores)
+        self._pool = Pool(_start(python, model, self.lights, samples), workers or _cores())
         self.version = self._pool.version
         self.points = _outermost(self._pool.points)
         size_m = float(np.ptp(self._pool.points, axis=0).max())
@@ -175,6 +174,13 @@ def shoot(worker: Worker, scene: Scene, points: Array) -> Shot:
         left, top, _, _ = asked["crop_px"]
         layers[number] = Layer(left, top, arrays["light"], arrays["depth"])
     return compose(camera, robots, look, layers)
+
+
+def _cores() -> int:
+    """Cores that this process may use; all, where that cannot be asked (macOS, Windows)."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def shipped_lights(python: Path) -> list[Path]:
