@@ -1,7 +1,7 @@
 """Figures of dmrl render: reprojection, grain, cost against the published way, memory.
 
     python benchmarks/bench_render.py reprojection [--images 500]
-    python benchmarks/bench_render.py grain --images 24
+    python benchmarks/bench_render.py grain --images 24 --backgrounds DIR
     python benchmarks/bench_render.py speed --model crazyflie-published.blend --backgrounds DIR
     python benchmarks/bench_render.py memory [--images 3000]
 
@@ -26,6 +26,7 @@ import numpy as np
 from dmrl.geometry import Array, Camera, project
 from dmrl.progress import say
 from dmrl.rendering import crazyflie
+from dmrl.rendering.backdrops import Photos
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.lens import Picture, image_from_pinhole
 from dmrl.rendering.randomise import World, draw_scene
@@ -108,10 +109,10 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
     }
 
 
-def grain(recipe: str, images: int) -> dict[str, float]:
+def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
     """What light paths leave of noise on robots, and the sensor's own, grey levels of 256.
 
-    Root mean squares, over pixels that a robot covers wholly, of the difference from a picture
+    Standard deviations, over pixels that a robot covers wholly, of the difference from a picture
     of many paths; the sensor is noiseless but where its noise is told.
 
     Parameters
@@ -120,14 +121,19 @@ def grain(recipe: str, images: int) -> dict[str, float]:
         Name of a recipe.
     images
         How many.
+    backgrounds
+        Folder of photos.
     """
     settings = settings_of(recipe, images=images, robots_max=1, empty_share=0.0)
+    photos = Photos(backgrounds)
     camera = camera_of(settings)
     shots: dict[str, list[Shot]] = {}
     for samples in (MANY_SAMPLES, 4, 8, 16):
         model = Model(None, settings.scale)
         with Renderer(ensure(say), model, workers=1, samples=samples) as renderer:
-            world = World(settings, camera, renderer.radius_m, tuple(renderer.lights), _grey, None)
+            world = World(
+                settings, camera, renderer.radius_m, tuple(renderer.lights), _grey, photos
+            )
             drawn = [draw_scene(world, k) for k in range(images)]
             calm = [replace(d.look, sensor=_noiseless(d.look.sensor)) for d in drawn]
             scenes = [(camera, d.robots, look) for d, look in zip(drawn, calm, strict=True)]
@@ -149,12 +155,12 @@ def _noiseless(sensor: Sensor) -> Sensor:
 
 
 def _difference(found: list[Shot], exact: list[Shot]) -> float:
-    """Root mean square where a robot covers pixels wholly."""
+    """Standard deviation where a robot covers pixels wholly."""
     apart = [
         (one.rgb.astype(float) - other.rgb)[(other.opacity == 255).any(axis=0)].ravel()
         for one, other in zip(found, exact, strict=True)
     ]
-    return float(np.sqrt(np.mean(np.concatenate(apart) ** 2)))
+    return float(np.std(np.concatenate(apart)))
 
 
 def _children_s() -> float:
@@ -351,13 +357,16 @@ def main() -> None:
     asked = parser.parse_args()
     if asked.what == "reprojection":
         result: object = {p: reprojection(p, asked.images) for p in ("published", "himax")}
-    elif asked.what == "grain":
-        result = {r: grain(r, asked.images) for r in ("synthetic_paper", "synthetic_large")}
     elif asked.what == "memory":
         result = memory(asked.images)
+    elif asked.backgrounds is None:
+        sys.exit(f"{asked.what} needs --backgrounds DIR")
+    elif asked.what == "grain":
+        recipes = ("synthetic_paper", "synthetic_large")
+        result = {r: grain(r, asked.images, asked.backgrounds) for r in recipes}
+    elif asked.model is None:
+        sys.exit("speed needs --model crazyflie-published.blend")
     else:
-        if asked.model is None or asked.backgrounds is None:
-            sys.exit("speed needs --model crazyflie-published.blend and --backgrounds DIR")
         result = speed(asked.model, asked.backgrounds, asked.images, asked.rounds)
     print(json.dumps(result, indent=2))
 
