@@ -1,32 +1,35 @@
 """Layout ``flight``: space, images, and plots of every pair of robots."""
 
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 
 import numpy as np
+import pyarrow as pa
 
 from dmrl import topics
 from dmrl.colours import RGB
 from dmrl.progress import say
 from dmrl.viewer import layouts, plots, space
-from dmrl.viewer.entity import (
-    WORLD,
-    camera_frame,
-    horizontal_frame,
-    optical_frame,
-)
+from dmrl.viewer.entity import WORLD, Entity, camera_frame, horizontal_frame, optical_frame
 from dmrl.viewer.layouts import Eye, Plot, Space
-from dmrl.viewer.motion import Motion, Names, read_motion
+from dmrl.viewer.motion import Motion, Names, glimpse, read_motion
 from dmrl.viewer.scene import Draw, Scene, Still, eyes_of, firsts, model_draws, picture_draws
 from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
 
 CAMERAS_MAX = 4
 
+Whole = Callable[[], Motion]
+"""The motion of a whole flight, read when it is first asked for."""
+
 
 def flight_scene(selection: Selection, settings: Settings) -> Scene:
-    """What a flight shows, as far as the recordings have it."""
+    """What a flight shows, as far as the recordings have it.
+
+    A few moments say what panels there are; the whole flight is read once images are seen.
+    """
     pairs = _pairs(selection, settings.robot)
-    motion = read_motion(selection.recordings, pairs, *selection.shown_ns)
+    seen = glimpse(selection.recordings, pairs, *selection.shown_ns)
+    whole: Whole = cache(partial(read_motion, selection.recordings, pairs, *selection.shown_ns))
     robots = _robots(selection, pairs, settings.robot)
     eyes = eyes_of(selection, sorted(selection.image_ns)[:CAMERAS_MAX], {})
     sources: dict[str, set[str]] = {eye.robot: set() for eye in eyes}
@@ -38,18 +41,24 @@ def flight_scene(selection: Selection, settings: Settings) -> Scene:
             draws += model_draws(eye, {}, smooth=False)
             named["detection"] = RGB["detection"]
     for robot in robots:
-        draws += _robot_draws(selection, motion, robot, own=robot == robots[0])
+        draws += _robot_draws(selection, seen, robot, own=robot == robots[0])
     for pair in pairs:
-        draws += _range_draws(pair, motion)
-    stills = [
-        *_frames(selection, motion, robots),
-        *(still for pair in pairs for still in _pair_stills(pair, motion)),
-    ]
-    spaces = _spaces(selection, motion, pairs, robots, eyes)
-    panels = {f"{a} sees {b}": _panels(selection, motion, (a, b)) for a, b in pairs}
+        draws += _range_draws(pair, whole)
+    spaces = _spaces(selection, seen, pairs, robots, eyes)
+    panels = {f"{a} sees {b}": _panels(selection, seen, (a, b)) for a, b in pairs}
     if not pairs:
         panels = {robots[0]: _own_panels(selection, robots)} if robots else {}
+    stills = partial(_stills, selection, whole, robots, pairs)
     return Scene(layouts.flight(spaces, eyes, panels), draws, stills, eyes, sources, named)
+
+
+def _stills(
+    selection: Selection, whole: Whole, robots: Sequence[str], pairs: Sequence[Names]
+) -> Iterator[Still]:
+    motion = whole()
+    yield from _frames(selection, motion, robots)
+    for pair in pairs:
+        yield from _pair_stills(pair, motion)
 
 
 def _topics(selection: Selection) -> set[str]:
@@ -91,13 +100,18 @@ def _robot_draws(selection: Selection, motion: Motion, robot: str, *, own: bool)
     return draws
 
 
-def _range_draws(pair: Names, motion: Motion) -> list[Draw]:
+def _range_draws(pair: Names, whole: Whole) -> list[Draw]:
     topic = topics.uwb_range(*pair)
-    towards = motion.estimates.get(pair) or motion.truths.get(pair)
     return [
         Draw(topic, partial(plots.ranges, topic)),
-        Draw(topic, partial(space.ranges, topic, pair[0], towards=towards)),
+        Draw(topic, partial(_ranges, topic, pair, whole)),
     ]
+
+
+def _ranges(topic: str, pair: Names, whole: Whole, batch: pa.RecordBatch) -> Iterator[Entity]:
+    motion = whole()
+    towards = motion.estimates.get(pair) or motion.truths.get(pair)
+    return space.ranges(topic, pair[0], batch, towards)
 
 
 def _frames(selection: Selection, motion: Motion, robots: Sequence[str]) -> Iterator[Still]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.geometry import Array
 from dmrl.positions import GAP_S
-from dmrl.recording import Summary, stretches
+from dmrl.recording import Summary, glance, stretches
 from dmrl.viewer.entity import WORLD, horizontal_frame
 
 Times = NDArray[np.int64]
@@ -118,21 +118,43 @@ class Motion:
 def read_motion(
     recordings: Mapping[Path, Summary], pairs: Iterable[Names], start_ns: int, end_ns: int
 ) -> Motion:
-    """What the recordings say of the pairs in [start_ns, end_ns), and their /tf."""
+    """All that the recordings say of the pairs in [start_ns, end_ns), and their /tf."""
     pairs = list(pairs)
-    kinds = {topics.position(*pair): ("estimates", pair) for pair in pairs}
-    kinds |= {topics.truth(*pair): ("truths", pair) for pair in pairs}
-    fields: dict[str, Sequence[str] | None] = {**dict.fromkeys(kinds)}
-    fields[topics.TRANSFORMS] = ("transforms",)
     found: dict[str, list[pa.RecordBatch]] = {}
     for path in recordings:
-        for stretch in stretches(path, fields, start_ns=start_ns, end_ns=end_ns):
+        for stretch in stretches(path, _fields(pairs), start_ns=start_ns, end_ns=end_ns):
             for topic, batch in stretch.items():
                 found.setdefault(topic, []).append(batch)
+    return _motion(found, pairs)
+
+
+def glimpse(
+    recordings: Mapping[Path, Summary], pairs: Iterable[Names], start_ns: int, end_ns: int
+) -> Motion:
+    """The same of a few moments: every frame and pair, and how far they go, without the wait."""
+    pairs = list(pairs)
+    found: dict[str, list[pa.RecordBatch]] = {}
+    for path in recordings:
+        seen = glance(path, _fields(pairs), start_ns=start_ns, end_ns=end_ns)
+        for topic, batch in seen.items():
+            found.setdefault(topic, []).append(batch)
+    return _motion(found, pairs)
+
+
+def _fields(pairs: Iterable[Names]) -> dict[str, Sequence[str] | None]:
+    kinds = [kind(*pair) for pair in pairs for kind in (topics.position, topics.truth)]
+    return {**dict.fromkeys(kinds), topics.TRANSFORMS: ("transforms",)}
+
+
+def _motion(found: Mapping[str, list[pa.RecordBatch]], pairs: Iterable[Names]) -> Motion:
     held: dict[str, dict[Names, Positions]] = {"estimates": {}, "truths": {}}
-    for topic, (kind, pair) in kinds.items():
-        if topic in found:
-            held[kind][pair] = _positions(pa.Table.from_batches(found[topic]))
+    for pair in pairs:
+        for kind, topic in (
+            ("estimates", topics.position(*pair)),
+            ("truths", topics.truth(*pair)),
+        ):
+            if topic in found:
+                held[kind][pair] = _positions(pa.Table.from_batches(found[topic]))
     moved = found.get(topics.TRANSFORMS)
     return Motion(_poses(pa.Table.from_batches(moved)) if moved else {}, **held)
 

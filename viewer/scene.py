@@ -59,7 +59,8 @@ class Scene:
     draws
         How topics are drawn, image by image or message by message.
     stills
-        What is known before: with log times, or for ever.
+        What is no matter of single messages: with log times, or for ever. Asked for after the
+        first images, so that they need not wait for it.
     eyes
         Cameras that have a legend.
     sources
@@ -70,27 +71,42 @@ class Scene:
 
     blueprint: rrb.Blueprint
     draws: list[Draw]
-    stills: list[Still]
+    stills: Callable[[], Iterable[Still]]
     eyes: Sequence[Eye]
     sources: dict[str, set[str]] = field(default_factory=dict)
     named: dict[str, Colour] = field(default_factory=dict)
 
 
 def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
-    """The whole scene: what stands still, then all that moves, by time."""
-    for time_ns, entity in scene.stills:
-        yield (None if time_ns is None else _times(selection, time_ns)), entity
+    """The whole scene: the first images, what is known of all times, then the rest by time."""
+    pictures = [draw for draw in scene.draws if draw.robot is not None]
+    others = [draw for draw in scene.draws if draw.robot is None]
     shown: dict[str, set[str]] = {}
+    waiting = True
     for path in selection.recordings:
         for stretch in track(_stretches(selection, scene, path), f"Reading {path.name}"):
-            for draw in scene.draws:
-                if draw.topic in stretch and draw.recording in (None, path):
-                    yield from _drawn(selection, draw, stretch[draw.topic])
-            for robot, eye in {eye.robot: eye for eye in scene.eyes}.items():
-                sources = scene.sources.get(robot, set())
-                if shown.get(robot) != sources and (sources or scene.named):
-                    shown[robot] = set(sources)
-                    yield None, _legend(eye, sources, scene.named)
+            yield from _all_drawn(selection, pictures, path, stretch)
+            yield from _legends(scene, shown)
+            if waiting:
+                yield from _timed(selection, scene.stills())
+                waiting = False
+            yield from _all_drawn(selection, others, path, stretch)
+    if waiting:
+        yield from _timed(selection, scene.stills())
+
+
+def _timed(selection: Selection, stills: Iterable[Still]) -> Iterator[Logged]:
+    for time_ns, entity in stills:
+        yield (None if time_ns is None else _times(selection, time_ns)), entity
+
+
+def _legends(scene: Scene, shown: dict[str, set[str]]) -> Iterator[Logged]:
+    """Legends that are not as they were ``shown``."""
+    for robot, eye in {eye.robot: eye for eye in scene.eyes}.items():
+        sources = scene.sources.get(robot, set())
+        if shown.get(robot) != sources and (sources or scene.named):
+            shown[robot] = set(sources)
+            yield None, _legend(eye, sources, scene.named)
 
 
 def _stretches(
@@ -102,11 +118,19 @@ def _stretches(
     if selection.all_images or not selection.image_ns:
         yield from stretches(path, wanted, start_ns=first_ns, end_ns=end_ns)
         return
+    few = {topic: None for topic in wanted if topic in around_images}
+    image_ns = min(int(times[0]) for times in selection.image_ns.values())
+    yield from stretches(path, few, start_ns=image_ns, end_ns=selection.last_image_ns + 1)
     always = {topic: None for topic in wanted if topic not in around_images}
     yield from stretches(path, always, start_ns=first_ns, end_ns=end_ns)
-    few = {topic: None for topic in wanted if topic in around_images}
-    first_ns = min(int(times[0]) for times in selection.image_ns.values())
-    yield from stretches(path, few, start_ns=first_ns, end_ns=selection.last_image_ns + 1)
+
+
+def _all_drawn(
+    selection: Selection, draws: Iterable[Draw], path: Path, stretch: Mapping[str, pa.RecordBatch]
+) -> Iterator[Logged]:
+    for draw in draws:
+        if draw.topic in stretch and draw.recording in (None, path):
+            yield from _drawn(selection, draw, stretch[draw.topic])
 
 
 def _drawn(selection: Selection, draw: Draw, batch: pa.RecordBatch) -> Iterator[Logged]:
