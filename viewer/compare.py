@@ -54,11 +54,10 @@ def compare_scene(selection: Selection, settings: Settings) -> Scene:
     scales = entities.scales(settings.depth_max_m)
     eyes = [eye for path in models for eye in eyes_of(selection, [robot], scales, model=path)]
     judged = {path: found for path in models if (found := _judged(path, robot, selection))}
-    stills = [*bars(eyes[0], scales), *_stills(models, judged)]
     scene = Scene(
         layouts.compare(eyes, scales, _plots(models, judged), TABLE, overlay=settings.overlay),
         picture_draws(eyes[0], set()),
-        lambda: stills,
+        [*bars(eyes[0], scales), *_stills(models, judged)],
         eyes[:1],
     )
     sources = scene.sources.setdefault(robot, set())

@@ -17,6 +17,7 @@ from dmrl.recording import stretches
 from dmrl.viewer import entities
 from dmrl.viewer.entities import Colour, Scale
 from dmrl.viewer.entity import Entity, image_frame
+from dmrl.viewer.follow import Follower
 from dmrl.viewer.layouts import TIMELINE, Eye
 from dmrl.viewer.legend import colour_bars, legend
 from dmrl.viewer.motion import Times
@@ -59,40 +60,47 @@ class Scene:
     draws
         How topics are drawn, image by image or message by message.
     stills
-        What is no matter of single messages: with log times, or for ever. Asked for after the
-        first images, so that they need not wait for it.
+        What is known before: with log times, or for ever.
     eyes
         Cameras that have a legend.
     sources
         Robot to sources of its labels; grows as they are read.
     named
         Names and colours of what else the legends explain.
+    follower
+        Makes one that draws what several topics say together; None: nothing does.
     """
 
     blueprint: rrb.Blueprint
     draws: list[Draw]
-    stills: Callable[[], Iterable[Still]]
+    stills: list[Still]
     eyes: Sequence[Eye]
     sources: dict[str, set[str]] = field(default_factory=dict)
     named: dict[str, Colour] = field(default_factory=dict)
+    follower: Callable[[], Follower] | None = None
+
+    def topics(self, path: Path) -> list[str]:
+        """What is read of a recording."""
+        drawn = [draw.topic for draw in self.draws if draw.recording in (None, path)]
+        return drawn + (self.follower().topics if self.follower else [])
 
 
 def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
-    """The whole scene: the first images, what is known of all times, then the rest by time."""
-    pictures = [draw for draw in scene.draws if draw.robot is not None]
-    others = [draw for draw in scene.draws if draw.robot is None]
+    """The whole scene: what stands still, then all that moves, by time, images first."""
+    yield from _timed(selection, scene.stills)
+    draws = sorted(scene.draws, key=lambda draw: draw.robot is None)
+    follower = scene.follower() if scene.follower else None
     shown: dict[str, set[str]] = {}
-    waiting = True
     for path in selection.recordings:
         for stretch in track(_stretches(selection, scene, path), f"Reading {path.name}"):
-            yield from _all_drawn(selection, pictures, path, stretch)
+            for draw in draws:
+                if draw.topic in stretch and draw.recording in (None, path):
+                    yield from _drawn(selection, draw, stretch[draw.topic])
             yield from _legends(scene, shown)
-            if waiting:
-                yield from _timed(selection, scene.stills())
-                waiting = False
-            yield from _all_drawn(selection, others, path, stretch)
-    if waiting:
-        yield from _timed(selection, scene.stills())
+            if follower:
+                yield from _timed(selection, follower.take(stretch))
+    if follower:
+        yield from _timed(selection, follower.rest())
 
 
 def _timed(selection: Selection, stills: Iterable[Still]) -> Iterator[Logged]:
@@ -112,7 +120,7 @@ def _legends(scene: Scene, shown: dict[str, set[str]]) -> Iterator[Logged]:
 def _stretches(
     selection: Selection, scene: Scene, path: Path
 ) -> Iterator[dict[str, pa.RecordBatch]]:
-    wanted = {draw.topic: None for draw in scene.draws if draw.recording in (None, path)}
+    wanted = dict.fromkeys(scene.topics(path))
     around_images = {draw.topic: None for draw in scene.draws if draw.robot is not None}
     first_ns, end_ns = selection.shown_ns
     if selection.all_images or not selection.image_ns:
@@ -123,14 +131,6 @@ def _stretches(
     yield from stretches(path, few, start_ns=image_ns, end_ns=selection.last_image_ns + 1)
     always = {topic: None for topic in wanted if topic not in around_images}
     yield from stretches(path, always, start_ns=first_ns, end_ns=end_ns)
-
-
-def _all_drawn(
-    selection: Selection, draws: Iterable[Draw], path: Path, stretch: Mapping[str, pa.RecordBatch]
-) -> Iterator[Logged]:
-    for draw in draws:
-        if draw.topic in stretch and draw.recording in (None, path):
-            yield from _drawn(selection, draw, stretch[draw.topic])
 
 
 def _drawn(selection: Selection, draw: Draw, batch: pa.RecordBatch) -> Iterator[Logged]:
