@@ -1,6 +1,6 @@
 """What of a selection is drawn, and how: read in one pass, stretch by stretch."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,10 @@ from dmrl.viewer.selection import Selection
 from dmrl.viewer.show import Logged, time_column
 
 Still = tuple[Times | None, Entity]
+Stretch = dict[str, pa.RecordBatch]
+
+ROWS_AT_ONCE = 20_000
+"""Messages that belong to no image are drawn so many at a time: half a minute of two robots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +92,13 @@ class Scene:
 def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
     """The whole scene: what stands still, then all that moves, by time, images first."""
     yield from _timed(selection, scene.stills)
-    draws = sorted(scene.draws, key=lambda draw: draw.robot is None)
     follower = scene.follower() if scene.follower else None
+    of_images = {draw.topic for draw in scene.draws if draw.robot is not None}
     shown: dict[str, set[str]] = {}
     for path in selection.recordings:
-        for stretch in track(_stretches(selection, scene, path), f"Reading {path.name}"):
-            for draw in draws:
+        parts = track(_stretches(selection, scene, path), f"Reading {path.name}")
+        for stretch in _gathered(parts, of_images):
+            for draw in scene.draws:
                 if draw.topic in stretch and draw.recording in (None, path):
                     yield from _drawn(selection, draw, stretch[draw.topic])
             yield from _legends(scene, shown)
@@ -101,6 +106,28 @@ def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
                 yield from _timed(selection, follower.take(stretch))
     if follower:
         yield from _timed(selection, follower.rest())
+
+
+def _gathered(parts: Iterable[Stretch], of_images: Set[str]) -> Iterator[Stretch]:
+    """What belongs to images at once, of all else more at a time: each call of rerun costs.
+
+    The first part comes whole.
+    """
+    held: dict[str, list[pa.RecordBatch]] = {}
+    count = ROWS_AT_ONCE
+    for part in parts:
+        yield {topic: batch for topic, batch in part.items() if topic in of_images}
+        for topic in part.keys() - of_images:
+            held.setdefault(topic, []).append(part[topic])
+            count += part[topic].num_rows
+        if count >= ROWS_AT_ONCE:
+            yield _joined(held)
+            held, count = {}, 0
+    yield _joined(held)
+
+
+def _joined(held: Mapping[str, Sequence[pa.RecordBatch]]) -> Stretch:
+    return {topic: pa.concat_batches(batches) for topic, batches in held.items()}
 
 
 def _timed(selection: Selection, stills: Iterable[Still]) -> Iterator[Logged]:
@@ -117,9 +144,7 @@ def _legends(scene: Scene, shown: dict[str, set[str]]) -> Iterator[Logged]:
             yield None, _legend(eye, sources, scene.named)
 
 
-def _stretches(
-    selection: Selection, scene: Scene, path: Path
-) -> Iterator[dict[str, pa.RecordBatch]]:
+def _stretches(selection: Selection, scene: Scene, path: Path) -> Iterator[Stretch]:
     wanted = dict.fromkeys(scene.topics(path))
     around_images = {draw.topic: None for draw in scene.draws if draw.robot is not None}
     first_ns, end_ns = selection.shown_ns
