@@ -46,7 +46,7 @@ def glance(
         If the file is not a complete recording, or a message is not of its type.
     """
     present = summary(path).topics
-    names = frozenset(topic for topic in fields if topic in present and present[topic].count)
+    names = frozenset(topic for topic in fields if topic in present)
     require_types(path, present, names)
     held, channels = _spread(path, names, start_ns, end_ns)
     missing = names - _topics(held, channels)
