@@ -28,6 +28,7 @@ LIMITS: dict[str, Range] = {
     "rotors_stopped_share": (0, 1),
     "wear": (0, 1),
     "colour_spread": (0, 1),
+    "painted_share": (0, 1),
     "light_strength": (0, 20),
     "sun_strength": (0, 50),
     "robot_gain": (0.05, 20),
@@ -105,6 +106,8 @@ class Settings:
         Range of wear: worn robots are duller and greyer.
     colour_spread
         How far colours of parts vary, 0 to 1.
+    painted_share
+        Share of robots in two strong colours drawn at random, as of another make.
     light_strength
         Range of the panorama's light on the robots.
     sun_strength
@@ -166,6 +169,7 @@ class Settings:
     rotors_stopped_share: float = 0.1
     wear: Range = (0.0, 0.6)
     colour_spread: float = 0.3
+    painted_share: float = 0.0
     light_strength: Range = (0.5, 1.5)
     sun_strength: Range = (0.0, 3.0)
     robot_gain: Range = (0.5, 1.5)
