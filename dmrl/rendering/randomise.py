@@ -228,9 +228,8 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
     backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
     gain = _factor(rng, settings.robot_gain) * float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
-    return Look(
-        backdrop, _light(settings, rng, name, turn), random_sensor(settings, rng), gain, seed
-    )
+    light, sensor = _light(settings, rng, name, turn), random_sensor(settings, rng)
+    return Look(backdrop, light, sensor, gain, _between(rng, settings.robot_opacity), seed)
 
 
 def _light(
