@@ -1,7 +1,7 @@
 """Where robots are and see each other, as arrays: what 3D views and plots are made from."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -112,24 +112,24 @@ Kind = TypeVar("Kind", bound=Timed)
 
 def taken(timed: Kind, rows: slice | NDArray[np.int64]) -> Kind:
     """Some rows."""
-    return replace(timed, **{name: column[rows] for name, column in _columns(timed).items()})
+    return _mapped(timed, lambda name: getattr(timed, name)[rows])
 
 
 def joined(parts: Sequence[Kind]) -> Kind:
     """All rows, by log time."""
     if len(parts) == 1:
         return parts[0]
-    names = _columns(parts[0])
-    both = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    whole = replace(parts[0], **both)
+    whole = _mapped(parts[0], lambda name: np.concatenate([getattr(p, name) for p in parts]))
     if (np.diff(whole.time_ns) >= 0).all():
         return whole
     return taken(whole, np.argsort(whole.time_ns, kind="stable"))
 
 
-def _columns(timed: Timed) -> dict[str, NDArray[Any]]:
-    values = {one.name: getattr(timed, one.name) for one in fields(timed)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+def _mapped(timed: Kind, column: Callable[[str], NDArray[Any]]) -> Kind:
+    """The same with other columns, by name."""
+    values: dict[str, Any] = {one.name: getattr(timed, one.name) for one in fields(timed)}
+    columns = {name: column(name) for name, v in values.items() if isinstance(v, np.ndarray)}
+    return type(timed)(**(values | columns))
 
 
 @dataclass(frozen=True, slots=True)

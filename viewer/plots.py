@@ -21,7 +21,8 @@ BOUND_SIGMAS = 3.0
 NEES_95 = 5.991
 """95 % of a chi-square with two degrees of freedom lie below."""
 
-DIM_ESTIMATE: Colour = tuple(value // 2 for value in RGB["estimate"])
+_RED, _GREEN, _BLUE = RGB["estimate"]
+DIM_ESTIMATE: Colour = (_RED // 2, _GREEN // 2, _BLUE // 2)
 WIDTH_UI, THIN_UI, MARKER_UI = 1.5, 0.8, 0.8
 
 
