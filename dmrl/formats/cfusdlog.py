@@ -9,8 +9,11 @@ battery as a rule, has no CRC: all its whole records are read, with a warning.
 
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -28,15 +31,20 @@ MAGIC = 0xBC
 VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}
 """Type and nanoseconds of a time, by version."""
 CODES = "bBhHiIef"
+SAMPLE = 32
+"""Records that say which events come together."""
 TYPES_MAX = 250
 CRC_BYTES = 4
-PIECE_BYTES = 1 << 17
+PIECE = 1 << 19
+"""Places looked at in one go: they stay in the cache."""
 
 Bytes = NDArray[np.uint8]
+Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
+Rows = NDArray[np.void]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Event:
     """One type of record, as the header describes it.
 
@@ -57,11 +65,14 @@ class Event:
     variables: tuple[tuple[str, str], ...]
     time: str
 
-    @property
+    @cached_property
     def dtype(self) -> np.dtype[np.void]:
         """A whole record, packed."""
         values = [(f"v{k}", f"<{code}") for k, (_, code) in enumerate(self.variables)]
         return np.dtype([("id", "<u2"), ("time", self.time), *values])
+
+
+Group = tuple[Event, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +127,13 @@ def decode(data: bytes, what: object = "the log") -> Log:
     sealed = len(data) - body >= CRC_BYTES and zlib.crc32(
         memoryview(data)[:-CRC_BYTES]
     ) == int.from_bytes(data[-CRC_BYTES:], "little")
-    records = np.frombuffer(data, np.uint8)[: len(data) - CRC_BYTES * sealed]
-    found, end = _records(records, body, events)
+    stop = len(data) - CRC_BYTES * sealed
+    rows, end = _records(data, body, stop, events)
     warnings = [] if sealed else [f"{what}: no valid CRC at its end; cut short, or damaged"]
-    if end < len(records):
-        left = len(records) - end
+    if left := stop - end:
         warnings.append(f"{what}: {left} bytes from byte {end} on are no whole record; left out")
-    view = [_rows(records, event, at) for event, at in zip(events, found, strict=True)]
     scale = VERSIONS[version][1]
-    blocks = [_block(e, rows, scale) for e, rows in zip(events, view, strict=True) if len(rows)]
+    blocks = [_block(e, rows[e.name], scale) for e in events if len(rows[e.name])]
     return Log(version, tuple(blocks), tuple(warnings))
 
 
@@ -173,56 +182,114 @@ def _check(events: list[Event], what: object) -> None:
             raise SourceError(f"{what}: two events have the same {kind}. Name another log")
 
 
-def _records(data: Bytes, body: int, events: list[Event]) -> tuple[list[Ints], int]:
-    """Offsets of the records of each event, and the end of the last whole one.
+def _records(
+    data: bytes, body: int, end: int, events: list[Event]
+) -> tuple[dict[str, Rows], int]:
+    """Records of each event, by its name, and where the last whole one ends."""
+    records = np.frombuffer(data, np.uint8)[body:end]
+    groups = _together(data, body, events)
+    rows, size = _rows_of(records, groups)
+    followers = [event for group in groups for event in group[1:]]
+    if followers and (
+        body + size < end or any((rows[e.name]["id"] != e.number).any() for e in followers)
+    ):
+        rows, size = _rows_of(records, [(event,) for event in events])
+    return rows, body + size
+
+
+def _together(data: bytes, at: int, events: list[Event]) -> list[Group]:
+    """Events of which one always follows the other, such as a gyroscope and an accelerometer.
+
+    As the first records have it. What is always together is found and gathered as one.
+    """
+    by_number = {event.number: event for event in events}
+    order: list[int] = []
+    while len(order) < SAMPLE and (
+        event := by_number.get(int.from_bytes(data[at : at + 2], "little"))
+    ):
+        order.append(event.number)
+        at += event.dtype.itemsize
+    firsts, seconds = Counter(order[:-1]), Counter(order[1:])
+    after = {
+        a: b
+        for (a, b), count in Counter(pairwise(order)).items()
+        if SAMPLE // 8 <= count == firsts[a] == seconds[b] and b != order[0]
+    }
+    groups = []
+    for number in [event.number for event in events if event.number not in after.values()]:
+        group = [number]
+        while group[-1] in after:
+            group.append(after[group[-1]])
+        groups.append(tuple(by_number[number] for number in group))
+    return groups
+
+
+def _rows_of(data: Bytes, groups: list[Group]) -> tuple[dict[str, Rows], int]:
+    """Records of each event, and where the last whole group ends.
 
     Records differ in size, so each begins where the one before it ends. To walk them one by
     one would take most of the time. Instead, all places that hold the id of an event are
     listed; but for chance they are the records, so that following the chain means to jump
     from one chance hit to the next.
     """
-    at = _ids(data, body, events)
-    # One byte of the ids tells the events apart as a rule, so that a small table will do.
-    wide = len({event.number & 0xFF for event in events}) < len(events)
-    key = data[at] | data[at + 1].astype(np.uint16) << 8 if wide else data[at]
-    mask = 0xFFFF if wide else 0xFF
-    sizes, kinds = np.zeros(mask + 1, np.int64), np.zeros(mask + 1, np.uint8)
-    for k, event in enumerate(events):
-        sizes[event.number & mask], kinds[event.number & mask] = event.dtype.itemsize, k
-    keep, end = _chain(at, at + sizes[key], body, len(data))
-    kind = kinds[key]
+    numbers = [group[0].number for group in groups]
+    sizes = [sum(event.dtype.itemsize for event in group) for group in groups]
+    # Records of even sizes stand at even places: half as many to look at.
+    unit = 1 if any(size % 2 for size in sizes) else 2
+    at = _places(data, numbers, unit)
+    # The low byte of the ids tells the events apart as a rule, so that a small table will do.
+    key, mask = data[::unit][at], 0xFF
+    if len({number & mask for number in numbers}) < len(numbers):
+        key, mask = key | data[1::unit][at].astype(np.uint16) << 8, 0xFFFF
+    steps = np.zeros(mask + 1, np.int64)
+    for number, size in zip(numbers, sizes, strict=True):
+        steps[number & mask] = size // unit
+    # All keys are in the table; "clip" is faster than to check that.
+    keep, end = _chain(at, at + steps.take(key, mode="clip"), len(data) // unit)
     if not keep.all():
-        at, kind = at[keep], kind[keep]
-    return [at[np.flatnonzero(kind == k)] for k in range(len(events))], end
+        at, key = at[keep], key[keep]
+    rows: dict[str, Rows] = {}
+    for group, number, size in zip(groups, numbers, sizes, strict=True):
+        found = _gather(data, at[np.flatnonzero(key == number & mask)], size, unit)
+        offset = 0
+        for event in group:
+            rows[event.name] = np.ndarray(len(found), event.dtype, found, offset, (size,))
+            offset += event.dtype.itemsize
+    return rows, end * unit
 
 
-def _ids(data: Bytes, body: int, events: list[Event]) -> Ints:
-    """Where the id of an event stands, piece by piece: small arrays stay in the cache."""
-    by_top: dict[int, list[int]] = {}
-    for event in events:
-        by_top.setdefault(event.number >> 8, []).append(event.number & 0xFF)
-    one, same, found = (np.empty(PIECE_BYTES, bool) for _ in range(3))
+def _places(data: Bytes, numbers: list[int], unit: int) -> Ints:
+    """Where one of the ids stands, in units of so many bytes."""
+    spare, hit, found = np.empty((3, min(PIECE, len(data) // unit)), bool)
     parts = [np.empty(0, np.int64)]
-    for start in range(body, len(data) - 1, PIECE_BYTES):
-        low = data[start : min(start + PIECE_BYTES, len(data) - 1)]
-        high = data[start + 1 : start + 1 + len(low)]
-        piece = slice(len(low))
-        for k, (top, bottoms) in enumerate(by_top.items()):
-            hit = np.equal(low, bottoms[0], out=(same if k else found)[piece])
-            for bottom in bottoms[1:]:
-                hit |= np.equal(low, bottom, out=one[piece])
-            hit &= np.equal(high, top, out=one[piece])
-            if k:
-                found[piece] |= hit
-        parts.append(np.flatnonzero(found[piece]) + start)
+    for start in range(0, len(data) - 1, PIECE * unit):
+        piece = data[start : start + PIECE * unit + 2 - unit]
+        count = (len(piece) - 2 + unit) // unit
+        if unit == 2:
+            piece = np.require(piece[: 2 * count].view("<u2"), requirements="A")
+        _hits(piece, numbers[0], found[:count], spare[:count])
+        for number in numbers[1:]:
+            _hits(piece, number, hit[:count], spare[:count])
+            found |= hit
+        parts.append(np.flatnonzero(found[:count]) + start // unit)
     return np.concatenate(parts)
 
 
-def _chain(at: Ints, target: Ints, start: int, end: int) -> tuple[NDArray[np.bool_], int]:
+def _hits(piece: NDArray[np.unsignedinteger], number: int, out: Bools, spare: Bools) -> None:
+    """Where an id stands in a piece of words, or of bytes of which any two may be a word."""
+    if piece.itemsize == 2:
+        np.equal(piece, number, out=out)
+    else:
+        np.equal(piece[:-1], number & 0xFF, out=out)
+        np.equal(piece[1:], number >> 8, out=spare)
+        np.logical_and(out, spare, out=out)
+
+
+def _chain(at: Ints, target: Ints, end: int) -> tuple[Bools, int]:
     """Which places are records, each where the one before it ends, and where the last ends."""
     keep = np.zeros(len(at), bool)
-    if not len(at) or at[0] != start:
-        return keep, start
+    if not len(at) or at[0]:
+        return keep, 0
     stops = np.append(np.flatnonzero(target[:-1] != at[1:]), len(at) - 1)
     goals = target[stops]
     onward = np.searchsorted(at, goals)
@@ -241,12 +308,11 @@ def _chain(at: Ints, target: Ints, start: int, end: int) -> tuple[NDArray[np.boo
         first, k = then, following_k
 
 
-def _rows(data: Bytes, event: Event, at: NDArray[np.intp]) -> NDArray[np.void]:
-    # A view with a stride of one byte gathers unaligned records in one go; as bytes without
+def _gather(data: Bytes, at: Ints, size: int, unit: int) -> NDArray[np.void]:
+    # A view with a stride of one unit gathers unaligned records in one go; as bytes without
     # fields, since those would be copied one by one.
-    size = event.dtype.itemsize
-    view = np.ndarray((max(len(data) - size + 1, 0),), np.dtype((np.void, size)), data, 0, (1,))
-    return view[at].view(event.dtype)
+    count = max((len(data) - size) // unit + 1, 0)
+    return np.ndarray((count,), np.dtype((np.void, size)), data, 0, (unit,))[at]
 
 
 def _block(event: Event, rows: NDArray[np.void], scale_ns: int) -> Block:
