@@ -128,9 +128,10 @@ def _rows_of(data: Bytes, groups: list[Group]) -> tuple[dict[str, Rows], int]:
     unit = 1 if any(size % 2 for size in sizes) else 2
     at = _places(data, numbers, [size // unit for size in sizes], unit)
     # The low byte of the ids tells the events apart as a rule, so that a small table will do.
-    key, mask = data[::unit][at], 0xFF
+    key: NDArray[np.unsignedinteger] = data[::unit][at]
+    mask = 0xFF
     if len({number & mask for number in numbers}) < len(numbers):
-        key, mask = key | data[1::unit][at].astype(np.uint16) << 8, 0xFFFF
+        key, mask = key | data[1::unit][at] * np.uint16(256), 0xFFFF
     steps = np.zeros(mask + 1, np.int64)
     for number, size in zip(numbers, sizes, strict=True):
         steps[number & mask] = size // unit
