@@ -20,6 +20,7 @@ from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import graph_of
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
+from dmrl.deploy.rounding import moments_of
 from dmrl.images import decode
 from dmrl.learn.model import load_model
 from dmrl.learn.trace import operations
@@ -63,11 +64,12 @@ def backends(data: Path) -> dict[str, Backend]:
     graph = graph_of(operations(model.network))
     seen = [image_of(data, name)[None] for name in CALIBRATION]
     graph, ranges = equalise(graph, calibrate(graph, seen))
+    moments = moments_of(graph, (image[0] for image in seen))
     network = model.network
     about = About(model.name, "locanet", network.stride_px, network.channels, model.threshold)
     return {
         "float": Float(graph, network.channels),
-        "int8": integer(quantise(graph, ranges, about)),
+        "int8": integer(quantise(graph, ranges, about, moments)),
     }
 
 

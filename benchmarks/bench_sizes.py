@@ -28,6 +28,7 @@ from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.measure import rates, state_bytes
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
+from dmrl.deploy.rounding import moments_of
 from dmrl.evaluation import labels_of_split
 from dmrl.examples import examples_of
 from dmrl.images import crop_and_scale
@@ -122,7 +123,7 @@ def judged(data: Dataset, form: Form, settings: FitSettings, most: int) -> Judge
     some = images[:: max(1, len(images) // 100)]
     graph, ranges = equalise(graph, calibrate(graph, (image[None] for image in some)))
     about = About(form.name, form.architecture, network.stride_px, network.channels, THRESHOLD)
-    small = quantise(graph, ranges, about)
+    small = quantise(graph, ranges, about, moments_of(graph, some[:50]))
     test = data.split("test")
     seen = images_of(test, form, len(test))
     points = points_of(integer(small).outputs(seen), small.stride_px)

@@ -30,6 +30,7 @@ from dmrl.deploy.integer import (
     MaxPool,
 )
 from dmrl.deploy.ranges import Ranges
+from dmrl.deploy.rounding import Moments, rounded
 from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]
@@ -65,8 +66,20 @@ class About:
     threshold: float
 
 
-def quantise(graph: Graph, ranges: Ranges, about: About) -> IntegerNetwork:
+def quantise(
+    graph: Graph, ranges: Ranges, about: About, moments: Moments | None = None
+) -> IntegerNetwork:
     """The int8 network of a float one.
+
+    Parameters
+    ----------
+    graph, ranges
+        The network, and the ranges of its tensors.
+    about
+        What it says of itself.
+    moments
+        Of the inputs of every convolution, for weights whose errors cancel. Without them each
+        weight goes to the nearest level.
 
     Raises
     ------
@@ -88,7 +101,7 @@ def quantise(graph: Graph, ranges: Ranges, about: About) -> IntegerNetwork:
         own = [head for head in heads.values() if head.tensor == tensor]
         made: AnyLayer
         if isinstance(layer, FloatConv):
-            made = _conv(layer, scales, ranges, tensor, own)
+            made = _conv(layer, scales, ranges, tensor, own, (moments or {}).get(index))
         elif isinstance(layer, FloatAdd):
             made = _add(layer, scales, ranges, tensor)
         else:
@@ -150,14 +163,21 @@ def _activation_scale(ranges: Ranges, tensor: int, *, signed: bool) -> float:
 
 
 def _conv(
-    layer: FloatConv, scales: list[float], ranges: Ranges, tensor: int, heads: list[Head]
+    layer: FloatConv,
+    scales: list[float],
+    ranges: Ranges,
+    tensor: int,
+    heads: list[Head],
+    moments: Array | None,
 ) -> Conv:
     outs = len(layer.bias)
     scale = 1.0 if heads else _activation_scale(ranges, tensor, signed=not layer.relu)
     out_scale, zero_point = np.full(outs, scale), np.zeros(outs)
     for head in heads:
         out_scale[head.channel], zero_point[head.channel] = head.scale, head.zero_point
-    weight, bias, factor = _integers(layer, scales[layer.sources[0]], out_scale, zero_point)
+    weight, bias, factor = _integers(
+        layer, scales[layer.sources[0]], out_scale, zero_point * out_scale, moments
+    )
     if layer.sources[0] == 0:
         bias -= PIXEL_ZERO * weight.sum(axis=(1, 2, 3))
     multiplier, shift = _fixed_point(factor)
@@ -179,7 +199,7 @@ def _conv(
 
 
 def _integers(
-    layer: FloatConv, in_scale: float, out_scale: Array, zero_point: Array
+    layer: FloatConv, in_scale: float, out_scale: Array, zero: Array, moments: Array | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Weights, bias and the real factor from sum to output, per output channel.
 
@@ -188,12 +208,17 @@ def _integers(
     """
     largest = np.abs(layer.weight).max(axis=(1, 2, 3))
     room = 2**31 - 1 - 128 * 255 * layer.weight[0].size
-    bias = layer.bias + zero_point * out_scale
+    bias = layer.bias + zero
     least = 2.0**-31 * out_scale / in_scale
     weight_scale = np.maximum.reduce([largest / 127, np.abs(bias) / (in_scale * room), least])
-    weight = np.rint(layer.weight / weight_scale[:, None, None, None]).astype(np.int64)
+    if moments is None:
+        weight = np.rint(layer.weight / weight_scale[:, None, None, None]).astype(np.int64)
+    else:
+        weight, suited = rounded(layer, weight_scale, moments)
+        bias = suited + zero
     sum_scale = in_scale * weight_scale
-    return weight, np.rint(bias / sum_scale).astype(np.int64), sum_scale / out_scale
+    steps = np.clip(np.rint(bias / sum_scale), -room, room).astype(np.int64)
+    return weight, steps, sum_scale / out_scale
 
 
 def _fixed_point(factor: Array) -> tuple[Int32, Int32]:

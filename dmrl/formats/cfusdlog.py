@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
 from dmrl.formats.flight_sample import in_order
 from dmrl.formats.log_block import Block
+from dmrl.formats.mixed_records import Event, Rows, records_of
 from dmrl.formats.sample import Content, Format, Options
 from dmrl.progress import say
 
@@ -30,38 +30,6 @@ VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}
 CODES = "bBhHiIef"
 TYPES_MAX = 250
 CRC_BYTES = 4
-PIECE_BYTES = 1 << 17
-
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """One type of record, as the header describes it.
-
-    Parameters
-    ----------
-    number
-        What its records begin with.
-    name
-        Such as "fixedFrequency".
-    variables
-        Name and letter of each.
-    time
-        NumPy type of the time.
-    """
-
-    number: int
-    name: str
-    variables: tuple[tuple[str, str], ...]
-    time: str
-
-    @property
-    def dtype(self) -> np.dtype[np.void]:
-        """A whole record, packed."""
-        values = [(f"v{k}", f"<{code}") for k, (_, code) in enumerate(self.variables)]
-        return np.dtype([("id", "<u2"), ("time", self.time), *values])
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +84,13 @@ def decode(data: bytes, what: object = "the log") -> Log:
     sealed = len(data) - body >= CRC_BYTES and zlib.crc32(
         memoryview(data)[:-CRC_BYTES]
     ) == int.from_bytes(data[-CRC_BYTES:], "little")
-    records = np.frombuffer(data, np.uint8)[: len(data) - CRC_BYTES * sealed]
-    found, end = _records(records, body, events)
+    stop = len(data) - CRC_BYTES * sealed
+    rows, end = records_of(data, body, stop, events)
     warnings = [] if sealed else [f"{what}: no valid CRC at its end; cut short, or damaged"]
-    if end < len(records):
-        left = len(records) - end
+    if left := stop - end:
         warnings.append(f"{what}: {left} bytes from byte {end} on are no whole record; left out")
-    view = [_rows(records, event, at) for event, at in zip(events, found, strict=True)]
     scale = VERSIONS[version][1]
-    blocks = [_block(e, rows, scale) for e, rows in zip(events, view, strict=True) if len(rows)]
+    blocks = [_block(e, rows[e.name], scale) for e in events if len(rows[e.name])]
     return Log(version, tuple(blocks), tuple(warnings))
 
 
@@ -173,83 +139,7 @@ def _check(events: list[Event], what: object) -> None:
             raise SourceError(f"{what}: two events have the same {kind}. Name another log")
 
 
-def _records(data: Bytes, body: int, events: list[Event]) -> tuple[list[Ints], int]:
-    """Offsets of the records of each event, and the end of the last whole one.
-
-    Records differ in size, so each begins where the one before it ends. To walk them one by
-    one would take most of the time. Instead, all places that hold the id of an event are
-    listed; but for chance they are the records, so that following the chain means to jump
-    from one chance hit to the next.
-    """
-    at = _ids(data, body, events)
-    # One byte of the ids tells the events apart as a rule, so that a small table will do.
-    wide = len({event.number & 0xFF for event in events}) < len(events)
-    key = data[at] | data[at + 1].astype(np.uint16) << 8 if wide else data[at]
-    mask = 0xFFFF if wide else 0xFF
-    sizes, kinds = np.zeros(mask + 1, np.int64), np.zeros(mask + 1, np.uint8)
-    for k, event in enumerate(events):
-        sizes[event.number & mask], kinds[event.number & mask] = event.dtype.itemsize, k
-    keep, end = _chain(at, at + sizes[key], body, len(data))
-    kind = kinds[key]
-    if not keep.all():
-        at, kind = at[keep], kind[keep]
-    return [at[np.flatnonzero(kind == k)] for k in range(len(events))], end
-
-
-def _ids(data: Bytes, body: int, events: list[Event]) -> Ints:
-    """Where the id of an event stands, piece by piece: small arrays stay in the cache."""
-    by_top: dict[int, list[int]] = {}
-    for event in events:
-        by_top.setdefault(event.number >> 8, []).append(event.number & 0xFF)
-    one, same, found = (np.empty(PIECE_BYTES, bool) for _ in range(3))
-    parts = [np.empty(0, np.int64)]
-    for start in range(body, len(data) - 1, PIECE_BYTES):
-        low = data[start : min(start + PIECE_BYTES, len(data) - 1)]
-        high = data[start + 1 : start + 1 + len(low)]
-        piece = slice(len(low))
-        for k, (top, bottoms) in enumerate(by_top.items()):
-            hit = np.equal(low, bottoms[0], out=(same if k else found)[piece])
-            for bottom in bottoms[1:]:
-                hit |= np.equal(low, bottom, out=one[piece])
-            hit &= np.equal(high, top, out=one[piece])
-            if k:
-                found[piece] |= hit
-        parts.append(np.flatnonzero(found[piece]) + start)
-    return np.concatenate(parts)
-
-
-def _chain(at: Ints, target: Ints, start: int, end: int) -> tuple[NDArray[np.bool_], int]:
-    """Which places are records, each where the one before it ends, and where the last ends."""
-    keep = np.zeros(len(at), bool)
-    if not len(at) or at[0] != start:
-        return keep, start
-    stops = np.append(np.flatnonzero(target[:-1] != at[1:]), len(at) - 1)
-    goals = target[stops]
-    onward = np.searchsorted(at, goals)
-    reached = at[np.minimum(onward, len(at) - 1)] == goals
-    following = np.searchsorted(stops, onward)
-    rows = np.stack([stops + 1, goals, onward, reached, following], axis=1).tolist()
-    first, k = 0, 0
-    while True:
-        last, goal, then, found, following_k = rows[k]
-        keep[first:last] = True
-        if goal > end:  # its last record is cut
-            keep[last - 1] = False
-            return keep, int(at[last - 1])
-        if not found:
-            return keep, goal
-        first, k = then, following_k
-
-
-def _rows(data: Bytes, event: Event, at: NDArray[np.intp]) -> NDArray[np.void]:
-    # A view with a stride of one byte gathers unaligned records in one go; as bytes without
-    # fields, since those would be copied one by one.
-    size = event.dtype.itemsize
-    view = np.ndarray((max(len(data) - size + 1, 0),), np.dtype((np.void, size)), data, 0, (1,))
-    return view[at].view(event.dtype)
-
-
-def _block(event: Event, rows: NDArray[np.void], scale_ns: int) -> Block:
+def _block(event: Event, rows: Rows, scale_ns: int) -> Block:
     count = rows["time"]
     ticks = unwrap(count, 32) if event.time == "<u4" else count.astype(np.int64)
     columns = {name: rows[f"v{k}"] for k, (name, _) in enumerate(event.variables)}

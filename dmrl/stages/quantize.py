@@ -20,6 +20,7 @@ from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.layers import LayerFigures, layer_figures
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
+from dmrl.deploy.rounding import moments_of
 from dmrl.deploy.samples import SAMPLES, save_samples
 from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.errors import MissingExtra, SettingError
@@ -46,6 +47,8 @@ Image = NDArray[np.uint8]
 
 REPORT_NAME = "quantisation.json"
 LAYER_IMAGES = 20
+ROUNDING_IMAGES = 50
+"""Images that say how to round the weights: each has hundreds of places or more."""
 DRAWN_IMAGES = 3
 Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
@@ -142,7 +145,9 @@ def run(model: Path, dataset: Path, out: Path, settings: Settings) -> Result:
     calibration = track(_images(seen, rows), "Calibrating", len(rows))
     ranges = calibrate(graph, (image[None] for image in calibration))
     graph, ranges = equalise(graph, ranges)
-    network = quantise(graph, ranges, _about(trained))
+    rows = _spread(len(seen), min(settings.images, ROUNDING_IMAGES))
+    moments = moments_of(graph, track(_images(seen, rows), "Rounding", len(rows)))
+    network = quantise(graph, ranges, _about(trained), moments)
     made = provenance("quantize", settings, (model, dataset), libraries=("torch", "numpy"))
     with partial_folder(out) as folder:
         result = _judge(trained, graph, network, judged, settings, ranges.images, folder)

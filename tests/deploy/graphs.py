@@ -16,6 +16,7 @@ from dmrl.deploy.graph import (
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
+from dmrl.deploy.rounding import moments_of
 
 SUB_CELL = ("log_depth", "confidence", "offset_u", "offset_v")
 
@@ -98,4 +99,4 @@ def quantised_network(seed: int) -> IntegerNetwork:
     rgb = np.repeat(images, 3, axis=3) if graph.channels == 1 else images
     graph, ranges = equalise(graph, calibrate(graph, [rgb]))
     about = About("random", "random", 8, channels, 0.3)
-    return quantise(graph, ranges, about)
+    return quantise(graph, ranges, about, moments_of(graph, rgb))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.formats import cfusdlog
+from dmrl.formats import cfusdlog, mixed_records
 from dmrl.formats.sample import Options, Sample
 
 from . import foreign, plain_usd
@@ -143,6 +143,31 @@ def test_bytes_that_look_like_ids_are_no_records() -> None:
     events = {7: ("a", [("x", "H"), ("y", "H")]), 9: ("b", [("z", "I")])}
     rows = [(7, 7 * 65536 + 9, (7, 9)) if k % 3 else (9, 7, (9 * 65536 + 7,)) for k in range(300)]
     raw = plain_usd.encode(events, rows)
+    same(cfusdlog.decode(raw), raw)
+
+
+@pytest.mark.parametrize("code", ["H", "B"])
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "aabab" + 60 * "ab",
+        60 * "abc",
+        60 * "bca",
+        40 * "abca",
+        60 * "ab" + "b" + 60 * "ab",
+        60 * "ab" + "a",
+        60 * "ab" + "ac" + 60 * "ab",
+        60 * "ab" + 60 * "ba",
+    ],
+)
+def test_events_that_come_together_are_told_apart(
+    pattern: str, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = {ord(c) - 90: (c, [("x", "H"), ("y", code)]) for c in "abc"}
+    rows = [(ord(c) - 90, 1000 * k, (k, 7)) for k, c in enumerate(pattern)]
+    raw = plain_usd.encode(events, rows)
+    same(cfusdlog.decode(raw), raw)
+    monkeypatch.setattr(mixed_records, "PIECE", 100)
     same(cfusdlog.decode(raw), raw)
 
 

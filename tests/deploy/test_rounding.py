@@ -1,0 +1,84 @@
+"""Weights rounded so that their errors cancel."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.deploy.backends import Float, integer
+from dmrl.deploy.equalise import equalise
+from dmrl.deploy.graph import FloatConv, Graph, tensors_of, to_input
+from dmrl.deploy.quantise import About, quantise
+from dmrl.deploy.ranges import calibrate
+from dmrl.deploy.rounding import LARGEST, moments_of, rounded
+
+from .graphs import random_graph
+
+STEPS = np.random.default_rng(3).integers(0, 9, (4, 24, 32, 3))
+SMOOTH = np.cumsum(STEPS, axis=2).astype(np.uint8)
+
+
+def layer(groups: int) -> FloatConv:
+    rng = np.random.default_rng(4)
+    weight = rng.normal(0, 0.3, (3, 3 // groups, 3, 3))
+    return FloatConv("conv", (0,), weight, rng.normal(0, 0.1, 3), padding=1, groups=groups)
+
+
+def output(one: FloatConv) -> np.ndarray:
+    return tensors_of(Graph((one,), ()), to_input(SMOOTH))[1].astype(np.float64)
+
+
+@pytest.mark.parametrize(("groups", "gain"), [(1, 4), (3, 2)])
+def test_errors_cancel_where_nearest_weights_add_them_up(groups: int, gain: float) -> None:
+    one = layer(groups)
+    scale = np.abs(one.weight).max(axis=(1, 2, 3)) / 7  # four bits, so that it shows
+    moments = moments_of(Graph((one,), ()), SMOOTH)[0]
+    weight, bias = rounded(one, scale, moments)
+    steps = scale[:, None, None, None]
+    nearest = replace(one, weight=np.rint(one.weight / steps) * steps)
+    wanted = output(one)
+    worse = ((output(nearest) - wanted) ** 2).mean()
+    better = ((output(replace(one, weight=weight * steps, bias=bias)) - wanted) ** 2).mean()
+    assert better < worse / gain
+
+
+def test_moments_are_mean_products_of_inputs_and_one() -> None:
+    one = layer(1)
+    moments = moments_of(Graph((one,), ()), SMOOTH)[0]
+    x = to_input(SMOOTH)
+    assert moments.shape == (1, 28, 28)
+    # Tap 4 of 9 is the pixel itself; the last row is the mean.
+    assert moments[0, 4, 9 + 4] == pytest.approx((x[:, 0] * x[:, 1]).mean(), rel=1e-4)
+    assert moments[0, 4, 27] == pytest.approx(x[:, 0].mean(), rel=1e-4)
+    assert moments[0, 27, 27] == 1
+
+
+def test_inputs_that_are_always_zero_do_no_harm() -> None:
+    one = layer(1)
+    moments = moments_of(Graph((one,), ()), [np.full((8, 8, 3), 128, np.uint8)])[0]
+    scale = np.abs(one.weight).max(axis=(1, 2, 3)) / LARGEST
+    weight, bias = rounded(one, scale, moments)
+    assert (weight == np.rint(one.weight / scale[:, None, None, None])).all()
+    np.testing.assert_allclose(bias, one.bias)
+
+
+def test_random_networks_lose_less_than_by_nearest_weights() -> None:
+    gained_db = []
+    for seed in range(40):
+        graph, channels, images = random_graph(seed)
+        rgb = np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
+        graph, ranges = equalise(graph, calibrate(graph, [rgb]))
+        about = About("random", "random", 8, channels, 0.3)
+        wanted = Float(graph, channels).outputs(rgb)
+        lost = [
+            sum(
+                float(((value - got[name]) ** 2).mean() / (value**2).mean())
+                for name, value in wanted.items()
+            )
+            for got in (
+                integer(quantise(graph, ranges, about, moments)).outputs(rgb)
+                for moments in (None, moments_of(graph, rgb))
+            )
+        ]
+        gained_db.append(10 * np.log10(lost[0] / lost[1]))
+    assert np.median(gained_db) > 0.5
