@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from dmrl.estimation import ekf, keyframe_filter
-from dmrl.estimation.batch import Solution, evidence, solve_batch
+from dmrl.estimation.batch import ROUGH, Solution, evidence, near, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
 from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, Statuses, statuses
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, mirrored, spread_of
@@ -212,23 +212,35 @@ def _from_smoother(
 
 def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Array) -> Estimate:
     first = noise or Noise()
-    # Even starts that look alike half-way may pass the peer on different sides: all are solved
-    # that are not hopeless.
-    starts = tracks.swapaxes(0, 1)[score > score.max() - HOPELESS]
-    solutions = [solve_batch(flight, first, s) for s in starts]
-    best = min(solutions, key=lambda s: s.cost)
-    solutions += [solve_batch(flight, first, s) for s in mirrored(best.state, KEY_HZ)]
-    solutions.sort(key=lambda s: s.cost)
+    solutions = _solutions(flight, first, score, tracks.swapaxes(0, 1))
     best = solutions[0]
     costs, states = zip(*((s.cost, s.state[:, :3]) for s in solutions), strict=True)
     apart = spread_of(np.array(costs), np.stack(states))
-    found = first if noise else noise_of(flight, first, best)
-    if not noise:
-        best = solve_batch(flight, found, best.state)
+    found = noise or noise_of(flight, first, best)
+    best = solve_batch(flight, found, best.state, best.constants)
     worse = max(1.0, found.bias_std_m / Noise().bias_std_m) ** 0.75
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
     none = np.zeros(len(tracks), np.int8)
     return Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
+
+
+def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> list[Solution]:
+    """What the likely starts (S, K, 3) lead to, best first.
+
+    Even starts that look alike half-way may pass the peer on different sides: all are solved that
+    are not hopeless, each until it comes to a solution that another one led to.
+    """
+    begun: list[Array] = []
+    found: list[Solution] = []
+    for number in np.argsort(-score):
+        start = tracks[number]
+        if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
+            begun.append(start)
+            found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
+    best = min(found, key=lambda s: s.cost)
+    for start in mirrored(best.state, KEY_HZ):
+        found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
+    return sorted(found, key=lambda s: s.cost)
 
 
 def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
@@ -246,11 +258,11 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
     tried: dict[int, float] = {}
     middle, last = 2, len(GRADES) - 2
     while True:
-        for number in range(middle - 1, middle + 2):
+        for number in range(middle + 1, middle - 2, -1):
             if number not in tried:
                 graded = noise.graded(GRADES[number])
-                solved = solve_batch(flight, graded, solution.state)
-                tried[number] = evidence(flight, graded, solved)
+                solution = solve_batch(flight, graded, solution.state, solution.constants)
+                tried[number] = evidence(flight, graded, solution)
         best = max(tried, key=lambda number: tried[number])
         if min(max(best, 1), last) == middle:
             break
