@@ -8,7 +8,15 @@ import numpy as np
 from dmrl.estimation import ekf, keyframe_filter
 from dmrl.estimation.batch import ROUGH, Solution, evidence, near, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
-from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, Statuses, statuses
+from dmrl.estimation.gate import (
+    AMBIGUOUS,
+    CLEAN_SHARE,
+    EXPECTED_SHARE,
+    GATE_M,
+    UNCONVERGED,
+    Statuses,
+    statuses,
+)
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, mirrored, spread_of
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK
@@ -25,6 +33,8 @@ SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
+CLEAN = 0.8
+"""Constants that are taken for smaller than this, against the default's, mark clean sensors."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
 GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
@@ -150,8 +160,10 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
     floor = silent * np.int8(UNCONVERGED)
-    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m), floor)
-    there = np.maximum(statuses(back.state, back.covariance, gate_m), floor)
+    clean = estimate.noise.bias_std_m < CLEAN * Noise().bias_std_m
+    share = CLEAN_SHARE if clean else EXPECTED_SHARE
+    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m, share), floor)
+    there = np.maximum(statuses(back.state, back.covariance, gate_m, share), floor)
     if own < STILL or relative < ALIKE:
         here[:] = AMBIGUOUS
     if peer < STILL or relative < ALIKE:
@@ -261,7 +273,8 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
         for number in range(middle + 1, middle - 2, -1):
             if number not in tried:
                 graded = noise.graded(GRADES[number])
-                solution = solve_batch(flight, graded, solution.state, solution.constants)
+                before = solution.state, solution.constants
+                solution = solve_batch(flight, graded, *before, tolerance=ROUGH)
                 tried[number] = evidence(flight, graded, solution)
         best = max(tried, key=lambda number: tried[number])
         if min(max(best, 1), last) == middle:
