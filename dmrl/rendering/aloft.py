@@ -89,7 +89,7 @@ class Flight:
         towards = here.body_from_world @ self._sun_world
         light = Light(name=self._place, turn_rad=turn, sun_camera=towards, **self._sun)
         gain = GAIN * self._level / MIDDLE
-        look = Look(backdrop, light, sensor, gain, int(rng.integers(2**31)))
+        look = Look(backdrop, light, sensor, gain, seed=int(rng.integers(2**31)))
         robots = [
             Robot(pose, self._turned(name, rng, shutter_s), view.velocity_mps[name] * shutter_s)
             for name, pose in view.poses.items()

@@ -44,7 +44,7 @@ def compose(
         _mark(canvas, camera, layers[k], visible[k], opacity[k], surface)
     picture = look.backdrop.astype(np.float32)
     for k in reversed(order):
-        _paint(canvas, camera, robots[k], layers[k], look.robot_gain, picture)
+        _paint(canvas, camera, robots[k], layers[k], look, picture)
     rgb = expose(picture, look.sensor, np.random.default_rng((look.seed, 1)))
     uv, depth_m = project(xyz, canvas.pinhole.image_from_optical)
     uv = image_from_pinhole(uv - canvas.shift_px, camera)
@@ -134,7 +134,7 @@ def _mark(
 
 
 def _paint(
-    canvas: Canvas, camera: Camera, robot: Robot, layer: Layer, gain: float, picture: Picture
+    canvas: Canvas, camera: Camera, robot: Robot, layer: Layer, look: Look, picture: Picture
 ) -> None:
     """Lay a robot over what is behind it, smeared by its movement."""
     move_px = _move_px(camera, robot)
@@ -142,8 +142,9 @@ def _paint(
     if found is None:
         return
     part, places = found
-    light = _smeared(layer.light, places, move_px)
-    picture[part] = picture[part] * (1 - light[..., 3:]) + np.float32(gain) * light[..., :3]
+    light = np.float32(look.robot_opacity) * _smeared(layer.light, places, move_px)
+    gain = np.float32(look.robot_gain)
+    picture[part] = picture[part] * (1 - light[..., 3:]) + gain * light[..., :3]
 
 
 def _smeared(light: Picture, places: Picture, move_px: Array) -> Picture:

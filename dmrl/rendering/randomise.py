@@ -164,6 +164,8 @@ def _robot(settings: Settings, rng: Generator, pose: Pose, shutter_s: float) -> 
     open_s = shutter_s or 0.01
     sweep = 0.0 if stopped else 2 * np.pi * _between(rng, settings.rotor_speed_rps) * open_s
     paint = random_paint(rng, _between(rng, settings.wear), settings.colour_spread)
+    if settings.painted_share and rng.random() < settings.painted_share:
+        paint |= strong_colours(rng)
     paint |= {"rotor_first_rad": float(rng.uniform(0, np.pi)), "rotor_sweep_rad": float(sweep)}
     return Robot(pose, paint, velocity * shutter_s)
 
@@ -196,6 +198,20 @@ def random_paint(rng: Generator, wear: float, spread: float) -> dict[str, Any]:
     return paint
 
 
+def strong_colours(rng: Generator) -> dict[str, Any]:
+    """Two colours at random over all parts that do not glow, as of a drone of another make.
+
+    Parameters
+    ----------
+    rng
+        Where the randomness comes from.
+    """
+    two = rng.random((2, 3)) ** 2  # linear light: rather dark and vivid than pale
+    shades = two[rng.integers(2, size=len(MATERIALS))] * rng.uniform(0.6, 1.4, (len(MATERIALS), 1))
+    dull = (k for k, name in enumerate(MATERIALS) if not PALETTE[name][3])
+    return {f"colour_{k}": np.clip(shades[k], 0, 1).tolist() for k in dull}
+
+
 def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s: float) -> Look:
     settings = world.settings
     name = world.lights[int(rng.integers(len(world.lights)))]
@@ -212,9 +228,8 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
     backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
     gain = _factor(rng, settings.robot_gain) * float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
-    return Look(
-        backdrop, _light(settings, rng, name, turn), random_sensor(settings, rng), gain, seed
-    )
+    light, sensor = _light(settings, rng, name, turn), random_sensor(settings, rng)
+    return Look(backdrop, light, sensor, gain, _between(rng, settings.robot_opacity), seed)
 
 
 def _light(

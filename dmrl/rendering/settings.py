@@ -28,9 +28,11 @@ LIMITS: dict[str, Range] = {
     "rotors_stopped_share": (0, 1),
     "wear": (0, 1),
     "colour_spread": (0, 1),
+    "painted_share": (0, 1),
     "light_strength": (0, 20),
     "sun_strength": (0, 50),
     "robot_gain": (0.05, 20),
+    "robot_opacity": (0, 1),
     "background_zoom": (1, 8),
     "background_blur_px": (0, 20),
     "brightness": (0.02, 0.98),
@@ -105,12 +107,16 @@ class Settings:
         Range of wear: worn robots are duller and greyer.
     colour_spread
         How far colours of parts vary, 0 to 1.
+    painted_share
+        Share of robots in two strong colours drawn at random, as of another make.
     light_strength
         Range of the panorama's light on the robots.
     sun_strength
         Range of the sun's or lamp's light on the robots, watts per square metre.
     robot_gain
         Range of the light of robots over that of the background; every factor is as likely.
+    robot_opacity
+        Range of how much of the background robots hide; the authors' let some of it through.
     background_zoom
         Range of how far photos are zoomed into.
     background_blur_px
@@ -166,9 +172,11 @@ class Settings:
     rotors_stopped_share: float = 0.1
     wear: Range = (0.0, 0.6)
     colour_spread: float = 0.3
+    painted_share: float = 0.0
     light_strength: Range = (0.5, 1.5)
     sun_strength: Range = (0.0, 3.0)
     robot_gain: Range = (0.5, 1.5)
+    robot_opacity: Range = (1.0, 1.0)
     background_zoom: Range = (1.0, 2.0)
     background_blur_px: Range = (0.0, 1.0)
     brightness: Range = (0.3, 0.6)
@@ -239,7 +247,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "background_zoom": [1.0, 1.0],
         "background_blur_px": [0.0, 0.0],
         "wear": [0.0, 0.0],
-        "brightness": [0.35, 0.55],
+        "brightness": [0.25, 0.65],
+        "robot_gain": [0.7, 2.0],
+        "robot_opacity": [0.5, 1.0],
         "jpeg_quality": [90, 90],
     },
     "plain": {},

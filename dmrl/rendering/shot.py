@@ -85,6 +85,8 @@ class Look:
         What the camera makes of it.
     robot_gain
         Light of the robots over that of the backdrop.
+    robot_opacity
+        How much of the backdrop a robot hides where it covers it, 0 to 1.
     seed
         Of the renderer's and the sensor's noise.
     """
@@ -93,6 +95,7 @@ class Look:
     light: Light
     sensor: Sensor
     robot_gain: float = 1.0
+    robot_opacity: float = 1.0
     seed: int = 0
 
 

@@ -48,6 +48,19 @@ def test_a_near_robot_hides_a_far_one_whatever_their_order() -> None:
     assert shot.surface_m[60, 115] == 1.0
 
 
+def test_a_see_through_robot_is_fainter_and_labelled_the_same() -> None:
+    black = square(100, 50, 20, 1.0)
+    black.light[..., :3] = 0
+    layers = {0: black}
+    solid = compose(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
+    faint = compose(PINHOLE, [robot(1.0)], replace(look(PINHOLE), robot_opacity=0.5), layers)
+    shown = [shot.rgb[60, 110, 0] / shot.rgb[0, 0, 0] for shot in (solid, faint)]
+    assert shown == pytest.approx([0.0, 0.5], abs=0.01)
+    assert np.array_equal(faint.box_px, solid.box_px)
+    assert np.array_equal(faint.opacity, solid.opacity)
+    assert faint.visible_share.tolist() == [1.0]
+
+
 def test_a_robot_wholly_hidden_has_no_box() -> None:
     layers = {0: square(100, 50, 20, 2.0), 1: square(90, 40, 40, 1.0)}
     shot = compose(PINHOLE, [robot(2.0), robot(1.0)], look(PINHOLE), layers)
