@@ -228,7 +228,7 @@ def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Arra
     best = solutions[0]
     costs, states = zip(*((s.cost, s.state[:, :3]) for s in solutions), strict=True)
     apart = spread_of(np.array(costs), np.stack(states))
-    found = noise or noise_of(flight, first, best)
+    found, best = (noise, best) if noise else noise_of(flight, first, best)
     best = solve_batch(flight, found, best.state, best.constants)
     worse = max(1.0, found.bias_std_m / Noise().bias_std_m) ** 0.75
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
@@ -250,13 +250,18 @@ def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> li
             begun.append(start)
             found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
     best = min(found, key=lambda s: s.cost)
+    # What stuck on its way may come free once all that is constant starts from zero again.
+    found.append(solve_batch(flight, noise, best.state, known=found, tolerance=ROUGH))
+    best = min(found, key=lambda s: s.cost)
     for start in mirrored(best.state, KEY_HZ):
         found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
     return sorted(found, key=lambda s: s.cost)
 
 
-def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
+def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
     """What the sensors are like: the grade of noise under which the flight is likeliest.
+
+    And the solution under the nearest of ``GRADES``.
 
     Parameters
     ----------
@@ -268,6 +273,7 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
         The flight's solution under that guess.
     """
     tried: dict[int, float] = {}
+    solved: dict[int, Solution] = {}
     middle, last = 2, len(GRADES) - 2
     while True:
         for number in range(middle + 1, middle - 2, -1):
@@ -275,7 +281,7 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
                 graded = noise.graded(GRADES[number])
                 before = solution.state, solution.constants
                 solution = solve_batch(flight, graded, *before, tolerance=ROUGH)
-                tried[number] = evidence(flight, graded, solution)
+                tried[number], solved[number] = evidence(flight, graded, solution), solution
         best = max(tried, key=lambda number: tried[number])
         if min(max(best, 1), last) == middle:
             break
@@ -284,9 +290,8 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
     bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in near]), [tried[n] for n in near], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
     likeliest, velocity, constants = TAKEN
-    return noise.graded(
-        float(np.interp(peak, likeliest, velocity)), float(np.interp(peak, likeliest, constants))
-    )
+    graded = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
+    return noise.graded(*graded), solved[best]
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:
