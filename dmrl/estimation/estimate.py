@@ -290,8 +290,8 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, 
     bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in near]), [tried[n] for n in near], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
     likeliest, velocity, constants = TAKEN
-    graded = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
-    return noise.graded(*graded), solved[best]
+    grades_taken = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
+    return noise.graded(*grades_taken), solved[best]
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:
