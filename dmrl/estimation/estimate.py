@@ -286,8 +286,8 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, 
         if min(max(best, 1), last) == middle:
             break
         middle = min(max(best, 1), last)
-    near = range(middle - 1, middle + 2)
-    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in near]), [tried[n] for n in near], 2)
+    around = range(middle - 1, middle + 2)
+    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
     likeliest, velocity, constants = TAKEN
     grades_taken = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
