@@ -1,11 +1,10 @@
-"""A long flight in the viewer: CPU time, memory, and how soon there is something to see.
+"""A long flight in the viewer: CPU time and memory. How soon it is seen: bench_view_first.py.
 
 Run as ``python benchmarks/bench_view.py [RECORDING] [--minutes 5]``. Without a recording: a flight
 of two robots with a camera each, 20 images a second, truth and estimates as labels, detections and
 maps; images are drawn once a second and repeated, which costs the viewer the same. Then, each in a
 process of its own: the .rrd by ``dmrl view``, the same recording by rerun's own importer as the
-peer (it shows no label, detection or plot), a flight of half the length, and the time until a
-viewer has its first picture.
+peer (it shows no label, detection or plot), and a flight of half the length.
 """
 
 import argparse
@@ -14,19 +13,16 @@ import resource
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 
 from dmrl import topics
-from dmrl.images import decode
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read, summary, trim
 from dmrl.stages import fly
-from dmrl.viewer import Settings, process, save, session, window
+from dmrl.viewer import Settings, process, save
 
 RATE_HZ = 20
 ROWS, COLS = 28, 40
@@ -111,39 +107,6 @@ def with_rerun(path: Path, out: Path) -> dict[str, float]:
     }
 
 
-def first_picture(path: Path, layout: str) -> dict[str, float]:
-    """Seconds from the call until a viewer, without a screen, shows the first image.
-
-    The clock starts with the process: imports count. What is drawn is looked for every 0.1 s.
-    """
-    port = process.free_port(process.LOOPBACK)
-    where = ("--headless", "--window-size", window.PICTURE_SIZE, "--port", str(port))
-    with process.running(process.command(process.LOOPBACK, *where)) as viewer:
-        show = session.prepare([path], Settings(layout=layout))  # type: ignore[arg-type]
-        assert process.listens(viewer, process.LOOPBACK, port)
-        sender = threading.Thread(target=process.stream_to, args=(show, viewer, port))
-        sender.start()
-        client = window.ViewerClient.connect(process.url_of(port))
-        child = psutil.Process(viewer.process.pid)
-        while not _seen(client):
-            time.sleep(0.1)
-        seconds = time.time() - float(sys.argv[-1])
-        used = child.cpu_times()
-        cpu_s = time.process_time(), used.user + used.system
-        sender.join()
-        all_s = time.time() - float(sys.argv[-1])
-    return {"first_s": seconds, "own_s": cpu_s[0], "viewer_s": cpu_s[1], "all_sent_s": all_s}
-
-
-def _seen(client: window.ViewerClient) -> bool:
-    """Whether there is more to see than empty panels: an image has thousands of colours."""
-    try:
-        rgb = decode(client.take_screenshot())
-    except RuntimeError:
-        return False
-    return len(np.unique(rgb[::4, ::4].reshape(-1, 3), axis=0)) > 2000
-
-
 def size_mb(path: Path) -> float:
     """Size of a file."""
     return path.stat().st_size / 1e6
@@ -151,7 +114,7 @@ def size_mb(path: Path) -> float:
 
 def apart(*arguments: object) -> dict[str, float]:
     """One measurement, in a fresh process."""
-    command = [sys.executable, __file__, *map(str, arguments), str(time.time())]
+    command = [sys.executable, __file__, *map(str, arguments)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
@@ -160,9 +123,7 @@ def measure(what: str, path: Path, layout: str) -> dict[str, float]:
     """The measurement of that name."""
     out = path.with_suffix(f".{what}.rrd")
     try:
-        if what == "dmrl":
-            return with_dmrl(path, out, layout)
-        return with_rerun(path, out) if what == "rerun" else first_picture(path, layout)
+        return with_rerun(path, out) if what == "rerun" else with_dmrl(path, out, layout)
     finally:
         out.unlink(missing_ok=True)
 
@@ -194,12 +155,6 @@ def main() -> None:
                 print(f"{name:<26}{row['cpu_s']:8.1f}{row['peak_mb']:10.0f}{row['rrd_mb']:10.0f}")
             shown = rows[f"dmrl view, {layout}"]
             print(f"{'  ratio to the peer':<26}{shown['cpu_s'] / peer['cpu_s']:8.2f}")
-            seen = apart("measure", "first", long, layout)
-            print(
-                f"  first picture after {seen['first_s']:.1f} s; CPU until then: "
-                f"dmrl {seen['own_s']:.1f} s, viewer {seen['viewer_s']:.1f} s"
-            )
-            print(f"  all of it sent after {seen['all_sent_s']:.1f} s")
             rows = {}
 
 

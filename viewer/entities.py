@@ -6,6 +6,7 @@ image where they belong.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -128,9 +129,7 @@ class _Labels:
     place: int
 
     def entities(self, path: str, source: str) -> Iterator[Entity]:
-        colour = RGB.get(source, RGB["other"])
-        # Where two sources agree, the one named first in the table is seen.
-        order = 30.0 - _order(source)[0]
+        dot, dust, outline, curve = _label_styles(source)
         edges = self.peers.field("box_px")
         boxed = edges.value_lengths().to_numpy() == 4
         corners = edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
@@ -141,11 +140,6 @@ class _Labels:
 
         points = rr.Points2D.columns(positions=uv_px)
         boxes = rr.Boxes2D.columns(centers=centres, half_sizes=(corners[:, 1] - corners[:, 0]) / 2)
-        dot, dust = (
-            rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
-            for radius in (POINT_UI, INVISIBLE)
-        )
-        outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
         yield Entity(f"{path}/points", self._rows(points), (dot,))
         yield Entity(f"{path}/boxes", self._rows(boxes, boxed), (outline,))
         yield Entity(f"{path}/texts", self._rows(self._texts(top_px)), (dust,))
@@ -153,9 +147,6 @@ class _Labels:
         unsure = (sigmas_px > 0).all(axis=1) & inside(uv_px, *self.size_px)
         ellipses = rr.Ellipses2D.columns(
             centers=uv_px[unsure], half_sizes=ELLIPSE_SIGMAS * sigmas_px[unsure]
-        )
-        curve = rr.Ellipses2D.from_fields(
-            colors=[colour], line_radii=[LINE_UI], draw_order=order - 10.0
         )
         yield Entity(f"{path}/sigmas", self._rows(ellipses, unsure), (curve,))
 
@@ -172,6 +163,23 @@ class _Labels:
     ) -> rr.ComponentColumnList:
         row_of = self.row_of if kept is None else self.row_of[kept]
         return columns.partition(np.bincount(row_of, minlength=self.rows))
+
+
+@cache
+def _label_styles(source: str) -> tuple[rr.Points2D, rr.Points2D, rr.Boxes2D, rr.Ellipses2D]:
+    """Of points, texts, boxes and ellipses. Asked for often, so made once."""
+    colour = RGB.get(source, RGB["other"])
+    # Where two sources agree, the one named first in the table is seen.
+    order = 30.0 - _order(source)[0]
+    dot, dust = (
+        rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
+        for radius in (POINT_UI, INVISIBLE)
+    )
+    outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
+    curve = rr.Ellipses2D.from_fields(
+        colors=[colour], line_radii=[LINE_UI], draw_order=order - 10.0
+    )
+    return dot, dust, outline, curve
 
 
 def _order(source: str) -> tuple[int, str]:
@@ -196,8 +204,13 @@ def detections(
         labels=texts,
         radii=np.where(believed, POINT_UI, FAINT_POINT_UI),
     )
-    style = rr.Points2D.from_fields(colors=[colour], draw_order=40.0)
+    style = _detection_style(colour)
     yield Entity(path, columns.partition(column.value_lengths().to_numpy()), (style,), frame)
+
+
+@cache
+def _detection_style(colour: Colour) -> rr.Points2D:
+    return rr.Points2D.from_fields(colors=[colour], draw_order=40.0)
 
 
 def grids(
@@ -272,10 +285,15 @@ def _best_cells(
     cols = np.array([form.width for form in formats])
     centres = (np.column_stack([best % cols, best // cols]) + 0.5) * stride_px
     columns = rr.Boxes2D.columns(centers=centres, half_sizes=np.full((len(best), 2), stride_px / 2))
-    style = rr.Boxes2D.from_fields(colors=[CELL_COLOUR], radii=[LINE_UI], draw_order=35.0)
-    return Entity(path, columns, (style,), frame)
+    return Entity(path, columns, (_cell_style(),), frame)
 
 
+@cache
+def _cell_style() -> rr.Boxes2D:
+    return rr.Boxes2D.from_fields(colors=[CELL_COLOUR], radii=[LINE_UI], draw_order=35.0)
+
+
+@cache
 def map_style(scale: Scale, *, smooth: bool = False) -> rr.DepthImage:
     """Colours of a map: fixed range; cells with sharp edges unless they are smoothed."""
     return rr.DepthImage.from_fields(

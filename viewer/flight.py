@@ -9,24 +9,20 @@ from dmrl import topics
 from dmrl.colours import RGB
 from dmrl.progress import say
 from dmrl.viewer import layouts, plots, space
-from dmrl.viewer.entity import (
-    WORLD,
-    camera_frame,
-    horizontal_frame,
-    optical_frame,
-)
+from dmrl.viewer.entity import WORLD, Entity, camera_frame, horizontal_frame, optical_frame
+from dmrl.viewer.follow import Follower
 from dmrl.viewer.layouts import Eye, Plot, Space
-from dmrl.viewer.motion import Motion, Names, read_motion
-from dmrl.viewer.scene import Draw, Scene, Still, eyes_of, firsts, model_draws, picture_draws
+from dmrl.viewer.motion import Motion, Names, glimpse
+from dmrl.viewer.scene import Draw, Scene, eyes_of, firsts, model_draws, picture_draws
 from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
 
 CAMERAS_MAX = 4
 
 
 def flight_scene(selection: Selection, settings: Settings) -> Scene:
-    """What a flight shows, as far as the recordings have it."""
+    """What a flight shows, as far as the recordings have it. A few moments of it say what."""
     pairs = _pairs(selection, settings.robot)
-    motion = read_motion(selection.recordings, pairs, *selection.shown_ns)
+    seen = glimpse(selection.recordings, pairs, *selection.shown_ns)
     robots = _robots(selection, pairs, settings.robot)
     eyes = eyes_of(selection, sorted(selection.image_ns)[:CAMERAS_MAX], {})
     sources: dict[str, set[str]] = {eye.robot: set() for eye in eyes}
@@ -38,18 +34,23 @@ def flight_scene(selection: Selection, settings: Settings) -> Scene:
             draws += model_draws(eye, {}, smooth=False)
             named["detection"] = RGB["detection"]
     for robot in robots:
-        draws += _robot_draws(selection, motion, robot, own=robot == robots[0])
+        draws += _robot_draws(selection, seen, robot, own=robot == robots[0])
     for pair in pairs:
-        draws += _range_draws(pair, motion)
-    stills = [
-        *_frames(selection, motion, robots),
-        *(still for pair in pairs for still in _pair_stills(pair, motion)),
-    ]
-    spaces = _spaces(selection, motion, pairs, robots, eyes)
-    panels = {f"{a} sees {b}": _panels(selection, motion, (a, b)) for a, b in pairs}
+        measured = topics.uwb_range(*pair)
+        draws.append(Draw(measured, partial(plots.ranges, measured)))
+    spaces = _spaces(selection, seen, pairs, robots, eyes)
+    panels = {f"{a} sees {b}": _panels(selection, seen, (a, b)) for a, b in pairs}
     if not pairs:
         panels = {robots[0]: _own_panels(selection, robots)} if robots else {}
-    return Scene(layouts.flight(spaces, eyes, panels), draws, stills, eyes, sources, named)
+    return Scene(
+        layouts.flight(spaces, eyes, panels),
+        draws,
+        [(None, entity) for entity in _stills(selection, seen, robots)],
+        eyes,
+        sources,
+        named,
+        partial(Follower, pairs, seen),
+    )
 
 
 def _topics(selection: Selection) -> set[str]:
@@ -91,54 +92,20 @@ def _robot_draws(selection: Selection, motion: Motion, robot: str, *, own: bool)
     return draws
 
 
-def _range_draws(pair: Names, motion: Motion) -> list[Draw]:
-    topic = topics.uwb_range(*pair)
-    towards = motion.estimates.get(pair) or motion.truths.get(pair)
-    return [
-        Draw(topic, partial(plots.ranges, topic)),
-        Draw(topic, partial(space.ranges, topic, pair[0], towards=towards)),
-    ]
-
-
-def _frames(selection: Selection, motion: Motion, robots: Sequence[str]) -> Iterator[Still]:
-    """Every frame that /tf has, those that hang on it, and what stands in them."""
-    for frame, poses in motion.poses.items():
-        drawn = space.transform(frame, poses)
-        yield (None if poses.fixed else poses.time_ns), drawn
+def _stills(selection: Selection, seen: Motion, robots: Sequence[str]) -> Iterator[Entity]:
+    """Robots, and the frames that hang on those of /tf."""
     present = _topics(selection)
     calibrations = firsts(selection, map(topics.calibration, robots))
     for robot in robots:
-        if camera_frame(robot) not in motion.poses and topics.attitude(robot) not in present:
-            yield None, space.still_frame(camera_frame(robot), horizontal_frame(robot))
-        if optical_frame(robot) not in motion.poses:
-            yield (
-                None,
-                space.still_frame(optical_frame(robot), camera_frame(robot), space.OPTICAL_XYZW),
-            )
-        for entity in space.body(robot):
-            yield None, entity
+        if camera_frame(robot) not in seen.poses and topics.attitude(robot) not in present:
+            yield space.still_frame(camera_frame(robot), horizontal_frame(robot))
+        if optical_frame(robot) not in seen.poses:
+            yield space.still_frame(optical_frame(robot), camera_frame(robot), space.OPTICAL_XYZW)
+        yield from space.body(robot)
         topic = topics.calibration(robot)
         # Zeros: not calibrated.
         if topic in calibrations and any(calibrations[topic]["K"]):
-            yield None, space.frustum(robot, topic, calibrations[topic])
-
-
-def _pair_stills(pair: Names, motion: Motion) -> Iterator[Still]:
-    estimate, truth = motion.estimates.get(pair), motion.truths.get(pair)
-    for positions, path, source in (
-        (truth, topics.truth(*pair), "truth"),
-        (estimate, topics.position(*pair), "estimate"),
-    ):
-        if positions is None:
-            continue
-        drawn = [*space.seen(path, pair, positions, source)]
-        there = motion.in_space(pair[0], positions.xyz, positions.time_ns)
-        drawn.append(space.trail(f"{path}/trail", motion.space(pair[0]), there, source))
-        drawn.append(plots.distance(path, positions, source))
-        if positions is estimate:
-            drawn += plots.status(path, positions)
-            drawn += [] if truth is None else plots.errors(path, positions, truth)
-        yield from ((positions.time_ns, entity) for entity in drawn)
+            yield space.frustum(robot, topic, calibrations[topic])
 
 
 def _spaces(

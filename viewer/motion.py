@@ -1,11 +1,9 @@
-"""Where robots are and see each other, as arrays: what 3D views and plots are made from.
+"""Where robots are and see each other, as arrays: what 3D views and plots are made from."""
 
-Positions of a whole flight are held, 200 bytes each: 15 MB an hour for a pair.
-"""
-
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.geometry import Array
 from dmrl.positions import GAP_S
-from dmrl.recording import Summary, stretches
+from dmrl.recording import Summary, glance
 from dmrl.viewer.entity import WORLD, horizontal_frame
 
 Times = NDArray[np.int64]
@@ -40,10 +38,15 @@ class Poses:
     xyz: Array
     xyzw: Array
 
-    @property
-    def fixed(self) -> bool:
-        """Whether it never moves."""
-        return bool((self.xyz == self.xyz[0]).all() and (self.xyzw == self.xyzw[0]).all())
+    def moved_from(self, last: "Poses | None") -> NDArray[np.bool_]:
+        """(N,) whether a pose is another than the one before it; ``last`` is before the first."""
+        poses = np.concatenate([self.xyz, self.xyzw], axis=1)
+        moved = np.ones(len(poses), np.bool_)
+        moved[1:] = (poses[1:] != poses[:-1]).any(axis=1)
+        if last is not None and last.parent == self.parent:
+            before = np.concatenate([last.xyz[-1], last.xyzw[-1]])
+            moved[0] = (poses[0] != before).any()
+        return moved
 
     def applied(self, points: Array, time_ns: Times) -> Array:
         """(M, 3) points at (M,) times, in the parent; between two poses on the way of both."""
@@ -96,8 +99,42 @@ class Positions:
 
 
 @dataclass(frozen=True, slots=True)
+class Ranges:
+    """Measured distances: (N,) log times, sorted, and metres."""
+
+    time_ns: Times
+    range_m: Array
+
+
+Timed = Poses | Positions | Ranges
+Kind = TypeVar("Kind", bound=Timed)
+
+
+def taken(timed: Kind, rows: slice | NDArray[np.int64]) -> Kind:
+    """Some rows."""
+    return _mapped(timed, lambda name: getattr(timed, name)[rows])
+
+
+def joined(parts: Sequence[Kind]) -> Kind:
+    """All rows, by log time."""
+    if len(parts) == 1:
+        return parts[0]
+    whole = _mapped(parts[0], lambda name: np.concatenate([getattr(p, name) for p in parts]))
+    if (np.diff(whole.time_ns) >= 0).all():
+        return whole
+    return taken(whole, np.argsort(whole.time_ns, kind="stable"))
+
+
+def _mapped(timed: Kind, column: Callable[[str], NDArray[Any]]) -> Kind:
+    """The same with other columns, by name."""
+    values: dict[str, Any] = {one.name: getattr(timed, one.name) for one in fields(timed)}
+    columns = {name: column(name) for name, v in values.items() if isinstance(v, np.ndarray)}
+    return type(timed)(**(values | columns))
+
+
+@dataclass(frozen=True, slots=True)
 class Motion:
-    """All poses and positions of some recordings, by frame and by robot and peer."""
+    """Poses and positions of some recordings, by frame and by robot and peer."""
 
     poses: Mapping[str, Poses] = field(default_factory=dict)
     estimates: Mapping[Names, Positions] = field(default_factory=dict)
@@ -108,57 +145,57 @@ class Motion:
         own = horizontal_frame(robot)
         return WORLD if own in self.poses and self.poses[own].parent == WORLD else own
 
-    def in_space(self, robot: str, points: Array, time_ns: Times) -> Array:
-        """(N, 3) points of a robot's horizontal frame in the frame it is shown in."""
-        if self.space(robot) != WORLD:
-            return points
-        return self.poses[horizontal_frame(robot)].applied(points, time_ns)
 
-
-def read_motion(
+def glimpse(
     recordings: Mapping[Path, Summary], pairs: Iterable[Names], start_ns: int, end_ns: int
 ) -> Motion:
-    """What the recordings say of the pairs in [start_ns, end_ns), and their /tf."""
+    """A few moments in [start_ns, end_ns): every frame and pair there is, and how far they go."""
     pairs = list(pairs)
     kinds = {topics.position(*pair): ("estimates", pair) for pair in pairs}
     kinds |= {topics.truth(*pair): ("truths", pair) for pair in pairs}
-    fields: dict[str, Sequence[str] | None] = {**dict.fromkeys(kinds)}
-    fields[topics.TRANSFORMS] = ("transforms",)
+    wanted: dict[str, Sequence[str] | None] = dict.fromkeys([*kinds, topics.TRANSFORMS])
     found: dict[str, list[pa.RecordBatch]] = {}
     for path in recordings:
-        for stretch in stretches(path, fields, start_ns=start_ns, end_ns=end_ns):
-            for topic, batch in stretch.items():
-                found.setdefault(topic, []).append(batch)
+        for topic, batch in glance(path, wanted, start_ns=start_ns, end_ns=end_ns).items():
+            found.setdefault(topic, []).append(batch)
     held: dict[str, dict[Names, Positions]] = {"estimates": {}, "truths": {}}
     for topic, (kind, pair) in kinds.items():
         if topic in found:
-            held[kind][pair] = _positions(pa.Table.from_batches(found[topic]))
-    moved = found.get(topics.TRANSFORMS)
-    return Motion(_poses(pa.Table.from_batches(moved)) if moved else {}, **held)
+            held[kind][pair] = joined([positions_of(batch) for batch in found[topic]])
+    poses: dict[str, list[Poses]] = {}
+    for batch in found.get(topics.TRANSFORMS, ()):
+        for frame, part in poses_of(batch).items():
+            poses.setdefault(frame, []).append(part)
+    return Motion({frame: joined(parts) for frame, parts in poses.items()}, **held)
 
 
-def _poses(table: pa.Table) -> dict[str, Poses]:
-    column = table["transforms"].combine_chunks()
+def poses_of(batch: pa.RecordBatch) -> dict[str, Poses]:
+    """Frames of columns of foxglove.FrameTransforms."""
+    column = batch["transforms"]
     rows = np.repeat(np.arange(len(column)), column.value_lengths().to_numpy())
     parts = column.flatten()
-    time_ns = table["log_time"].to_numpy()[rows]
+    time_ns = batch["log_time"].to_numpy()[rows]
     xyz = vectors(parts.field("translation"), "xyz")
     xyzw = vectors(parts.field("rotation"), "xyzw")
     children = parts.field("child_frame_id").to_numpy(zero_copy_only=False)
     out = {}
     for frame in dict.fromkeys(children):
         own = np.flatnonzero(children == frame)
-        own = own[np.argsort(time_ns[own], kind="stable")]
         parent = parts.field("parent_frame_id")[int(own[0])].as_py()
         out[frame] = Poses(parent, time_ns[own], xyz[own], xyzw[own])
     return out
 
 
-def _positions(table: pa.Table) -> Positions:
-    table = table.sort_by("log_time")
-    xyz = np.stack([table[axis].to_numpy() for axis in "xyz"], axis=1)
-    covariance = covariances(table["covariance"].combine_chunks())
-    return Positions(table["log_time"].to_numpy(), xyz, covariance, table["status"].to_numpy())
+def positions_of(batch: pa.RecordBatch) -> Positions:
+    """Columns of PeerPosition."""
+    xyz = np.stack([batch[axis].to_numpy() for axis in "xyz"], axis=1)
+    covariance = covariances(batch["covariance"])
+    return Positions(batch["log_time"].to_numpy(), xyz, covariance, batch["status"].to_numpy())
+
+
+def ranges_of(batch: pa.RecordBatch) -> Ranges:
+    """Columns of UwbRange."""
+    return Ranges(batch["log_time"].to_numpy(), batch["range_m"].to_numpy())
 
 
 def covariances(column: pa.ListArray) -> Array:

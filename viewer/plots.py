@@ -1,6 +1,10 @@
-"""What is plotted over time, every line with its unit in the name of its panel."""
+"""What is plotted over time, every line with its unit in the name of its panel.
+
+Styles are logged once, but asked for with every stretch: they are made once too.
+"""
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 
 import numpy as np
 import pyarrow as pa
@@ -17,19 +21,30 @@ BOUND_SIGMAS = 3.0
 NEES_95 = 5.991
 """95 % of a chi-square with two degrees of freedom lie below."""
 
+_RED, _GREEN, _BLUE = RGB["estimate"]
+DIM_ESTIMATE: Colour = (_RED // 2, _GREEN // 2, _BLUE // 2)
 WIDTH_UI, THIN_UI, MARKER_UI = 1.5, 0.8, 0.8
 
 
 def line(path: str, values: Array, name: str, colour: Colour, width: float = WIDTH_UI) -> Entity:
     """One line: (N,) values; where they are NaN, it has a gap."""
-    style = rr.SeriesLines(colors=[colour], names=[name], widths=[width])
+    style = _lines((colour,), (name,), width)
     return Entity(path, rr.Scalars.columns(scalars=values), (style,))
+
+
+@cache
+def _lines(colours: tuple[Colour, ...], names: tuple[str, ...], width: float) -> rr.SeriesLines:
+    return rr.SeriesLines(colors=colours, names=names, widths=[width] * len(names))
 
 
 def dots(path: str, values: Array, name: str, colour: Colour) -> Entity:
     """(N,) values that scatter too much for a line."""
-    style = rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[MARKER_UI])
-    return Entity(path, rr.Scalars.columns(scalars=values), (style,))
+    return Entity(path, rr.Scalars.columns(scalars=values), (_dots(name, colour),))
+
+
+@cache
+def _dots(name: str, colour: Colour) -> rr.SeriesPoints:
+    return rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[MARKER_UI])
 
 
 def height(path: str, robot: str, batch: pa.RecordBatch, *, own: bool) -> Iterator[Entity]:
@@ -66,12 +81,9 @@ def errors(path: str, positions: Positions, truth: Positions) -> Iterator[Entity
     error = (positions.xyz - truth.at(positions.time_ns))[:, :2]
     covariance = positions.covariance[:, :2, :2]
     bound = BOUND_SIGMAS * np.sqrt(np.einsum("nii->ni", covariance))
-    dim = tuple(value // 2 for value in RGB["estimate"])
     for k, axis in enumerate("xy"):
         both = np.stack([bound[:, k], -bound[:, k]], axis=1)
-        style = rr.SeriesLines(
-            colors=[dim, dim], names=["3 sigma", "3 sigma"], widths=[THIN_UI, THIN_UI]
-        )
+        style = _lines((DIM_ESTIMATE, DIM_ESTIMATE), ("3 sigma", "3 sigma"), THIN_UI)
         yield Entity(f"{path}/bound/{axis}", rr.Scalars.columns(scalars=both), (style,))
         yield line(f"{path}/error/{axis}", error[:, k], "estimate", RGB["estimate"])
     yield line(f"{path}/nees", _nees(error, covariance), "estimate", RGB["estimate"])
@@ -95,12 +107,16 @@ def status(path: str, positions: Positions) -> Iterator[Entity]:
     kind = descriptor("PeerPosition").fields_by_name["status"].enum_type
     names = {} if kind is None else {n: v.name for n, v in kind.values_by_number.items()}
     states = [names.get(number, str(number)) for number in positions.status.tolist()]
-    style = rr.StateConfiguration(
+    yield Entity(f"{path}/status", rr.StateChange.columns(state=states), (_states(),))
+
+
+@cache
+def _states() -> rr.StateConfiguration:
+    return rr.StateConfiguration(
         values=list(STATUS_RGB),
         labels=list(STATUS_RGB),
         colors=np.array([_rgba(colour) for colour in STATUS_RGB.values()], np.uint32),
     )
-    yield Entity(f"{path}/status", rr.StateChange.columns(state=states), (style,))
 
 
 def _rgba(colour: Sequence[int]) -> int:

@@ -1,6 +1,6 @@
 """What of a selection is drawn, and how: read in one pass, stretch by stretch."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from dmrl.recording import stretches
 from dmrl.viewer import entities
 from dmrl.viewer.entities import Colour, Scale
 from dmrl.viewer.entity import Entity, image_frame
+from dmrl.viewer.follow import Follower
 from dmrl.viewer.layouts import TIMELINE, Eye
 from dmrl.viewer.legend import colour_bars, legend
 from dmrl.viewer.motion import Times
@@ -24,6 +25,10 @@ from dmrl.viewer.selection import Selection
 from dmrl.viewer.show import Logged, time_column
 
 Still = tuple[Times | None, Entity]
+Stretch = dict[str, pa.RecordBatch]
+
+ROWS_AT_ONCE = 20_000
+"""Messages that belong to no image are drawn so many at a time: half a minute of two robots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,8 @@ class Scene:
         Robot to sources of its labels; grows as they are read.
     named
         Names and colours of what else the legends explain.
+    follower
+        Makes one that draws what several topics say together; None: nothing does.
     """
 
     blueprint: rrb.Blueprint
@@ -74,39 +81,81 @@ class Scene:
     eyes: Sequence[Eye]
     sources: dict[str, set[str]] = field(default_factory=dict)
     named: dict[str, Colour] = field(default_factory=dict)
+    follower: Callable[[], Follower] | None = None
+
+    def topics(self, path: Path) -> list[str]:
+        """What is read of a recording."""
+        drawn = [draw.topic for draw in self.draws if draw.recording in (None, path)]
+        return drawn + (self.follower().topics if self.follower else [])
 
 
 def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
-    """The whole scene: what stands still, then all that moves, by time."""
-    for time_ns, entity in scene.stills:
-        yield (None if time_ns is None else _times(selection, time_ns)), entity
+    """The whole scene: what stands still, then all that moves, by time, images first."""
+    yield from _timed(selection, scene.stills)
+    follower = scene.follower() if scene.follower else None
+    of_images = {draw.topic for draw in scene.draws if draw.robot is not None}
     shown: dict[str, set[str]] = {}
     for path in selection.recordings:
-        for stretch in track(_stretches(selection, scene, path), f"Reading {path.name}"):
+        parts = track(_stretches(selection, scene, path), f"Reading {path.name}")
+        for stretch in _gathered(parts, of_images):
             for draw in scene.draws:
                 if draw.topic in stretch and draw.recording in (None, path):
                     yield from _drawn(selection, draw, stretch[draw.topic])
-            for robot, eye in {eye.robot: eye for eye in scene.eyes}.items():
-                sources = scene.sources.get(robot, set())
-                if shown.get(robot) != sources and (sources or scene.named):
-                    shown[robot] = set(sources)
-                    yield None, _legend(eye, sources, scene.named)
+            yield from _legends(scene, shown)
+            if follower:
+                yield from _timed(selection, follower.take(stretch))
+    if follower:
+        yield from _timed(selection, follower.rest())
 
 
-def _stretches(
-    selection: Selection, scene: Scene, path: Path
-) -> Iterator[dict[str, pa.RecordBatch]]:
-    wanted = {draw.topic: None for draw in scene.draws if draw.recording in (None, path)}
+def _gathered(parts: Iterable[Stretch], of_images: Set[str]) -> Iterator[Stretch]:
+    """What belongs to images at once, of all else more at a time: each call of rerun costs.
+
+    The first part comes whole.
+    """
+    held: dict[str, list[pa.RecordBatch]] = {}
+    count = ROWS_AT_ONCE
+    for part in parts:
+        yield {topic: batch for topic, batch in part.items() if topic in of_images}
+        for topic in part.keys() - of_images:
+            held.setdefault(topic, []).append(part[topic])
+            count += part[topic].num_rows
+        if count >= ROWS_AT_ONCE:
+            yield _joined(held)
+            held, count = {}, 0
+    yield _joined(held)
+
+
+def _joined(held: Mapping[str, Sequence[pa.RecordBatch]]) -> Stretch:
+    return {topic: pa.concat_batches(batches) for topic, batches in held.items()}
+
+
+def _timed(selection: Selection, stills: Iterable[Still]) -> Iterator[Logged]:
+    for time_ns, entity in stills:
+        yield (None if time_ns is None else _times(selection, time_ns)), entity
+
+
+def _legends(scene: Scene, shown: dict[str, set[str]]) -> Iterator[Logged]:
+    """Legends that are not as they were ``shown``."""
+    for robot, eye in {eye.robot: eye for eye in scene.eyes}.items():
+        sources = scene.sources.get(robot, set())
+        if shown.get(robot) != sources and (sources or scene.named):
+            shown[robot] = set(sources)
+            yield None, _legend(eye, sources, scene.named)
+
+
+def _stretches(selection: Selection, scene: Scene, path: Path) -> Iterator[Stretch]:
+    wanted = dict.fromkeys(scene.topics(path))
     around_images = {draw.topic: None for draw in scene.draws if draw.robot is not None}
     first_ns, end_ns = selection.shown_ns
     if selection.all_images or not selection.image_ns:
         yield from stretches(path, wanted, start_ns=first_ns, end_ns=end_ns)
         return
+    few = {topic: None for topic in wanted if topic in around_images}
+    image_ns = min(int(times[0]) for times in selection.image_ns.values())
+    yield from stretches(path, few, start_ns=image_ns, end_ns=selection.last_image_ns + 1)
     always = {topic: None for topic in wanted if topic not in around_images}
     yield from stretches(path, always, start_ns=first_ns, end_ns=end_ns)
-    few = {topic: None for topic in wanted if topic in around_images}
-    first_ns = min(int(times[0]) for times in selection.image_ns.values())
-    yield from stretches(path, few, start_ns=first_ns, end_ns=selection.last_image_ns + 1)
 
 
 def _drawn(selection: Selection, draw: Draw, batch: pa.RecordBatch) -> Iterator[Logged]:

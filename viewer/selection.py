@@ -160,7 +160,7 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
     start_ns = min(kept.start_ns for kept in found.values() if kept.count)
     last_ns = max(kept.end_ns for kept in found.values() if kept.count)
     lower_ns, upper_ns = (
-        other if s is None else start_ns + round(s * 1e9)
+        other if s is None else start_ns + _nanoseconds(s)
         for s, other in ((settings.from_s, start_ns), (settings.to_s, last_ns + 1))
     )
     image_ns = _image_times(found, robots, lower_ns, upper_ns)
@@ -182,6 +182,12 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
         lower_ns = first_image_ns
     shown_ns = lower_ns, min(upper_ns, last_ns + 1)
     return Selection(found, layout, start_ns, shown_ns, chosen, settings.every == 1)
+
+
+def _nanoseconds(seconds: float) -> int:
+    if not np.isfinite(seconds):
+        raise SettingError(f"{seconds} s is no time. Give seconds from the start")
+    return round(seconds * 1e9)
 
 
 def _fitting(every: Sequence[str]) -> Layout:
@@ -224,7 +230,7 @@ def at_time(selection: Selection, time_s: float | None) -> Selection:
     """
     wanted_ns = min((int(t[0]) for t in selection.image_ns.values()), default=selection.shown_ns[0])
     if time_s is not None:
-        wanted_ns = selection.start_ns + round(time_s * 1e9)
+        wanted_ns = selection.start_ns + _nanoseconds(time_s)
     nearest = {
         robot: times[[np.abs(times - wanted_ns).argmin()]]
         for robot, times in selection.image_ns.items()
@@ -241,7 +247,7 @@ def moment_ns(selection: Selection, time_s: float | None) -> int:
     if selection.image_ns or time_s is None:
         return selection.last_image_ns
     first, end = selection.shown_ns
-    return min(max(selection.start_ns + round(time_s * 1e9), first), end - 1)
+    return min(max(selection.start_ns + _nanoseconds(time_s), first), end - 1)
 
 
 def _image_times(

@@ -3,20 +3,16 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any, cast
 
 import rerun as rr
 
-from dmrl import topics
-from dmrl.colours import RGB
 from dmrl.errors import OutputError
 from dmrl.output import partial_file
-from dmrl.viewer import entities, layouts
-from dmrl.viewer.browse import browse
-from dmrl.viewer.compare import compare_scene
-from dmrl.viewer.flight import flight_scene
 from dmrl.viewer.layouts import TIMELINE
-from dmrl.viewer.scene import Scene, bars, eyes_of, logged, model_draws, picture_draws
-from dmrl.viewer.selection import Selection, Settings, at_time, moment_ns, select
+from dmrl.viewer.scene import Scene, logged
+from dmrl.viewer.selection import Settings, at_time, moment_ns, select
 from dmrl.viewer.show import Logger, Show, cursor_at, stream_of
 
 
@@ -60,11 +56,12 @@ def prepare(
     As `save`.
     """
     if any(path.is_dir() for path in paths):
+        browse: Callable[..., Show] = _loaded(_DATASET)
         return browse(paths, settings, rank=rank if picture else None)
     selection = select(paths, settings)
     if picture:
         selection = at_time(selection, time_s)
-    scene = _SCENES[selection.layout](selection, settings)
+    scene: Scene = _loaded(_SCENES[selection.layout])(selection, settings)
     shown_ns = moment_ns(selection, time_s)
     return Show(
         " + ".join(recording.stem for recording in selection.recordings),
@@ -106,22 +103,15 @@ def log(show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lam
         logger.log(times, entity)
 
 
-def image_scene(selection: Selection, settings: Settings) -> Scene:
-    """Images and maps of every robot."""
-    scales = entities.scales(settings.depth_max_m)
-    eyes = eyes_of(selection, sorted(selection.image_ns), scales)
-    scene = Scene(layouts.image(eyes, scales, overlay=settings.overlay), [], [], eyes)
-    for eye in eyes:
-        scene.draws += picture_draws(eye, scene.sources.setdefault(eye.robot, set()))
-        scene.draws += model_draws(eye, scales, smooth=settings.overlay)
-        scene.stills += bars(eye, scales)
-        if any(n["robot"] == eye.robot for n in selection.found(topics.DETECTIONS)):
-            scene.named["detection"] = RGB["detection"]
-    return scene
-
-
-_SCENES: dict[str, Callable[[Selection, Settings], Scene]] = {
-    "image": image_scene,
-    "flight": flight_scene,
-    "compare": compare_scene,
+# Loaded when they are shown: the picture waits for what is imported, and compare and dataset
+# judge models.
+_SCENES = {
+    "image": "dmrl.viewer.pictures:image_scene",
+    "flight": "dmrl.viewer.flight:flight_scene",
+    "compare": "dmrl.viewer.compare:compare_scene",
 }
+_DATASET = "dmrl.viewer.browse:browse"
+
+
+def _loaded(name: str) -> Callable[..., Any]:
+    return cast(Callable[..., Any], resolve_name(name))

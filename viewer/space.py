@@ -25,7 +25,7 @@ from dmrl.viewer.entity import (
     image_frame,
     optical_frame,
 )
-from dmrl.viewer.motion import Names, Poses, Positions, covariances, vectors
+from dmrl.viewer.motion import Names, Poses, Positions, Ranges, covariances, vectors
 
 FRUSTUM_M, AXES_M, NAME_ABOVE_M = 0.35, 0.12, 0.08
 TRAIL_UI, RANGE_UI = -1.0, -0.75
@@ -36,29 +36,23 @@ OPTICAL_XYZW = [-0.5, 0.5, -0.5, 0.5]
 
 def transform(frame: str, poses: Poses) -> Entity:
     """Where a frame is in its parent; its log times are those of the poses."""
-    path, count = f"/tf/{frame}", len(poses.time_ns)
-    if poses.fixed:
-        return Entity(path, style=(fixed(frame, poses.parent, poses.xyzw[0], poses.xyz[0]),))
+    count = len(poses.time_ns)
     columns = rr.Transform3D.columns(
         translation=poses.xyz,
         quaternion=poses.xyzw,
         child_frame=[frame] * count,
         parent_frame=[poses.parent] * count,
     )
-    return Entity(path, columns)
-
-
-def fixed(
-    frame: str, parent: str, xyzw: Sequence[float], xyz: Sequence[float] = (0, 0, 0)
-) -> rr.Transform3D:
-    """A frame that stays where it is in its parent."""
-    turn = rr.Quaternion(xyzw=xyzw)
-    return rr.Transform3D(translation=xyz, quaternion=turn, child_frame=frame, parent_frame=parent)
+    return Entity(f"/tf/{frame}", columns)
 
 
 def still_frame(frame: str, parent: str, xyzw: Sequence[float] = (0, 0, 0, 1)) -> Entity:
     """A frame that stays where it is."""
-    return Entity(f"/tf/{frame}", style=(fixed(frame, parent, xyzw),))
+    turn = rr.Quaternion(xyzw=xyzw)
+    place = rr.Transform3D(
+        translation=(0, 0, 0), quaternion=turn, child_frame=frame, parent_frame=parent
+    )
+    return Entity(f"/tf/{frame}", style=(place,))
 
 
 def attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
@@ -178,30 +172,34 @@ def _quaternions(matrices: Array) -> Array:
     return np.asarray(row / np.linalg.norm(row, axis=1, keepdims=True))
 
 
-def trail(path: str, frame: str, xyz: Array, source: str) -> Entity:
-    """The way from each position to the next; a view shows the last seconds of it."""
-    steps = np.stack([np.roll(xyz, 1, axis=0), xyz], axis=1)
-    steps[0] = xyz[:1]
-    columns = rr.LineStrips3D.columns(strips=list(steps))
+def trail(path: str, frame: str, steps: Array, source: str) -> Entity:
+    """(N, 2, 3) the way from each position to the next; a view shows the last seconds of it."""
     style = rr.LineStrips3D.from_fields(colors=[RGB[source]], radii=[TRAIL_UI])
-    return Entity(path, columns, (style,), frame)
+    return Entity(path, rr.LineStrips3D.columns(strips=_strips(steps)), (style,), frame)
 
 
-def ranges(
-    path: str, robot: str, batch: pa.RecordBatch, towards: Positions | None
-) -> Iterator[Entity]:
+def _strips(points: Array) -> pa.ListArray:
+    """(N, k, 3) as N lines. From a list of arrays rerun takes each for itself: 20 us."""
+    kind = rr.components.LineStrip3DBatch([]).as_arrow_array().type
+    flat = pa.array(points.astype(np.float32).reshape(-1))
+    offsets = np.arange(len(points) + 1, dtype=np.int32) * points.shape[1]
+    inner = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
+    return pa.ListArray.from_arrays(pa.array(offsets), inner, type=kind)
+
+
+def ranges(path: str, robot: str, measured: Ranges, towards: Positions | None) -> Iterator[Entity]:
     """Measured distances: lines to where the peer is thought to be, or spheres where nobody knows.
 
     Parameters
     ----------
     path, robot
         Where the ranges stand, and who measured them.
-    batch
-        Columns of UwbRange.
+    measured
+        The distances.
     towards
         Where the peer is thought to be.
     """
-    range_m = batch["range_m"].to_numpy()
+    range_m = measured.range_m
     frame = horizontal_frame(robot)
     if towards is None:
         sphere = rr.Ellipsoids3D.columns(
@@ -214,11 +212,11 @@ def ranges(
         )
         yield Entity(f"{path}/sphere", sphere, (thin,), frame)
         return
-    there = towards.at(batch["log_time"].to_numpy())
+    there = towards.at(measured.time_ns)
     length = np.linalg.norm(there, axis=1, keepdims=True)
     known = np.isfinite(length[:, 0]) & (length[:, 0] > 0)
     ends = there[known] / length[known] * range_m[known, None]
-    lines = rr.LineStrips3D.columns(strips=list(np.stack([np.zeros_like(ends), ends], axis=1)))
+    lines = rr.LineStrips3D.columns(strips=_strips(np.stack([np.zeros_like(ends), ends], axis=1)))
     style = rr.LineStrips3D.from_fields(colors=[RGB["range"]], radii=[RANGE_UI])
     yield Entity(f"{path}/line", lines.partition(known.astype(int)), (style,), frame)
 

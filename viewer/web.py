@@ -112,10 +112,15 @@ class Page:
         words = command(web.bind, "--serve-web", *ports, *allowed)
         self._host = LOOPBACK if web.bind in ANYWHERE else web.bind
         self._viewer = Viewer(words)
-        if not listens(self._viewer, self._host, self._data_port):
-            said = last_line(self._viewer.said())
+        try:
+            if not listens(self._viewer, self._host, self._data_port):
+                said = last_line(self._viewer.said())
+                raise SettingError(
+                    f"rerun's server stopped: {said}. Choose another --port or --bind"
+                )
+        except BaseException:
             self.close()
-            raise SettingError(f"rerun's server stopped: {said}. Choose another --port or --bind")
+            raise
 
     def fill(self) -> None:
         """Send everything that is shown; the page can be looked at meanwhile."""

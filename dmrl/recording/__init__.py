@@ -6,6 +6,7 @@ The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
 from dmrl.recording.check import Finding, check
 from dmrl.recording.edit import merge, trim
 from dmrl.recording.extras import copy_extras, splits
+from dmrl.recording.glance import glance
 from dmrl.recording.index import SPLIT_METADATA, Summary, TopicInfo, summary
 from dmrl.recording.inputs import input_of, provenance
 from dmrl.recording.provenance import Input, Provenance
@@ -41,6 +42,7 @@ __all__ = [
     "check",
     "columns",
     "copy_extras",
+    "glance",
     "input_of",
     "interrupted",
     "log_times",

@@ -8,7 +8,7 @@ in it, its times and where its payload starts and ends. Decoders work on whole b
 import io
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from pathlib import Path
 from typing import BinaryIO
 
@@ -87,7 +87,7 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
             return
         channels = {n: channel_of(n, summary.channels, summary.schemas) for n in summary.channels}
         for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
-            yield _indexed(path, stream, chunk, channels), channels
+            yield in_chunk(path, stream, chunk, channels), channels
 
 
 def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
@@ -133,21 +133,10 @@ def _in_time_order(
     low: int,
     high: int,
 ) -> Iterator[Block]:
-    def wanted(chunk: ChunkIndex) -> bool:
-        seen = chunk.message_index_offsets
-        return (
-            chunk.message_end_time >= low
-            and chunk.message_start_time < high
-            and (not seen or not channels.keys().isdisjoint(seen))
-        )
-
-    chunks = sorted(
-        filter(wanted, summary.chunk_indexes),
-        key=lambda c: (c.message_start_time, c.chunk_start_offset),
-    )
+    chunks = chunks_between(summary, channels.keys(), low, high)
     held: Block | None = None
     for k, chunk in enumerate(chunks):
-        block = _indexed(path, stream, chunk, channels)
+        block = in_chunk(path, stream, chunk, channels)
         block = block.take((block.time_ns >= low) & (block.time_ns < high))
         held = concatenate(held, block).sorted()
         if k + 1 == len(chunks):
@@ -161,9 +150,29 @@ def _in_time_order(
         yield held
 
 
-def _indexed(
+def chunks_between(
+    summary: McapSummary, numbers: Set[int], low: int, high: int
+) -> list[ChunkIndex]:
+    """Chunks that may hold messages of some channels in [low, high), by time."""
+
+    def wanted(chunk: ChunkIndex) -> bool:
+        seen = chunk.message_index_offsets
+        return (
+            chunk.message_end_time >= low
+            and chunk.message_start_time < high
+            and (not seen or not numbers.isdisjoint(seen))
+        )
+
+    return sorted(
+        filter(wanted, summary.chunk_indexes),
+        key=lambda c: (c.message_start_time, c.chunk_start_offset),
+    )
+
+
+def in_chunk(
     path: Path, stream: BinaryIO, chunk: ChunkIndex, channels: dict[int, Channel]
 ) -> Block:
+    """The messages of a chunk that are of some channels, in the order of the chunk."""
     stream.seek(chunk.chunk_start_offset)
     raw = stream.read(chunk.chunk_length + chunk.message_index_length)
     if len(raw) < RECORD_HEADER or raw[0] != Opcode.CHUNK:

@@ -4,7 +4,7 @@ import os
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
+from mcap.records import Attachment, AttachmentIndex, MetadataIndex
 from mcap.records import Channel as McapChannel
 from mcap.records import Message as McapMessage
 from mcap.records import Metadata as McapMetadata
@@ -69,6 +70,7 @@ class Summary:
 SETTLED_NS, MOST_REMEMBERED = 1_000_000_000, 8
 _MADE: dict[tuple[Path, str], tuple[tuple[int, int, int], Any]] = {}
 Made = TypeVar("Made")
+Record = TypeVar("Record", Attachment, McapMetadata)
 
 
 @contextmanager
@@ -206,15 +208,13 @@ def summary(path: Path) -> Summary:
 
 
 def _summary(path: Path, stream: BinaryIO) -> Summary:
-    # One reader: each reads the summary again.
-    reader = SeekingReader(stream)
-    found = _summary_of(reader)
+    found = mcap_summary(path, stream)
     if found is None:
         return _scanned(path, stream)
     metadata: dict[str, list[dict[str, str]]] = {}
-    for record in reader.iter_metadata():
+    for record in _records(stream, found.metadata_indexes, McapMetadata):
         metadata.setdefault(record.name, []).append(dict(record.metadata))
-    attachments = {a.name: a.data for a in reader.iter_attachments()}
+    attachments = {a.name: a.data for a in _records(stream, found.attachment_indexes, Attachment)}
     statistics = found.statistics
     counts = statistics.channel_message_counts if statistics else {}
     topics: dict[str, TopicInfo] = {}
@@ -230,6 +230,18 @@ def _summary(path: Path, stream: BinaryIO) -> Summary:
         attachments=attachments,
         provenance=_provenance(path, metadata),
     )
+
+
+def _records(
+    stream: BinaryIO, places: Sequence[MetadataIndex | AttachmentIndex], kind: type[Record]
+) -> Iterator[Record]:
+    """The records that an index names. mcap's reader would read the whole summary again."""
+    for place in places:
+        stream.seek(place.offset)
+        record = next(StreamReader(stream, skip_magic=True).records)
+        if not isinstance(record, kind):
+            raise McapError(f"no {kind.__name__} at byte {place.offset}")
+        yield record
 
 
 def _scanned(path: Path, stream: BinaryIO) -> Summary:

@@ -61,11 +61,18 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
         if not hits:
             raise MissingTopic(want, topics, path)
         found |= hits
-    _require_types(path, topics, found)
+    require_types(path, topics, found)
     return frozenset(found)
 
 
-def _require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> None:
+def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> None:
+    """Nothing, if topics of dmrl's carry the types they should.
+
+    Raises
+    ------
+    RecordingError
+        If one does not.
+    """
     for topic in sorted(chosen):
         row = row_of(topic)
         if row is not None and not row.carries(topics[topic].schema):
@@ -234,7 +241,7 @@ def stretches(
     """
     present = summary(path).topics
     names = frozenset(topic for topic in fields if topic in present)
-    _require_types(path, present, names)
+    require_types(path, present, names)
     held: list[Block] = []
     size = 0
     channels: dict[int, Channel] = {}
@@ -242,10 +249,10 @@ def stretches(
         held.append(block)
         size += len(block.data)
         if size >= STRETCH_BYTES:
-            yield _by_topic(path, joined(held), channels, fields)
+            yield by_topic(path, joined(held), channels, fields)
             held, size = [], 0
     if held:
-        yield _by_topic(path, joined(held), channels, fields)
+        yield by_topic(path, joined(held), channels, fields)
 
 
 def log_times(
@@ -274,19 +281,20 @@ def log_times(
     """
     present = summary(path).topics
     names = frozenset(topic for topic in topics if topic in present)
-    _require_types(path, present, names)
+    require_types(path, present, names)
     low = 0 if start_ns is None else start_ns
     high = np.iinfo(np.int64).max if end_ns is None else end_ns
     found = {topic: np.sort(times) for topic, times in indexed_times(path, names).items()}
     return {topic: t[(t >= low) & (t < high)] for topic, t in found.items()}
 
 
-def _by_topic(
+def by_topic(
     path: Path,
     block: Block,
     channels: Mapping[int, Channel],
     fields: Mapping[str, Sequence[str] | None],
 ) -> dict[str, pa.RecordBatch]:
+    """The messages of a block as columns, by topic."""
     numbers: dict[str, list[int]] = {}
     for number in np.unique(block.channel).tolist():
         numbers.setdefault(channels[number].topic, []).append(number)

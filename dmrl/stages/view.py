@@ -1,5 +1,6 @@
 """``dmrl view``: recordings in rerun, or what it would show as a file or a picture."""
 
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -67,6 +68,8 @@ def command(
     rank
         Take the picture of this row of a dataset; 1 is the worst.
     """
+    # A kill ends rerun's viewer too, as Ctrl-C does; it would be left behind.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     if save_to is not None:
         count = save(recording, save_to, settings)
         print(f"{save_to}: {count} images")

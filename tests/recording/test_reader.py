@@ -12,7 +12,9 @@ from dmrl.messages import message, schema_bytes
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
+    blocks,
     columns,
+    glance,
     log_times,
     read,
     read_raw,
@@ -20,6 +22,7 @@ from dmrl.recording import (
     reader,
     stretches,
     summary,
+    writer,
 )
 
 HEIGHT = message("Height")
@@ -62,6 +65,10 @@ def test_any_complete_file_is_read_in_time_order(
     assert [s.message.height_m for s in read(path)] == list(range(500))
     assert read_table(path, "/cf1/height")["height_m"].to_pylist() == list(range(500))
     assert summary(path).topics["/cf1/height"].count == 500
+    seen = glance(path, {"/cf1/height": None}, start_ns=100, end_ns=400)["/cf1/height"]
+    found = seen["height_m"].to_pylist()
+    assert found == sorted(found)
+    assert 100 <= found[0] < found[-1] < 400
 
 
 def test_a_stretch_of_time_is_half_open(flight: Path) -> None:
@@ -269,3 +276,35 @@ def test_topics_are_read_in_one_pass_as_one_by_one(
     assert sorted(times) == ["/cf1/height", "/cf1/range/cf2"]
     for topic, ns in times.items():
         assert ns.tolist() == [t for b in found[topic] for t in b["log_time"].to_pylist()]
+
+
+def test_a_glance_sees_every_topic_all_over_the_recording_in_a_few_chunks(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "chunks.mcap"
+    monkeypatch.setattr(writer, "CHUNK_BYTES", 1000)
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for raw in read_raw(flight):
+            sink.write_raw(raw)
+        # One message, in the middle of the file though not of the time.
+        sink.write(39_000_000_000, "/cf2/height", HEIGHT(height_m=2.0))
+    unpacked, chunks = blocks.unpacked, set()
+    monkeypatch.setattr(
+        blocks, "unpacked", lambda path, chunk, at: chunks.add(at) or unpacked(path, chunk, at)
+    )
+    wanted = {"/cf1/attitude": ("roll_rad",), "/cf1/range/cf2": None, "/cf2/height": None}
+    seen = glance(path, {**wanted, "/cf9/height": None}, start_ns=0, end_ns=10**12)
+    assert seen.keys() == wanted.keys()
+    assert seen["/cf2/height"]["height_m"].to_pylist() == [2.0]
+    times = seen["/cf1/attitude"]["log_time"].to_numpy()
+    assert times[[0, -1]].tolist() == [0, 39_990_000_000]
+    assert np.diff(times).max() < 40_000_000_000 / 12
+    assert len(chunks) <= 33
+
+
+def test_a_glance_finds_what_the_chunks_it_takes_do_not_hold(tmp_path: Path) -> None:
+    # Chunks of a few messages each that all span the whole time.
+    times = [time for k in range(1, 499) for time in (0, k, 499)]
+    path = foreign(tmp_path / "a.mcap", times)
+    (time_ns,) = glance(path, {"/cf1/height": None}, start_ns=251, end_ns=252)["/cf1/height"][0]
+    assert time_ns.as_py() == 251

@@ -72,34 +72,40 @@ def fly(tmp_path: Path) -> Make:
     """Two seconds of two robots that see and measure each other, cf2 1 m ahead of cf1.
 
     Both stand still; cf1 looks along the world's y from (1, 2, 0.5). What it estimates is 0.1 m
-    too far, one standard deviation.
+    too far, one standard deviation. With ``moving``
+    both fly, and the truth and /tf come a third of a step later than the rest.
     """
 
-    def build(name: str = "flight.mcap", without: tuple[str, ...] = ()) -> Path:
+    def build(
+        name: str = "flight.mcap", without: tuple[str, ...] = (), *, moving: bool = False
+    ) -> Path:
         with RecordingWriter(tmp_path / name, Provenance("test")) as sink:
             for k in range(20):
-                for topic, sample in _flown(k).items():
+                for topic, sample in _flown(k, 0.05 * k * moving).items():
+                    late = moving and topic in (topics.TRANSFORMS, topics.truth("cf1", "cf2"))
                     if not any(word in topic for word in without):
-                        sink.write(k * STEP_NS, topic, sample)
+                        sink.write(k * STEP_NS + late * STEP_NS // 3, topic, sample)
         return tmp_path / name
 
     return build
 
 
-def _flown(k: int) -> dict[str, Any]:
+def _flown(k: int, way_m: float) -> dict[str, Any]:
     exact, known = [0.0] * 9, [0.01, 0, 0, 0, 0.04, 0, 0, 0, 0.0025]
-    truth = {"x": 1.0, "covariance": exact, "frame_id": "cf1/horizontal"}
+    truth = {"x": 1.0 + way_m, "covariance": exact, "frame_id": "cf1/horizontal"}
     followed = {"id": 3, "peer": "cf2", "x": 1.0, "vx_mps": 0.5, "covariance": known}
     messages = {
         topics.TRANSFORMS: message("FrameTransforms")(
             transforms=[
-                _frame("world", "cf1/horizontal", (1.0, 2.0, 0.5), (0, 0, 0.5**0.5, 0.5**0.5)),
+                _frame(
+                    "world", "cf1/horizontal", (1.0 + way_m, 2.0, 0.5), (0, 0, 0.5**0.5, 0.5**0.5)
+                ),
                 _frame("world", "cf2/horizontal", (1.0, 3.0 + 0.01 * k, 0.5), (0, 0, 0, 1)),
             ]
         ),
         topics.truth("cf1", "cf2"): message("PeerPosition")(**truth),
         topics.position("cf1", "cf2"): message("PeerPosition")(
-            **{**truth, "x": 1.1, "covariance": known, "status": 0 if k > 4 else 1}
+            **{**truth, "x": 1.1 + way_m, "covariance": known, "status": 0 if k > 4 else 1}
         ),
         topics.uwb_range("cf1", "cf2"): message("UwbRange")(range_m=1.05),
         topics.uwb_range("cf2", "cf1"): message("UwbRange")(range_m=1.0),

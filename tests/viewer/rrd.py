@@ -1,6 +1,7 @@
 """What is in an .rrd file."""
 
 from collections import Counter
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,21 @@ def column(path: Path, entity: str, component: str) -> list[Any]:
         if str(chunk.entity_path) == entity and component in batch.schema.names:
             values += batch[component].to_pylist()
     return values
+
+
+def columns(path: Path) -> dict[tuple[str, str], list[Any]]:
+    """Values of every component of every entity, by log time."""
+    rows: dict[tuple[str, str], list[tuple[int, Any]]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        times = [0] * chunk.num_rows
+        if not chunk.is_static:
+            times = batch["log_time"].cast("int64").to_pylist()
+        for name in batch.schema.names:
+            if ":" in name:
+                values = zip(times, batch[name].to_pylist(), strict=True)
+                rows.setdefault((str(chunk.entity_path), name), []).extend(values)
+    return {key: sorted(found, key=itemgetter(0)) for key, found in rows.items()}
 
 
 def panels(path: Path) -> set[str]:

@@ -1,19 +1,25 @@
 """What the layout ``flight`` logs, read back from the .rrd files."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
-from dmrl.viewer import Settings, save
+from dmrl.recording import blocks, glance, reader, writer
+from dmrl.viewer import Settings, save, scene
+from dmrl.viewer.session import prepare
 
-from .rrd import column, logged, panels
+from .rrd import column, columns, logged, panels
 
 Make = Callable[..., Path]
 POSITION, TRUTH = "/cf1/peer/cf2/position", "/cf1/peer/cf2/truth"
+STILL = ("/tf/cf1/horizontal", "Transform3D")
+"""A frame that never moves has one row."""
 
 
 @pytest.fixture
@@ -34,6 +40,7 @@ def test_every_message_of_a_flight_becomes_its_archetypes(fly: Make, rrd: Path) 
     assert save([fly()], rrd, Settings()) == 20
     plots = ["distance", "error/x", "error/y", "bound/x", "bound/y", "nees", "nees/limit"]
     assert moving(rrd) == {
+        STILL: 1,
         ("/tf/cf2/horizontal", "Transform3D"): 20,
         ("/tf/cf1/camera", "Transform3D"): 20,
         ("/tf/cf2/camera", "Transform3D"): 20,
@@ -62,7 +69,6 @@ def test_every_message_of_a_flight_becomes_its_archetypes(fly: Make, rrd: Path) 
     }
     still = {key for key in logged(rrd) if key[1].startswith("static")}
     assert {
-        ("/tf/cf1/horizontal", "static Transform3D"),
         ("/tf/cf1/optical", "static Transform3D"),
         ("/cf1/camera/calibration", "static Pinhole"),
         ("/cf1/body", "static Mesh3D"),
@@ -176,7 +182,8 @@ def test_a_flight_without_images_is_shown_all_the_same(fly: Make, rrd: Path) -> 
 
 def test_from_and_to_hold_for_plots_too(fly: Make, rrd: Path) -> None:
     assert save([fly()], rrd, Settings(from_s=0.5, to_s=1.0)) == 5
-    assert set(moving(rrd).values()) == {5}
+    assert moving(rrd)[STILL] == 1
+    assert {n for key, n in moving(rrd).items() if key != STILL} == {5}
 
 
 def test_every_thins_images_and_leaves_plots_whole(fly: Make, rrd: Path) -> None:
@@ -194,3 +201,47 @@ def test_an_empty_stretch_of_a_flight_is_refused(fly: Make, rrd: Path) -> None:
 def test_a_robot_that_is_not_there_is_named_with_those_that_are(fly: Make, rrd: Path) -> None:
     with pytest.raises(SettingError, match=r"no robot cf9 in .*It has: cf1, cf2"):
         save([fly()], rrd, Settings(robot="cf9"))
+
+
+def test_images_come_first_and_wait_for_no_more_of_the_flight(
+    fly: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
+    monkeypatch.setattr(sys.modules[glance.__module__], "CHUNKS", 2)
+    opened: list[int] = []
+    unpacked = blocks.unpacked
+    monkeypatch.setattr(
+        blocks, "unpacked", lambda path, chunk, at: opened.append(at) or unpacked(path, chunk, at)
+    )
+    show = prepare([fly()], Settings())
+    paths, before = [], None
+    for times, entity in show.logged():
+        if times is not None:
+            paths.append(entity.path)
+            before = before or len(set(opened))
+    assert paths[0] == "/cf1/camera/image"
+    assert before is not None
+    assert before < len(set(opened)) / 2
+
+
+def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_ends(
+    fly: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def saved(name: str) -> dict[tuple[str, str], list[Any]]:
+        path = tmp_path / f"{name}.rrd"
+        save([fly(f"{name}.mcap", moving=True)], path, Settings())
+        return {
+            key: values
+            for key, values in columns(path).items()
+            if "/peer/" in key[0] or "/range/" in key[0]
+        }
+
+    whole = saved("whole")
+    monkeypatch.setattr(writer, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
+    monkeypatch.setattr(scene, "ROWS_AT_ONCE", 1)
+    pieces = saved("pieces")
+    assert len(whole[f"{TRUTH}/trail", "LineStrips3D:strips"]) == 20
+    assert whole.keys() == pieces.keys()
+    assert [key for key, values in whole.items() if values != pieces[key]] == []

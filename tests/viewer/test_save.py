@@ -182,6 +182,12 @@ def test_a_time_without_images_is_refused(make: Make, rrd: Path) -> None:
     assert list(rrd.parent.glob("*.rrd*")) == []
 
 
+@pytest.mark.parametrize("settings", [{"from_s": float("nan")}, {"to_s": float("inf")}])
+def test_a_time_that_is_none_is_refused(make: Make, rrd: Path, settings: dict[str, float]) -> None:
+    with pytest.raises(SettingError, match=r"s is no time\. Give seconds from the start"):
+        save([make()], rrd, Settings(**settings))
+
+
 def test_an_output_is_never_overwritten(make: Make, rrd: Path) -> None:
     rrd.write_bytes(b"mine")
     with pytest.raises(OutputError, match="never overwritten"):

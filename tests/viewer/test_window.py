@@ -90,7 +90,8 @@ def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
     assert {environment[name] for name in ("https_proxy", "HTTPS_PROXY")} == {"http://127.0.0.1:9"}
 
 
-def test_the_page_is_served_until_ctrl_c(make: Make) -> None:
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_the_page_is_served_until_ctrl_c_or_a_kill(make: Make, ending: signal.Signals) -> None:
     code = "from dmrl.cli import main; main()"
     command = [sys.executable, "-c", code, "view", str(make()), "--serve"]
 
@@ -106,8 +107,10 @@ def test_the_page_is_served_until_ctrl_c(make: Make) -> None:
             address = server.stderr.readline().split()[0]
             assert address.startswith("http://127.0.0.1:")
             assert b"<html" in _page(address)
-            server.send_signal(signal.SIGINT)
+            server.send_signal(ending)
             assert server.wait(timeout=10) == 0
+            with pytest.raises(urllib.error.URLError):
+                urllib.request.urlopen(address)
         finally:
             server.kill()
 

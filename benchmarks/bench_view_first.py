@@ -1,0 +1,141 @@
+"""How soon `dmrl view` shows the first image of a long recording.
+
+Run as ``python benchmarks/bench_view_first.py RECORDING [--times 5]``, the recording as
+``bench_view.py`` says. The command itself is run, its viewer without a screen, and asked for a
+picture every 0.1 s; the clock starts with the process, so imports count. Each layout, in turns:
+with the recording in memory, and with it on the disk only (Linux). Do it on an idle computer: CPU
+seconds stand beside the seconds because nothing else is worth comparing on a busy one.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import psutil
+
+from dmrl.images import Rgb, decode, encode_png
+from dmrl.viewer import process, window
+
+SHOWS_COLOURS = 2000
+"""More than panels without an image have."""
+LOOK_EVERY_S, PATIENCE_S = 0.1, 120.0
+
+# `dmrl view`, its viewer without a screen and at a known port; says when everything is sent.
+COMMAND = """
+import sys
+from dmrl.cli import main
+from dmrl.viewer import process, window
+port, command, stream_to = int(sys.argv.pop(1)), window.command, window.stream_to
+size = ("--headless", "--window-size", window.PICTURE_SIZE)
+def streamed(*arguments):
+    stream_to(*arguments)
+    print("sent", flush=True)
+window.free_port = lambda bind: port
+window.command = lambda bind, *rest: command(bind, *size, *rest)
+window.stream_to = streamed
+main()
+"""
+
+
+def first_picture(path: Path, layout: str, *, kept: Path | None) -> dict[str, float]:
+    """Seconds until the first image is seen and until all is sent, and CPU seconds until then.
+
+    Parameters
+    ----------
+    path
+        Recording.
+    layout
+        Layout.
+    kept
+        Where to write the first picture.
+    """
+    port = process.free_port(process.LOOPBACK)
+    words = [sys.executable, "-c", COMMAND, str(port), "view", str(path), "--layout", layout]
+    begun = time.monotonic()
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as running:
+        try:
+            picture = _until_seen(running, port)
+            found = {"first_s": time.monotonic() - begun}
+            found |= {f"{name}_cpu_s": s for name, s in _cpu_s(running.pid).items()}
+            assert running.stdout is not None
+            assert running.stdout.readline() == "sent\n"
+            found["sent_s"] = time.monotonic() - begun
+        finally:
+            running.terminate()
+    if kept is not None:
+        kept.write_bytes(encode_png(picture))
+    return found
+
+
+def _until_seen(running: subprocess.Popen[str], port: int) -> Rgb:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline and running.poll() is None:
+        try:
+            client = window.ViewerClient.connect(process.url_of(port))
+            rgb = decode(client.take_screenshot())
+        except (OSError, RuntimeError):
+            rgb = np.zeros((1, 1, 3), np.uint8)
+        if len(np.unique(rgb[::4, ::4].reshape(-1, 3), axis=0)) > SHOWS_COLOURS:
+            return rgb
+        time.sleep(LOOK_EVERY_S)
+    raise SystemExit("no picture")
+
+
+def _cpu_s(pid: int) -> dict[str, float]:
+    own = psutil.Process(pid)
+    used = {"dmrl": own.cpu_times(), "viewer": own.children()[0].cpu_times()}
+    return {name: times.user + times.system for name, times in used.items()}
+
+
+def in_memory(path: Path) -> None:
+    """Have the file in the page cache."""
+    with path.open("rb") as stream:
+        while stream.read(1 << 24):
+            pass
+
+
+def on_disk(path: Path) -> None:
+    """Have the file out of the page cache."""
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+        os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+PLACES: dict[str, Callable[[Path], None]] = {"memory": in_memory, "disk": on_disk}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--times", type=int, default=5)
+    parser.add_argument("--layouts", nargs="+", default=["image", "flight"])
+    parser.add_argument("--keep", type=Path, help="folder for the first pictures")
+    given = parser.parse_args()
+    rows: dict[tuple[str, str], list[dict[str, float]]] = {}
+    for number in range(given.times):
+        for layout in given.layouts:
+            for place, prepare in PLACES.items():
+                prepare(given.recording)
+                name = f"{layout}-{place}-{number}.png"
+                kept = None if given.keep is None else given.keep / name
+                found = first_picture(given.recording, layout, kept=kept)
+                rows.setdefault((layout, place), []).append(found)
+    print(f"{given.times} times each; first picture, s; CPU until then, s; all sent, s")
+    print(f"{'layout':<8}{'in':<8}{'median':>8}{'worst':>8}{'dmrl':>8}{'viewer':>8}{'sent':>8}")
+    for (layout, place), runs in rows.items():
+        keys = ("first_s", "dmrl_cpu_s", "viewer_cpu_s", "sent_s")
+        first, dmrl, viewer, sent = (median(run[key] for run in runs) for key in keys)
+        worst = max(run["first_s"] for run in runs)
+        cells = (first, worst, dmrl, viewer, sent)
+        print(f"{layout:<8}{place:<8}" + "".join(f"{cell:8.1f}" for cell in cells))
+
+
+if __name__ == "__main__":
+    main()

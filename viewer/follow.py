@@ -1,0 +1,210 @@
+"""A flight while it is read: frames, positions, trails, errors and ranges, stretch by stretch.
+
+A trail needs the pose of its robot at the time of a position, an error the truth at the time of
+an estimate. What lies between two messages of the other topic waits until the second is read, so
+that nothing depends on where a stretch ends.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import pyarrow as pa
+
+from dmrl import topics
+from dmrl.geometry import Array
+from dmrl.viewer import plots, space
+from dmrl.viewer.entity import WORLD, Entity, horizontal_frame
+from dmrl.viewer.motion import (
+    Motion,
+    Names,
+    Poses,
+    Positions,
+    Timed,
+    Times,
+    joined,
+    poses_of,
+    positions_of,
+    ranges_of,
+    taken,
+)
+
+Rows = tuple[Times, Entity]
+
+
+@dataclass(slots=True)
+class Heard:
+    """All that was read of a topic or frame, in parts."""
+
+    parts: list[Timed] = field(default_factory=list)
+    until_ns: int = -1
+
+    def add(self, part: Timed) -> None:
+        """One part more."""
+        self.parts.append(part)
+        self.until_ns = max(self.until_ns, int(part.time_ns[-1]))
+
+    def around(self, first_ns: int, last_ns: int) -> Timed:
+        """The parts that reach into a stretch of time, and their neighbours on both sides."""
+        within = [k for k, p in enumerate(self.parts) if p.time_ns[-1] >= first_ns]
+        within = [k for k in within if self.parts[k].time_ns[0] <= last_ns]
+        before = [k for k, p in enumerate(self.parts) if p.time_ns[-1] < first_ns][-1:]
+        after = [k for k, p in enumerate(self.parts) if p.time_ns[0] > last_ns][:1]
+        return joined([self.parts[k] for k in (*before, *within, *after)])
+
+
+@dataclass(slots=True)
+class Derived:
+    """What is drawn of a topic's rows with what another says at their times.
+
+    Parameters
+    ----------
+    topic
+        Whose rows.
+    other
+        The other one; None: nothing is needed.
+    draw
+        Rows, and what was heard of the other around them, to entities.
+    waiting
+        Rows that the other one has not reached.
+    """
+
+    topic: str
+    other: Heard | None
+    draw: Callable[..., Iterator[Entity]]
+    waiting: list[Timed] = field(default_factory=list)
+
+    def ready(self, *, all_read: bool = False) -> Iterator[Rows]:
+        """The rows that can be drawn."""
+        if not self.waiting or (self.other is not None and not self.other.parts):
+            return
+        rows = joined(self.waiting)
+        cut = len(rows.time_ns)
+        if self.other is not None and not all_read:
+            cut = int(np.searchsorted(rows.time_ns, self.other.until_ns, "right"))
+        self.waiting = [taken(rows, slice(cut, None))] if cut < len(rows.time_ns) else []
+        if not cut:
+            return
+        rows = taken(rows, slice(cut))
+        times = rows.time_ns
+        others = None
+        if self.other is not None:
+            others = self.other.around(int(times[0]), int(times[-1]))
+        for entity in self.draw(rows, others):
+            yield times, entity
+
+
+class Follower:
+    """Draws the motion of a flight as it is read. One pass, one follower.
+
+    Parameters
+    ----------
+    pairs
+        Who sees whom.
+    seen
+        A glimpse of the flight: which frames and positions there will be.
+    """
+
+    def __init__(self, pairs: Sequence[Names], seen: Motion) -> None:
+        self._sent: dict[str, Poses] = {}
+        self._frames: dict[str, Heard] = {}
+        self._positions: dict[str, tuple[Names, str, Heard]] = {}
+        self._ranges = {topics.uwb_range(*pair) for pair in pairs}
+        self._derived: list[Derived] = []
+        for pair in pairs:
+            self._follow(pair, seen)
+
+    def _follow(self, pair: Names, seen: Motion) -> None:
+        estimate, truth = topics.position(*pair), topics.truth(*pair)
+        frame = seen.space(pair[0])
+        around = None
+        if frame == WORLD:
+            around = self._frames.setdefault(horizontal_frame(pair[0]), Heard())
+        known = {}
+        for topic, source, has in (
+            (truth, "truth", pair in seen.truths),
+            (estimate, "estimate", pair in seen.estimates),
+        ):
+            if has:
+                known[topic] = Heard()
+                self._positions[topic] = pair, source, known[topic]
+                self._derived.append(Derived(topic, around, Trail(topic, frame, source).draw))
+        if len(known) == 2:
+            errors = partial(plots.errors, estimate)
+            self._derived.append(Derived(estimate, known[truth], errors))
+        towards = known.get(estimate) or known.get(truth)
+        measured = topics.uwb_range(*pair)
+        lines = partial(space.ranges, measured, pair[0])
+        self._derived.append(Derived(measured, towards, lines))
+
+    @property
+    def topics(self) -> list[str]:
+        """What it has to be given."""
+        return [topics.TRANSFORMS, *self._positions, *self._ranges]
+
+    def take(self, stretch: Mapping[str, pa.RecordBatch]) -> Iterator[Rows]:
+        """What can be drawn after a stretch more."""
+        if topics.TRANSFORMS in stretch:
+            yield from self._moved(poses_of(stretch[topics.TRANSFORMS]))
+        fresh: dict[str, Timed] = {}
+        for topic in self._ranges & stretch.keys():
+            fresh[topic] = ranges_of(stretch[topic])
+        for topic, (pair, source, heard) in self._positions.items():
+            if topic in stretch:
+                positions = fresh[topic] = positions_of(stretch[topic])
+                heard.add(positions)
+                for entity in _own(topic, pair, positions, source):
+                    yield positions.time_ns, entity
+        for derived in self._derived:
+            if derived.topic in fresh:
+                derived.waiting.append(fresh[derived.topic])
+            yield from derived.ready()
+
+    def rest(self) -> Iterator[Rows]:
+        """What is left when everything is read."""
+        for derived in self._derived:
+            yield from derived.ready(all_read=True)
+
+    def _moved(self, poses: Mapping[str, Poses]) -> Iterator[Rows]:
+        """Frames where they have moved: one that stands still has one row."""
+        for frame, part in poses.items():
+            if frame in self._frames:
+                self._frames[frame].add(part)
+            last = self._sent.get(frame)
+            rows = np.flatnonzero(part.moved_from(last))
+            self._sent[frame] = taken(part, slice(-1, None))
+            if len(rows):
+                moved = taken(part, rows)
+                yield moved.time_ns, space.transform(frame, moved)
+
+
+@dataclass(slots=True)
+class Trail:
+    """The way of one robot as another sees it; goes on where it stopped."""
+
+    topic: str
+    frame: str
+    source: str
+    last: Array | None = None
+    last_ns: int = -1
+
+    def draw(self, positions: Positions, poses: Poses | None) -> Iterator[Entity]:
+        """Some steps more."""
+        there = positions.xyz
+        if poses is not None:
+            there = poses.applied(there, positions.time_ns)
+        # Another recording begins anew.
+        goes_on = self.last is not None and positions.time_ns[0] >= self.last_ns
+        first = self.last if goes_on else there[:1]
+        self.last, self.last_ns = there[-1:], int(positions.time_ns[-1])
+        steps = np.stack([np.concatenate([first, there[:-1]]), there], axis=1)
+        yield space.trail(f"{self.topic}/trail", self.frame, steps, self.source)
+
+
+def _own(topic: str, pair: Names, positions: Positions, source: str) -> Iterator[Entity]:
+    """What positions say by themselves."""
+    yield from space.seen(topic, pair, positions, source)
+    yield plots.distance(topic, positions, source)
+    if source == "estimate":
+        yield from plots.status(topic, positions)

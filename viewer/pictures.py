@@ -1,0 +1,22 @@
+"""Layout ``image``: images of every robot with labels and detections, and maps beside them."""
+
+from dmrl import topics
+from dmrl.colours import RGB
+from dmrl.viewer import entities, layouts
+from dmrl.viewer.scene import Scene, bars, eyes_of, model_draws, picture_draws
+from dmrl.viewer.selection import Selection, Settings
+
+
+def image_scene(selection: Selection, settings: Settings) -> Scene:
+    """Images and maps of every robot."""
+    scales = entities.scales(settings.depth_max_m)
+    eyes = eyes_of(selection, sorted(selection.image_ns), scales)
+    blueprint = layouts.image(eyes, scales, overlay=settings.overlay)
+    scene = Scene(blueprint, [], [], eyes)
+    for eye in eyes:
+        scene.draws += picture_draws(eye, scene.sources.setdefault(eye.robot, set()))
+        scene.draws += model_draws(eye, scales, smooth=settings.overlay)
+        scene.stills += bars(eye, scales)
+        if any(n["robot"] == eye.robot for n in selection.found(topics.DETECTIONS)):
+            scene.named["detection"] = RGB["detection"]
+    return scene
