@@ -52,37 +52,33 @@ def normal(
     prior
         (n,) information on every keyframe; tiny, so that there is always a solution.
     """
-    start, end, across = linear.step_by_start, linear.step_by_end, linear.step_by_globals
-    keyframes, size = len(start) + 1, across.shape[2]
-    width = start.shape[1]
-    diagonal = np.zeros((keyframes, width, width)) + np.diag(prior)
-    border, gradient = np.zeros((keyframes, width, size)), np.zeros((keyframes, width))
-    start_t, end_t = start.swapaxes(1, 2), end.swapaxes(1, 2)
-    step = linear.step[..., None]
-    diagonal[:-1] += start_t @ start
-    diagonal[1:] += end_t @ end
-    border[:-1] += start_t @ across
-    border[1:] += end_t @ across
-    gradient[:-1] += (start_t @ step)[..., 0]
-    gradient[1:] += (end_t @ step)[..., 0]
+    steps, ranges, width = linear.steps, linear.ranges, len(prior)
+    size = steps.shape[2] - 2 * width - 1
+    diagonal = np.zeros((len(steps) + 1, width, width)) + np.diag(prior)
+    border, gradient = np.zeros((*diagonal.shape[:2], size)), np.zeros(diagonal.shape[:2])
+    products = steps[..., : 2 * width].swapaxes(1, 2) @ steps
+    for keyframes, rows in ((slice(-1), slice(width)), (slice(1, None), slice(width, 2 * width))):
+        diagonal[keyframes] += products[:, rows, rows]
+        border[keyframes] += products[:, rows, 2 * width : -1]
+        gradient[keyframes] += products[:, rows, -1]
 
-    weighted = linear.range_by_state * range_weight[:, None]
-    _add(diagonal, range_key, weighted[:, :, None] * linear.range_by_state[:, None, :])
-    _add(border, range_key, weighted[:, :, None] * linear.range_by_globals[:, None, :])
-    _add(gradient, range_key, weighted * linear.range[:, None])
-    weighted_globals = linear.range_by_globals * range_weight[:, None]
-    flat = across.reshape(-1, size)
-    corner = flat.T @ flat + weighted_globals.T @ linear.range_by_globals
-    corner_gradient = flat.T @ linear.step.reshape(-1) + weighted_globals.T @ linear.range
-    return Normal(diagonal, start_t @ end, border, corner, gradient, corner_gradient)
+    weighted = ranges * range_weight[:, None]
+    keys, sums = _summed(range_key, weighted[:, :3, None] * ranges[:, None, :])
+    diagonal[keys, :3, :3] += sums[..., :3]
+    border[keys, :3, :2] += sums[..., 3:5]
+    gradient[keys, :3] += sums[..., 5]
+    flat = steps.reshape(-1, steps.shape[2])[:, 2 * width :]
+    rest = flat.T @ flat
+    shared = [0, 1, -1]  # bias and scale of the ranges, and the residual
+    rest[np.ix_(shared, shared)] += weighted[:, 3:].T @ ranges[:, 3:]
+    above = products[:, :width, width : 2 * width]
+    return Normal(diagonal, above, border, rest[:-1, :-1], gradient, rest[:-1, -1])
 
 
-def _add(total: Array, key: NDArray[np.intp], parts: Array) -> None:
-    """Sum parts by key, which never goes back, into the total."""
-    if not len(key):
-        return
+def _summed(key: NDArray[np.intp], parts: Array) -> tuple[NDArray[np.intp], Array]:
+    """The keys that occur, and the sum of the parts of each. Keys never go back."""
     first = np.flatnonzero(np.diff(key, prepend=-1))
-    total[key[first]] += np.add.reduceat(parts, first, axis=0)
+    return key[first], np.add.reduceat(parts, first, axis=0) if len(key) else parts
 
 
 def bands(diagonal: Array, above: Array) -> Array:
@@ -161,10 +157,10 @@ def block_inverse(diagonal: Array, above: Array) -> Array:
     above
         (K - 1, ..., n, n).
     """
-    forward, backward = diagonal.copy(), diagonal.copy()
-    below = above.swapaxes(-1, -2)
+    # Backwards is forwards in a mirror.
+    left = np.stack([diagonal, diagonal[::-1]], axis=1)
+    right = np.stack([above, above[::-1].swapaxes(-1, -2)], axis=1)
+    under = right.swapaxes(-1, -2)
     for k in range(len(above)):
-        forward[k + 1] -= below[k] @ np.linalg.inv(forward[k]) @ above[k]
-    for k in range(len(above) - 1, -1, -1):
-        backward[k] -= above[k] @ np.linalg.inv(backward[k + 1]) @ below[k]
-    return np.asarray(np.linalg.inv(forward + backward - diagonal))
+        left[k + 1] -= under[k] @ np.linalg.inv(left[k]) @ right[k]
+    return np.asarray(np.linalg.inv(left[:, 0] + left[::-1, 1] - diagonal))

@@ -1,5 +1,6 @@
 """Gauss-Newton over a whole flight: keyframe states and what is constant, together."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,10 @@ from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
 
 ITERATIONS = 25
-TOLERANCE = 1e-5
-"""Relative change of the cost at which the iteration ends."""
+TOLERANCE, ROUGH = 1e-5, 1e-4
+"""Relative change of the cost at which the iteration ends; and where solutions are but compared."""
+SAME_M = 0.05
+"""Solutions that are nowhere further apart are one."""
 WEAK: Array = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
 """Information on every keyframe, in inverse squares of its units: next to none."""
 
@@ -42,7 +45,14 @@ class Solution:
     cost: float
 
 
-def solve_batch(problem: Problem, noise: Noise, state: Array) -> Solution:
+def solve_batch(
+    problem: Problem,
+    noise: Noise,
+    state: Array,
+    constants: Array | None = None,
+    known: Sequence[Solution] = (),
+    tolerance: float = TOLERANCE,
+) -> Solution:
     """The most likely flight near a first guess (Levenberg-Marquardt).
 
     Parameters
@@ -51,15 +61,21 @@ def solve_batch(problem: Problem, noise: Noise, state: Array) -> Solution:
         The flight, and what is believed about its sensors.
     state
         (K, 3) or (K, 5) first guess.
+    constants
+        (G,) first guess, zeros if None.
+    known
+        Solutions that were found before: where the iteration comes to one of them, it ends.
+    tolerance
+        Relative change of the cost at which the iteration ends.
     """
-    constants = np.zeros(len(GLOBALS))
+    constants = np.zeros(len(GLOBALS)) if constants is None else constants
     if state.shape[1] == 3:
         state = np.column_stack([state, np.zeros((len(state), 2))])
     linear = linearise(problem, noise, state, constants)
     best = cost_of(linear, noise, constants)
+    equations = equations_of(problem, noise, linear, constants)
     damping = 0.0
     for _ in range(ITERATIONS):
-        equations = equations_of(problem, noise, linear, constants)
         change, change_constants, *_ = solve(damped(equations, damping))
         tried = linearise(problem, noise, state + change, constants + change_constants)
         cost = cost_of(tried, noise, constants + change_constants)
@@ -70,9 +86,15 @@ def solve_batch(problem: Problem, noise: Noise, state: Array) -> Solution:
             continue
         state, constants, linear = state + change, constants + change_constants, tried
         damping, gained, best = damping / 10, best - cost, cost
-        if gained < TOLERANCE * best:
+        if gained < tolerance * best or any(near(state, other.state) for other in known):
             break
+        equations = equations_of(problem, noise, linear, constants)
     return Solution(state, constants, best)
+
+
+def near(state: Array, other: Array) -> bool:
+    """Whether two flights are nowhere so far apart that they are two solutions."""
+    return bool(np.hypot(*(state - other)[:, :2].T).max() <= SAME_M)
 
 
 def evidence(problem: Problem, noise: Noise, solution: Solution) -> float:

@@ -44,7 +44,7 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
     calm, state = calmed(problem, noise, solution.state)
     linear = linearise(calm, noise, state, solution.constants)
     # The calmed copy does not fit the ranges; their weights come from the solution.
-    linear = replace(linear, range=at_solution.range, step=at_solution.step)
+    linear.ranges[:, -1] = at_solution.range
     equations = equations_of(calm, noise, linear, solution.constants)
     return _inverse(equations)
 

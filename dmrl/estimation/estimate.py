@@ -6,9 +6,17 @@ from typing import Literal
 import numpy as np
 
 from dmrl.estimation import ekf, keyframe_filter
-from dmrl.estimation.batch import Solution, evidence, solve_batch
+from dmrl.estimation.batch import ROUGH, Solution, evidence, near, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
-from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, Statuses, statuses
+from dmrl.estimation.gate import (
+    AMBIGUOUS,
+    CLEAN_SHARE,
+    EXPECTED_SHARE,
+    GATE_M,
+    UNCONVERGED,
+    Statuses,
+    statuses,
+)
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, mirrored, spread_of
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK
@@ -25,6 +33,8 @@ SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
+CLEAN = 0.8
+"""Constants that are taken for smaller than this, against the default's, mark clean sensors."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
 GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
@@ -150,8 +160,10 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
     floor = silent * np.int8(UNCONVERGED)
-    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m), floor)
-    there = np.maximum(statuses(back.state, back.covariance, gate_m), floor)
+    clean = estimate.noise.bias_std_m < CLEAN * Noise().bias_std_m
+    share = CLEAN_SHARE if clean else EXPECTED_SHARE
+    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m, share), floor)
+    there = np.maximum(statuses(back.state, back.covariance, gate_m, share), floor)
     if own < STILL or relative < ALIKE:
         here[:] = AMBIGUOUS
     if peer < STILL or relative < ALIKE:
@@ -212,27 +224,44 @@ def _from_smoother(
 
 def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Array) -> Estimate:
     first = noise or Noise()
-    # Even starts that look alike half-way may pass the peer on different sides: all are solved
-    # that are not hopeless.
-    starts = tracks.swapaxes(0, 1)[score > score.max() - HOPELESS]
-    solutions = [solve_batch(flight, first, s) for s in starts]
-    best = min(solutions, key=lambda s: s.cost)
-    solutions += [solve_batch(flight, first, s) for s in mirrored(best.state, KEY_HZ)]
-    solutions.sort(key=lambda s: s.cost)
+    solutions = _solutions(flight, first, score, tracks.swapaxes(0, 1))
     best = solutions[0]
     costs, states = zip(*((s.cost, s.state[:, :3]) for s in solutions), strict=True)
     apart = spread_of(np.array(costs), np.stack(states))
-    found = first if noise else noise_of(flight, first, best)
-    if not noise:
-        best = solve_batch(flight, found, best.state)
+    found, best = (noise, best) if noise else noise_of(flight, first, best)
+    best = solve_batch(flight, found, best.state, best.constants)
     worse = max(1.0, found.bias_std_m / Noise().bias_std_m) ** 0.75
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
     none = np.zeros(len(tracks), np.int8)
     return Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
 
 
-def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
+def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> list[Solution]:
+    """What the likely starts (S, K, 3) lead to, best first.
+
+    Even starts that look alike half-way may pass the peer on different sides: all are solved that
+    are not hopeless, each until it comes to a solution that another one led to.
+    """
+    begun: list[Array] = []
+    found: list[Solution] = []
+    for number in np.argsort(-score):
+        start = tracks[number]
+        if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
+            begun.append(start)
+            found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
+    best = min(found, key=lambda s: s.cost)
+    # What stuck on its way may come free once all that is constant starts from zero again.
+    found.append(solve_batch(flight, noise, best.state, known=found, tolerance=ROUGH))
+    best = min(found, key=lambda s: s.cost)
+    for start in mirrored(best.state, KEY_HZ):
+        found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
+    return sorted(found, key=lambda s: s.cost)
+
+
+def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
     """What the sensors are like: the grade of noise under which the flight is likeliest.
+
+    And the solution under the nearest of ``GRADES``.
 
     Parameters
     ----------
@@ -244,24 +273,25 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> Noise:
         The flight's solution under that guess.
     """
     tried: dict[int, float] = {}
+    solved: dict[int, Solution] = {}
     middle, last = 2, len(GRADES) - 2
     while True:
-        for number in range(middle - 1, middle + 2):
+        for number in range(middle + 1, middle - 2, -1):
             if number not in tried:
                 graded = noise.graded(GRADES[number])
-                solved = solve_batch(flight, graded, solution.state)
-                tried[number] = evidence(flight, graded, solved)
+                before = solution.state, solution.constants
+                solution = solve_batch(flight, graded, *before, tolerance=ROUGH)
+                tried[number], solved[number] = evidence(flight, graded, solution), solution
         best = max(tried, key=lambda number: tried[number])
         if min(max(best, 1), last) == middle:
             break
         middle = min(max(best, 1), last)
-    near = range(middle - 1, middle + 2)
-    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in near]), [tried[n] for n in near], 2)
+    around = range(middle - 1, middle + 2)
+    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
     likeliest, velocity, constants = TAKEN
-    return noise.graded(
-        float(np.interp(peak, likeliest, velocity)), float(np.interp(peak, likeliest, constants))
-    )
+    grades_taken = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
+    return noise.graded(*grades_taken), solved[best]
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:

@@ -15,10 +15,11 @@ OK, UNCONVERGED, AMBIGUOUS = range(3)
 
 GATE_M = 0.3
 """A position that is off by more than this is a bad one."""
-EXPECTED_SHARE = 0.035
-"""Share of a flight's OK positions that may be expected to be bad. Covariances are cautious, and
-few flights spend all of it: some 1 % are bad in the end."""
-WORST_SHARE = 0.15
+EXPECTED_SHARE, CLEAN_SHARE = 0.01, 0.035
+"""Share of a flight's OK positions that may be expected to be bad; and where its sensors are
+clearly better than the default's. Most of those flights are good from end to end and spend little
+of it; with ordinary sensors a flight spends all that it gets."""
+WORST_SHARE = 0.08
 """Probability of being bad that no OK position exceeds."""
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
 """Sigma over distance beyond which a bearing is open rather than imprecise; and the median
@@ -32,7 +33,9 @@ twenty times the other."""
 Statuses = NDArray[np.int8]
 
 
-def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
+def statuses(
+    state: Array, covariance: Array, gate_m: float, share: float = EXPECTED_SHARE
+) -> Statuses:
     """(K,) from the covariance.
 
     Parameters
@@ -43,9 +46,11 @@ def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
         (K, 3, 3) of the state.
     gate_m
         A position that is off by more than this is a bad one, metres.
+    share
+        Share of the OK positions that may be expected to be bad.
     """
     xy, spread = state[:, :2], covariance[:, :2, :2]
-    good = within_budget(probability_beyond(spread, gate_m))
+    good = within_budget(probability_beyond(spread, gate_m), share)
     status = np.where(good, OK, UNCONVERGED).astype(np.int8)
     sigma_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
     bearing_rad = sigma_m / np.maximum(np.hypot(*xy.T), NEAR_M)
@@ -75,16 +80,18 @@ def probability_beyond(covariance: Array, error_m: float) -> Array:
     return np.asarray(beyond / weight.sum(axis=1))
 
 
-def within_budget(probability: Array) -> Mask:
+def within_budget(probability: Array, share: float) -> Mask:
     """(K,) the largest set of the best whose mean probability of being bad is small enough.
 
     Parameters
     ----------
     probability
         (K,) of being bad.
+    share
+        The largest mean.
     """
     ordered = np.sort(probability)
     mean = np.cumsum(ordered) / np.arange(1, len(ordered) + 1)
-    count = int(np.searchsorted(mean, EXPECTED_SHARE, "right"))
+    count = int(np.searchsorted(mean, share, "right"))
     limit = min(float(ordered[count - 1]), WORST_SHARE) if count else -1.0
     return np.asarray(probability <= limit)

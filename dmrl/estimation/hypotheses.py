@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from dmrl.estimation import keyframe_filter
+from dmrl.estimation.batch import near
 from dmrl.estimation.keyframe_filter import QUARTER, Inputs
 from dmrl.estimation.pair import Array
 
@@ -20,8 +21,6 @@ START_STD: Array = np.array([0.35, 0.35, 0.45])
 """Half the distance to the next start, roughly: m, m, rad."""
 APART_M, APART_RAD = 0.4, 0.5
 """Starts nearer than both are one."""
-SAME_M = 0.05
-"""Solutions that are nowhere further apart are one."""
 PASS_M = 0.35
 """Two passes nearer than this leave open on which side the peer was in between."""
 MIRRORED = 4
@@ -119,8 +118,7 @@ def spread_of(cost: Array, states: Array) -> Array:
     """
     kept: list[int] = []
     for number, state in enumerate(states):
-        ways = [np.hypot(*(state - states[other])[:, :2].T).max() for other in kept]
-        if all(way > SAME_M for way in ways):
+        if not any(near(state, states[other]) for other in kept):
             kept.append(number)
     share = np.exp((cost[0] - cost[kept]) / COST_UNIT)
     apart = states[kept] - states[0]

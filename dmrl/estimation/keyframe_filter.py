@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array
@@ -71,22 +72,26 @@ def _inputs(problem: Problem, noise: Noise) -> tuple[Array, ...]:
     def means(values: Array) -> Array:
         return np.column_stack([mean(column) for column in values.T])
 
-    median = np.full(count, np.nan)
-    edges = np.concatenate([[0], np.cumsum(per_key)])
-    for k in np.flatnonzero(per_key):
-        median[k] = np.median(problem.range_m[edges[k] : edges[k + 1]])
     # pi/2 / n is the variance of a median; half the bias is what the first guess cannot know.
     variance = 1.5 * noise.range_std_m**2 / many + (0.5 * noise.bias_std_m) ** 2
     shifts = (problem.own.shift_m, problem.peer.shift_m, step_variance(problem, noise))
     return (
         *(np.append(turn, 0.0) for turn in (problem.own.turn_rad, problem.peer.turn_rad)),
         *(np.vstack([shift, 0.0 * shift[:1]]) for shift in shifts),
-        median,
+        _medians(problem.range_key, problem.range_m, per_key),
         variance,
         means(problem.own_to_range.shift_m),
         means(problem.peer_to_range.shift_m),
         mean(problem.height_m),
     )
+
+
+def _medians(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) -> Array:
+    """(K,) median of the values of each key, NaN where there are none."""
+    ordered = np.append(values[np.lexsort((values, key))], np.nan)
+    first = np.cumsum(per_key) - per_key
+    middle = np.stack([first + (per_key - 1) // 2, first + per_key // 2])
+    return np.where(per_key > 0, ordered[middle * (per_key > 0)].mean(axis=0), np.nan)
 
 
 def step_variance(problem: Problem, noise: Noise) -> Array:

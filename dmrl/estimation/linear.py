@@ -28,29 +28,30 @@ OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
 class Linear:
     """Whitened residuals and Jacobians at one solution. K keyframes, R ranges, G globals.
 
+    Each Jacobian stands beside its residuals in one array, so that all products of a row come
+    from one multiplication.
+
     Parameters
     ----------
-    step
-        (K - 1, 5) residuals of x, y, psi, wx, wy between neighbouring keyframes.
-    step_by_start, step_by_end
-        (K - 1, 5, 5) Jacobians by the keyframe before and after.
-    step_by_globals
-        (K - 1, 5, G).
-    range
-        (R,) residuals of the ranges.
-    range_by_state
-        (R, 5).
-    range_by_globals
-        (R, G).
+    steps
+        (K - 1, 5, 5 + 5 + G + 1) of x, y, psi, wx, wy between neighbouring keyframes: by the
+        keyframe before, by the one after, by the globals; the residual.
+    ranges
+        (R, 3 + 2 + 1) by x, y, psi; by bias and scale of the ranges; the residual.
     """
 
-    step: Array
-    step_by_start: Array
-    step_by_end: Array
-    step_by_globals: Array
-    range: Array
-    range_by_state: Array
-    range_by_globals: Array
+    steps: Array
+    ranges: Array
+
+    @property
+    def step(self) -> Array:
+        """(K - 1, 5) residuals of the steps."""
+        return self.steps[..., -1]
+
+    @property
+    def range(self) -> Array:
+        """(R,) residuals of the ranges."""
+        return self.ranges[:, -1]
 
 
 def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) -> Linear:
@@ -66,7 +67,7 @@ def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) ->
         (G,) as in ``GLOBALS``.
     """
     steps = _steps(problem, noise, state, constants)
-    return Linear(*steps, *_ranges(problem, noise, state, constants))
+    return Linear(steps, _ranges(problem, noise, state, constants))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,20 +119,21 @@ def _moves(problem: Problem, noise: Noise, state: Array, constants: Array) -> _S
     )
 
 
-def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> tuple[Array, ...]:
+def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> Array:
     moves = _moves(problem, noise, state, constants)
     share = np.sqrt((moves.own_gain**2 + moves.peer_gain**2) / 2)
     weight = 1 / np.sqrt(step_variance(problem, noise))
     weight[:, METRIC] /= share
-    residual = weight * _residual(moves, state)
-    by_start, by_end = _by_states(moves)
-    by_globals = _by_globals(moves, problem)
-    for jacobian in (by_start, by_end, by_globals):
-        jacobian *= weight[:, :, None]
+    out = np.zeros((len(moves.own), SIZE, 2 * SIZE + len(GLOBALS) + 1))
+    by_start, by_end, by_globals = np.split(out[..., :-1], [SIZE, 2 * SIZE], axis=2)
+    out[..., -1] = _residual(moves, state)
+    _by_states(moves, by_start, by_end)
+    _by_globals(moves, problem, by_globals)
+    out *= weight[:, :, None]
     # The division by the share depends on the scales too.
     for column, gain in ((OWN_SCALE, moves.own_gain), (PEER_SCALE, moves.peer_gain)):
-        by_globals[:, METRIC, column] += residual[:, METRIC] * gain**3 / (2 * share**2)
-    return residual, by_start, by_end, by_globals
+        by_globals[:, METRIC, column] += out[:, METRIC, -1] * gain**3 / (2 * share**2)
+    return out
 
 
 def _residual(moves: _Steps, state: Array) -> Array:
@@ -142,20 +144,18 @@ def _residual(moves: _Steps, state: Array) -> Array:
     return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error])
 
 
-def _by_states(moves: _Steps) -> tuple[Array, Array]:
-    by_start = np.zeros((len(moves.own), SIZE, SIZE))
+def _by_states(moves: _Steps, by_start: Array, by_end: Array) -> None:
+    """Fill in (S, 5, 5) zeros each."""
     by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0])
     by_start[:, :2, 2] = -moves.peer @ QUARTER.T
     by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -moves.half_s, -moves.kept
-    by_end = np.zeros_like(by_start)
     by_end[:, :2, :2] = by_end[:, 3:, 3:] = moves.turned
     by_end[:, :2, 3:] = -moves.half_s[:, None] * moves.turned
     by_end[:, 2, 2] = 1.0
-    return by_start, by_end
 
 
-def _by_globals(moves: _Steps, problem: Problem) -> Array:
-    out = np.zeros((len(moves.own), SIZE, len(GLOBALS)))
+def _by_globals(moves: _Steps, problem: Problem, out: Array) -> None:
+    """Fill in (S, 5, G) zeros."""
     steps_s, heading = problem.steps_s, moves.heading
     moved = moves.ahead - moves.half_s * moves.error_ahead
     out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER.T)
@@ -166,7 +166,6 @@ def _by_globals(moves: _Steps, problem: Problem) -> Array:
     out[:, :2, OWN_VELOCITY] = -moves.own_gain * problem.own.drift_s
     out[:, :2, PEER_VELOCITY] = moves.peer_gain * (heading @ problem.peer.drift_s)
     out[:, :2, CLOCK] = -moves.peer_gain * _apply(heading, problem.peer_by_clock)
-    return out
 
 
 def step_variance(problem: Problem, noise: Noise) -> Array:
@@ -179,22 +178,20 @@ def step_variance(problem: Problem, noise: Noise) -> Array:
     return np.column_stack([shift, shift, turn, error, error])
 
 
-def _ranges(problem: Problem, noise: Noise, state: Array, constants: Array) -> tuple[Array, ...]:
-    at = state[problem.range_key]
-    peer = _apply(rotation(at[:, 2]), problem.peer_to_range.shift_m)
+def _ranges(problem: Problem, noise: Noise, state: Array, constants: Array) -> Array:
+    at = state[problem.range_key, :3]
+    peer = _apply(rotation(state[:, 2])[problem.range_key], problem.peer_to_range.shift_m)
     offset = at[:, :2] + peer - problem.own_to_range.shift_m
     distance = np.sqrt((offset**2).sum(axis=1) + problem.height_m**2) + 1e-6
     towards = offset / distance[:, None]
     gain = 1 + constants[SCALE]
-    residual = problem.range_m - gain * distance - constants[BIAS]
-    by_turn = np.einsum("ri,ri->r", towards, peer @ QUARTER.T)
-    by_state = np.zeros((len(at), SIZE))
-    by_state[:, :3] = -gain * np.column_stack([towards, by_turn])
-    by_globals = np.zeros((len(at), len(GLOBALS)))
-    by_globals[:, BIAS], by_globals[:, SCALE] = -1.0, -distance
-    std = noise.range_std_m
-    return residual / std, by_state / std, by_globals / std
+    out = np.empty((len(at), 6))
+    out[:, :2] = -gain * towards
+    out[:, 2] = gain * (towards[:, 0] * peer[:, 1] - towards[:, 1] * peer[:, 0])
+    out[:, 3 + BIAS], out[:, 3 + SCALE] = -1.0, -distance
+    out[:, -1] = problem.range_m - gain * distance - constants[BIAS]
+    return out / noise.range_std_m
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
+    return matrices[..., 0] * vectors[:, :1] + matrices[..., 1] * vectors[:, 1:]

@@ -13,8 +13,11 @@ from dmrl.estimation.pair import Array, Track
 
 def rotation(angle_rad: Array) -> Array:
     """(..., 2, 2) rotations by angles, counter-clockwise."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    out = np.empty((*np.shape(angle_rad), 2, 2))
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(angle_rad)
+    out[..., 1, 0] = np.sin(angle_rad)
+    out[..., 0, 1] = -out[..., 1, 0]
+    return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation import banded
-from dmrl.estimation.batch import equations_of, solve_batch
+from dmrl.estimation.batch import Solution, equations_of, near, solve_batch
 from dmrl.estimation.linear import SIZE, linearise
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
@@ -36,9 +36,10 @@ def test_the_jacobian_by_the_globals_is_that_of_finite_differences(
         ahead, behind = (linearise(flight, NOISE, state, constants + s * change) for s in (1, -1))
         slope = (ahead.step - behind.step) / (2 * step)
         scale = max(1.0, np.abs(slope).max())
-        assert np.abs(slope - linear.step_by_globals[..., column]).max() < 1e-6 * scale
+        assert np.abs(slope - linear.steps[..., 2 * SIZE + column]).max() < 1e-6 * scale
         slope = (ahead.range - behind.range) / (2 * step)
-        assert np.abs(slope - linear.range_by_globals[:, column]).max() < 1e-5
+        expected = linear.ranges[:, 3 + column] if column < 2 else 0.0
+        assert np.abs(slope - expected).max() < 1e-5
 
 
 def test_the_jacobian_by_the_keyframes_is_that_of_finite_differences(
@@ -52,11 +53,12 @@ def test_the_jacobian_by_the_keyframes_is_that_of_finite_differences(
         change[even, column] = step
         ahead, behind = (linearise(flight, NOISE, state + s * change, constants) for s in (1, -1))
         slope = (ahead.step - behind.step) / (2 * step)
-        own = np.where(even[:-1, None], linear.step_by_start[..., column], 0.0)
-        own += np.where(even[1:, None], linear.step_by_end[..., column], 0.0)
+        own = np.where(even[:-1, None], linear.steps[..., column], 0.0)
+        own += np.where(even[1:, None], linear.steps[..., SIZE + column], 0.0)
         assert np.abs(slope - own).max() < 1e-6 * max(1.0, np.abs(slope).max())
         slope = (ahead.range - behind.range) / (2 * step)
-        expected = np.where(even[flight.range_key], linear.range_by_state[:, column], 0.0)
+        by_state = linear.ranges[:, column] if column < 3 else 0.0
+        expected = np.where(even[flight.range_key], by_state, 0.0)
         assert np.abs(slope - expected).max() < 1e-2  # ranges near zero bend sharply
 
 
@@ -111,3 +113,32 @@ def test_a_range_bias_is_found_where_it_may_be_large() -> None:
     noise = Noise(bias_std_m=0.5, velocity_std_mps=0.02)
     solution = solve_batch(task, noise, np.column_stack([truth, heading]))
     assert solution.constants[0] == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[Problem, Array, Solution]:
+    """A flight, a guess that is some decimetres off, and the solution."""
+    flight = flown("in_view", "calibrated", 1000, 30.0)
+    task = problem(pair_of(flight))
+    heading = flight.truth["cf2"].yaw_at(task.key_s) - flight.truth["cf1"].yaw_at(task.key_s)
+    start = np.column_stack([truth_at(flight, task.key_s) + 0.2, heading])
+    return task, start, solve_batch(task, NOISE, start)
+
+
+def test_an_iteration_ends_where_it_comes_to_a_known_solution(
+    solved: tuple[Problem, Array, Solution],
+) -> None:
+    task, start, solution = solved
+    again = solve_batch(task, NOISE, start, known=[solution])
+    assert near(again.state, solution.state)
+    assert again.cost > solution.cost
+
+
+def test_a_solve_that_starts_at_the_solution_stays_there(
+    solved: tuple[Problem, Array, Solution],
+) -> None:
+    task, _, solution = solved
+    again = solve_batch(task, NOISE, solution.state, solution.constants)
+    assert again.cost <= solution.cost
+    assert np.abs(again.state - solution.state).max() < 1e-2
+    assert np.abs(again.constants - solution.constants).max() < 1e-3

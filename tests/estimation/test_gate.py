@@ -26,20 +26,30 @@ def test_the_probability_of_a_long_error_is_that_of_samples() -> None:
 
 def test_a_flight_keeps_its_best_until_the_budget_is_spent() -> None:
     probability = np.array([0.1, 0.0, 0.06, 0.05, 0.0])
-    kept = within_budget(probability)
-    assert probability[kept].mean() <= gate.EXPECTED_SHARE
-    worse = np.sort(probability[~kept])[:1]
-    assert np.append(probability[kept], worse).mean() > gate.EXPECTED_SHARE
+    for share, count in ((0.01, 2), (0.02, 3)):
+        kept = within_budget(probability, share)
+        assert kept.sum() == count
+        assert probability[kept].mean() <= share
+        worse = np.sort(probability[~kept])[:1]
+        assert np.append(probability[kept], worse).mean() > share
 
 
 def test_no_budget_pays_for_a_position_that_may_be_anywhere() -> None:
     probability = np.append(np.zeros(1000), 0.5)
-    assert within_budget(probability).tolist() == [True] * 1000 + [False]
-    assert not within_budget(np.full(10, 0.5)).any()
+    assert within_budget(probability, 0.2).tolist() == [True] * 1000 + [False]
+    assert not within_budget(np.full(10, 0.5), 0.6).any()
+
+
+def test_the_same_covariance_is_trusted_less_where_sensors_are_ordinary() -> None:
+    state, covariance = np.tile([2.0, 0.0, 0.0], (4, 1)), spread(0.09, 0.09, 0.12, 0.12)
+    clean = statuses_of(state, covariance, 0.3, gate.CLEAN_SHARE)
+    ordinary = statuses_of(state, covariance, 0.3)
+    assert clean.tolist() == [OK] * 4
+    assert ordinary.tolist() == [OK, OK, UNCONVERGED, UNCONVERGED]
 
 
 def test_a_bearing_that_is_open_is_ambiguous_and_a_blurred_one_unconverged() -> None:
     far = np.tile([4.0, 0.0, 0.0], (5, 1))
-    assert (statuses_of(far, spread(*[0.1] * 5), 0.3) == OK).all()
+    assert (statuses_of(far, spread(*[0.08] * 5), 0.3) == OK).all()
     assert (statuses_of(far, spread(*[0.5] * 5), 0.3) == UNCONVERGED).all()
     assert (statuses_of(far / 4, spread(*[0.5] * 5), 0.3) == AMBIGUOUS).all()
