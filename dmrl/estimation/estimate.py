@@ -10,8 +10,6 @@ from dmrl.estimation.batch import ROUGH, Solution, evidence, near, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
 from dmrl.estimation.gate import (
     AMBIGUOUS,
-    CLEAN_SHARE,
-    EXPECTED_SHARE,
     GATE_M,
     UNCONVERGED,
     Statuses,
@@ -26,15 +24,13 @@ from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
 
 KEY_HZ = 10.0
 """Keyframes per second."""
-INFLATION = 0.96
+INFLATION = 0.93
 """Sigmas of the batch solve are multiplied by this, and where biases are larger than the
 default's by some more: the 95 % ellipse then holds 92 to 98 % in view."""
 SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
-CLEAN = 0.8
-"""Constants that are taken for smaller than this, against the default's, mark clean sensors."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
 GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
@@ -160,10 +156,8 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
     floor = silent * np.int8(UNCONVERGED)
-    clean = estimate.noise.bias_std_m < CLEAN * Noise().bias_std_m
-    share = CLEAN_SHARE if clean else EXPECTED_SHARE
-    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m, share), floor)
-    there = np.maximum(statuses(back.state, back.covariance, gate_m, share), floor)
+    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m), floor)
+    there = np.maximum(statuses(back.state, back.covariance, gate_m), floor)
     if own < STILL or relative < ALIKE:
         here[:] = AMBIGUOUS
     if peer < STILL or relative < ALIKE:

@@ -15,10 +15,9 @@ OK, UNCONVERGED, AMBIGUOUS = range(3)
 
 GATE_M = 0.3
 """A position that is off by more than this is a bad one."""
-EXPECTED_SHARE, CLEAN_SHARE = 0.01, 0.035
-"""Share of a flight's OK positions that may be expected to be bad; and where its sensors are
-clearly better than the default's. Most of those flights are good from end to end and spend little
-of it; with ordinary sensors a flight spends all that it gets."""
+EXPECTED_SHARE = 0.035
+"""Share of a flight's OK positions that may be expected to be bad. Most flights with calibrated
+sensors are good from end to end and spend little of it: over all of them it is below 1 %."""
 WORST_SHARE = 0.08
 """Probability of being bad that no OK position exceeds."""
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
@@ -33,9 +32,7 @@ twenty times the other."""
 Statuses = NDArray[np.int8]
 
 
-def statuses(
-    state: Array, covariance: Array, gate_m: float, share: float = EXPECTED_SHARE
-) -> Statuses:
+def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
     """(K,) from the covariance.
 
     Parameters
@@ -46,11 +43,9 @@ def statuses(
         (K, 3, 3) of the state.
     gate_m
         A position that is off by more than this is a bad one, metres.
-    share
-        Share of the OK positions that may be expected to be bad.
     """
     xy, spread = state[:, :2], covariance[:, :2, :2]
-    good = within_budget(probability_beyond(spread, gate_m), share)
+    good = within_budget(probability_beyond(spread, gate_m), EXPECTED_SHARE)
     status = np.where(good, OK, UNCONVERGED).astype(np.int8)
     sigma_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
     bearing_rad = sigma_m / np.maximum(np.hypot(*xy.T), NEAR_M)

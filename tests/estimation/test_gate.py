@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation import gate
 from dmrl.estimation.gate import AMBIGUOUS, OK, UNCONVERGED, probability_beyond, within_budget
 from dmrl.estimation.gate import statuses as statuses_of
 from dmrl.estimation.pair import Array
@@ -38,14 +37,6 @@ def test_no_budget_pays_for_a_position_that_may_be_anywhere() -> None:
     probability = np.append(np.zeros(1000), 0.5)
     assert within_budget(probability, 0.2).tolist() == [True] * 1000 + [False]
     assert not within_budget(np.full(10, 0.5), 0.6).any()
-
-
-def test_the_same_covariance_is_trusted_less_where_sensors_are_ordinary() -> None:
-    state, covariance = np.tile([2.0, 0.0, 0.0], (4, 1)), spread(0.09, 0.09, 0.12, 0.12)
-    clean = statuses_of(state, covariance, 0.3, gate.CLEAN_SHARE)
-    ordinary = statuses_of(state, covariance, 0.3)
-    assert clean.tolist() == [OK] * 4
-    assert ordinary.tolist() == [OK, OK, UNCONVERGED, UNCONVERGED]
 
 
 def test_a_bearing_that_is_open_is_ambiguous_and_a_blurred_one_unconverged() -> None:
