@@ -98,8 +98,8 @@ class Photos:
         part_u, part_v = camera.width_px * fit, camera.height_px * fit
         left, top = (width - part_u) * place_u, (height - part_v) * place_v
         box = (left, top, left + part_u, top + part_v)
-        rgb = crop_and_scale(photo, box, camera.width_px, camera.height_px)
-        return LIGHT_OF[rgb[:, ::-1] if mirrored < 0.5 else rgb]
+        rgb = crop_and_scale(photo, box, camera.width_px, camera.height_px, sharp=False)
+        return np.take(LIGHT_OF, rgb[:, ::-1] if mirrored < 0.5 else rgb)
 
 
 def _begins(path: Path) -> bool:

@@ -182,20 +182,22 @@ def random_paint(rng: Generator, wear: float, spread: float) -> dict[str, Any]:
     spread
         How far colours vary, 0 to 1.
     """
-    paint: dict[str, Any] = {}
+    parts = len(MATERIALS)
+    other, which, dust, glow = rng.random((4, parts))
+    base, roughness, metallic, light = zip(*(PALETTE[name] for name in MATERIALS), strict=True)
+    colour = np.array(base)
     for k, name in enumerate(MATERIALS):
-        base, roughness, metallic, glow = PALETTE[name]
-        others = OTHERS.get(name, ())
-        if others and rng.random() < spread:
-            base = others[int(rng.integers(len(others)))]
-        colour = np.array(base) * np.exp(rng.normal(0, spread, 3) * 0.5 + rng.normal(0, spread))
-        dust = wear * rng.random()
-        colour = np.clip(colour * (1 - 0.5 * dust) + 0.06 * dust, 0, 1)
-        rough = float(np.clip(roughness + 0.5 * dust + rng.normal(0, 0.1), 0.05, 1))
-        shine = metallic * (1 - 0.6 * dust)
-        paint[f"colour_{k}"] = colour.tolist()
-        paint[f"finish_{k}"] = [rough, shine, glow * float(rng.uniform(0, 2))]
-    return paint
+        if name in OTHERS and other[k] < spread:
+            colour[k] = OTHERS[name][int(which[k] * len(OTHERS[name]))]
+    dust = wear * dust
+    tint, shade = spread * rng.standard_normal((parts, 3)), spread * rng.standard_normal(parts)
+    colour *= np.exp(0.5 * tint + shade[:, None])
+    colour = np.clip(colour * (1 - 0.5 * dust[:, None]) + 0.06 * dust[:, None], 0, 1)
+    rough = np.clip(roughness + 0.5 * dust + 0.1 * rng.standard_normal(parts), 0.05, 1)
+    finish = np.column_stack([rough, metallic * (1 - 0.6 * dust), 2 * glow * light])
+    colours, finishes = colour.tolist(), finish.tolist()
+    paint = {f"colour_{k}": colours[k] for k in range(parts)}
+    return paint | {f"finish_{k}": finishes[k] for k in range(parts)}
 
 
 def strong_colours(rng: Generator) -> dict[str, Any]:
