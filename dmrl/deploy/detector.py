@@ -20,6 +20,7 @@ from dmrl.deploy.compiled import Compiled
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError, SettingError
+from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 
 Images = NDArray[np.uint8]
@@ -108,7 +109,10 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
         If the backend needs a package that is not installed.
     """
     if not model.exists():
-        raise ModelError(f"no model {model}. Give a run folder, a Keras .h5 or an export folder")
+        raise ModelError(
+            f"no model {model}. Give a run folder, a Keras .h5, an export folder, or the name of "
+            f"one that ships with dmrl: {', '.join(pretrained.names())}"
+        )
     return OPENS[backend](model, backend)
 
 

@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from dmrl.errors import ModelError, SettingError
+from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 from dmrl.learn.keras import read_h5
 from dmrl.learn.network import ARCHITECTURES, SUB_CELL, Network, build, parameter_count, to_input
@@ -174,7 +175,10 @@ def load_model(path: Path) -> Model:
     if path.is_dir():
         return _load_safetensors(path / WEIGHTS_NAME, path / DESCRIPTION_NAME, path.name)
     if not path.is_file():
-        raise ModelError(f"no model {path}. Give a run folder, a .safetensors or a Keras .h5")
+        raise ModelError(
+            f"no model {path}. Give a run folder, a .safetensors, a Keras .h5, or the name of one "
+            f"that ships with dmrl: {', '.join(pretrained.names())}"
+        )
     with path.open("rb") as stream:
         head = stream.read(16)
     if head.startswith(b"\x89HDF\r\n\x1a\n"):

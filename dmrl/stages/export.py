@@ -21,6 +21,7 @@ from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError
+from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.progress import say
 from dmrl.recording import provenance
@@ -81,6 +82,7 @@ def run(model: Path, out: Path, settings: Settings) -> list[Written]:
         If ``out`` exists.
     """
     refuse_existing(out)
+    model = resolved(model)
     if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
         raise ModelError(f"{model} is an export folder already. Give the model it was made from")
     try:

@@ -16,6 +16,7 @@ from dmrl.errors import MissingTopic
 from dmrl.images import Rgb, decode
 from dmrl.learn.decode import Found
 from dmrl.learn.decode import decode as find
+from dmrl.learn.pretrained import resolved
 from dmrl.messages import message
 from dmrl.progress import track
 from dmrl.recording import (
@@ -101,6 +102,7 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     OutputError
         If ``out`` exists.
     """
+    model = resolved(model)
     detector = open_detector(model, settings.backend)
     if settings.threshold is not None:
         detector = replace(detector, threshold=settings.threshold)
@@ -235,8 +237,8 @@ def command(
     Parameters
     ----------
     model
-        A run folder of dmrl train, a .safetensors, a Keras .h5, a quantised model or an export
-        folder.
+        A run folder of dmrl train, a .safetensors, a Keras .h5, a quantised model, an export
+        folder, or dmrl-nano, which ships with dmrl.
     recording
         Recording with images.
     out

@@ -26,6 +26,7 @@ from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import labels_of_split
 from dmrl.learn.metrics import DEFINITIONS
+from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.progress import say, track
 from dmrl.recording import provenance
@@ -135,6 +136,7 @@ def run(model: Path, dataset: Path, out: Path, settings: Settings) -> Result:
         If ``out`` exists.
     """
     refuse_existing(out)
+    model = resolved(model)
     trained, data = load_model(model), open_dataset(dataset)
     seen, judged = data.split(_first(data, "train")), data.split(settings.split or _judged(data))
     for split in (seen, judged):

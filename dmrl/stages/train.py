@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from dmrl import recipe as recipes
 from dmrl.dataset import Split, open_dataset
 from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
+from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, partial_of, refuse_existing
 from dmrl.progress import track
 from dmrl.recording import provenance
@@ -90,6 +91,7 @@ def run(
     SettingError
         If the network cannot take the images, or the loss is no longer a number.
     """
+    init = resolved(init) if init is not None else None
     group = join_group()
     try:
         return _run(dataset, out, settings, init, group, resume=resume)
