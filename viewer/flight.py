@@ -49,7 +49,7 @@ def flight_scene(selection: Selection, settings: Settings) -> Scene:
         eyes,
         sources,
         named,
-        partial(Follower, pairs, seen),
+        partial(Follower, pairs, seen, selection.shown_ns[0]),
     )
 
 

@@ -6,7 +6,7 @@ that nothing depends on where a stretch ends.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -104,9 +104,13 @@ class Follower:
         Who sees whom.
     seen
         A glimpse of the flight: which frames and positions there will be.
+    begin_ns
+        Log time from which frames stand where they are first known: without a place of its
+        frame at the time that a viewer opens at, a view of space shows nothing at all.
     """
 
-    def __init__(self, pairs: Sequence[Names], seen: Motion) -> None:
+    def __init__(self, pairs: Sequence[Names], seen: Motion, begin_ns: int) -> None:
+        self._begin_ns = begin_ns
         self._sent: dict[str, Poses] = {}
         self._frames: dict[str, Heard] = {}
         self._positions: dict[str, tuple[Names, str, Heard]] = {}
@@ -172,6 +176,9 @@ class Follower:
             if frame in self._frames:
                 self._frames[frame].add(part)
             last = self._sent.get(frame)
+            if last is None:
+                first_ns = np.append(min(self._begin_ns, part.time_ns[0]), part.time_ns[1:])
+                part = replace(part, time_ns=first_ns)
             rows = np.flatnonzero(part.moved_from(last))
             self._sent[frame] = taken(part, slice(-1, None))
             if len(rows):

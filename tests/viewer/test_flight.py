@@ -143,6 +143,15 @@ def test_without_tf_everything_is_around_the_robot(fly: Make, rrd: Path) -> None
     assert column(rrd, f"{TRUTH}/trail", "CoordinateFrame:frame") == [["cf1/horizontal"]]
 
 
+def test_frames_have_a_place_at_the_time_that_a_viewer_opens_at(fly: Make, rrd: Path) -> None:
+    save([fly(moving=True)], rrd, Settings())
+    found = columns(rrd)
+    opens_ns, _ = found["/cf1/camera/image", "EncodedImage:blob"][0]
+    first_ns, pose = found["/tf/cf1/horizontal", "Transform3D:translation"][0]
+    assert first_ns == opens_ns
+    assert pose is not None
+
+
 def test_a_range_points_to_where_the_peer_is_thought_to_be(fly: Make, rrd: Path) -> None:
     save([fly()], rrd, Settings())
     ((start, end),) = column(rrd, "/cf1/range/cf2/line", "LineStrips3D:strips")[0]
