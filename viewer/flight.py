@@ -158,14 +158,18 @@ def _three(point: np.ndarray) -> tuple[float, float, float]:
 def _extent(
     motion: Motion, frame: str, pairs: Sequence[Names], robots: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box that holds nearly all positions, metres."""
+    """Corners of the box that holds nearly all positions, and who sees them, metres."""
     if frame == WORLD:
         own = (horizontal_frame(robot) for robot in robots)
         found = [motion.poses[name].xyz for name in own if name in motion.poses]
-    else:
-        every = (motion.truths.get(pair) or motion.estimates.get(pair) for pair in pairs)
-        found = [np.zeros((1, 3)), *(p.xyz for p in every if p is not None)]
-    points = np.concatenate(found)
+        return _nearly_all(found)
+    every = (motion.truths.get(pair) or motion.estimates.get(pair) for pair in pairs)
+    low, high = _nearly_all([p.xyz for p in every if p is not None])
+    return np.minimum(low, 0.0), np.maximum(high, 0.0)
+
+
+def _nearly_all(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    points = np.concatenate([*parts] or [np.zeros((1, 3))])
     return np.percentile(points, 2, axis=0), np.percentile(points, 98, axis=0)
 
 
