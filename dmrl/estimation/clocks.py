@@ -6,6 +6,7 @@ roughly by cross-correlation, then by Gauss-Newton with Huber's weights.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,9 +179,39 @@ def _slow(values: Array) -> Array:
     return np.asarray(total[width:] - total[:-width])[: len(values)] / width
 
 
+class _Fit(NamedTuple):
+    """Normal equations of offset, drift, scale and bias, and how well the series agree."""
+
+    normal: Array
+    gradient: Array
+    variance: float
+    correlation: float
+
+
+def _linearised(one: _Series, then: Array, from_middle: Array, wanted: Array, drift: float) -> _Fit:
+    """What one series at the times ``then`` tells of another's values ``wanted``."""
+    seen = np.interp(then, one.time_s, one.values)
+    known = np.interp(then, one.time_s, one.known) > 0.5
+    rate = np.interp(then, one.time_s, np.gradient(one.values, STEP_S))
+    # Offset and drift of the clock, scale and bias of the values.
+    jacobian = np.stack([rate, rate * from_middle, seen, np.ones(len(seen))], axis=1)[known]
+    scale_bias = np.linalg.lstsq(jacobian[:, 2:], wanted[known], rcond=None)[0]
+    residual = wanted[known] - jacobian[:, 2:] @ scale_bias
+    spread = 1.4826 * np.median(np.abs(residual)) + 1e-12
+    weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-12))
+    full = jacobian * (scale_bias[0], scale_bias[0], 1.0, 1.0)
+    # Smoothing ties neighbours together: so many of them count as one.
+    variance = float((weight * residual**2).mean()) * TOGETHER
+    normal = full.T @ (weight[:, None] * full)
+    gradient = full.T @ (weight * residual)
+    normal[1, 1] += variance / DRIFT_STD**2
+    gradient[1] -= variance / DRIFT_STD**2 * drift
+    correlation = float(np.corrcoef(seen[known], wanted[known])[0, 1])
+    return _Fit(normal, gradient, variance, correlation)
+
+
 def _refined(one: _Series, other: _Series, lag_s: float) -> Clock | None:
     time_s, grid_s = other.time_s, one.time_s
-    slope = np.gradient(one.values, STEP_S)
     share = other.known & (time_s + lag_s > grid_s[0]) & (time_s + lag_s < grid_s[-1])
     time_s, wanted = time_s[share], other.values[share]
     if len(time_s) * STEP_S < OVERLAP_S:
@@ -190,40 +221,17 @@ def _refined(one: _Series, other: _Series, lag_s: float) -> Clock | None:
     offset_s, drift = lag_s, 0.0
     for _ in range(ITERATIONS):
         then = time_s + offset_s + drift * from_middle
-        seen = np.interp(then, grid_s, one.values)
-        known = np.interp(then, grid_s, one.known) > 0.5
-        rate = np.interp(then, grid_s, slope)
-        # Offset and drift of the clock, scale and bias of the values.
-        jacobian = np.stack([rate, rate * from_middle, seen, np.ones(len(seen))], axis=1)[known]
-        scale_bias = np.linalg.lstsq(jacobian[:, 2:], wanted[known], rcond=None)[0]
-        residual = wanted[known] - jacobian[:, 2:] @ scale_bias
-        spread = 1.4826 * np.median(np.abs(residual)) + 1e-12
-        weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-12))
-        full = jacobian * (scale_bias[0], scale_bias[0], 1.0, 1.0)
-        # Smoothing ties neighbours together: so many of them count as one.
-        variance = float((weight * residual**2).mean()) * TOGETHER
-        normal = full.T @ (weight[:, None] * full)
-        gradient = full.T @ (weight * residual)
-        normal[1, 1] += variance / DRIFT_STD**2
-        gradient[1] -= variance / DRIFT_STD**2 * drift
-        if np.linalg.cond(normal) > 1e15:
+        fit = _linearised(one, then, from_middle, wanted, drift)
+        if np.linalg.cond(fit.normal) > 1e15:
             return None
-        step = np.linalg.solve(normal, gradient)
+        step = np.linalg.solve(fit.normal, fit.gradient)
         offset_s, drift = offset_s + step[0], drift + step[1]
         if abs(step[0]) < 1e-7 and abs(step[1]) < 1e-10:
             break
-    correlation = float(np.corrcoef(seen[known], wanted[known])[0, 1])
-    if not correlation >= CONVINCING:
+    if not fit.correlation >= CONVINCING:
         return None
-    covariance = np.linalg.inv(normal) * variance
-    return Clock(
-        float(offset_s),
-        float(drift),
-        at_s,
-        float(np.sqrt(covariance[0, 0])),
-        float(np.sqrt(covariance[1, 1])),
-        correlation,
-    )
+    offset_std, drift_std = np.sqrt(np.diag(np.linalg.inv(fit.normal))[:2] * fit.variance).tolist()
+    return Clock(float(offset_s), float(drift), at_s, offset_std, drift_std, fit.correlation)
 
 
 def connected(pairs: dict[tuple[str, str], Clock], reference: str) -> dict[str, Clock]:
