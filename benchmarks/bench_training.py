@@ -55,7 +55,7 @@ def build(folder: Path, count: int) -> Examples:
 
 def endless(examples: Examples, settings: FitSettings) -> Iterator[Batch]:
     """Whole augmented batches, epoch after epoch."""
-    augmenter, size, epoch = Augmenter(examples, settings.augmentation, seed=0), 0, 0
+    augmenter, size, epoch = Augmenter(examples, settings.augmentation(0), seed=0), 0, 0
     size = settings.batch_size
     while True:
         chosen = order(len(examples), seed=0, epoch=epoch)

@@ -81,10 +81,20 @@ def encode_png(rgb: Rgb | NDArray[np.uint16]) -> bytes:
     return buffer.getvalue()
 
 
-def encode_jpeg(rgb: Rgb, quality: int = 95) -> bytes:
-    """JPEG of an (H, W, 3) uint8 RGB array, without chroma subsampling."""
+def encode_jpeg(rgb: Rgb, quality: int = 95, *, subsampled: bool = False) -> bytes:
+    """JPEG of an (H, W, 3) uint8 RGB array.
+
+    Parameters
+    ----------
+    rgb
+        The picture.
+    quality
+        1 to 100.
+    subsampled
+        Whether four pixels share their colour (4:2:0), as most JPEGs have it.
+    """
     buffer = BytesIO()
-    Image.fromarray(rgb).save(buffer, "JPEG", quality=quality, subsampling=0)
+    Image.fromarray(rgb).save(buffer, "JPEG", quality=quality, subsampling=2 if subsampled else 0)
     return buffer.getvalue()
 
 

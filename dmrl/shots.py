@@ -41,7 +41,11 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         Pixels and labels.
     """
     jpeg = settings.image_format == "jpeg"
-    data = encode_jpeg(shot.rgb, scene.jpeg_quality) if jpeg else encode_png(shot.rgb)
+    data = (
+        encode_jpeg(shot.rgb, scene.jpeg_quality, subsampled=settings.jpeg_subsampled)
+        if jpeg
+        else encode_png(shot.rgb)
+    )
     yield image(time_ns, ROBOT, data, settings.image_format)
     yield labels(time_ns, ROBOT, list(_peers(shot)))
     attitude = {"roll_rad": scene.roll_rad, "pitch_rad": scene.pitch_rad}

@@ -10,7 +10,7 @@ zoom by z divides the depth by z. A turn about the optical axis keeps it.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -75,6 +75,11 @@ class Augmentation:
     colour: float = 0.0
     noise: float = 0.0
     blur_share: float = 0.0
+
+    @property
+    def plain(self) -> "Augmentation":
+        """The same without what moves or cuts anything but whole images."""
+        return replace(self, zoom=(1.0, 1.0), rotation_deg=0.0, mosaic_share=0.0, paste=0.0)
 
     @property
     def is_nothing(self) -> bool:

@@ -135,11 +135,6 @@ class Training:
         self._settings, self._folder = settings, folder
         self._optimizer = new_optimizer(network, settings)
         self._average = Average(network, settings.ema_steps) if settings.ema_steps else None
-        self._augmenter = (
-            None
-            if settings.augmentation.is_nothing
-            else Augmenter(examples, settings.augmentation, seed=settings.seed)
-        )
         self._steps_per_epoch = batch_count(len(examples), settings.batch_size)
         run = {**asdict(settings), "data": identity}
         self._state = State(run)
@@ -205,14 +200,18 @@ class Training:
     def _batches(self, epoch: int) -> Iterator[Batch]:
         size, seed = self._settings.batch_size, self._settings.seed
         indices = order(len(self._examples), seed=seed, epoch=epoch, shares=self._shares)
+        augmentation = self._settings.augmentation(epoch)
+        augmenter = (
+            None if augmentation.is_nothing else Augmenter(self._examples, augmentation, seed=seed)
+        )
         for index, start in enumerate(range(0, len(indices), size)):
             whole = indices[start : start + size]
             # Where there are more processes than images some compute one that does not count.
             chosen = self._group.part(whole) if len(whole) >= self._group.size else whole[:1]
-            if self._augmenter is None:
+            if augmenter is None:
                 yield gathered(self._examples, chosen)
             else:
-                yield self._augmenter.batch(
+                yield augmenter.batch(
                     chosen, epoch=epoch, index=index * self._group.size + self._group.rank
                 )
 

@@ -65,6 +65,9 @@ class FitSettings:
         Share of images put together from windows of two or four, 0 to 1.
     paste
         Mean number of patches of other images pasted into one. Needs labels with boxes.
+    plain_epochs
+        The last epochs, in which images stay whole: mirrored and tinted, but not zoomed, turned
+        or put together (Ge et al. 2021).
     colour
         Spread (one sigma) of contrast, brightness and white balance, 0 to 1.
     noise
@@ -103,6 +106,7 @@ class FitSettings:
     rotation_deg: float = 8.0
     mosaic_share: float = 0.5
     paste: float = 0.0
+    plain_epochs: int = 0
     colour: float = 0.05
     noise: float = 0.01
     blur_share: float = 0.1
@@ -130,10 +134,9 @@ class FitSettings:
         if any(share < 0 for share in self.shares.values()):
             raise ValueError("shares: must not be negative")
 
-    @property
-    def augmentation(self) -> Augmentation:
-        """The keys that say how images are varied."""
-        return Augmentation(
+    def augmentation(self, epoch: int) -> Augmentation:
+        """How images are varied in an epoch, from 0."""
+        whole = Augmentation(
             self.flip_share,
             self.zoom,
             self.rotation_deg,
@@ -143,6 +146,7 @@ class FitSettings:
             self.noise,
             self.blur_share,
         )
+        return whole if epoch < self.epochs - self.plain_epochs else whole.plain
 
 
 SHARES = (
@@ -151,5 +155,13 @@ SHARES = (
 )
 NOT_NEGATIVE = (
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus"),
-    *("confidence_weight", "depth_weight", "offset_weight", "rotation_deg", "paste", "seed"),
+    *(
+        "confidence_weight",
+        "depth_weight",
+        "offset_weight",
+        "rotation_deg",
+        "paste",
+        "plain_epochs",
+        "seed",
+    ),
 )

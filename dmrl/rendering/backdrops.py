@@ -79,7 +79,9 @@ class Photos:
                 self.broken.append(self.paths[here])
         raise SettingError("every photo is broken. Choose another --backgrounds")
 
-    def backdrop(self, rng: Generator, camera: Camera, zoom: float) -> Picture:
+    def backdrop(
+        self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True
+    ) -> Picture:
         """(H, W, 3) linear light of a photo at random, cropped to fill the image.
 
         Parameters
@@ -90,6 +92,8 @@ class Photos:
             Gives the size.
         zoom
             1: as much of the photo as fits; 2: half its width and height.
+        averaged
+            Whether a pixel is the mean of what it covers of the photo, or what is in its middle.
         """
         number, place_u, place_v, mirrored = rng.random(4)
         photo = self.photo(int(number * len(self.paths)))
@@ -98,8 +102,23 @@ class Photos:
         part_u, part_v = camera.width_px * fit, camera.height_px * fit
         left, top = (width - part_u) * place_u, (height - part_v) * place_v
         box = (left, top, left + part_u, top + part_v)
-        rgb = crop_and_scale(photo, box, camera.width_px, camera.height_px, sharp=False)
+        if averaged:
+            rgb = crop_and_scale(photo, box, camera.width_px, camera.height_px, sharp=False)
+        else:
+            rgb = _middles(photo, (left, top), fit, camera)
         return np.take(LIGHT_OF, rgb[:, ::-1] if mirrored < 0.5 else rgb)
+
+
+def _middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera) -> Rgb:
+    """A part of a photo, bilinear in the middles of pixels ``fit`` wide."""
+    height, width, _ = photo.shape
+    limits = zip(corner, (camera.width_px, camera.height_px), (width, height), strict=True)
+    u, v = (
+        np.clip(first + (np.arange(count) + 0.5) * fit - 0.5, 0, size - 1.001)
+        for first, count, size in limits
+    )
+    places = np.stack(np.meshgrid(u, v), axis=-1)
+    return np.round(between(photo.astype(np.float32), places)).astype(np.uint8)
 
 
 def _begins(path: Path) -> bool:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dmrl.geometry import Array, Camera, project
 from dmrl.rendering.lens import Canvas, Picture, canvas_of, image_from_pinhole, sample
-from dmrl.rendering.sensor import expose
+from dmrl.rendering.sensor import blur, expose
 from dmrl.rendering.shot import Layer, Look, Part, Robot, Shot
 
 COVERED = 1 / 255
@@ -85,16 +85,16 @@ def _box(canvas: Canvas, camera: Camera, layer: Layer, seen: NDArray[np.bool_]) 
 
 
 def _place(
-    canvas: Canvas, camera: Camera, layer: Layer, move_px: Array
+    canvas: Canvas, camera: Camera, layer: Layer, spread_px: Array
 ) -> tuple[Part, Picture] | None:
-    """Part of the image that shows a layer, and where its pixels lie in the layer."""
+    """Part of the image that shows a layer, so far smeared, and where its pixels lie in it."""
     height, width = layer.depth_m.shape
     u, v = np.linspace(0, width, 9), np.linspace(0, height, 9)
     rim = np.concatenate([np.column_stack([u, v * 0 + y]) for y in (0, height)])
     rim = np.concatenate([rim, *(np.column_stack([u * 0 + x, v]) for x in (0, width))])
     corner = np.array([layer.left_px, layer.top_px])
     bent = image_from_pinhole(rim + corner - canvas.shift_px, camera)
-    reach = np.ceil(np.abs(move_px) / 2) + 1
+    reach = np.ceil(spread_px) + 1
     limit = (camera.width_px, camera.height_px)
     left, top = np.clip(np.floor(bent.min(axis=0) - reach), 0, limit).astype(int).tolist()
     right, bottom = np.clip(np.ceil(bent.max(axis=0) + reach), 0, limit).astype(int).tolist()
@@ -138,11 +138,11 @@ def _paint(
 ) -> None:
     """Lay a robot over what is behind it, smeared by its movement."""
     move_px = _move_px(camera, robot)
-    found = _place(canvas, camera, layer, move_px)
+    found = _place(canvas, camera, layer, np.abs(move_px) / 2 + 3 * look.robot_blur_px)
     if found is None:
         return
     part, places = found
-    light = np.float32(look.robot_opacity) * _smeared(layer.light, places, move_px)
+    light = blur(_smeared(layer.light, places, move_px), look.robot_blur_px)
     gain = np.float32(look.robot_gain)
     picture[part] = picture[part] * (1 - light[..., 3:]) + gain * light[..., :3]
 

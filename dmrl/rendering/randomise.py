@@ -19,6 +19,7 @@ from dmrl.rendering.sketch import Pose
 TRIES = 30
 # Of panoramas, whose suns and lamps would leave nothing else to see; photos end below.
 HIGHLIGHTS = 3.0
+BEHIND_THE_CAMERA = np.array([-1.0, 0.0, 0.0])
 
 # Base colour, roughness, metallic, glow of every material; linear light.
 PALETTE: Mapping[str, tuple[tuple[float, float, float], float, float, float]] = {
@@ -136,11 +137,12 @@ def _poses(world: World, rng: Generator, tilt: Array) -> list[Pose]:
 
 
 def _place(world: World, rng: Generator) -> Array:
-    """Uniform in the image as it is seen, distorted; every factor of depth as likely."""
+    """Uniform in the image as it is seen, distorted."""
     camera = world.camera
     uv = rng.uniform((0, 0), (camera.width_px, camera.height_px))
     u_px, v_px = pinhole_from_image(uv, camera)
-    depth_m = _factor(rng, world.settings.depth_m)
+    draw = _between if world.settings.depth_spacing == "linear" else _factor
+    depth_m = draw(rng, world.settings.depth_m)
     left = (camera.cx_px - u_px) / camera.fx_px
     up = (camera.cy_px - v_px) / camera.fy_px
     return np.array([depth_m, depth_m * left, depth_m * up])
@@ -220,33 +222,40 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
     turn = (*tilt_rad, float(rng.uniform(-np.pi, np.pi)))
     zoom = _between(rng, settings.background_zoom)
     if world.photos is not None:
-        backdrop = world.photos.backdrop(rng, world.camera, zoom)
+        averaged = not settings.pasted
+        backdrop = world.photos.backdrop(rng, world.camera, zoom, averaged=averaged)
+        if settings.recoloured_share and rng.random() < settings.recoloured_share:
+            backdrop = backdrop[..., rng.permutation(3)]
     else:
         backdrop = panorama_view(world.panorama(name), world.camera, turn)
     backdrop = blur(backdrop, _between(rng, settings.background_blur_px))
     shake = rng.normal(size=2)
     shake *= np.radians(settings.shake_max_dps) * rng.random() / np.linalg.norm(shake)
     backdrop = smeared(backdrop, (shake * shutter_s * world.camera.fx_px).tolist())
-    backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
-    gain = _factor(rng, settings.robot_gain) * float(backdrop.mean()) / 0.3
+    gain = _factor(rng, settings.robot_gain)
+    if not settings.pasted:
+        backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
+        gain *= float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
     light, sensor = _light(settings, rng, name, turn), random_sensor(settings, rng)
-    return Look(backdrop, light, sensor, gain, _between(rng, settings.robot_opacity), seed)
+    return Look(backdrop, light, sensor, gain, _between(rng, settings.robot_blur_px), seed)
 
 
 def _light(
     settings: Settings, rng: Generator, name: str, turn: tuple[float, float, float]
 ) -> Light:
     towards = rng.normal((0.0, 0.0, 1.2), 1.0)
+    towards = camera_from_horizontal(*turn[:2]) @ (towards / np.linalg.norm(towards))
     warm = float(rng.normal(0, 0.12))
     return Light(
         name=name,
         turn_rad=turn,
         strength=_between(rng, settings.light_strength),
-        sun_camera=camera_from_horizontal(*turn[:2]) @ (towards / np.linalg.norm(towards)),
+        sun_camera=BEHIND_THE_CAMERA if settings.pasted else towards,
         sun_strength=_between(rng, settings.sun_strength),
-        sun_colour=(1 + warm, 1.0, 1 - warm),
+        sun_colour=(1.0, 1.0, 1.0) if settings.pasted else (1 + warm, 1.0, 1 - warm),
         sun_angle_rad=_between(rng, (0.01, 0.6)),
+        sun_shadow=not settings.pasted,
     )
 
 
@@ -254,7 +263,7 @@ def random_sensor(settings: Settings, rng: Generator) -> Sensor:
     """A camera's response, from the ranges of the settings."""
     warmth = _factor(rng, settings.warmth) ** 0.5
     return Sensor(
-        brightness=_between(rng, settings.brightness),
+        brightness=None if settings.pasted else _between(rng, settings.brightness),
         contrast_gamma=_between(rng, settings.contrast_gamma),
         balance=(warmth, 1.0, 1 / warmth),
         saturation=_between(rng, settings.saturation),

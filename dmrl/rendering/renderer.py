@@ -41,11 +41,14 @@ class Model:
         Metres per unit of the file; of the drawn one, times its life size.
     up
         Axis of the file that points up.
+    centre
+        What labels are about: the middle of the model's box, or the file's origin.
     """
 
     path: Path | None = None
     scale: float = 1.0
     up: Literal["y", "z"] = "z"
+    centre: Literal["box", "origin"] = "box"
 
 
 def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> Start:
@@ -56,6 +59,7 @@ def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> S
         "model": None if model.path is None else str(model.path),
         "model_scale": model.scale,
         "model_up": model.up,
+        "model_centre": model.centre,
         "materials": crazyflie.MATERIALS,
         "blade_half_width_m": crazyflie.BLADE_HALF_WIDTH_M,
         "between_rotors_rad": crazyflie.BETWEEN_ROTORS_RAD,

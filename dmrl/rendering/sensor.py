@@ -19,7 +19,8 @@ class Sensor:
     Parameters
     ----------
     brightness
-        Mean of the picture, 0 to 1, before vignetting: what automatic exposure aims at.
+        Mean of the picture, 0 to 1, before vignetting: what automatic exposure aims at. None:
+        a fixed exposure, where light of 1 is full scale.
     contrast_gamma
         1: values are proportional to light, as raw sensors give; 2.2: as screens expect.
     balance
@@ -38,7 +39,7 @@ class Sensor:
         Standard deviation of the noise in the dark; full scale is 1.
     """
 
-    brightness: float = 0.4
+    brightness: float | None = 0.4
     contrast_gamma: float = 2.2
     balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     saturation: float = 1.0
@@ -61,9 +62,10 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
     rng
         Where the noise comes from.
     """
-    target = sensor.brightness**sensor.contrast_gamma
-    mean = max(float((light @ LUMINANCE).mean()), 1e-6)
-    gain = np.array(sensor.balance, np.float32) * np.float32(target / mean)
+    gain = np.array(sensor.balance, np.float32)
+    if sensor.brightness is not None:
+        target = sensor.brightness**sensor.contrast_gamma
+        gain *= np.float32(target / max(float((light @ LUMINANCE).mean()), 1e-6))
     height, width, _ = light.shape
     values = blur(_mixed(light, sensor.saturation), sensor.defocus_px)
     # Row by row: NumPy is ten times slower where the innermost axis is three colours.

@@ -32,8 +32,9 @@ LIMITS: dict[str, Range] = {
     "light_strength": (0, 20),
     "sun_strength": (0, 50),
     "robot_gain": (0.05, 20),
-    "robot_opacity": (0, 1),
+    "robot_blur_px": (0, 5),
     "background_zoom": (1, 8),
+    "recoloured_share": (0, 1),
     "background_blur_px": (0, 20),
     "brightness": (0.02, 0.98),
     "contrast_gamma": (0.5, 3),
@@ -69,6 +70,8 @@ class Settings:
         .blend, .glb, .obj or .stl of the robot. Without it, the Crazyflie that dmrl draws.
     model_up
         Axis of the model's file that points up.
+    model_centre
+        What of the model its labels are about: the middle of its box, or the file's origin.
     scale
         Metres per unit of the model; without a model, times life size.
     backgrounds
@@ -88,7 +91,9 @@ class Settings:
     robots_max
         Robots in an image, at most; every number is as likely.
     depth_m
-        Range of depths; every factor is as likely.
+        Range of depths.
+    depth_spacing
+        log: every factor of depth is as likely; linear: every metre.
     robot_tilt_max_deg
         Roll and pitch of the robots, at most.
     camera_tilt_max_deg
@@ -115,10 +120,16 @@ class Settings:
         Range of the sun's or lamp's light on the robots, watts per square metre.
     robot_gain
         Range of the light of robots over that of the background; every factor is as likely.
-    robot_opacity
-        Range of how much of the background robots hide; the authors' let some of it through.
+    robot_blur_px
+        Range of the blur of the robots alone, a standard deviation, pixels: what a renderer's
+        pixel filter does to what it lays over a photo.
+    pasted
+        Whether robots are laid over photos as the authors did: the photo keeps its values, and
+        the robots are lit by a lamp at the camera that knows nothing of the photo.
     background_zoom
         Range of how far photos are zoomed into.
+    recoloured_share
+        Share of photos whose colours are exchanged: leaves may be blue.
     background_blur_px
         Range of the background's blur, a standard deviation, pixels.
     brightness
@@ -143,6 +154,8 @@ class Settings:
         Of the images in the recording.
     jpeg_quality
         Range of qualities, 1 to 100.
+    jpeg_subsampled
+        Whether four pixels share their colour (4:2:0).
     """
 
     images: int = 1000
@@ -153,6 +166,7 @@ class Settings:
     distorted: bool = True
     model: Path | None = None
     model_up: Literal["y", "z"] = "z"
+    model_centre: Literal["box", "origin"] = "box"
     scale: float = 1.0
     backgrounds: Path | None = None
     lights: Path | None = None
@@ -163,6 +177,7 @@ class Settings:
     empty_share: float = 0.1
     robots_max: int = 1
     depth_m: Range = (0.2, 2.0)
+    depth_spacing: Literal["log", "linear"] = "log"
     robot_tilt_max_deg: float = 20.0
     camera_tilt_max_deg: float = 20.0
     speed_max_mps: float = 0.0
@@ -176,8 +191,10 @@ class Settings:
     light_strength: Range = (0.5, 1.5)
     sun_strength: Range = (0.0, 3.0)
     robot_gain: Range = (0.5, 1.5)
-    robot_opacity: Range = (1.0, 1.0)
+    robot_blur_px: Range = (0.0, 0.0)
+    pasted: bool = False
     background_zoom: Range = (1.0, 2.0)
+    recoloured_share: float = 0.0
     background_blur_px: Range = (0.0, 1.0)
     brightness: Range = (0.3, 0.6)
     contrast_gamma: Range = (2.2, 2.2)
@@ -190,6 +207,7 @@ class Settings:
     read_noise: Range = (0.0, 0.0)
     image_format: Literal["jpeg", "png"] = "jpeg"
     jpeg_quality: tuple[int, int] = (95, 95)
+    jpeg_subsampled: bool = False
 
     def __post_init__(self) -> None:
         if faults := list(_faults(self)):
@@ -247,9 +265,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "background_zoom": [1.0, 1.0],
         "background_blur_px": [0.0, 0.0],
         "wear": [0.0, 0.0],
-        "brightness": [0.25, 0.65],
-        "robot_gain": [0.7, 2.0],
-        "robot_opacity": [0.5, 1.0],
+        "pasted": True,
+        "depth_spacing": "linear",
+        "light_strength": [0.08, 0.16],
+        "sun_strength": [1.5, 1.9],
+        "robot_gain": [1.0, 1.0],
+        "robot_blur_px": [0.35, 0.5],
+        "jpeg_subsampled": True,
         "jpeg_quality": [90, 90],
     },
     "plain": {},

@@ -41,6 +41,8 @@ class Light:
         Red, green, blue.
     sun_angle_rad
         Apparent size: large is soft.
+    sun_shadow
+        Whether parts of a robot shade others from it.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Light:
     sun_strength: float
     sun_colour: tuple[float, float, float]
     sun_angle_rad: float
+    sun_shadow: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +88,8 @@ class Look:
         What the camera makes of it.
     robot_gain
         Light of the robots over that of the backdrop.
-    robot_opacity
-        How much of the backdrop a robot hides where it covers it, 0 to 1.
+    robot_blur_px
+        Blur of the robots alone, a standard deviation, pixels.
     seed
         Of the renderer's and the sensor's noise.
     """
@@ -95,7 +98,7 @@ class Look:
     light: Light
     sensor: Sensor
     robot_gain: float = 1.0
-    robot_opacity: float = 1.0
+    robot_blur_px: float = 0.0
     seed: int = 0
 
 
@@ -193,6 +196,7 @@ def request(
         "sun_strength": light.sun_strength,
         "sun_colour": light.sun_colour,
         "sun_angle_rad": light.sun_angle_rad,
+        "sun_shadow": light.sun_shadow,
         "sun_matrix": _pointing(light.sun_camera).tolist(),
     }
 

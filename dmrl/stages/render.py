@@ -110,7 +110,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     before = interrupted(out, resume=resume)
     photos = None if settings.backgrounds is None else Photos(settings.backgrounds)
     lights = None if settings.lights is None else _panoramas(settings.lights)
-    model = Model(settings.model, settings.scale, settings.model_up)
+    model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre)
     with ExitStack() as stack:
         renderer = stack.enter_context(
             Renderer(

@@ -27,6 +27,7 @@ EVERYTHING = FitSettings(
     warmup_epochs=1,
     ema_steps=20,
     paste=1.0,
+    plain_epochs=1,
     label_noise="weight",
     precision="bfloat16",
     device="cpu",
@@ -137,6 +138,15 @@ def test_the_kept_weights_are_the_mean_of_those_of_many_steps(
         assert not torch.equal(a, b)
         assert torch.isfinite(b).all()
         torch.testing.assert_close(a.detach(), c, rtol=0.2, atol=0.05)
+
+
+def test_the_last_epochs_keep_images_whole() -> None:
+    settings = FitSettings(epochs=10, plain_epochs=3, paste=1.0)
+    assert settings.augmentation(6) == replace(settings, plain_epochs=0).augmentation(9)
+    plain = settings.augmentation(7)
+    assert (plain.mosaic_share, plain.paste, plain.rotation_deg) == (0, 0, 0)
+    assert plain.zoom == (1.0, 1.0)
+    assert (plain.flip_share, plain.colour) == (settings.flip_share, settings.colour)
 
 
 def test_another_training_is_not_resumed(examples: Examples, tmp_path: Path) -> None:

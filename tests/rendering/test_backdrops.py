@@ -8,7 +8,7 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.geometry import AIDECK
-from dmrl.images import encode_jpeg
+from dmrl.images import encode_jpeg, encode_png
 from dmrl.rendering.backdrops import LIGHT_OF, Photos, panorama_view, smeared
 
 CAMERA = replace(AIDECK, distortion=())
@@ -32,6 +32,20 @@ def test_broken_photos_are_skipped_and_counted(folder: Path) -> None:
         backdrop = photos.backdrop(np.random.default_rng(seed), CAMERA, zoom=1.5)
         assert backdrop.shape == (224, 320, 3)
     assert sorted(path.name for path in photos.broken) == ["a.jpg", "c.jpg"]
+
+
+def test_a_photo_is_averaged_or_sampled_in_the_middles_of_pixels(tmp_path: Path) -> None:
+    stripes = np.zeros((448, 640, 3), np.uint8)
+    stripes[:, ::4] = 252
+    (tmp_path / "stripes.png").write_bytes(encode_png(stripes))
+    photos, levels = Photos(tmp_path), []
+    for averaged in (True, False):
+        rng = np.random.default_rng(0)
+        light = photos.backdrop(rng, CAMERA, zoom=1.0, averaged=averaged)
+        levels.append(np.unique(np.round(np.interp(light[:, 8:-8], LIGHT_OF, np.arange(256)))))
+    # A pixel is two columns wide: every other one holds a stripe.
+    assert levels[1].tolist() == [0, 126]
+    assert levels[0].min() > 0
 
 
 def test_a_folder_without_a_photo_is_refused(tmp_path: Path) -> None:

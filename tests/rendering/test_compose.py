@@ -48,17 +48,19 @@ def test_a_near_robot_hides_a_far_one_whatever_their_order() -> None:
     assert shot.surface_m[60, 115] == 1.0
 
 
-def test_a_see_through_robot_is_fainter_and_labelled_the_same() -> None:
+def test_a_blurred_robot_reaches_past_its_edge_and_is_labelled_the_same() -> None:
     black = square(100, 50, 20, 1.0)
     black.light[..., :3] = 0
     layers = {0: black}
-    solid = compose(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
-    faint = compose(PINHOLE, [robot(1.0)], replace(look(PINHOLE), robot_opacity=0.5), layers)
-    shown = [shot.rgb[60, 110, 0] / shot.rgb[0, 0, 0] for shot in (solid, faint)]
-    assert shown == pytest.approx([0.0, 0.5], abs=0.01)
-    assert np.array_equal(faint.box_px, solid.box_px)
-    assert np.array_equal(faint.opacity, solid.opacity)
-    assert faint.visible_share.tolist() == [1.0]
+    sharp = compose(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
+    soft = compose(PINHOLE, [robot(1.0)], replace(look(PINHOLE), robot_blur_px=1.0), layers)
+    across = soft.rgb[60, 95:125, 0].astype(float)
+    assert across == pytest.approx(across[::-1], abs=1)
+    assert soft.rgb[60, 110, 0] == sharp.rgb[60, 110, 0] == 0
+    assert (np.diff(across[:9]) <= 0).all()
+    assert 0 < across[5] < across[3] < across[0]
+    assert np.array_equal(soft.box_px, sharp.box_px)
+    assert np.array_equal(soft.opacity, sharp.opacity)
 
 
 def test_a_robot_wholly_hidden_has_no_box() -> None:

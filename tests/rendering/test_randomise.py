@@ -1,9 +1,17 @@
 """Looks drawn at random."""
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from dmrl.geometry import PUBLISHED_RENDER
+from dmrl.images import encode_png
+from dmrl.rendering.backdrops import Photos
 from dmrl.rendering.crazyflie import MATERIALS
-from dmrl.rendering.randomise import PALETTE, strong_colours
+from dmrl.rendering.randomise import PALETTE, World, draw_scene, strong_colours
+from dmrl.rendering.sensor import expose
+from dmrl.rendering.settings import PRESETS, Settings
 
 
 def test_strong_colours_are_two_hues_over_every_part_that_does_not_glow() -> None:
@@ -17,3 +25,36 @@ def test_strong_colours_are_two_hues_over_every_part_that_does_not_glow() -> Non
 def test_two_robots_are_not_painted_alike() -> None:
     rng = np.random.default_rng(3)
     assert strong_colours(rng) != strong_colours(rng)
+
+
+def world(settings: Settings, folder: Path) -> World:
+    photo = np.full((224, 320, 3), (200, 100, 50), np.uint8)
+    (folder / "photo.png").write_bytes(encode_png(photo))
+    return World(settings, PUBLISHED_RENDER, 0.1, ("sky",), lambda _: photo, Photos(folder))
+
+
+def test_what_is_pasted_leaves_the_photo_as_it_is(tmp_path: Path) -> None:
+    keys = {k: tuple(v) if isinstance(v, list) else v for k, v in PRESETS["published"].items()}
+    settings = Settings(**keys)
+    scene = draw_scene(world(settings, tmp_path), 0)
+    rgb = expose(scene.look.backdrop, scene.look.sensor, np.random.default_rng(0))
+    assert np.abs(rgb.astype(int) - (200, 100, 50)).max() <= 4  # power 2.2 for sRGB's curve
+    assert scene.look.robot_gain == 1
+    assert scene.look.light.sun_camera.tolist() == [-1, 0, 0]
+    assert not scene.look.light.sun_shadow
+
+
+def test_colours_of_a_photo_are_exchanged(tmp_path: Path) -> None:
+    scenes = world(Settings(recoloured_share=1.0, pasted=True), tmp_path)
+    seen = {tuple(draw_scene(scenes, k).look.backdrop[0, 0].argsort()) for k in range(40)}
+    assert len(seen) == 6
+
+
+def test_depths_are_spread_by_factor_or_by_metre(tmp_path: Path) -> None:
+    shares = []
+    for spacing in ("log", "linear"):
+        settings = Settings(depth_spacing=spacing, depth_m=(0.2, 2.0), empty_share=0.0)
+        scenes = (draw_scene(world(settings, tmp_path), k) for k in range(300))
+        depths = np.array([scene.robots[0].pose.xyz_camera[0] for scene in scenes])
+        shares.append(np.mean(depths < 1.1))
+    assert shares == pytest.approx([np.log(5.5) / np.log(10), 0.5], abs=0.08)

@@ -162,6 +162,16 @@ def test_a_model_of_the_user_s_is_rendered_about_its_middle(blender: Path, tmp_p
     run(out, Settings(images=3, model=path, scale=0.1, empty_share=0.0, samples=2, workers=1))
     labels = read_table(out, "/cf1/labels")["peers"].to_pylist()
     assert all(len(peers) == 1 for peers in labels)
+    # The cube's own origin is its corner; the middle of a box is off the labels only then.
+    kept = tmp_path / "origin.mcap"
+    cornered = Settings(3, model=path, model_centre="origin", scale=0.1, empty_share=0.0, samples=2)
+    run(kept, cornered)
+    for recording, least, most in ((out, 0, 15), (kept, 5, 400)):
+        for (peer,) in read_table(recording, "/cf1/labels")["peers"].to_pylist():
+            left, top, right, bottom = peer["box_px"]
+            away = np.hypot((left + right) / 2 - peer["u_px"], (top + bottom) / 2 - peer["v_px"])
+            if left > 0 and top > 0 and right < 320 and bottom < 224:
+                assert least <= away * peer["depth_m"] <= most
     with pytest.raises(SettingError, match=r"robots of 100 m.*Change --scale"):
         run(tmp_path / "big.mcap", Settings(images=3, model=path, scale=100.0, workers=1))
     assert not (tmp_path / "big.mcap").exists()

@@ -132,7 +132,7 @@ def test_what_cannot_be_trained_is_said_in_one_line(dataset: Path, tmp_path: Pat
 def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers() -> None:
     assert recipe.load("dmrl_nano", "train", Settings) == Settings()
     published = recipe.load("locanet", "train", Settings)
-    assert published.augmentation.is_nothing
+    assert published.augmentation(0).is_nothing
     assert (published.architecture, published.epochs, published.batch_size) == ("locanet", 15, 5)
     for name in recipe.names():
         if recipe.read(name)["kind"] == "train":

@@ -33,8 +33,8 @@ def drawn(head, arrays):
     return mesh
 
 
-def loaded(path, scale, up):
-    """The user's model, as one mesh about the middle of its bounding box."""
+def loaded(path, scale, up, *, boxed):
+    """The user's model, as one mesh about the middle of its bounding box or the file's origin."""
     meshes = _meshes(path)
     robot = bpy.data.meshes.new("robot")
     corners, faces, indices, start = [], [], [], 0
@@ -53,7 +53,8 @@ def loaded(path, scale, up):
     points = np.concatenate(corners) * scale
     if up == "y":
         points = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
-    points -= (points.min(axis=0) + points.max(axis=0)) / 2
+    if boxed:
+        points -= (points.min(axis=0) + points.max(axis=0)) / 2
     robot.from_pydata(points.tolist(), [], faces)
     robot.polygons.foreach_set("material_index", np.array(indices, np.int32))
     robot.update()

@@ -55,7 +55,12 @@ class Stage:
         if head["model"] is None:
             mesh = drawn(head, arrays)
         else:
-            mesh = loaded(Path(head["model"]), head["model_scale"], head["model_up"])
+            mesh = loaded(
+                Path(head["model"]),
+                head["model_scale"],
+                head["model_up"],
+                boxed=head["model_centre"] == "box",
+            )
         self.robot = self.add("robot", mesh)
         # A mesh that two objects share is kept as it is; that of one alone would be moved to
         # its place, and its tree of triangles built anew, whenever robot or sun change.
@@ -101,6 +106,7 @@ class Stage:
         self.sun.data.energy = head["sun_strength"]
         self.sun.data.color = head["sun_colour"]
         self.sun.data.angle = head["sun_angle_rad"]
+        self.sun.data.use_shadow = head["sun_shadow"]
         self.sun.matrix_world = Matrix(head["sun_matrix"])
         for name, value in head["paint"].items():
             self.robot[name] = value
