@@ -1,7 +1,7 @@
 """``dmrl label``: where every robot's peers are, from ranges and odometry, as labels."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,11 +10,11 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.errors import MissingExtra, RecordingError, SettingError
+from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.formats.camera_toml import read_camera
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
-from dmrl.recording import provenance, rewrite, summary
+from dmrl.recording import Summary, provenance, rewrite, summary
 from dmrl.tables import print_json, print_table
 
 try:
@@ -24,7 +24,14 @@ try:
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import read_logs
     from dmrl.labelling.report import PairReport, pair_report
-    from dmrl.labelling.write import image_times, label_messages, position_messages
+    from dmrl.labelling.sight import read_sight
+    from dmrl.labelling.sighted import sighted
+    from dmrl.labelling.write import (
+        camera_of,
+        image_times,
+        label_messages,
+        position_messages,
+    )
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl label") from e
 
@@ -53,6 +60,11 @@ class Settings:
         those that are OK is bad.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
+    detections
+        Correct bearings by the detections that are in the recording, of a network that learned
+        from such labels.
+    pixel_std_px
+        Error of such a detection in u and in v, pixels.
     range_offset_m
         Known offset of every range, subtracted first: an antenna delay, 0.35 m for some.
     undistorted
@@ -65,6 +77,8 @@ class Settings:
     preset: Literal["published-sim", "published-firmware"] = "published-sim"
     gate_m: Positive = GATE_M
     attitude_std_rad: Positive = 0.015
+    detections: bool = False
+    pixel_std_px: Positive = 6.0
     range_offset_m: float = 0.0
     undistorted: bool = False
     camera: dict[str, Path] = field(default_factory=dict)
@@ -118,6 +132,8 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
         pair: _positions(logs.start_ns, _oriented(logs.pairs, pair), estimate, exposures[pair[0]])
         for pair, estimate in estimates.items()
     }
+    if settings.detections:
+        _correct(recording, held, positions, look, settings.pixel_std_px)
     reports = [
         pair_report(recording, held, pair, positions[pair], estimates[pair]) for pair in positions
     ]
@@ -134,6 +150,25 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     rewrite(recording, out, origin, without=replaced, fresh=fresh)
     return Result(reports, labels, logs.warnings)
+
+
+def _correct(
+    recording: Path, held: Summary, positions: dict[Names, Positions], look: Look, std_px: float
+) -> None:
+    """Put into the positions what their observers' cameras detected."""
+    robots = topics.robots(list(held.topics), topics.DETECTIONS)
+    if not robots:
+        raise MissingTopic(topics.detections("*"), held.topics, recording)
+    for robot in robots:
+        camera = look.cameras.get(robot) or camera_of(recording, held, robot)
+        if camera is None:
+            raise MissingTopic(topics.calibration(robot), held.topics, recording)
+        if not look.distorted:
+            camera = replace(camera, distortion=())
+        sight = read_sight(recording, held, robot, camera, None)
+        for pair in (pair for pair in positions if pair[0] == robot):
+            positions[pair], used = sighted(sight, positions[pair], std_px)
+            say(f"{' -> '.join(pair)}: {used} detections in {len(sight.time_ns)} images counted")
 
 
 def _oriented(pairs: Mapping[Names, Pair], pair: Names) -> Pair:

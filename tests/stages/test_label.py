@@ -1,12 +1,14 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dmrl.errors import OutputError, RecordingError
+from dmrl import topics
+from dmrl.errors import MissingTopic, OutputError, RecordingError
 from dmrl.geometry import pixels_from_horizontal
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
@@ -119,6 +121,44 @@ def test_labels_are_projections_of_the_positions(labelled: Path) -> None:
                 assert peer.depth_m == pytest.approx(depth_m[0])
                 seen += 1
     assert seen > 5
+
+
+def off_px(recording: Path) -> float:
+    """Root mean square distance of the labels that are OK from the true ones."""
+    off = []
+    for stamped in read(recording, "/cf1/labels"):
+        by_source = {peer.source: peer for peer in stamped.message.peers}
+        one, true = by_source.get("estimate"), by_source.get("truth")
+        if one and true and one.status == STATUS_OK:
+            off.append((one.u_px - true.u_px, one.v_px - true.v_px))
+    return float(np.sqrt(np.mean(np.square(off).sum(axis=1))))
+
+
+def test_what_a_network_saw_makes_labels_better(
+    flight: Path, labelled: Path, tmp_path: Path
+) -> None:
+    seen, rng = tmp_path / "seen.mcap", np.random.default_rng(0)
+    with RecordingWriter(seen, Provenance("test")) as sink:
+        for stamped in read(flight):
+            sink.write(stamped.time_ns, stamped.topic, stamped.message)
+            if stamped.topic != topics.labels("cf1"):
+                continue
+            found = [
+                {
+                    "u_px": peer.u_px + 4 * rng.standard_normal(),
+                    "v_px": peer.v_px + 4 * rng.standard_normal(),
+                    "depth_m": peer.depth_m * np.exp(0.2 * rng.standard_normal()),
+                    "confidence": 0.9,
+                }
+                for peer in stamped.message.peers
+            ]
+            made = message("Detections")(detections=found, threshold=0.33)
+            sink.write(stamped.time_ns, topics.detections("cf1"), made)
+    label.run(seen, tmp_path / "refined.mcap", replace(LENIENT, detections=True))
+    assert off_px(tmp_path / "refined.mcap") < 0.6 * off_px(labelled)
+    with pytest.raises(MissingTopic, match="no topic /\\*/detections"):
+        label.run(flight, tmp_path / "none.mcap", replace(LENIENT, detections=True))
+    assert not (tmp_path / "none.mcap").exists()
 
 
 def test_labelling_again_changes_no_position(labelled: Path, tmp_path: Path) -> None:
