@@ -1,0 +1,154 @@
+"""How like the published images renders are that stand at the same poses.
+
+    python benchmarks/bench_likeness.py DATA/locanet-synthetic --model crazyflie-published.blend
+        [--images 60] [--plot OUT.png]
+
+Every published image says where its drone is and how it is turned. The drone is taken out of the
+picture (OpenCV's inpainting), rendered again in its place, and compared: mean absolute difference
+of luma and of both colour channels, of 256 levels, where the drone is. The rest of the difference
+is what inpainting got wrong behind a drone's gaps, so each row is one thing changed.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.formats.locanet import LocanetImage, read
+from dmrl.geometry import PUBLISHED_RENDER, Array
+from dmrl.images import Rgb, decode, encode_jpeg
+from dmrl.progress import say
+from dmrl.rendering.backdrops import LIGHT_OF
+from dmrl.rendering.environment import ensure
+from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.shot import Light, Look, Robot, Shot
+from dmrl.rendering.sketch import Pose
+from dmrl.tables import print_table
+
+SCALE = 0.002
+YAW_OF_MODEL_RAD = np.radians(270.0)  # dmrl's x is forward, the authors' model looks aside
+LUMA = np.array([[0.299, 0.587, 0.114], [-0.1687, -0.3313, 0.5], [0.5, -0.4187, -0.0813]])
+AROUND_PX = 3
+LIGHT = Light("", (0.0, 0.0, 0.0), 0.12, np.array([-1.0, 0, 0]), 1.7, (1.0, 1.0, 1.0), 0.19, False)
+LOOK = Look(np.zeros((224, 320, 3), np.float32), LIGHT, Sensor(brightness=None), robot_blur_px=0.45)
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One way to render: its name, how the model is used, the light, and the look."""
+
+    name: str
+    model: Model
+    light: Light = LIGHT
+    blur_px: float = 0.45
+
+
+def variants(path: Path) -> list[Variant]:
+    """As the preset has it, and with one thing changed."""
+    model = Model(path, SCALE, "y", "origin")
+    scene = replace(LIGHT, sun_camera=np.array([0.3, 0.3, 0.9]), sun_shadow=True)
+    return [
+        Variant("as published", model),
+        Variant("about the middle of its box", replace(model, centre="box")),
+        Variant("5 % smaller", replace(model, scale=0.95 * SCALE)),
+        Variant("5 % larger", replace(model, scale=1.05 * SCALE)),
+        Variant("with shadows", model, replace(LIGHT, sun_shadow=True)),
+        Variant("lit from above, with shadows", model, scene),
+        Variant("not blurred", model, blur_px=0.0),
+        Variant("blurred by 0.8 px", model, blur_px=0.8),
+    ]
+
+
+def turned(axis: int, angle_rad: float) -> Array:
+    """(3, 3) rotation about x, y or z."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    matrix = np.eye(3)
+    one, other = (axis + 1) % 3, (axis + 2) % 3
+    matrix[[one, other, one, other], [one, other, other, one]] = c, c, -s, s
+    return matrix
+
+
+def robot_of(item: LocanetImage) -> Robot:
+    """The drone of a published image."""
+    tilt = turned(0, item.roll_rad) @ turned(1, item.pitch_rad)
+    roll, pitch, yaw = item.attitude_rad[0]
+    body = turned(0, roll) @ turned(2, yaw) @ turned(1, pitch) @ turned(2, YAW_OF_MODEL_RAD)
+    return Robot(Pose(item.xyz_camera[0], tilt.T @ body))
+
+
+def covered(shot: Shot) -> NDArray[np.uint8]:
+    """(H, W) 1 where a drone is, and a little around it."""
+    size = 2 * AROUND_PX + 1
+    there = (shot.opacity[0] > 0).astype(np.uint8)
+    return np.asarray(cv2.dilate(there, np.ones((size, size), np.uint8)), np.uint8)
+
+
+def shots(
+    items: list[LocanetImage], pictures: list[Rgb], variant: Variant, masks: list[NDArray[np.uint8]]
+) -> Iterator[Shot]:
+    """Every drone rendered again, over its picture without it."""
+    with Renderer(ensure(say), variant.model, samples=16) as renderer:
+        light = replace(variant.light, name=renderer.lights[0])
+        look = replace(LOOK, light=light, robot_blur_px=variant.blur_px)
+        backs = (
+            LIGHT_OF[cv2.inpaint(rgb, mask, 3, cv2.INPAINT_TELEA)] if len(masks) else look.backdrop
+            for rgb, mask in zip(pictures, masks or pictures, strict=True)
+        )
+        scenes = zip(items, backs, strict=True)
+        yield from renderer.shots(
+            (PUBLISHED_RENDER, [robot_of(item)], replace(look, backdrop=back))
+            for item, back in scenes
+        )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--images", type=int, default=60)
+    parser.add_argument("--plot", type=Path)
+    args = parser.parse_args()
+    items = [item for item in read(args.data) if item.split == "train"]
+    chosen = np.random.default_rng(0).permutation(len(items))[: args.images]
+    items = [items[k] for k in chosen]
+    pictures = [decode(item.path.read_bytes(), item.path) for item in items]
+    ways = variants(args.model)
+    masks = [covered(shot) for shot in shots(items, pictures, ways[0], [])]
+    rows, shown = [], []
+    for way in ways:
+        off = []
+        for rgb, mask, shot in zip(
+            pictures, masks, shots(items, pictures, way, masks), strict=True
+        ):
+            again = decode(encode_jpeg(shot.rgb, 90, subsampled=True), "render")
+            difference = (again.astype(float) - rgb) @ LUMA.T
+            off.append(np.abs(difference)[mask > 0].mean(axis=0))
+            if way is ways[0]:
+                shown.append((rgb, again, mask))
+        means = [round(float(value), 2) for value in np.mean(off, axis=0)]
+        rows.append((way.name, means[0], means[1], means[2]))
+    print_table(f"{len(items)} images", ("rendered", "luma", "blue", "red"), rows)
+    if args.plot:
+        args.plot.write_bytes(sheet(shown))
+
+
+def sheet(shown: list[tuple[Rgb, Rgb, NDArray[np.uint8]]], columns: int = 6) -> bytes:
+    """Published beside rendered, around the drone."""
+    tiles = []
+    for rgb, again, mask in shown[: 4 * columns]:
+        left, top, width, height = cv2.boundingRect(mask)
+        part = np.s_[top : top + height, left : left + width]
+        both = (cv2.resize(one[part], (150, 110), interpolation=0) for one in (rgb, again))
+        tiles.append(np.hstack(list(both)))
+    lines = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
+    return encode_jpeg(np.vstack(lines), 90)
+
+
+if __name__ == "__main__":
+    main()
