@@ -1,0 +1,21 @@
+"""Figures of datasets and evaluations, as PNG and SVG. The only home of matplotlib."""
+
+from dmrl.plots.datasets import depth_histogram, peers_per_image, position_heat
+from dmrl.plots.errors import error_by_distance, error_trace, error_violins, trade_offs
+from dmrl.plots.pictures import Example, MapPair, examples, map_pairs
+from dmrl.plots.style import save
+
+__all__ = [
+    "Example",
+    "MapPair",
+    "depth_histogram",
+    "error_by_distance",
+    "error_trace",
+    "error_violins",
+    "examples",
+    "map_pairs",
+    "peers_per_image",
+    "position_heat",
+    "save",
+    "trade_offs",
+]

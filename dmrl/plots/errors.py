@@ -1,0 +1,199 @@
+"""Figures of errors: their spread, over time, over distance, against what they cost."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, mpl, save
+
+
+def error_violins(
+    u_px: NDArray[np.float64], v_px: NDArray[np.float64], depth_m: NDArray[np.float64], stem: Path
+) -> None:
+    """Violins of the errors in u, v and depth, as in the paper.
+
+    Parameters
+    ----------
+    u_px, v_px, depth_m
+        (N,) label minus detection; NaN where there was no detection.
+    stem
+        Path without suffix.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(SIZE_INCHES, layout="constrained")
+        pixels, metres = figure.subplots(1, 2, width_ratios=(2, 1))
+        _violins(pixels, {"u": u_px, "v": v_px}, 24.0)
+        pixels.set(ylabel="pixel error, px", title=f"{len(u_px)} labels")
+        _violins(metres, {"depth": depth_m}, 0.6)
+        metres.set(ylabel="depth error, m")
+        figure.supxlabel("label minus detection; line: median, bar: middle half", fontsize=9)
+    save(figure, stem)
+
+
+def _violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float) -> None:
+    """One violin per name, over what lies within the axis; the rest is counted."""
+    known = {name: values[np.isfinite(values)] for name, values in errors.items()}
+    spread = [np.percentile(np.abs(values), 80) for values in known.values() if values.size]
+    limit = max([least, *spread])
+    labels = []
+    for place, (name, values) in enumerate(known.items(), start=1):
+        near = values[np.abs(values) <= limit]
+        if np.ptp(near) if near.size else False:
+            axes.violinplot(near, [place], widths=0.8, showextrema=False)
+        if values.size:
+            low, middle, high = np.percentile(values, (25, 50, 75))
+            axes.vlines(place, low, high, color="black", linewidth=4)
+            axes.hlines(middle, place - 0.15, place + 0.15, color="black")
+        labels.append(f"{name}\n{values.size - near.size} outside")
+    axes.axhline(0, color="grey", linewidth=0.8)
+    axes.set(xticks=range(1, len(known) + 1), xticklabels=labels, ylim=(-limit, limit))
+    axes.set_xlim(0.4, len(known) + 0.6)
+    axes.grid(axis="y", alpha=0.3)
+
+
+def error_trace(
+    title: str,
+    time_s: NDArray[np.float64],
+    sigma_m: NDArray[np.float64],
+    errors_m: Mapping[str, NDArray[np.float64]],
+    stem: Path,
+) -> None:
+    """Errors of positions over time, one axis above the other, with their 3-sigma bands.
+
+    Parameters
+    ----------
+    title
+        Words above it.
+    time_s
+        (N,) seconds.
+    sigma_m
+        (N, A) standard deviations, as the estimator has them.
+    errors_m
+        (N, A) errors by what made them, NaN where there are none; the last in black, on top.
+    stem
+        Path without suffix.
+    """
+    colours = ["tab:red", "black"][-len(errors_m) :]
+    with mpl.rc_context(STYLE):
+        figure = Figure((SIZE_INCHES[0], 2.2 * sigma_m.shape[1]), layout="constrained")
+        rows: Any = figure.subplots(sigma_m.shape[1], 1, sharex=True, sharey=True)
+        for k, axes in enumerate(rows):
+            band = 3 * sigma_m[:, k]
+            axes.fill_between(time_s, -band, band, alpha=0.25, linewidth=0, label="3 sigma")
+            for (word, error_m), colour in zip(errors_m.items(), colours, strict=True):
+                axes.plot(time_s, error_m[:, k], ".", color=colour, markersize=2, label=word)
+            axes.axhline(0, color="grey", linewidth=0.8)
+            axes.grid(alpha=0.3)
+            axes.set_ylabel(f"error in {'xyz'[k]}, m")
+        # Far errors and wide bands at the start would flatten the rest.
+        sizes = np.abs(np.concatenate([error.ravel() for error in errors_m.values()]))
+        limit = np.percentile(sizes[np.isfinite(sizes)], 99) if np.isfinite(sizes).any() else 0.0
+        axes.set_ylim(-1.2 * max(0.3, float(limit)), 1.2 * max(0.3, float(limit)))
+        axes.set_xlabel("time, s")
+        figure.axes[0].set_title(title)
+        figure.axes[0].legend(loc="upper right", fontsize=8, markerscale=4)
+    save(figure, stem)
+
+
+def error_by_distance(
+    distance_m: NDArray[np.float64],
+    error_px: NDArray[np.float64],
+    depth_error_m: NDArray[np.float64],
+    stem: Path,
+    *,
+    step_m: float = 0.25,
+) -> None:
+    """Pixel and depth error of every label over its distance, with medians.
+
+    Parameters
+    ----------
+    distance_m
+        (N,) depth of the label, metres.
+    error_px
+        (N,) length of the pixel error; not finite where there was no detection.
+    depth_error_m
+        (N,) label minus detection, metres.
+    stem
+        Path without suffix.
+    step_m
+        Range of distance that one median is taken over.
+    """
+    found = np.isfinite(error_px)
+    with mpl.rc_context(STYLE):
+        figure = Figure((SIZE_INCHES[0], 5.0), layout="constrained")
+        pixels, metres = figure.subplots(2, 1, sharex=True)
+        # Below a tenth of a pixel a logarithmic axis would show nothing but noise.
+        shown_px = np.maximum(error_px[found], 0.1)
+        for axes, values in ((pixels, shown_px), (metres, depth_error_m[found])):
+            axes.plot(distance_m[found], values, ".", alpha=0.5, label="label")
+            edges, medians = _medians(distance_m[found], values, step_m)
+            axes.stairs(medians, edges, color="black", baseline=None, linewidth=2, label="median")
+            axes.grid(alpha=0.3)
+        pixels.set(yscale="log", ylabel="pixel error, px", title=f"{found.sum()} labels")
+        for radius_px in (8, 20):
+            pixels.axhline(radius_px, color="grey", linestyle=":", linewidth=1)
+            pixels.annotate(
+                f"{radius_px} px", (1, radius_px), xycoords=("axes fraction", "data"), fontsize=8
+            )
+        metres.axhline(0, color="grey", linewidth=0.8)
+        metres.set(ylabel="depth error, m\n(label minus detection)", xlabel="depth of the label, m")
+        metres.set_xlim(left=0)
+        metres.legend(loc="best", fontsize=9)
+    save(figure, stem)
+
+
+def _medians(
+    at: NDArray[np.float64], values: NDArray[np.float64], step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Edges of equal steps from zero, and the median in each; NaN where there is none."""
+    edges = np.arange(0.0, at.max(initial=step) + step, step)
+    place = np.digitize(at, edges) - 1
+    medians = [
+        np.median(values[place == k]) if (place == k).any() else np.nan
+        for k in range(len(edges) - 1)
+    ]
+    return edges, np.array(medians)
+
+
+def trade_offs(
+    costs: Mapping[str, Sequence[float]],
+    gains: Sequence[float],
+    names: Sequence[str],
+    gain: str,
+    stem: Path,
+) -> None:
+    """A gain against each of several costs, one marker per name, the same in all.
+
+    Parameters
+    ----------
+    costs
+        Words of an axis to a value per name.
+    gains
+        A value per name.
+    names
+        What was measured.
+    gain
+        Words of the axis up.
+    stem
+        Path without suffix.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure((4.0 * len(costs), 4.2), layout="constrained")
+        for axes, (words, values) in zip(
+            figure.subplots(1, len(costs), sharey=True, squeeze=False)[0],
+            costs.items(),
+            strict=True,
+        ):
+            for place, name in enumerate(names):
+                axes.plot(
+                    values[place], gains[place], "osD^vP*X"[place % 8], markersize=8, label=name
+                )
+            axes.set(xlabel=words, xlim=(0, 1.08 * max(values)))
+            axes.grid(alpha=0.3)
+        figure.axes[0].set_ylabel(gain)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    save(figure, stem)

@@ -1,0 +1,149 @@
+"""Figures of images: with labels and detections, with the maps of networks."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.colours import RGB
+from dmrl.plots.style import STYLE, Figure, mpl, save
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """One image with its labels and what the network made of it.
+
+    Parameters
+    ----------
+    title
+        Line above it.
+    rgb
+        (H, W, 3) uint8.
+    confidence, depth_m
+        (rows, cols) of the network.
+    labels_px, detections_px
+        (N, 2) pixels, u right and v down.
+    source
+        Source of the labels.
+    """
+
+    title: str
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float64]
+    depth_m: NDArray[np.float64]
+    labels_px: NDArray[np.float64]
+    detections_px: NDArray[np.float64]
+    source: str
+
+
+def examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) -> None:
+    """A row per example: image with labels and detections, confidence map, depth map.
+
+    Parameters
+    ----------
+    shown
+        At least one.
+    stem
+        Path without suffix.
+    depth_max_m
+        Depth of the last colour, metres.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure((10.5, 2.6 * len(shown) + 0.6), layout="constrained")
+        grid = figure.subplots(len(shown), 3, squeeze=False)
+        maps: list[Any] = []
+        for row, example in zip(grid, shown, strict=True):
+            height, width = example.rgb.shape[:2]
+            at = {"extent": (0, width, height, 0)}  # pixel-edge coordinates
+            row[0].imshow(example.rgb, **at)
+            row[0].set_title(example.title, fontsize=9, loc="left")
+            maps = [
+                row[1].imshow(example.confidence, vmin=0, vmax=1, cmap="inferno", **at),
+                row[2].imshow(example.depth_m, vmin=0, vmax=depth_max_m, cmap="turbo", **at),
+            ]
+            for axes in row:
+                _mark(axes, example)
+                axes.set(xticks=[], yticks=[])
+        for column, (image, name) in enumerate(
+            zip(maps, ("confidence", "depth, m"), strict=True), start=1
+        ):
+            figure.colorbar(image, ax=grid[:, column], location="bottom", shrink=0.8, label=name)
+        handles, names = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower left", ncols=2, frameon=False)
+    save(figure, stem)
+
+
+def _mark(axes: Any, example: Example) -> None:
+    """Labels as squares, detections as crosses, in their colours with a dark rim."""
+    marks = (
+        (example.labels_px, "s", 9, example.source, f"label ({example.source})"),
+        (example.detections_px, "x", 6, "detection", "detection"),
+    )
+    for uv_px, marker, points, kind, name in marks:
+        colour = tuple(value / 255 for value in RGB.get(kind, RGB["other"]))
+        for edge, ink, words in ((2.6, "black", None), (1.3, colour, name)):
+            axes.plot(
+                *uv_px.reshape(-1, 2).T,
+                marker,
+                markersize=points,
+                markerfacecolor="none",
+                markeredgecolor=ink,
+                markeredgewidth=edge,
+                label=words,
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class MapPair:
+    """One image, and the maps of two networks.
+
+    Parameters
+    ----------
+    title
+        Line above it.
+    rgb
+        (H, W, 3) uint8.
+    maps
+        What computed them, to its (rows, cols) confidence and depth; two of them.
+    """
+
+    title: str
+    rgb: NDArray[np.uint8]
+    maps: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
+    """A row per image: the image, then confidence and depth, each by one and by the other.
+
+    Colours run from 0 to the largest value of a column's pair over all rows.
+
+    Parameters
+    ----------
+    shown
+        At least one, all computed by the same two.
+    stem
+        Path without suffix.
+    """
+    names = list(shown[0].maps)
+    words = ("confidence", "depth, m")
+    with mpl.rc_context(STYLE):
+        figure = Figure((13.0, 2.1 * len(shown) + 1.1), layout="constrained")
+        figure.get_layout_engine().set(h_pad=0.12)  # type: ignore[call-arg, union-attr]
+        grid = figure.subplots(len(shown), 5, squeeze=False)
+        for channel, (name, colours) in enumerate(zip(words, ("inferno", "turbo"), strict=True)):
+            columns = slice(1 + 2 * channel, 3 + 2 * channel)
+            most = max(pair.maps[who][channel].max() for pair in shown for who in names)
+            for row, pair in zip(grid, shown, strict=True):
+                for axes, who in zip(row[columns], names, strict=True):
+                    drawn = axes.imshow(pair.maps[who][channel], vmin=0, vmax=most, cmap=colours)
+                    axes.set_title(who, fontsize=9)
+            figure.colorbar(drawn, ax=grid[:, columns], location="bottom", shrink=0.6, label=name)
+        for row, pair in zip(grid, shown, strict=True):
+            row[0].imshow(pair.rgb)
+            row[0].set_title(pair.title, fontsize=9)
+            for axes in row:
+                axes.set(xticks=[], yticks=[])
+    save(figure, stem)
