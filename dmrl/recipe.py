@@ -1,7 +1,8 @@
 """Recipes: TOML files that describe a run, checked before anything is done.
 
 A recipe of one stage holds ``kind`` and that stage's settings. A pipeline holds ``[[step]]``
-tables, each a stage with its inputs, output and settings, run in order. A recipe with
+tables, each a stage with its inputs, output and settings, run in order; one with ``each`` stands
+for several. A recipe with
 faults is refused whole, every fault named.
 """
 
@@ -20,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from dmrl.errors import RecipeError
 
 Settings = TypeVar("Settings")
+EACH = "{each}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,13 +150,17 @@ def load_pipeline(
     steps = keys.get("step")
     if not isinstance(steps, list) or not steps:
         raise _faulty(name, [*faults, "step: at least one [[step]] is required"])
-    steps = [_with_recipe(step) for step in steps]
-    for k, step in enumerate(steps):
-        faults += [f"step.{k + 1}.{fault}" for fault in _step_faults(step, stages, schema_of)]
+    numbered = [
+        (number, _with_recipe(one))
+        for number, step in enumerate(steps, start=1)
+        for one in _repeated(step)
+    ]
+    for number, step in numbered:
+        faults += [f"step.{number}.{fault}" for fault in _step_faults(step, stages, schema_of)]
     if faults:
-        raise _faulty(name, faults)
+        raise _faulty(name, dict.fromkeys(faults))
     return Pipeline(
-        tuple(Step(**{**step, "inputs": tuple(step.get("inputs", ()))}) for step in steps),
+        tuple(Step(**{**step, "inputs": tuple(step.get("inputs", ()))}) for _, step in numbered),
         content,
     )
 
@@ -193,6 +199,38 @@ def _faulty(name: str | Path, faults: Iterable[str]) -> RecipeError:
     lines = list(faults)
     keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
     return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Mend them all")
+
+
+def _repeated(step: Any) -> list[Any]:
+    """The steps that one with ``each = [1, 2, ...]`` stands for.
+
+    Where ``{each}`` is in the output there is a step for each number, and a setting that is
+    "{each}" is that number. Where it is in inputs alone, there is an input for each.
+    """
+    match step:
+        case {"each": [_, *_] as numbers, "out": str(out), **others}:
+            if EACH in out:
+                return [_numbered({"out": out, **others}, number) for number in numbers]
+            names: Any = others.get("inputs", [])
+            inputs = [
+                _numbered(name, number)
+                for name in names
+                for number in (numbers if EACH in str(name) else numbers[:1])
+            ]
+            return [{"out": out, **others, "inputs": inputs}]
+    return [step]
+
+
+def _numbered(value: Any, number: Any) -> Any:
+    """A value of a step with a number for every ``{each}``."""
+    match value:
+        case str():
+            return number if value == EACH else value.replace(EACH, str(number))
+        case list():
+            return [_numbered(one, number) for one in value]
+        case dict():
+            return {key: _numbered(one, number) for key, one in value.items()}
+    return value
 
 
 def _with_recipe(step: Any) -> Any:

@@ -173,6 +173,35 @@ def test_a_pipeline_is_its_steps_in_order_and_its_text(write: Write) -> None:
     assert found.needs_data
 
 
+def test_a_step_with_each_stands_for_several(write: Write) -> None:
+    text = """
+kind = "pipeline"
+
+[[step]]
+stage = "draw"
+each = [3, 5]
+out = "drawn-{each}"
+inputs = ["{data}/{each}"]
+settings = { images = "{each}", folder = "in-{each}" }
+
+[[step]]
+stage = "draw"
+each = [3, 5]
+out = "all"
+inputs = ["first", "drawn-{each}"]
+"""
+    steps = recipe.load_pipeline(write(text), SCHEMAS, SCHEMAS.__getitem__).steps
+    assert [(step.out, step.inputs) for step in steps] == [
+        ("drawn-3", ("{data}/3",)),
+        ("drawn-5", ("{data}/5",)),
+        ("all", ("first", "drawn-3", "drawn-5")),
+    ]
+    assert steps[1].settings == {"images": 5, "folder": "in-5"}
+    with pytest.raises(RecipeError, match=r"step.2.each: extra inputs"):
+        broken = text.replace('each = [3, 5]\nout = "all"', 'each = []\nout = "all"')
+        recipe.load_pipeline(write(broken), SCHEMAS, SCHEMAS.__getitem__)
+
+
 def test_every_fault_of_a_pipeline_is_named_with_its_step(write: Write) -> None:
     text = PIPELINE.replace("images = 3", "imagse = 3").replace('robot = "cf1"', "robot = 1")
     with pytest.raises(RecipeError) as caught:
