@@ -221,9 +221,9 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
     name = world.lights[int(rng.integers(len(world.lights)))]
     turn = (*tilt_rad, float(rng.uniform(-np.pi, np.pi)))
     zoom = _between(rng, settings.background_zoom)
+    pasted = settings.pasted and world.photos is not None
     if world.photos is not None:
-        averaged = not settings.pasted
-        backdrop = world.photos.backdrop(rng, world.camera, zoom, averaged=averaged)
+        backdrop = world.photos.backdrop(rng, world.camera, zoom, averaged=not pasted)
         if settings.recoloured_share and rng.random() < settings.recoloured_share:
             backdrop = backdrop[..., rng.permutation(3)]
     else:
@@ -233,16 +233,22 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
     shake *= np.radians(settings.shake_max_dps) * rng.random() / np.linalg.norm(shake)
     backdrop = smeared(backdrop, (shake * shutter_s * world.camera.fx_px).tolist())
     gain = _factor(rng, settings.robot_gain)
-    if not settings.pasted:
+    if not pasted:
         backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
         gain *= float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
-    light, sensor = _light(settings, rng, name, turn), random_sensor(settings, rng)
+    light = _light(settings, rng, name, turn, pasted=pasted)
+    sensor = random_sensor(settings, rng, exposed=not pasted)
     return Look(backdrop, light, sensor, gain, _between(rng, settings.robot_blur_px), seed)
 
 
 def _light(
-    settings: Settings, rng: Generator, name: str, turn: tuple[float, float, float]
+    settings: Settings,
+    rng: Generator,
+    name: str,
+    turn: tuple[float, float, float],
+    *,
+    pasted: bool,
 ) -> Light:
     towards = rng.normal((0.0, 0.0, 1.2), 1.0)
     towards = camera_from_horizontal(*turn[:2]) @ (towards / np.linalg.norm(towards))
@@ -251,19 +257,19 @@ def _light(
         name=name,
         turn_rad=turn,
         strength=_between(rng, settings.light_strength),
-        sun_camera=BEHIND_THE_CAMERA if settings.pasted else towards,
+        sun_camera=BEHIND_THE_CAMERA if pasted else towards,
         sun_strength=_between(rng, settings.sun_strength),
-        sun_colour=(1.0, 1.0, 1.0) if settings.pasted else (1 + warm, 1.0, 1 - warm),
+        sun_colour=(1.0, 1.0, 1.0) if pasted else (1 + warm, 1.0, 1 - warm),
         sun_angle_rad=_between(rng, (0.01, 0.6)),
-        sun_shadow=not settings.pasted,
+        sun_shadow=not pasted,
     )
 
 
-def random_sensor(settings: Settings, rng: Generator) -> Sensor:
-    """A camera's response, from the ranges of the settings."""
+def random_sensor(settings: Settings, rng: Generator, *, exposed: bool = True) -> Sensor:
+    """A camera's response, from the ranges of the settings; its exposure fixed or as they say."""
     warmth = _factor(rng, settings.warmth) ** 0.5
     return Sensor(
-        brightness=None if settings.pasted else _between(rng, settings.brightness),
+        brightness=_between(rng, settings.brightness) if exposed else None,
         contrast_gamma=_between(rng, settings.contrast_gamma),
         balance=(warmth, 1.0, 1 / warmth),
         saturation=_between(rng, settings.saturation),

@@ -125,7 +125,8 @@ class Settings:
         pixel filter does to what it lays over a photo.
     pasted
         Whether robots are laid over photos as the authors did: the photo keeps its values, and
-        the robots are lit by a lamp at the camera that knows nothing of the photo.
+        the robots are lit by a lamp at the camera that knows nothing of the photo. Without
+        photos, no.
     background_zoom
         Range of how far photos are zoomed into.
     recoloured_share

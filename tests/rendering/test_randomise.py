@@ -1,6 +1,8 @@
 """Looks drawn at random."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +36,9 @@ def world(settings: Settings, folder: Path) -> World:
 
 
 def test_what_is_pasted_leaves_the_photo_as_it_is(tmp_path: Path) -> None:
-    keys = {k: tuple(v) if isinstance(v, list) else v for k, v in PRESETS["published"].items()}
+    keys: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in PRESETS["published"].items()
+    }
     settings = Settings(**keys)
     scene = draw_scene(world(settings, tmp_path), 0)
     rgb = expose(scene.look.backdrop, scene.look.sensor, np.random.default_rng(0))
@@ -42,6 +46,14 @@ def test_what_is_pasted_leaves_the_photo_as_it_is(tmp_path: Path) -> None:
     assert scene.look.robot_gain == 1
     assert scene.look.light.sun_camera.tolist() == [-1, 0, 0]
     assert not scene.look.light.sun_shadow
+
+
+def test_without_photos_nothing_is_pasted(tmp_path: Path) -> None:
+    bright = np.full((8, 16, 3), 5, np.float32)
+    scenes = replace(world(Settings(pasted=True), tmp_path), photos=None, panorama=lambda _: bright)
+    look = draw_scene(scenes, 0).look
+    assert look.sensor.brightness is not None
+    assert look.light.sun_shadow
 
 
 def test_colours_of_a_photo_are_exchanged(tmp_path: Path) -> None:
