@@ -32,7 +32,14 @@ def test_two_robots_are_not_painted_alike() -> None:
 def world(settings: Settings, folder: Path) -> World:
     photo = np.full((224, 320, 3), (200, 100, 50), np.uint8)
     (folder / "photo.png").write_bytes(encode_png(photo))
-    return World(settings, PUBLISHED_RENDER, 0.1, ("sky",), lambda _: photo, Photos(folder))
+    return World(
+        settings,
+        PUBLISHED_RENDER,
+        0.1,
+        ("sky",),
+        lambda _: np.ones((8, 16, 3), np.float32),
+        Photos(folder),
+    )
 
 
 def test_what_is_pasted_leaves_the_photo_as_it_is(tmp_path: Path) -> None:
