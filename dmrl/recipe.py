@@ -2,8 +2,7 @@
 
 A recipe of one stage holds ``kind`` and that stage's settings. A pipeline holds ``[[step]]``
 tables, each a stage with its inputs, output and settings, run in order; one with ``each`` stands
-for several. A recipe with
-faults is refused whole, every fault named.
+for several. A recipe with faults is refused whole, every fault named.
 """
 
 import json
