@@ -246,6 +246,8 @@ def _with_recipe(step: Any) -> Any:
 def _step_faults(
     step: Any, stages: Collection[str], schema_of: Callable[[str], type[Any]]
 ) -> list[str]:
+    if isinstance(step, dict) and "each" in step:  # what could be repeated has it no more
+        return ["each: must be a list of numbers, beside an out"]
     if faults := _faults(step, Step):
         return faults
     if step["stage"] not in stages:

@@ -197,7 +197,7 @@ inputs = ["first", "drawn-{each}"]
         ("all", ("first", "drawn-3", "drawn-5")),
     ]
     assert steps[1].settings == {"images": 5, "folder": "in-5"}
-    with pytest.raises(RecipeError, match=r"step.2.each: extra inputs"):
+    with pytest.raises(RecipeError, match=r"step.2.each: must be a list"):
         broken = text.replace('each = [3, 5]\nout = "all"', 'each = []\nout = "all"')
         recipe.load_pipeline(write(broken), SCHEMAS, SCHEMAS.__getitem__)
 
