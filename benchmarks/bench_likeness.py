@@ -17,9 +17,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dmrl.formats.locanet import LocanetImage, read
-from dmrl.geometry import PUBLISHED_RENDER, Array
+from dmrl.geometry import PUBLISHED_RENDER
 from dmrl.images import Rgb, decode, encode_jpeg
 from dmrl.progress import say
 from dmrl.rendering.backdrops import LIGHT_OF
@@ -64,21 +65,13 @@ def variants(path: Path) -> list[Variant]:
     ]
 
 
-def turned(axis: int, angle_rad: float) -> Array:
-    """(3, 3) rotation about x, y or z."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    matrix = np.eye(3)
-    one, other = (axis + 1) % 3, (axis + 2) % 3
-    matrix[[one, other, one, other], [one, other, other, one]] = c, c, -s, s
-    return matrix
-
-
 def robot_of(item: LocanetImage) -> Robot:
     """The drone of a published image."""
-    tilt = turned(0, item.roll_rad) @ turned(1, item.pitch_rad)
+    tilt = Rotation.from_euler("XY", (item.roll_rad, item.pitch_rad))
     roll, pitch, yaw = item.attitude_rad[0]
-    body = turned(0, roll) @ turned(2, yaw) @ turned(1, pitch) @ turned(2, YAW_OF_MODEL_RAD)
-    return Robot(Pose(item.xyz_camera[0], tilt.T @ body))
+    body = Rotation.from_euler("XZY", (roll, yaw, pitch))
+    turn = tilt.inv() * body * Rotation.from_euler("Z", YAW_OF_MODEL_RAD)
+    return Robot(Pose(item.xyz_camera[0], turn.as_matrix()))
 
 
 def covered(shot: Shot) -> NDArray[np.uint8]:

@@ -154,14 +154,7 @@ SHARES = (
     *("blur_share", "colour", "noise"),
 )
 NOT_NEGATIVE = (
-    *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus"),
-    *(
-        "confidence_weight",
-        "depth_weight",
-        "offset_weight",
-        "rotation_deg",
-        "paste",
-        "plain_epochs",
-        "seed",
-    ),
+    *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
+    *("confidence_weight", "depth_weight", "offset_weight", "rotation_deg", "paste"),
+    "plain_epochs",
 )
