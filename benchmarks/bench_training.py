@@ -26,7 +26,8 @@ from dmrl.learn.batches import Batch, Examples, gathered, order
 from dmrl.learn.depthwise import Depthwise
 from dmrl.learn.fit import new_network
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.step import new_optimizer, train_step
+from dmrl.learn.optimizer import new_optimizer
+from dmrl.learn.step import train_step
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
@@ -74,7 +75,7 @@ def ways(examples: Examples, settings: FitSettings) -> dict[str, Callable[[], ob
     def stepper(change: dict[str, object], batches: Iterator[Batch] | None = None) -> object:
         mine = replace(settings, **change)  # type: ignore[arg-type]
         network = new_network(mine, examples).train()
-        optimizer = new_optimizer(network, mine)
+        optimizer = new_optimizer(network, mine.optimizer, mine.weight_decay)
 
         def step() -> None:
             batch = ready if batches is None else next(batches)

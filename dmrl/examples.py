@@ -1,6 +1,7 @@
 """Datasets to what a training learns from: images with their robots, some of them held out."""
 
 import fnmatch
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from dmrl.dataset import Dataset, Split
 from dmrl.errors import SettingError
-from dmrl.learn.batches import FIELDS, Examples
+from dmrl.learn.batches import BOX, CLASS_ID, FIELDS, Examples
 from dmrl.learn.settings import FitSettings
 
 
@@ -41,12 +42,16 @@ def material(data: Dataset, settings: FitSettings) -> Material:
     DatasetError
         If there is no train split.
     SettingError
-        If the shares do not fit the recordings.
+        If the shares do not fit the recordings, or the classes the peers.
     """
     train = data.split("train")
-    every, sources = examples_of(train), np.array(train.table.column("source").to_pylist())
+    every = examples_of(train, settings.classes)
+    for number, pattern in enumerate(settings.classes):
+        if not (every.robots[..., CLASS_ID] == number).any():
+            raise SettingError(f"classes: no peer in the train split is {pattern} and none before")
+    sources = np.array(train.table.column("source").to_pylist())
     held = np.zeros(len(every), bool)
-    watched = examples_of(data.split("val")) if "val" in data.splits else None
+    watched = examples_of(data.split("val"), settings.classes) if "val" in data.splits else None
     if watched is None and settings.validation_share:
         held = _last_of_each(sources, settings.validation_share)
         watched = every.select(held) if held.any() else None
@@ -91,8 +96,8 @@ def _shares(sources: NDArray[np.str_], wanted: dict[str, float]) -> NDArray[np.f
     return shares
 
 
-def examples_of(split: Split) -> Examples:
-    """Images of a split with the robots in them."""
+def examples_of(split: Split, classes: Sequence[str] = ()) -> Examples:
+    """Images of a split with the robots in them; ``classes`` are patterns of peer names."""
     column = split.table.column("peers").combine_chunks()
     counts = pc.list_value_length(column).to_numpy(zero_copy_only=False).astype(np.int64)
     peers = column.flatten()
@@ -102,9 +107,20 @@ def examples_of(split: Split) -> Examples:
     boxes = pc.struct_field(peers, "box_px")
     boxed = pc.list_value_length(boxes).to_numpy(zero_copy_only=False) == 4
     corners = boxes.filter(pa.array(boxed)).flatten().to_numpy(zero_copy_only=False)
-    flat[boxed, 6:] = corners.reshape(-1, 4)
+    flat[np.ix_(boxed, range(*BOX.indices(len(FIELDS))))] = corners.reshape(-1, 4)
+    flat[:, CLASS_ID] = _class_ids(pc.struct_field(peers, "peer"), classes)
     robots = np.full((len(counts), max(int(counts.max(initial=0)), 1), len(FIELDS)), np.nan)
     image = np.repeat(np.arange(len(counts)), counts)
     place = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
     robots[image, place] = flat
     return Examples(split.pixels, robots.astype(np.float32))
+
+
+def _class_ids(names: pa.Array, classes: Sequence[str]) -> NDArray[np.float32]:
+    """(n,) number of the first pattern that fits a peer's name, NaN where none does."""
+    known = pc.unique(names).to_pylist()
+    place = np.array(pc.index_in(names, pa.array(known)).to_pylist(), np.int64)
+    of_name = np.full(len(known), np.nan, np.float32)
+    for k in reversed(range(len(classes))):
+        of_name[[fnmatch.fnmatchcase(name, classes[k]) for name in known]] = k
+    return of_name[place]

@@ -34,8 +34,8 @@ class Tuning:
     pixel_std_px
         Error of a detection in u and in v.
     depth_std_ratio, depth_bias_ratio, depth_bias_s
-        Error of a detection's depth over the depth: what is new in every image; what stays;
-        for how long it stays.
+        Error of a detection's depth over the depth: what is new in every image, where the
+        detection does not say; what stays; for how long it stays.
     speed_std_mps, acceleration_std_mps2
         How fast a peer is when first seen, and how it changes its velocity (in a second).
     own_velocity_std_mps, yaw_rate_std_radps, attitude_std_rad
@@ -178,26 +178,37 @@ class Tracker:
         ekf.predict(shift)
 
     def _measured(self, track: Track, view: View) -> tuple[Array, Array, Array]:
-        """(3,) expected u, v, log depth; (3, 7) its Jacobian; (3, 3) noise of a detection."""
+        """(3,) expected u, v, log depth; (3, 7) its Jacobian; (3, 3) noise but for the depth's."""
         t = self.tuning
         attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
         uv, depth_m, by = pixels_from_horizontal(track.position_m[None], *attitude, self.camera)
         by = by[0] / np.array([[1.0], [1.0], [depth_m[0]]])
         row = np.zeros((3, 7))
         row[:, P], row[2, BIAS] = by[:, :3], 1.0
-        white = np.diag([t.pixel_std_px**2, t.pixel_std_px**2, t.depth_std_ratio**2])
+        white = np.diag([t.pixel_std_px**2, t.pixel_std_px**2, 0.0])
         noise = white + t.attitude_std_rad**2 * by[:, 3:] @ by[:, 3:].T
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.array([*uv[0], np.log(depth_m[0]) + track.filter.x[BIAS]]), row, noise
 
+    def _of_depth(self, view: View) -> Array:
+        """(N, 3, 3) noise of each detection's log depth."""
+        ratio = np.full(len(view.depth_m), self.tuning.depth_std_ratio)
+        if view.sigma_depth_m is not None:
+            known = view.sigma_depth_m > 0
+            ratio[known] = view.sigma_depth_m[known] / view.depth_m[known]
+        noise = np.zeros((len(ratio), 3, 3))
+        noise[:, 2, 2] = ratio**2
+        return noise
+
     def _associate(self, view: View) -> list[int]:
         """Give every track the detection that suits it best; return those nobody took."""
         seen = np.column_stack([view.uv, np.log(view.depth_m)])
+        of_depth = self._of_depth(view)
         expected = [self._measured(track, view) for track in self.tracks]
         gain = np.full((len(self.tracks), len(seen)), -np.inf)
         for k, (track, (mean, row, noise)) in enumerate(zip(self.tracks, expected, strict=True)):
             if np.isfinite(mean).all():
-                spread = row @ track.filter.P @ row.T + noise
+                spread = row @ track.filter.P @ row.T + noise + of_depth
                 gain[k] = self._likelihood(seen - mean, spread)
         free = set(range(len(seen)))
         rows, columns = linear_sum_assignment(np.maximum(gain, -1e6), maximize=True)
@@ -206,7 +217,7 @@ class Tracker:
             mean, row, noise = expected[k]
             if k in taken:
                 free.discard(taken[k])
-                self._update(track, seen[taken[k]], mean, row, noise)
+                self._update(track, seen[taken[k]], mean, row, noise + of_depth[taken[k]])
                 track.score += gain[k, taken[k]]
             elif np.isfinite(mean).all() and self._in_view(mean):
                 track.score += np.log1p(-self.tuning.detection_share)
@@ -214,7 +225,7 @@ class Tracker:
 
     def _likelihood(self, difference: Array, spread: Array) -> Array:
         """(N,) log of how much likelier detections are from a track; -inf outside its gate."""
-        squared = np.einsum("ni,ij,nj->n", difference, np.linalg.inv(spread), difference)
+        squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
         density = -0.5 * (squared + np.linalg.slogdet(2 * np.pi * spread)[1])
         ratio = np.log(self.tuning.detection_share / self._false_density) + density
         return np.where(squared <= self._gate, ratio, -np.inf)
@@ -244,6 +255,7 @@ class Tracker:
         """Start a track at every detection that no track explains."""
         t = self.tuning
         attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
+        of_depth = self._of_depth(view)
         for k in free:
             at = view.uv[k : k + 1], view.depth_m[k : k + 1]
             xyz = horizontal_from_pixels(*at, *attitude, self.camera)[0]
@@ -254,6 +266,7 @@ class Tracker:
             ekf.P[BIAS, BIAS] = t.depth_bias_ratio**2
             track = Track(self._born, ekf)
             _, row, noise = self._measured(track, view)
+            noise += of_depth[k]
             noise[2, 2] += t.depth_bias_ratio**2
             by_pixel = np.linalg.inv(row[:, P])
             ekf.P[P, P] = by_pixel @ noise @ by_pixel.T

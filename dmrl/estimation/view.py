@@ -36,9 +36,12 @@ class View:
         (N,) metres.
     roll_rad, pitch_rad
         Attitude of the observer.
+    sigma_depth_m
+        (N,) standard deviation of the depth, 0 where it is not known. None: nowhere.
     """
 
     uv: Array
     depth_m: Array
     roll_rad: float
     pitch_rad: float
+    sigma_depth_m: Array | None = None

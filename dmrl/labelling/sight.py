@@ -34,7 +34,8 @@ class Sight:
     logged_ns, time_ns
         (K,) log times of the images, and when they were taken.
     detections
-        (M, 3) u and v in pixels, depth in metres, of all images.
+        (M, 4) u and v in pixels, depth and its standard deviation in metres (0: not known), of
+        all images.
     first
         (K + 1,) row of each image's first detection, and the end.
     attitude_rad
@@ -74,7 +75,7 @@ class Sight:
         """Detections of image k."""
         rows = self.detections[self.first[k] : self.first[k + 1]]
         roll_rad, pitch_rad = self.attitude_rad[k]
-        return View(rows[:, :2], rows[:, 2], float(roll_rad), float(pitch_rad))
+        return View(rows[:, :2], rows[:, 2], float(roll_rad), float(pitch_rad), rows[:, 3])
 
     def ranges(self, k: int) -> dict[str, float]:
         """Distance by peer, metres, of those that were heard near image k."""
@@ -194,13 +195,17 @@ def _detections(recording: Path, robot: str, threshold: float | None) -> tuple[T
     if hasattr(lists, "chunks"):
         lists = lists.chunk(0)
     flat = lists.flatten()
-    names = ("u_px", "v_px", "depth_m", "confidence")
-    values = np.column_stack([flat.field(name).to_numpy(zero_copy_only=False) for name in names])
+    names = ("u_px", "v_px", "depth_m", "sigma_depth_m", "confidence")
+    known = {field.name for field in flat.type}  # recordings of before have no sigma
+    zero = np.zeros(len(flat))
+    values = np.column_stack(
+        [flat.field(n).to_numpy(zero_copy_only=False) if n in known else zero for n in names]
+    )
     image = np.repeat(np.arange(len(table)), np.diff(lists.offsets.to_numpy()))
     least = np.array(table["threshold"].to_numpy()) if threshold is None else threshold
-    keep = (values[:, 3] >= np.broadcast_to(least, len(table))[image]) & (values[:, 2] > 0)
+    keep = (values[:, 4] >= np.broadcast_to(least, len(table))[image]) & (values[:, 2] > 0)
     first = np.searchsorted(image[keep], np.arange(len(table) + 1))
-    return table["log_time"].to_numpy(), values[keep, :3].astype(float), first
+    return table["log_time"].to_numpy(), values[keep, :4].astype(float), first
 
 
 def _columns(recording: Path, topic: str, *fields: str) -> tuple[Times, Array] | None:

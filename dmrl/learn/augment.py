@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dmrl.learn.batches import BOX, DEPTH, Batch, Examples, Robots, U, V
+from dmrl.learn.batches import BOX, DEPTH, FIELDS, Batch, Examples, Robots, U, V
 from dmrl.learn.layers import (
     Rect,
     Rng,
@@ -131,7 +131,7 @@ class Augmenter:
         """
         rng = np.random.default_rng([self._seed, epoch, index])
         canvas = torch.empty(len(chosen), self._height, self._width, 3)
-        robots = np.full((len(chosen), MAX_ROBOTS, 10), np.nan, np.float32)
+        robots = np.full((len(chosen), MAX_ROBOTS, len(FIELDS)), np.nan, np.float32)
         for slot, number in enumerate(chosen):
             found = self._draw(canvas[slot], int(number), rng)
             robots[slot, : min(len(found), MAX_ROBOTS)] = found[:MAX_ROBOTS]
@@ -139,8 +139,8 @@ class Augmenter:
         return Batch(pixels.permute(0, 3, 1, 2), torch.from_numpy(robots))
 
     def _draw(self, canvas: Tensor, number: int, rng: Rng) -> Robots:
-        """Fill a canvas (H, W, 3); returns (n, 10) the robots in it."""
-        robots = np.empty((0, 10), np.float32)
+        """Fill a canvas (H, W, 3); returns (n, 11) the robots in it."""
+        robots = np.empty((0, len(FIELDS)), np.float32)
         whole = (0, 0, self._width, self._height)
         mosaic = rng.random() < self._settings.mosaic_share
         rects = parts(whole, rng) if mosaic else [whole]

@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Robots = NDArray[np.float32]
-"""(..., 10): ``FIELDS`` of each robot; a row whose u is NaN is no robot."""
+"""(..., 11): ``FIELDS`` of each robot; a row whose u is NaN is no robot."""
 
 FIELDS = (
     *("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m"),
     *("left_px", "top_px", "right_px", "bottom_px"),
+    "class_id",
 )
 U, V, DEPTH, SIGMA_U, SIGMA_V, SIGMA_DEPTH = range(6)
-BOX = slice(6, 10)
+BOX, CLASS_ID = slice(6, 10), 10
 
 T = TypeVar("T")
 
@@ -34,7 +35,7 @@ T = TypeVar("T")
 class Batch(NamedTuple):
     """Images and the robots in them.
 
-    ``images`` (N, 3, H, W) uint8, channels last in memory; ``robots`` (N, K, 10) float32.
+    ``images`` (N, 3, H, W) uint8, channels last in memory; ``robots`` (N, K, 11) float32.
     """
 
     images: Tensor
@@ -50,8 +51,8 @@ class Examples:
     pixels
         Arrays of (n_i, H, W, 3) uint8, RGB, such as zero-copy views of a mapped file.
     robots
-        (N, K, 10) float32, ``FIELDS`` of up to K robots in each of the N images, N the sum of
-        the n_i. Sigmas are 0 where the label is exact, a box NaN where there is none.
+        (N, K, 11) float32, ``FIELDS`` of up to K robots in each of the N images, N the sum of
+        the n_i. Sigmas are 0 where the label is exact, a box or class NaN where there is none.
     """
 
     pixels: Sequence[NDArray[np.uint8]]

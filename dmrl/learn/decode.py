@@ -7,13 +7,14 @@ and of detections closer than ``SAME_PX`` only the most confident stays.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+PER_DETECTION = ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m", "class_id")
 SAME_PX = 8.0
 """Detections closer than this are of one robot."""
 
@@ -30,11 +31,17 @@ class Grids(NamedTuple):
     offset
         (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells; None
         for a network that has no such channels.
+    spread
+        (N, rows, cols) scale b of the error of log depth, exp(-|error| / b); None likewise.
+    class_id
+        (N, rows, cols) the likeliest class; None likewise.
     """
 
     confidence: NDArray[np.floating]
     depth_m: NDArray[np.floating]
     offset: NDArray[np.floating] | None
+    spread: NDArray[np.floating] | None = None
+    class_id: NDArray[np.integer] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +52,10 @@ class Found:
     ----------
     u_px, v_px, depth_m, confidence
         (N, K). Only the first ``count[i]`` columns of row i are detections.
+    sigma_depth_m
+        (N, K) standard deviation of the depth; 0 where the network does not say.
+    class_id
+        (N, K) the likeliest class; 0 where the network does not say.
     count
         (N,) detections in each image, at least 1.
     """
@@ -53,6 +64,8 @@ class Found:
     v_px: Array
     depth_m: Array
     confidence: Array
+    sigma_depth_m: Array
+    class_id: NDArray[np.int64]
     count: NDArray[np.int64]
 
 
@@ -78,6 +91,8 @@ def decode(
     confidence: NDArray[np.floating],
     depth_m: NDArray[np.floating],
     offset: NDArray[np.floating] | None = None,
+    spread: NDArray[np.floating] | None = None,
+    class_id: NDArray[np.integer] | None = None,
     *,
     stride_px: int = 8,
     most: int = 20,
@@ -92,6 +107,8 @@ def decode(
     offset
         (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells. None:
         the middle is as good as it gets.
+    spread, class_id
+        (N, rows, cols), as in `Grids`.
     stride_px
         Pixels per cell, both ways.
     most
@@ -110,9 +127,17 @@ def decode(
         uv += np.stack([np.take_along_axis(flat[:, axis], best, axis=1) for axis in range(2)])
         uv = np.clip(uv, 0, np.array([cols, rows])[:, None, None])
     uv *= stride_px
-    depth = np.take_along_axis(depth_m.reshape(images, -1), best, axis=1).astype(np.float64)
+
+    def there(grid: NDArray[Any] | None) -> NDArray[Any]:
+        """A grid's values where the detections are, 0 where there is no grid."""
+        if grid is None:
+            return np.zeros(best.shape, np.int64)
+        return np.take_along_axis(grid.reshape(images, -1), best, axis=1)
+
+    depth = there(depth_m).astype(np.float64)
+    sigma = np.sqrt(2) * depth * there(spread)  # Laplace
     count = np.maximum((kept >= max(min_confidence, 0.0)).sum(axis=1), 1)
-    found = Found(uv[0], uv[1], depth, kept.astype(np.float64), count)
+    found = Found(uv[0], uv[1], depth, kept.astype(np.float64), sigma, there(class_id), count)
     return found if offset is None else _without_doubles(found)
 
 
@@ -128,6 +153,7 @@ def _without_doubles(found: Found) -> Found:
         stays[:, k] &= ~((away_px < SAME_PX) & stays[:, :k]).any(axis=1)
     # Those that stay first, in their order.
     first = np.argsort(~stays, axis=1, kind="stable")
-    columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
-    u_px, v_px, depth_m, confidence = (np.take_along_axis(c, first, axis=1) for c in columns)
-    return Found(u_px, v_px, depth_m, confidence, stays.sum(axis=1))
+    sorted_columns = {
+        name: np.take_along_axis(getattr(found, name), first, axis=1) for name in PER_DETECTION
+    }
+    return Found(**sorted_columns, count=stays.sum(axis=1))

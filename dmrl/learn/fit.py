@@ -19,8 +19,9 @@ from dmrl.learn.batches import Batch, Examples, ahead, batch_count, gathered, or
 from dmrl.learn.checkpoint import State, load_checkpoint, save_checkpoint
 from dmrl.learn.group import Group
 from dmrl.learn.network import Network, build
+from dmrl.learn.optimizer import new_optimizer
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.step import ALONE, LOSSES, Average, new_optimizer, train_step
+from dmrl.learn.step import ALONE, LOSSES, Average, train_step
 from dmrl.learn.validate import validation_figures
 
 WATCH_STEPS = 10  # reading a loss makes an accelerator wait, so not at every step
@@ -71,7 +72,7 @@ def new_network(settings: FitSettings, examples: Examples) -> Network:
     SettingError
         If there is no such architecture, no image, or the network cannot take their size.
     """
-    network = build(settings.architecture, seed=settings.seed)
+    network = build(settings.architecture, seed=settings.seed, extra=settings.extra)
     if not len(examples):
         raise SettingError("no images to train on. Give a dataset with a train split")
     height_px, width_px, _ = examples.image_shape
@@ -103,6 +104,8 @@ class Training:
         (N,) how often each image shall come in an epoch. None: once.
     identity
         Names the data, so that a training is resumed on the same.
+    teacher
+        A network whose output is learnt beside the labels. None: the labels alone.
     group
         The processes that train this network together; only the first writes to ``folder``.
     resume
@@ -126,14 +129,16 @@ class Training:
         validation: Examples | None = None,
         shares: NDArray[np.float64] | None = None,
         identity: str = "",
+        teacher: Network | None = None,
         group: Group = ALONE,
         resume: bool = False,
     ) -> None:
         self._group = group
         self._learning = network.to(device_of(settings.device))
+        self._teacher = teacher and teacher.to(device_of(settings.device)).eval()
         self._examples, self._validation, self._shares = examples, validation, shares
         self._settings, self._folder = settings, folder
-        self._optimizer = new_optimizer(network, settings)
+        self._optimizer = new_optimizer(network, settings.optimizer, settings.weight_decay)
         self._average = Average(network, settings.ema_steps) if settings.ema_steps else None
         self._steps_per_epoch = batch_count(len(examples), settings.batch_size)
         run = {**asdict(settings), "data": identity}
@@ -241,11 +246,18 @@ class Training:
         return {"loss": sum(means), **dict(zip(LOSSES, means, strict=True))}
 
     def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:
-        """(3,) losses of a batch of ``whole`` images, of which this process has a part."""
+        """(5,) losses of a batch of ``whole`` images, of which this process has a part."""
         group = self._group
         share = len(group.part(np.arange(whole))) / whole
         return train_step(
-            self._learning, self._optimizer, batch, self._settings, rate, group, share
+            self._learning,
+            self._optimizer,
+            batch,
+            self._settings,
+            rate,
+            group,
+            share,
+            self._teacher,
         )
 
 

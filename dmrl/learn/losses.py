@@ -1,12 +1,15 @@
 """Losses on a grid of cells: summed over cells, mean over images."""
 
+import math
 from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
 DepthLoss = Literal["squared", "log"]
+LEAST_LOG_SPREAD = math.log(0.01)
+"""A spread below this is taken for it: a hundredth of the depth."""
 
 
 def confidence_loss(
@@ -69,3 +72,43 @@ def offset_loss(predicted: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
         (N, rows, cols) factor of each cell.
     """
     return (weight[:, None] * (predicted - offset).abs()).sum(dim=(1, 2, 3)).mean()
+
+
+def spread_loss(log_spread: Tensor, log_depth: Tensor, depth_m: Tensor, weight: Tensor) -> Tensor:
+    """How badly the spread fits the error of log depth: -log of a Laplace density (less log 2).
+
+    The depth does not learn from it: a network that also says how sure it is sees as well as one
+    that does not.
+
+    Parameters
+    ----------
+    log_spread, log_depth
+        (N, rows, cols) predicted: log of the scale b of the error, and log of the depth, metres.
+    depth_m
+        (N, rows, cols) labels, metres; any value where ``weight`` is 0.
+    weight
+        (N, rows, cols) factor of each cell.
+    """
+    there = weight > 0
+    error = (log_depth.detach() - torch.where(there, depth_m, 1.0).log()).abs() * there
+    # Without a floor, a depth that is met exactly is worth infinitely much.
+    log_b = log_spread.clamp(min=LEAST_LOG_SPREAD)
+    return (weight * (error * (-log_b).exp() + log_b)).sum(dim=(1, 2)).mean()
+
+
+def class_loss(logits: Tensor, class_id: Tensor, weight: Tensor) -> Tensor:
+    """Cross entropy of every class in cells with a robot (paper eq. 8).
+
+    Parameters
+    ----------
+    logits
+        (N, classes, rows, cols).
+    class_id
+        (N, rows, cols) labels; -1 where it is not known.
+    weight
+        (N, rows, cols) factor of each cell.
+    """
+    known = class_id >= 0
+    wanted = one_hot(class_id.clamp(min=0), logits.shape[1]).movedim(3, 1).to(logits.dtype)
+    entropy = binary_cross_entropy_with_logits(logits, wanted, reduction="none").sum(dim=1)
+    return (weight * known * entropy).sum(dim=(1, 2)).mean()

@@ -19,7 +19,15 @@ from dmrl.errors import ModelError, SettingError
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 from dmrl.learn.keras import read_h5
-from dmrl.learn.network import ARCHITECTURES, SUB_CELL, Network, build, parameter_count, to_input
+from dmrl.learn.network import (
+    ARCHITECTURES,
+    CLASS,
+    SPREAD,
+    Network,
+    build,
+    parameter_count,
+    to_input,
+)
 
 WEIGHTS_NAME = "model.safetensors"
 DESCRIPTION_NAME = "model.json"
@@ -33,9 +41,16 @@ def grids_of(network: Network, images: Tensor) -> Grids:
     """Grids of (N, 3, H, W) uint8 images; the network as it stands, on its device."""
     device = next(network.parameters()).device
     with torch.inference_mode():
-        out = network(to_input(images.to(device)))
-        offset = out[:, 2:4].cpu().numpy() if network.channels == SUB_CELL else None
-        return Grids(out[:, 1].sigmoid().cpu().numpy(), out[:, 0].exp().cpu().numpy(), offset)
+        out = network(to_input(images.to(device))).cpu()
+    named = dict(zip(network.channels, out.unbind(1), strict=True))
+    classes = [named[name] for name in network.channels if name.startswith(CLASS)]
+    return Grids(
+        named["confidence"].sigmoid().numpy(),
+        named["log_depth"].exp().numpy(),
+        np.stack([named["offset_u"], named["offset_v"]], axis=1) if "offset_u" in named else None,
+        named[SPREAD].exp().numpy() if SPREAD in named else None,
+        torch.stack(classes).argmax(dim=0).numpy() if classes else None,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +123,23 @@ def weights_of(network: Network) -> dict[str, Tensor]:
         for name, value in network.state_dict().items()
         if not name.endswith("num_batches_tracked")
     }
+
+
+def with_channels(known: Network, network: Network) -> dict[str, Tensor]:
+    """Weights of a known network for one that may have other channels on top of the same body.
+
+    Channels that only the latter has keep the weights it has now.
+    """
+    weights, fresh = weights_of(known), weights_of(network)
+    for name in ("head.weight", "head.bias"):
+        if known.channels == network.channels or name not in weights:
+            continue
+        rows = fresh[name].clone()
+        for k, channel in enumerate(network.channels):
+            if channel in known.channels:
+                rows[k] = weights[name][known.channels.index(channel)]
+        weights[name] = rows
+    return weights
 
 
 def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> None:
@@ -200,7 +232,7 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
         if not file.is_file():
             raise ModelError(f"no {file.name} in {file.parent}. Give a run folder of dmrl train")
     said = _read_description(description)
-    network = build(said["architecture"])
+    network = build(said["architecture"], extra=_extra(said, description))
     try:
         tensors = load_file(weights)
     except (SafetensorError, OSError) as e:
@@ -208,6 +240,18 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
     set_weights(network, tensors, weights)
     known = ("width_px", "height_px", "threshold", "label_source", "training")
     return Model(network.eval(), said["architecture"], name, **{k: said[k] for k in known})
+
+
+def _extra(said: dict[str, Any], path: Path) -> list[str]:
+    """Channels on top of the architecture's own, as a description lists them all."""
+    own = list(ARCHITECTURES[said["architecture"]].own)
+    outputs = said.get("outputs", own)
+    extra = outputs[len(own) :] if isinstance(outputs, list) else None
+    wanted = [name for name in extra or [] if name == SPREAD]
+    wanted += [f"{CLASS}{k}" for k in range(len(extra or []) - len(wanted))]
+    if extra is None or outputs != own + wanted:
+        raise ModelError(f"{path} has no valid outputs. Give the model.json of dmrl train")
+    return wanted
 
 
 def _read_description(path: Path) -> dict[str, Any]:

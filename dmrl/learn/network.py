@@ -6,6 +6,7 @@ are the same for all, see ``CHANNEL_MEANINGS``.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -20,11 +21,15 @@ CHANNEL_MEANINGS = {
     "confidence": "logit of the confidence that a robot's centre lies in the cell",
     "offset_u": "centre minus middle of the cell, to the right, in cells",
     "offset_v": "the same, downwards",
+    "log_spread": "natural log of the scale b of log depth's error, exp(-|error| / b)",
+    "class_0": "logit that the robot is of class 0; class_1 and so on for the others",
 }
 DETECTION = ("log_depth", "confidence")
 """Channels of a network that knows a robot to the cell."""
 SUB_CELL = (*DETECTION, "offset_u", "offset_v")
 """Channels of a network that knows where in its cell a robot is."""
+SPREAD, CLASS = "log_spread", "class_"
+"""Channels that a recipe may add to those of an architecture; classes are numbered."""
 # One cell in 1120 holds a robot. With a zero-mean head the loss starts near 190 and the first
 # epochs go into learning that most cells are empty.
 CONFIDENCE_BIAS = -4.0
@@ -34,11 +39,16 @@ class Network(nn.Module, ABC):
     """What training, prediction and export ask of a network.
 
     ``stride_px`` is the side of a grid cell; images are a whole number of cells. ``channels``
-    are names in ``CHANNEL_MEANINGS``, in the order of the output.
+    are names in ``CHANNEL_MEANINGS``, in the order of the output: the architecture's ``own``
+    first, then those that were asked for on top.
     """
 
     stride_px: ClassVar[int] = 8
-    channels: ClassVar[tuple[str, ...]] = DETECTION
+    own: ClassVar[tuple[str, ...]] = DETECTION
+
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__()
+        self.channels = (*self.own, *extra)
 
     @abstractmethod
     def forward(self, images: Tensor) -> Tensor:
@@ -55,8 +65,8 @@ class LocaNet(Network):
 
     widths: ClassVar[tuple[int, ...]] = (8, 16, 32, 64)
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__(extra)
         ins = (CHANNELS, *self.widths)
         self.convs = nn.ModuleList(
             nn.Conv2d(a, b, 3, padding=1, bias=False)
@@ -64,19 +74,17 @@ class LocaNet(Network):
         )
         # torch's momentum is the share of the new batch: 0.01 is Keras' 0.99.
         self.norms = nn.ModuleList(nn.BatchNorm2d(w, eps=1e-3, momentum=0.01) for w in self.widths)
-        self.head = nn.Conv2d(self.widths[-1], 2, 1)
+        self.head = nn.Conv2d(self.widths[-1], len(self.channels), 1)
         self._initialise()
 
     def _initialise(self) -> None:
         for conv in (*self.convs, self.head):
             assert isinstance(conv, nn.Conv2d)
             nn.init.normal_(conv.weight, std=0.01)  # as published
-        assert self.head.bias is not None
-        with torch.no_grad():
-            self.head.bias.copy_(torch.tensor([0.0, CONFIDENCE_BIAS]))
+        _start_empty(self.head, self.channels)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(N, 2, H/8, W/8) log depth and confidence logit of (N, 3, H, W) images."""
+        """(N, C, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
         x = images
         for index, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
             if index:
@@ -84,6 +92,14 @@ class LocaNet(Network):
             x = torch.relu(norm(conv(x)))
         out: Tensor = self.head(x)
         return out
+
+
+def _start_empty(head: nn.Conv2d, channels: Sequence[str]) -> None:
+    """Biases of a head that takes nearly every cell for empty."""
+    assert head.bias is not None
+    with torch.no_grad():
+        head.bias.zero_()
+        head.bias[channels.index("confidence")] = CONFIDENCE_BIAS
 
 
 class ConvNorm(nn.Sequential):
@@ -134,12 +150,12 @@ class DmrlNano(Network):
     dilation grows to see a near robot whole, and a 1x1 convolution for the four channels.
     """
 
-    channels: ClassVar[tuple[str, ...]] = SUB_CELL
+    own: ClassVar[tuple[str, ...]] = SUB_CELL
     widths: ClassVar[tuple[int, int, int]] = (16, 32, 48)
     dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 1), (1, 2, 4, 8, 1))
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__(extra)
         stem, fine, coarse = self.widths
         self.body = nn.Sequential(
             ConvNorm(CHANNELS, stem, stride=2),
@@ -151,24 +167,33 @@ class DmrlNano(Network):
         )
         self.head = nn.Conv2d(coarse, len(self.channels), 1)
         nn.init.normal_(self.head.weight, std=0.01)
-        assert self.head.bias is not None
-        with torch.no_grad():
-            self.head.bias.zero_()
-            self.head.bias[self.channels.index("confidence")] = CONFIDENCE_BIAS
+        _start_empty(self.head, self.channels)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(N, 4, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
+        """(N, C, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
         features = self.body(images)
         with torch.autocast(features.device.type, enabled=False):
             out: Tensor = self.head(features.float())
         return out
 
 
-ARCHITECTURES: dict[str, type[Network]] = {"dmrl-nano": DmrlNano, "locanet": LocaNet}
+class DmrlLarge(DmrlNano):
+    """The same, wider: a teacher, too large for a microcontroller."""
+
+    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)
 
 
-def build(name: str, *, seed: int = 0) -> Network:
+ARCHITECTURES: dict[str, type[Network]] = {
+    "dmrl-nano": DmrlNano,
+    "dmrl-large": DmrlLarge,
+    "locanet": LocaNet,
+}
+
+
+def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     """A new network, its weights drawn with ``seed``, channels last in memory.
+
+    ``extra`` are channels on top of the architecture's own.
 
     Raises
     ------
@@ -180,7 +205,7 @@ def build(name: str, *, seed: int = 0) -> Network:
         raise SettingError(f"no architecture {name}. Choose one of: {known}")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = ARCHITECTURES[name]()
+        network = ARCHITECTURES[name](extra)
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 

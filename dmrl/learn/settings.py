@@ -5,6 +5,8 @@ from typing import Literal
 
 from dmrl.learn.augment import Augmentation
 from dmrl.learn.losses import DepthLoss
+from dmrl.learn.network import CLASS, SPREAD
+from dmrl.learn.optimizer import OptimizerName
 from dmrl.learn.targets import LabelNoise
 
 
@@ -20,6 +22,9 @@ class FitSettings:
         Times that as many images are seen as there are.
     batch_size
         Images per step.
+    optimizer
+        "muon": Muon for the kernels that mix channels, AdamW for the rest; halves the epochs.
+        "adam": Adam as published or, with a weight decay, AdamW.
     learning_rate
         Of the optimizer, at the end of the warm-up.
     final_learning_rate
@@ -27,7 +32,7 @@ class FitSettings:
     warmup_epochs
         Epochs over which the learning rate rises linearly from zero.
     weight_decay
-        Of AdamW, on convolution weights. 0: plain Adam.
+        Decoupled, on convolution weights. 0 with "adam": plain Adam.
     ema_steps
         Steps over which the weights that are kept are averaged. 0: the last weights are kept.
     target_sigma_cells
@@ -43,6 +48,16 @@ class FitSettings:
         Factor of the depth loss.
     offset_weight
         Factor of the sub-cell offset's loss, for networks that have the channels.
+    spread_weight
+        Factor of the loss of a channel that says how sure the depth is. 0: no such channel.
+    classes
+        What tells robots apart, one pattern of peer names each: ["cf2", "cf[3-9]"] is two
+        classes. Empty: the network does not tell.
+    class_weight
+        Factor of the class loss.
+    distill_share
+        With a teacher: how much of the losses is against what it says, the rest against the
+        labels, 0 to 1.
     label_noise
         What the labels' sigmas do: "ignore" them, "weight" the cells, or "soften" the targets.
     shares
@@ -86,6 +101,7 @@ class FitSettings:
     architecture: str = "dmrl-nano"
     epochs: int = 60
     batch_size: int = 16
+    optimizer: OptimizerName = "muon"
     learning_rate: float = 4e-3
     final_learning_rate: float = 1e-5
     warmup_epochs: int = 2
@@ -97,6 +113,10 @@ class FitSettings:
     depth_loss: DepthLoss = "log"
     depth_weight: float = 1.0
     offset_weight: float = 0.5
+    spread_weight: float = 0.0
+    classes: tuple[str, ...] = ()
+    class_weight: float = 1.0
+    distill_share: float = 0.5
     label_noise: LabelNoise = "ignore"
     shares: dict[str, float] = field(default_factory=dict)
     validation_share: float = 0.1
@@ -134,6 +154,12 @@ class FitSettings:
         if any(share < 0 for share in self.shares.values()):
             raise ValueError("shares: must not be negative")
 
+    @property
+    def extra(self) -> tuple[str, ...]:
+        """Channels of the network on top of its architecture's own."""
+        classes = tuple(f"{CLASS}{k}" for k in range(len(self.classes)))
+        return (*([SPREAD] if self.spread_weight else []), *classes)
+
     def augmentation(self, epoch: int) -> Augmentation:
         """How images are varied in an epoch, from 0."""
         whole = Augmentation(
@@ -151,10 +177,11 @@ class FitSettings:
 
 SHARES = (
     *("validation_share", "threshold", "flip_share", "mosaic_share"),
-    *("blur_share", "colour", "noise"),
+    *("blur_share", "colour", "noise", "distill_share"),
 )
 NOT_NEGATIVE = (
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
-    *("confidence_weight", "depth_weight", "offset_weight", "rotation_deg", "paste"),
+    *("confidence_weight", "depth_weight", "offset_weight", "spread_weight", "class_weight"),
+    *("rotation_deg", "paste"),
     "plain_epochs",
 )

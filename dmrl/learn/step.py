@@ -1,4 +1,4 @@
-"""One step of a training: losses of a batch, optimizer, and the average of the weights."""
+"""One step of a training: losses of a batch, and the average of the weights."""
 
 from copy import deepcopy
 
@@ -7,24 +7,23 @@ from torch import Tensor
 
 from dmrl.learn.batches import Batch
 from dmrl.learn.group import Group
-from dmrl.learn.losses import confidence_loss, depth_loss, offset_loss
-from dmrl.learn.network import SUB_CELL, Network, to_input
+from dmrl.learn.losses import class_loss, confidence_loss, depth_loss, offset_loss, spread_loss
+from dmrl.learn.network import CLASS, SPREAD, Network, to_input
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.targets import targets
+from dmrl.learn.targets import Targets, as_targets, targets
 
-ADAM_EPSILON = 1e-7  # Keras' default, with which the paper trained
 ALONE = Group()
-LOSSES = ("confidence_loss", "depth_loss", "offset_loss")
+LOSSES = ("confidence_loss", "depth_loss", "offset_loss", "spread_loss", "class_loss")
 
 
-def losses(network: Network, batch: Batch, settings: FitSettings) -> Tensor:
-    """(3,) weighted confidence, depth and offset loss of a batch."""
+def losses(
+    network: Network, batch: Batch, settings: FitSettings, teacher: Network | None = None
+) -> Tensor:
+    """(5,) weighted ``LOSSES`` of a batch; with a teacher, a share of what it says for labels."""
     device = next(network.parameters()).device
     images, robots = (t.to(device, non_blocking=True) for t in batch)
-    half = settings.precision == "bfloat16"
-    with torch.autocast(device.type, torch.bfloat16, enabled=half):
-        out = network(to_input(images))
-    out = out.float()
+    pixels = to_input(images)
+    out = _output(network, pixels, settings)
     wanted = targets(
         robots,
         (out.shape[2], out.shape[3]),
@@ -32,29 +31,46 @@ def losses(network: Network, batch: Batch, settings: FitSettings) -> Tensor:
         stride_px=network.stride_px,
         label_noise=settings.label_noise,
     )
+    named = dict(zip(network.channels, out.unbind(1), strict=True))
+    parts = _against(named, wanted, settings)
+    if teacher is None:
+        return parts
+    with torch.no_grad():
+        said = _output(teacher, pixels, settings)
+    taught = _against(named, as_targets(teacher.channels, said, wanted), settings)
+    return torch.lerp(parts, taught, settings.distill_share)
+
+
+def _output(network: Network, pixels: Tensor, settings: FitSettings) -> Tensor:
+    """(N, C, rows, cols) float32."""
+    half = settings.precision == "bfloat16"
+    with torch.autocast(pixels.device.type, torch.bfloat16, enabled=half):
+        out: Tensor = network(pixels)
+    return out.float()
+
+
+def _against(out: dict[str, Tensor], wanted: Targets, settings: FitSettings) -> Tensor:
+    """(5,) weighted losses of an output, by channel, against targets."""
+    none = out["confidence"].new_zeros(())
     confidence = confidence_loss(
-        out[:, 1], wanted.confidence, wanted.confidence_weight, focus=settings.focus
+        out["confidence"], wanted.confidence, wanted.confidence_weight, focus=settings.focus
     )
-    depth = depth_loss(out[:, 0], wanted.depth_m, wanted.weight, settings.depth_loss)
-    offset = out.new_zeros(())
-    if network.channels == SUB_CELL:
-        offset = offset_loss(out[:, 2:4], wanted.offset, wanted.offset_weight)
-    weights = (settings.confidence_weight, settings.depth_weight, settings.offset_weight)
-    parts: Tensor = torch.stack((confidence, depth, offset)) * out.new_tensor(weights)
-    return parts
-
-
-def new_optimizer(network: Network, settings: FitSettings) -> torch.optim.Optimizer:
-    """Adam as published; with a weight decay, AdamW that leaves biases and norms alone."""
-    if not settings.weight_decay:
-        return torch.optim.Adam(network.parameters(), eps=ADAM_EPSILON)
-    kernels = [p for p in network.parameters() if p.ndim > 1]
-    others = [p for p in network.parameters() if p.ndim == 1]
-    groups = [
-        {"params": kernels, "weight_decay": settings.weight_decay},
-        {"params": others, "weight_decay": 0.0},
-    ]
-    return torch.optim.AdamW(groups, eps=ADAM_EPSILON)
+    depth = depth_loss(out["log_depth"], wanted.depth_m, wanted.weight, settings.depth_loss)
+    offset = spread = classes = none
+    if "offset_u" in out:
+        both = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
+        offset = offset_loss(both, wanted.offset, wanted.offset_weight)
+    if SPREAD in out:
+        spread = spread_loss(out[SPREAD], out["log_depth"], wanted.depth_m, wanted.weight)
+    if settings.classes:
+        logits = torch.stack([out[f"{CLASS}{k}"] for k in range(len(settings.classes))], dim=1)
+        classes = class_loss(logits, wanted.class_id, wanted.weight)
+    weights = (
+        *(settings.confidence_weight, settings.depth_weight, settings.offset_weight),
+        *(settings.spread_weight, settings.class_weight),
+    )
+    parts: Tensor = torch.stack((confidence, depth, offset, spread, classes))
+    return parts * none.new_tensor(weights)
 
 
 def train_step(
@@ -65,8 +81,9 @@ def train_step(
     learning_rate: float,
     group: Group = ALONE,
     share: float = 1.0,
+    teacher: Network | None = None,
 ) -> Tensor:
-    """(3,) losses of a batch, after one step of the optimizer on their sum.
+    """(5,) losses of a batch, after one step of the optimizer on their sum.
 
     Parameters
     ----------
@@ -82,10 +99,12 @@ def train_step(
         The processes that train together.
     share
         Share of the whole batch that ``batch`` is. 0: of ``batch`` nothing is learnt.
+    teacher
+        A network whose output is learnt beside the labels.
     """
     for parameters in optimizer.param_groups:
         parameters["lr"] = learning_rate
-    parts = losses(network, batch, settings)
+    parts = losses(network, batch, settings, teacher)
     optimizer.zero_grad(set_to_none=True)
     parts.sum().backward()  # type: ignore[no-untyped-call]
     parts = group.average(network, parts.detach(), share)

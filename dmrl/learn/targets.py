@@ -6,12 +6,13 @@ cells; at s = 0 g is 1 in the cell of the centre and 0 elsewhere (paper eq. 4). 
 depth and offset are those of the robot that is most present there, the nearer one of equals.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from dmrl.learn.batches import DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, U, V
+from dmrl.learn.batches import CLASS_ID, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, U, V
 
 PRESENT = 0.1
 """Cells where g is below this learn neither depth nor offset."""
@@ -37,6 +38,8 @@ class Targets(NamedTuple):
         (N, rows, cols) metres; 1 where the weight is 0.
     offset
         (N, 2, rows, cols) centre minus middle of the cell, (u, v), cells.
+    class_id
+        (N, rows, cols) class of the robot, -1 where it is not known or there is none.
     """
 
     confidence: Tensor
@@ -45,6 +48,7 @@ class Targets(NamedTuple):
     offset_weight: Tensor
     depth_m: Tensor
     offset: Tensor
+    class_id: Tensor
 
 
 def targets(
@@ -60,7 +64,7 @@ def targets(
     Parameters
     ----------
     robots
-        (N, K, 10), see ``batches.FIELDS``. A robot whose centre is outside the image is in no
+        (N, K, 11), see ``batches.FIELDS``. A robot whose centre is outside the image is in no
         cell, but may reach into it.
     shape
         Rows and columns of the grid.
@@ -98,6 +102,7 @@ def targets(
         trust_px = of_best(_trust(sigma_px / TOLERANCE_PX))
         trust_depth = of_best(_trust(relative / TOLERANCE_DEPTH))
     found = near > 0
+    class_id = torch.nan_to_num(robots[..., CLASS_ID, None, None], nan=-1.0)
     return Targets(
         confidence,
         torch.where(confidence > 0.01, trust_px, 1.0),
@@ -105,6 +110,38 @@ def targets(
         near * trust_px,
         torch.where(found, of_best(clean[..., DEPTH, None, None]), 1.0),
         torch.stack((of_best(du), of_best(dv)), dim=1) * found[:, None],
+        torch.where(found, of_best(class_id), -1.0).to(torch.int64),
+    )
+
+
+def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Targets:
+    """What a teacher says of N images, for others to learn (Hinton et al. 2015).
+
+    Its confidence is present everywhere, also where it doubts; depth and offset count where it
+    sees a robot, by its confidence. Classes are those of the labels.
+
+    Parameters
+    ----------
+    channels
+        Of the output.
+    output
+        (N, C, rows, cols).
+    labelled
+        Targets of the same images by their labels.
+    """
+    out = dict(zip(channels, output.unbind(1), strict=True))
+    confidence = out["confidence"].sigmoid()
+    near = confidence * (confidence >= PRESENT)
+    offset = labelled.offset
+    if "offset_u" in out:
+        offset = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
+    return labelled._replace(
+        confidence=confidence,
+        confidence_weight=torch.ones_like(confidence),
+        weight=near,
+        offset_weight=near,
+        depth_m=torch.where(near > 0, out["log_depth"].exp(), 1.0),
+        offset=offset,
     )
 
 

@@ -14,7 +14,7 @@ from dmrl import topics
 from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, open_detector
 from dmrl.errors import MissingTopic
 from dmrl.images import Rgb, decode
-from dmrl.learn.decode import Found
+from dmrl.learn.decode import PER_DETECTION, Found
 from dmrl.learn.decode import decode as find
 from dmrl.learn.pretrained import resolved
 from dmrl.messages import message
@@ -188,10 +188,9 @@ def _seen(pictures: list[Rgb], detector: Detector, settings: Settings) -> list[_
 
 
 def _detections(found: Found, image: int, threshold: float) -> Any:
-    columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
-    rows = np.stack([column[image, : found.count[image]] for column in columns], axis=1)
-    names = ("u_px", "v_px", "depth_m", "confidence")
-    detections = [dict(zip(names, row, strict=True)) for row in rows.tolist()]
+    columns = [getattr(found, name)[image, : found.count[image]] for name in PER_DETECTION]
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    detections = [dict(zip(PER_DETECTION, row, strict=True)) for row in rows]
     return message("Detections")(detections=detections, threshold=threshold)
 
 

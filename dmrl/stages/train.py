@@ -5,7 +5,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import pyarrow.compute as pc
 from cyclopts import Parameter
@@ -31,7 +31,7 @@ try:
         load_model,
         save_model,
         set_weights,
-        weights_of,
+        with_channels,
     )
     from dmrl.learn.network import Network
     from dmrl.learn.settings import FitSettings
@@ -59,6 +59,7 @@ def run(
     settings: Settings,
     *,
     init: Path | None = None,
+    teacher: Path | None = None,
     resume: bool = False,
 ) -> Result:
     """Train on the train split of ``dataset`` and write the run folder ``out``.
@@ -76,6 +77,8 @@ def run(
         See `FitSettings`.
     init
         Model whose weights to start from. None: new weights, by the seed.
+    teacher
+        Model that is learnt from beside the labels. None: the labels alone.
     resume
         Go on with the interrupted training in ``<out>.partial``; from the start, if that had
         not come to the end of its first epoch.
@@ -87,20 +90,28 @@ def run(
     DatasetError
         If ``dataset`` is not one, or has no train split.
     ModelError
-        If ``init`` cannot be used, or there is nothing to resume.
+        If ``init`` or ``teacher`` cannot be used, or there is nothing to resume.
     SettingError
-        If the network cannot take the images, or the loss is no longer a number.
+        If the network cannot take the images, its grid is not the teacher's, or the loss is no
+        longer a number.
     """
-    init = resolved(init) if init is not None else None
+    given = Given(init and resolved(init), teacher and resolved(teacher))
     group = join_group()
     try:
-        return _run(dataset, out, settings, init, group, resume=resume)
+        return _run(dataset, out, settings, given, group, resume=resume)
     finally:
         leave_group()
 
 
+class Given(NamedTuple):
+    """Models that a training is given: whose weights to start from, and whose word to learn."""
+
+    init: Path | None
+    teacher: Path | None
+
+
 def _run(
-    dataset: Path, out: Path, settings: Settings, init: Path | None, group: Group, *, resume: bool
+    dataset: Path, out: Path, settings: Settings, given: Given, group: Group, *, resume: bool
 ) -> Result:
     refuse_existing(out)
     if group.leads:
@@ -108,8 +119,9 @@ def _run(
     data = open_dataset(dataset)
     train = data.split("train")
     examples, held_out, shares = material(data, settings)
-    network = _first_network(settings, examples, init)
-    inputs = (dataset,) if init is None else (dataset, init)
+    network = _first_network(settings, examples, given.init)
+    teacher = _teacher(given.teacher, network) if given.teacher else None
+    inputs = [dataset, *filter(None, given)]
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
     identity = " ".join(source.sha256 for source in made.inputs)
     where = partial_folder(out, keep_on_error=True) if group.leads else nullcontext(partial_of(out))
@@ -122,6 +134,7 @@ def _run(
             validation=held_out,
             shares=shares,
             identity=identity,
+            teacher=teacher,
             group=group,
             resume=resume and has_checkpoint(folder),
         )
@@ -157,8 +170,19 @@ def _threshold(network: Network, held_out: Examples | None, settings: Settings) 
 def _first_network(settings: Settings, examples: Examples, init: Path | None) -> Network:
     network = new_network(settings, examples)
     if init is not None:
-        set_weights(network, weights_of(load_model(init).network), init)
+        known = load_model(init).network
+        set_weights(network, with_channels(known, network), init)
     return network
+
+
+def _teacher(path: Path, network: Network) -> Network:
+    teacher = load_model(path).network
+    if teacher.stride_px != network.stride_px:
+        raise SettingError(
+            f"{path} has cells of {teacher.stride_px} px, the network to train "
+            f"{network.stride_px} px. Give a teacher with the same grid"
+        )
+    return teacher
 
 
 def _train(training: Training, settings: Settings, images: int) -> Result:
@@ -239,6 +263,7 @@ def command(
     *,
     recipe: str = "dmrl_nano",
     init: Path | None = None,
+    teacher: Path | None = None,
     resume: bool = False,
     flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
@@ -255,13 +280,16 @@ def command(
         Every setting: a TOML file, or the name of a shipped recipe. Flags win over it.
     init
         Model to start from: a run folder, a .safetensors or a Keras .h5.
+    teacher
+        Model to learn from beside the labels, by the recipe's distill_share; as a rule a larger
+        one, such as dmrl-large, trained on the same dataset.
     resume
         Go on with the interrupted training in OUT_DIR.partial.
     as_json
         Print one JSON document in place of the table.
     """
     settings = flags.over(recipes.load(recipe, "train", Settings))
-    result = run(dataset, out, settings, init=init, resume=resume)
+    result = run(dataset, out, settings, init=init, teacher=teacher, resume=resume)
     if as_json:
         print_json({"model": str(out), **asdict(result)})
         return

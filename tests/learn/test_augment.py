@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.learn.augment import Augmentation, Augmenter
-from dmrl.learn.batches import Batch, Examples
+from dmrl.learn.batches import FIELDS, Batch, Examples
 
 GEOMETRY = Augmentation(
     flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0
@@ -20,13 +20,13 @@ def squares(count: int = 24, seed: int = 0) -> Examples:
     """Dark images with one bright square each; its side tells its depth."""
     rng = np.random.default_rng(seed)
     pixels = np.zeros((count, 112, 160, 3), np.uint8)
-    robots = np.full((count, 2, 10), np.nan, np.float32)
+    robots = np.full((count, 2, len(FIELDS)), np.nan, np.float32)
     for k in range(count):
         side = int(rng.integers(8, 25))
         left, top = int(rng.integers(2, 158 - side)), int(rng.integers(2, 110 - side))
         pixels[k, top : top + side, left : left + side] = 255
         centre = (left + side / 2, top + side / 2, SIDE_M / side, 1.0, 1.0, 0.1)
-        robots[k, 0] = (*centre, left, top, left + side, top + side)
+        robots[k, 0] = (*centre, left, top, left + side, top + side, 0)
     return Examples([pixels], robots)
 
 
@@ -109,7 +109,7 @@ def test_a_batch_depends_on_seed_epoch_and_place_alone() -> None:
 
 def test_images_without_robots_or_boxes_can_be_varied_too() -> None:
     empty = Examples(
-        [np.zeros((2, 112, 160, 3), np.uint8)], np.full((2, 1, 10), np.nan, np.float32)
+        [np.zeros((2, 112, 160, 3), np.uint8)], np.full((2, 1, len(FIELDS)), np.nan, np.float32)
     )
     batch = Augmenter(empty, GEOMETRY, seed=0).batch([0, 1], epoch=0, index=0)
     assert not torch.isfinite(batch.robots[..., 0]).any()

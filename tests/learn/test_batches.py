@@ -11,7 +11,8 @@ def numbered(*sizes: int) -> Examples:
     """Images and robots whose every value is the image's number."""
     count = sum(sizes)
     images = np.arange(count, dtype=np.uint8)[:, None, None, None] + np.zeros((8, 16, 3), np.uint8)
-    robots = np.arange(count, dtype=np.float32)[:, None, None] + np.zeros((2, 10), np.float32)
+    robots = np.repeat(np.arange(count, dtype=np.float32), 2 * len(FIELDS))
+    robots = robots.reshape(count, 2, len(FIELDS))
     return Examples(np.split(images, np.cumsum(sizes)[:-1]), robots)
 
 

@@ -67,3 +67,16 @@ def test_equal_neighbours_give_one_peak_and_the_first_maximum_is_always_one(
     for a in range(len(rows)):
         for b in range(a):
             assert max(abs(rows[a] - rows[b]), abs(cols[a] - cols[b])) > 1
+
+
+def test_depth_error_and_class_are_those_of_the_peak() -> None:
+    confidence, offset = np.zeros((1, 4, 9)), np.zeros((1, 2, 4, 9))
+    confidence[0, 1, [1, 7]] = 0.7, 0.9
+    spread, class_id = np.full((1, 4, 9), 0.1), np.zeros((1, 4, 9), np.int64)
+    spread[0, 1, 1], class_id[0, 1, 7] = 0.2, 1
+    found = decode(confidence, np.full((1, 4, 9), 2.0), offset, spread, class_id)
+    assert found.class_id[0, :2].tolist() == [1, 0]
+    np.testing.assert_allclose(found.sigma_depth_m[0, :2], np.sqrt(2) * np.array([0.2, 0.4]))
+    silent = decode(confidence, np.full((1, 4, 9), 2.0), offset)
+    assert not silent.sigma_depth_m.any()
+    assert not silent.class_id.any()

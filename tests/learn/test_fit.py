@@ -10,13 +10,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dmrl import recipe
 from dmrl.errors import ModelError, SettingError
-from dmrl.learn.batches import Examples
+from dmrl.learn.batches import CLASS_ID, FIELDS, Examples, gathered
 from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
 from dmrl.learn.decode import decode
 from dmrl.learn.fit import Training, device_of, learning_rate_at, new_network
 from dmrl.learn.model import Model, save_model
-from dmrl.learn.network import Network
+from dmrl.learn.network import Network, build
 from dmrl.learn.settings import FitSettings
+from dmrl.learn.step import losses
 from dmrl.learn.validate import best_threshold, scores
 
 PUBLISHED = recipe.load("locanet", "train", FitSettings)
@@ -38,12 +39,12 @@ def dots(count: int) -> Examples:
     """Dark images with one bright square, labelled at its centre, depth 1.5 m."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 40, (count, 32, 48, 3), np.uint8)
-    robots = np.zeros((count, 1, 10), np.float32)
+    robots = np.zeros((count, 1, len(FIELDS)), np.float32)
     for k, cell in enumerate(rng.integers(0, 24, count)):
         row, col = divmod(int(cell), 6)
         pixels[k, 8 * row + 2 : 8 * row + 6, 8 * col + 2 : 8 * col + 6] = 250
         box = (8 * col + 2, 8 * row + 2, 8 * col + 6, 8 * row + 6)
-        robots[k, 0] = (8 * col + 4, 8 * row + 4, 1.5, 0, 0, 0, *box)
+        robots[k, 0] = (8 * col + 4, 8 * row + 4, 1.5, 0, 0, 0, *box, k % 2)
     return Examples([pixels[:7], pixels[7:]], robots)
 
 
@@ -147,6 +148,47 @@ def test_the_last_epochs_keep_images_whole() -> None:
     assert (plain.mosaic_share, plain.paste, plain.rotation_deg) == (0, 0, 0)
     assert plain.zoom == (1.0, 1.0)
     assert (plain.flip_share, plain.colour) == (settings.flip_share, settings.colour)
+
+
+def test_a_teacher_that_says_the_same_leaves_nothing_to_learn(examples: Examples) -> None:
+    settings = FitSettings(distill_share=1.0, device="cpu")
+    batch = gathered(examples, np.arange(8))
+    student = build("dmrl-nano", seed=1).eval()
+    teacher = build("dmrl-large", seed=2).eval()
+    for network in (student, teacher):
+        with torch.no_grad():
+            network.head.bias[1] = 1.0  # type: ignore[union-attr, index, operator]
+    itself = losses(student, batch, settings, student)
+    other = losses(student, batch, settings, teacher)
+    assert itself.tolist() == pytest.approx([0.0] * 5, abs=1e-6)
+    assert (other[:3] > 1e-3).all()
+    half = losses(student, batch, replace(settings, distill_share=0.5), teacher)
+    labels = losses(student, batch, settings)
+    torch.testing.assert_close(half, (other + labels) / 2)
+
+
+def test_classes_and_the_spread_are_learnt(examples: Examples, tmp_path: Path) -> None:
+    # Squares of class 1 are grey: that is what tells them apart.
+    pixels: NDArray[np.uint8] = np.concatenate(list(dots(64).pixels))
+    robots = dots(64).robots
+    grey = robots[:, 0, CLASS_ID] == 1
+    pixels[grey] = np.minimum(pixels[grey], 120)
+    settings = FitSettings(
+        epochs=15,
+        batch_size=8,
+        ema_steps=20,
+        rotation_deg=0.0,
+        blur_share=0.0,
+        noise=0.0,
+        device="cpu",
+        spread_weight=1.0,
+        classes=("a", "b"),
+    )
+    _, network = trained(Examples([pixels], robots), tmp_path / "run", settings)
+    found = decode(*Model(network, "dmrl-nano").grids(pixels))
+    assert (found.class_id[:, 0] == grey).mean() > 0.9
+    error_m = np.abs(found.depth_m[:, 0] - 1.5)
+    assert 0.2 < np.median(error_m) / np.median(found.sigma_depth_m[:, 0]) < 2
 
 
 def test_another_training_is_not_resumed(examples: Examples, tmp_path: Path) -> None:

@@ -1,9 +1,17 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from dmrl.learn.losses import DepthLoss, confidence_loss, depth_loss, offset_loss
+from dmrl.learn.losses import (
+    DepthLoss,
+    class_loss,
+    confidence_loss,
+    depth_loss,
+    offset_loss,
+    spread_loss,
+)
 
 
 def test_confidence_loss_is_the_published_sum_over_cells() -> None:
@@ -60,3 +68,27 @@ def test_offset_loss_is_the_sum_of_both_ways_where_there_is_a_robot() -> None:
     wanted = torch.tensor([[[[0.1, 0.0]], [[-0.3, 0.0]]]])
     weight = torch.tensor([[[0.5, 0.0]]])
     assert float(offset_loss(predicted, wanted, weight)) == pytest.approx(0.35)
+
+
+def test_the_best_spread_is_the_mean_error_and_depth_learns_nothing_from_it() -> None:
+    errors = torch.tensor([0.1, 0.3, 0.2, 0.4])
+    log_depth = errors.reshape(1, 1, 4).requires_grad_()
+    log_b = torch.linspace(-4, 0, 401)
+    loss = [
+        float(spread_loss(b.expand(1, 1, 4), log_depth, torch.ones(1, 1, 4), torch.ones(1, 1, 4)))
+        for b in log_b
+    ]
+    assert float(log_b[int(np.argmin(loss))].exp()) == pytest.approx(0.25, rel=0.01)
+    spread = torch.zeros(1, 1, 4, requires_grad=True)
+    spread_loss(spread, log_depth, torch.ones(1, 1, 4), torch.ones(1, 1, 4)).backward()  # type: ignore[no-untyped-call]
+    assert log_depth.grad is None
+    assert spread.grad is not None
+    assert (spread.grad > 0).all()
+
+
+def test_class_loss_is_the_papers_and_only_where_the_class_is_known() -> None:
+    logits = torch.tensor([[[[1.0, 5.0, 2.0]], [[-1.0, 5.0, 2.0]]]])
+    class_id = torch.tensor([[[0, -1, 1]]])
+    weight = torch.tensor([[[0.5, 1.0, 0.0]]])
+    p = 1 / (1 + math.exp(-1))
+    assert float(class_loss(logits, class_id, weight)) == pytest.approx(-0.5 * 2 * math.log(p))

@@ -8,7 +8,14 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from dmrl.errors import ModelError, SettingError
-from dmrl.learn.model import Model, load_model, save_model
+from dmrl.learn.model import (
+    Model,
+    load_model,
+    save_model,
+    set_weights,
+    weights_of,
+    with_channels,
+)
 from dmrl.learn.network import build
 
 
@@ -57,6 +64,38 @@ def test_dmrl_nano_says_where_in_the_cell(tmp_path: Path) -> None:
     assert grids.offset[0, :, 1, 2].tolist() == [0.25, -0.5]
     said = json.loads((tmp_path / "model.json").read_text())
     assert said["outputs"] == ["log_depth", "confidence", "offset_u", "offset_v"]
+
+
+def test_a_model_with_more_channels_comes_back_with_them(tmp_path: Path) -> None:
+    extra = ("log_spread", "class_0", "class_1")
+    network = build("dmrl-nano", seed=1, extra=extra).eval()
+    with torch.no_grad():
+        network.head.bias[4:] = torch.tensor([-1.0, 0.5, 0.6])  # type: ignore[union-attr, index]
+        network.head.weight.zero_()  # type: ignore[union-attr, operator]
+    save_model(Model(network, "dmrl-nano"), tmp_path)
+    grids = load_model(tmp_path).grids(np.zeros((1, 16, 24, 3), np.uint8))
+    assert grids.spread is not None
+    assert grids.class_id is not None
+    np.testing.assert_allclose(grids.spread, np.exp(-1), rtol=1e-6)
+    assert (grids.class_id == 1).all()
+
+
+def test_a_description_with_strange_outputs_is_refused(run: Path) -> None:
+    said = json.loads((run / "model.json").read_text())
+    for outputs in (["log_depth"], [*said["outputs"], "class_1"], 3):
+        (run / "model.json").write_text(json.dumps(said | {"outputs": outputs}))
+        with pytest.raises(ModelError, match=r"model\.json has no valid outputs"):
+            load_model(run)
+
+
+def test_a_known_network_lends_its_weights_to_one_with_more_channels() -> None:
+    known, fresh = build("dmrl-nano", seed=1), build("dmrl-nano", seed=2, extra=("log_spread",))
+    wanted, new = weights_of(known), weights_of(fresh)
+    got = with_channels(known, fresh)
+    set_weights(fresh, got, "here")
+    assert torch.equal(got["head.weight"][:4], wanted["head.weight"])
+    assert torch.equal(got["head.weight"][4:], new["head.weight"][4:])
+    assert torch.equal(got["body.0.0.weight"], wanted["body.0.0.weight"])
 
 
 def test_run_folders_of_before_the_offset_still_load(run: Path) -> None:
@@ -142,7 +181,7 @@ def test_damaged_weights_are_one_line(run: Path) -> None:
         (
             "architecture",
             "resnet",
-            "asks for architecture resnet, this dmrl knows dmrl-nano, locanet",
+            "asks for architecture resnet, this dmrl knows dmrl-large, dmrl-nano, locanet",
         ),
     ],
 )

@@ -83,6 +83,6 @@ def test_input_is_scaled_to_about_one_and_stays_channels_last() -> None:
 
 def test_an_unknown_architecture_is_answered_with_the_known_ones() -> None:
     with pytest.raises(
-        SettingError, match=r"no architecture resnet\. Choose one of: dmrl-nano, loc"
+        SettingError, match=r"no architecture resnet\. Choose one of: dmrl-large, dmrl-nano, loc"
     ):
         build("resnet")

@@ -3,14 +3,15 @@ import pytest
 import torch
 
 from dmrl.geometry import grid_label
-from dmrl.learn.targets import targets
+from dmrl.learn.batches import CLASS_ID, FIELDS
+from dmrl.learn.targets import as_targets, targets
 
 SHAPE = (28, 40)
 
 
 def robots(*rows: tuple[float, ...]) -> torch.Tensor:
-    """(1, K, 10) from u, v, depth and, where given, sigmas."""
-    out = torch.full((1, len(rows), 10), float("nan"))
+    """(1, K, 11) from u, v, depth and, where given, sigmas."""
+    out = torch.full((1, len(rows), len(FIELDS)), float("nan"))
     for k, row in enumerate(rows):
         out[0, k, 3:6] = 0
         out[0, k, : len(row)] = torch.tensor(row)
@@ -68,3 +69,25 @@ def test_a_noisy_label_weighs_less_or_is_spread_out() -> None:
     assert softened.confidence.max() < 0.5 * plain.confidence.max()
     # Spread, not lost: the sum over cells stays.
     torch.testing.assert_close(softened.confidence.sum(), plain.confidence.sum(), rtol=1e-2, atol=0)
+
+
+def test_every_cell_of_a_robot_knows_its_class() -> None:
+    near, far, strange = robots((100, 100, 1.0), (116, 100, 2.0), (200, 50, 1.0))[0].unbind()
+    near[CLASS_ID], far[CLASS_ID] = 0, 1
+    got = targets(torch.stack((near, far, strange))[None], SHAPE, sigma_cells=0.7)
+    assert got.class_id[0, 12, 11:16].tolist() == [0, 0, 0, 1, 1]
+    assert (got.class_id[0, :8] == -1).all()  # neither the strange one nor empty cells
+    assert got.weight[0, 6, 25] > 0
+
+
+def test_a_teacher_is_learnt_where_it_sees_a_robot_and_where_it_doubts() -> None:
+    labelled = targets(robots((100, 100, 1.0)), SHAPE, sigma_cells=0.7)
+    said = torch.full((1, 4, *SHAPE), -6.0)
+    said[0, :, 3, 5] = torch.tensor([0.5, 2.0, 0.2, -0.1])
+    said[0, 1, 9, 9] = -3.0
+    got = as_targets(("log_depth", "confidence", "offset_u", "offset_v"), said, labelled)
+    assert got.confidence[0, 3, 5] == pytest.approx(1 / (1 + np.exp(-2)))
+    assert got.confidence[0, 9, 9] == pytest.approx(1 / (1 + np.exp(3)))
+    assert torch.nonzero(got.weight[0]).tolist() == [[3, 5]]
+    assert got.depth_m[0, 3, 5] == pytest.approx(np.exp(0.5))
+    assert got.offset[0, :, 3, 5].tolist() == pytest.approx([0.2, -0.1])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.learn.batches import Examples
+from dmrl.learn.batches import FIELDS, Examples
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import score
 from dmrl.learn.network import build
@@ -31,7 +31,7 @@ def test_few_labels_or_nothing_right_give_no_threshold() -> None:
 
 
 def test_figures_are_of_robots_inside_the_images() -> None:
-    robots = np.full((3, 2, 10), np.nan, np.float32)
+    robots = np.full((3, 2, len(FIELDS)), np.nan, np.float32)
     robots[0, 0, :6] = (20, 10, 1, 0, 0, 0)
     robots[0, 1, :6] = (-5, 10, 1, 0, 0, 0)
     robots[2, 1, :6] = (30, 31.5, 1, 0, 0, 0)
