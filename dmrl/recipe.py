@@ -201,12 +201,14 @@ def _faulty(name: str | Path, faults: Iterable[str]) -> RecipeError:
 
 
 def _repeated(step: Any) -> list[Any]:
-    """The steps that one with ``each = [1, 2, ...]`` stands for.
+    """The steps that one with ``each`` stands for, a count or a list of numbers.
 
     Where ``{each}`` is in the output there is a step for each number, and a setting that is
     "{each}" is that number. Where it is in inputs alone, there is an input for each.
     """
     match step:
+        case {"each": int(count), **others} if count > 0 and count is not True:
+            return _repeated({"each": list(range(1, count + 1)), **others})
         case {"each": [_, *_] as numbers, "out": str(out), **others}:
             if EACH in out:
                 return [_numbered({"out": out, **others}, number) for number in numbers]
@@ -247,7 +249,7 @@ def _step_faults(
     step: Any, stages: Collection[str], schema_of: Callable[[str], type[Any]]
 ) -> list[str]:
     if isinstance(step, dict) and "each" in step:  # what could be repeated has it no more
-        return ["each: must be a list of numbers, beside an out"]
+        return ["each: must be a count or a list of numbers, beside an out"]
     if faults := _faults(step, Step):
         return faults
     if step["stage"] not in stages:

@@ -197,9 +197,13 @@ inputs = ["first", "drawn-{each}"]
         ("all", ("first", "drawn-3", "drawn-5")),
     ]
     assert steps[1].settings == {"images": 5, "folder": "in-5"}
-    with pytest.raises(RecipeError, match=r"step.2.each: must be a list"):
-        broken = text.replace('each = [3, 5]\nout = "all"', 'each = []\nout = "all"')
-        recipe.load_pipeline(write(broken), SCHEMAS, SCHEMAS.__getitem__)
+    counted = text.replace("each = [3, 5]", "each = 2")
+    steps = recipe.load_pipeline(write(counted), SCHEMAS, SCHEMAS.__getitem__).steps
+    assert [step.out for step in steps] == ["drawn-1", "drawn-2", "all"]
+    for wrong in ("[]", "0", "true", '"3"'):
+        broken = text.replace('each = [3, 5]\nout = "all"', f'each = {wrong}\nout = "all"')
+        with pytest.raises(RecipeError, match=r"step.2.each: must be a count or a list"):
+            recipe.load_pipeline(write(broken), SCHEMAS, SCHEMAS.__getitem__)
 
 
 def test_every_fault_of_a_pipeline_is_named_with_its_step(write: Write) -> None:

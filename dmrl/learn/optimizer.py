@@ -54,7 +54,7 @@ def new_optimizer(
     return torch.optim.AdamW(groups, eps=ADAM_EPSILON)
 
 
-def _mixing(network: Network) -> list[nn.Parameter]:
+def _mixing(network: Network) -> list[Tensor]:
     """Kernels between hidden layers: neither of the image, nor depthwise, nor the head's."""
     convs = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
     return [
@@ -83,7 +83,7 @@ class Muon(torch.optim.AdamW):
         super().__init__(groups, eps=ADAM_EPSILON)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step of all parameters; the mixing kernels' gradients are used up."""
         for group in self.param_groups:
             if group["mixing"]:
@@ -112,7 +112,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
     By five rounds of a quintic Newton-Schulz iteration: products alone, no decomposition.
     """
     tall = matrix.shape[0] > matrix.shape[1]
-    x = matrix.T if tall else matrix
+    x: Tensor = matrix.T if tall else matrix
     x = x / (x.norm() + ADAM_EPSILON)
     a, b, c = NEWTON_SCHULZ
     for _ in range(NEWTON_SCHULZ_STEPS):
