@@ -25,8 +25,8 @@ from dmrl.learn.augment import Augmenter
 from dmrl.learn.batches import Batch, Examples, gathered, order
 from dmrl.learn.depthwise import Depthwise
 from dmrl.learn.fit import new_network
-from dmrl.learn.settings import FitSettings
 from dmrl.learn.optimizer import new_optimizer
+from dmrl.learn.settings import FitSettings
 from dmrl.learn.step import train_step
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
