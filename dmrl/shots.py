@@ -15,15 +15,15 @@ from dmrl.geometry import Array, camera_from_horizontal
 from dmrl.images import encode_jpeg, encode_png
 from dmrl.rendering.randomise import Drawn
 from dmrl.rendering.settings import Settings
-from dmrl.rendering.shot import Shot
+from dmrl.rendering.shot import Robot, Shot
 
 ROBOT = "cf1"
 """The robot that carries the camera."""
 
 
-def peer(number: int) -> str:
+def peer(number: int, robot: Robot) -> str:
     """Name of the robot of that number in an image, from 0."""
-    return f"cf{number + 2}"
+    return f"{robot.make}{number + 2}"
 
 
 def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Iterator[Sample]:
@@ -47,13 +47,13 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         else encode_png(shot.rgb)
     )
     yield image(time_ns, ROBOT, data, settings.image_format)
-    yield labels(time_ns, ROBOT, list(_peers(shot)))
+    yield labels(time_ns, ROBOT, list(_peers(scene, shot)))
     attitude = {"roll_rad": scene.roll_rad, "pitch_rad": scene.pitch_rad}
     yield Sample(time_ns, topics.attitude(ROBOT), "Attitude", attitude)
     horizontal_from_camera = camera_from_horizontal(scene.roll_rad, scene.pitch_rad).T
     for k, robot in enumerate(scene.robots):
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
-        yield _truth(time_ns, peer(k), xyz)
+        yield _truth(time_ns, peer(k, robot), xyz)
     yield _transforms(time_ns, scene, horizontal_from_camera)
     if settings.masks:
         mask = encode_png(_mask(shot))
@@ -63,13 +63,13 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         yield replace(image(time_ns, ROBOT, depth, "png"), topic=topics.depths(ROBOT))
 
 
-def _peers(shot: Shot) -> Iterator[dict[str, Any]]:
+def _peers(scene: Drawn, shot: Shot) -> Iterator[dict[str, Any]]:
     """Labels of the robots of which anything is seen."""
     for k, share in enumerate(shot.visible_share.tolist()):
         if share <= 0 or np.isnan(shot.box_px[k]).any():
             continue
         yield {
-            "peer": peer(k),
+            "peer": peer(k, scene.robots[k]),
             "u_px": float(shot.uv_px[k, 0]),
             "v_px": float(shot.uv_px[k, 1]),
             "depth_m": float(shot.depth_m[k]),
@@ -101,7 +101,7 @@ def _transforms(time_ns: int, scene: Drawn, horizontal_from_camera: Array) -> Sa
     for k, robot in enumerate(scene.robots):
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
         turn = horizontal_from_camera @ robot.pose.camera_from_body
-        poses.append((f"{ROBOT}/horizontal", peer(k), xyz, turn))
+        poses.append((f"{ROBOT}/horizontal", peer(k, robot), xyz, turn))
     transforms = [
         {
             "timestamp": {"seconds": seconds, "nanos": nanos},

@@ -166,10 +166,11 @@ def _robot(settings: Settings, rng: Generator, pose: Pose, shutter_s: float) -> 
     open_s = shutter_s or 0.01
     sweep = 0.0 if stopped else 2 * np.pi * _between(rng, settings.rotor_speed_rps) * open_s
     paint = random_paint(rng, _between(rng, settings.wear), settings.colour_spread)
-    if settings.painted_share and rng.random() < settings.painted_share:
+    painted = bool(settings.painted_share) and rng.random() < settings.painted_share
+    if painted:
         paint |= strong_colours(rng)
     paint |= {"rotor_first_rad": float(rng.uniform(0, np.pi)), "rotor_sweep_rad": float(sweep)}
-    return Robot(pose, paint, velocity * shutter_s)
+    return Robot(pose, paint, velocity * shutter_s, "painted" if painted else "cf")
 
 
 def random_paint(rng: Generator, wear: float, spread: float) -> dict[str, Any]:

@@ -113,7 +113,8 @@ class Settings:
     colour_spread
         How far colours of parts vary, 0 to 1.
     painted_share
-        Share of robots in two strong colours drawn at random, as of another make.
+        Share of robots in two strong colours drawn at random, as of another make. They are called
+        painted2 and so on in place of cf2.
     light_strength
         Range of the panorama's light on the robots.
     sun_strength

@@ -67,11 +67,14 @@ class Robot:
         Properties of its materials, as the worker's shaders read them.
     move_camera_m
         (3,) how far it moves in the camera frame while the shutter is open, metres.
+    make
+        What it is called, before its number.
     """
 
     pose: Pose
     paint: Mapping[str, Any] = field(default_factory=dict)
     move_camera_m: Array = field(default_factory=lambda: np.zeros(3))
+    make: str = "cf"
 
 
 @dataclass(frozen=True, slots=True)

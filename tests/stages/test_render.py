@@ -25,7 +25,15 @@ from dmrl.shots import quaternion
 from dmrl.stages.render import camera_of, run
 
 SMALL = Settings(
-    images=6, robots_max=3, empty_share=0.2, seed=3, workers=1, samples=4, masks=True, depths=True
+    images=6,
+    robots_max=3,
+    empty_share=0.2,
+    painted_share=0.5,
+    seed=3,
+    workers=1,
+    samples=4,
+    masks=True,
+    depths=True,
 )
 
 
@@ -51,18 +59,21 @@ def test_masks_depths_and_labels_agree(recording: Path) -> None:
     samples = list(read(recording, *topics))
     labels = {s.time_ns: s.message.peers for s in samples if s.topic == topics[0]}
     seen = 0
+    makes = set()
     for sample in samples:
         if sample.topic != topics[1]:
             continue
         mask = decode(sample.message.data)[..., 0]
         for label in labels[sample.time_ns]:
-            rows, cols = np.nonzero(mask == int(label.peer[2:]))
+            makes.add(label.peer[:-1])
+            rows, cols = np.nonzero(mask == int(label.peer[-1]))
             if label.visible_share < 1 or not len(rows):
                 continue
             edges = [cols.min(), rows.min(), cols.max() + 1, rows.max() + 1]
             assert np.abs(np.array(edges) - label.box_px).max() <= 1.5
             seen += 1
     assert seen
+    assert makes == {"cf", "painted"}
 
 
 def test_the_number_of_workers_changes_no_byte(recording: Path, tmp_path: Path) -> None:
