@@ -65,6 +65,31 @@ def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) 
     assert [source["name"] for source in made["inputs"]] == ["dots", "a"]
 
 
+def test_a_teacher_is_learnt_from_and_named(dataset: Path, tmp_path: Path) -> None:
+    taught = replace(SETTINGS, distill_share=1.0)
+    run(dataset, tmp_path / "teacher", replace(SETTINGS, architecture="dmrl-large"))
+    run(dataset, tmp_path / "a", taught, teacher=tmp_path / "teacher")
+    run(dataset, tmp_path / "b", taught)
+    first, second = (load_model(tmp_path / name).network.state_dict() for name in ("a", "b"))
+    assert not np.allclose(first["head.weight"], second["head.weight"])
+    made = json.loads((tmp_path / "a" / "provenance.json").read_text())
+    assert [source["name"] for source in made["inputs"]] == ["dots", "teacher"]
+
+
+def test_classes_are_patterns_of_peer_names(dataset: Path, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, classes=("cf9", "cf*"), spread_weight=1.0)
+    with pytest.raises(SettingError, match=r"classes: no peer in the train split is cf9 and none"):
+        run(dataset, tmp_path / "run", settings)
+    settings = replace(settings, classes=("cf2", "cf*"))
+    with pytest.raises(SettingError, match=r"is cf\* and none before"):
+        run(dataset, tmp_path / "run", settings)
+    run(dataset, tmp_path / "plain", SETTINGS)
+    settings = replace(settings, classes=("cf2",))
+    run(dataset, tmp_path / "more", settings, init=tmp_path / "plain")
+    outputs = json.loads((tmp_path / "more" / "model.json").read_text())["outputs"]
+    assert outputs[4:] == ["log_spread", "class_0"]
+
+
 KILLED = """
 import sys, time
 from pathlib import Path
