@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
 from dmrl.images import decode, encode_png
-from dmrl.learn.model import load_model
+from dmrl.learn.model import Model, load_model, save_model
+from dmrl.learn.network import build
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary
 from dmrl.stages import predict
@@ -47,13 +49,30 @@ def test_detections_have_the_time_of_their_image(dots: Path, model: Path, tmp_pa
         assert [(raw.time_ns, raw.publish_ns) for raw in read_raw(out, topic)] == images
 
 
+def test_what_a_network_says_beyond_is_written_with_its_detections(
+    dots: Path, tmp_path: Path
+) -> None:
+    network = build("dmrl-nano", seed=1, extra=("log_spread", "class_0", "class_1")).eval()
+    with torch.no_grad():
+        network.head.bias[4:] = torch.tensor([-1.0, 0.0, 9.0])  # type: ignore[union-attr, index]
+        network.head.weight[4:] = 0  # type: ignore[union-attr, index, operator]
+    (tmp_path / "model").mkdir()
+    save_model(Model(network, "dmrl-nano"), tmp_path / "model")
+    run(tmp_path / "model", dots, tmp_path / "out.mcap", Settings())
+    found = [d for s in read(tmp_path / "out.mcap", OWN[0]) for d in s.message.detections]
+    assert len(found) >= 30
+    assert {d.class_id for d in found} == {1}
+    for d in found:
+        assert d.sigma_depth_m == pytest.approx(2**0.5 * np.exp(-1) * d.depth_m)
+
+
 def test_the_grid_is_what_the_network_says_and_detections_are_its_peaks(
     dots: Path, model: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.mcap"
     run(model, dots, out, Settings(min_confidence=0.0, most=3))
     image = next(read(dots, "/cf1/camera/image")).message
-    confidence, depth_m, _ = load_model(model).grids(decode(image.data)[None])
+    confidence, depth_m, *_ = load_model(model).grids(decode(image.data)[None])
     grid = next(read(out, OWN[1])).message
     assert (grid.rows, grid.cols, grid.stride_px) == (6, 8, 8)
     assert list(grid.channels) == ["confidence", "depth_m"]
