@@ -36,6 +36,8 @@ STAGES: dict[str, int | None] = {
     "export": 1,
     "view": None,
 }
+# What one more input is, where a stage takes one.
+ONE_MORE = {"train": "init"}
 # These go on with what a killed run has left.
 RESUMABLE = ("train", "render")
 RECIPE_FILE = "recipe.toml"
@@ -97,12 +99,8 @@ def _check_order(name: str | Path, pipeline: Pipeline) -> None:
     """Refuse a step that reads what no earlier step writes, and outputs given twice."""
     made: set[str] = set()
     for number, step in enumerate(pipeline.steps, start=1):
-        wants = STAGES[step.stage]
-        if (wants is None and not step.inputs) or (wants is not None and wants != len(step.inputs)):
-            raise RecipeError(
-                f"{name}: step {number} ({step.stage}) has {len(step.inputs)} inputs, not "
-                f"{'one or more' if wants is None else wants}. See: dmrl {step.stage} --help"
-            )
+        if wrong := _wrong_inputs(step):
+            raise RecipeError(f"{name}: step {number} {wrong}. See: dmrl {step.stage} --help")
         for source in step.inputs:
             if not source.startswith("{data}") and source.split("/")[0] not in made:
                 raise RecipeError(
@@ -112,6 +110,16 @@ def _check_order(name: str | Path, pipeline: Pipeline) -> None:
         if step.out in made:
             raise RecipeError(f"{name}: step {number} writes {step.out} again. Name another out")
         made.add(step.out)
+
+
+def _wrong_inputs(step: Step) -> str:
+    """What is wrong with the number of a step's inputs; empty: nothing."""
+    count, wants = len(step.inputs), STAGES[step.stage]
+    most = wants if wants is None else wants + (step.stage in ONE_MORE)
+    if count >= (1 if wants is None else wants) and (most is None or count <= most):
+        return ""
+    words = "one or more" if wants is None else wants if wants == most else f"{wants} or {most}"
+    return f"({step.stage}) has {count} inputs, not {words}"
 
 
 def _claim(out: Path, pipeline: Pipeline) -> None:
@@ -158,7 +166,10 @@ def _call(step: Step, inputs: list[Path], out: Path) -> None:
     extra: dict[str, Any] = {}
     if step.stage in RESUMABLE and partial_of(out).exists():
         extra["resume"] = True
-    sources = [inputs] if STAGES[step.stage] is None else inputs
+    wants = STAGES[step.stage]
+    if wants is not None and len(inputs) > wants:
+        extra[ONE_MORE[step.stage]] = inputs.pop()
+    sources = [inputs] if wants is None else inputs
     module.run(*sources, out, settings, **extra)
 
 

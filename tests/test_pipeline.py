@@ -81,6 +81,23 @@ def test_a_pipeline_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert [(d.stage, d.skipped) for d in done] == [("sketch", True), ("convert", False)]
 
 
+def test_a_training_may_go_on_from_the_model_of_another(tmp_path: Path) -> None:
+    refine = """
+[[step]]
+stage = "train"
+inputs = ["dataset", "model"]
+out = "refined"
+settings = { epochs = 1, learning_rate = 1e-9, final_learning_rate = 0.0 }
+"""
+    first = SMALL.split('\n[[step]]\nstage = "predict"')[0]
+    pipeline.run(write(tmp_path, first + refine), tmp_path / "out")
+    made = json.loads((tmp_path / "out" / "refined" / "provenance.json").read_text())
+    assert [source["name"] for source in made["inputs"]] == ["dataset", "model"]
+    with pytest.raises(RecipeError, match=r"\(train\) has 3 inputs, not 1 or 2"):
+        wrong = refine.replace('"model"]', '"model", "model"]')
+        pipeline.run(write(tmp_path, first + wrong), tmp_path / "again")
+
+
 def test_another_recipe_does_not_reuse_the_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
     pipeline.run(write(tmp_path, SMALL.split('\n[[step]]\nstage = "convert"')[0]), out)
