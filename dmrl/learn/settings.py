@@ -23,7 +23,7 @@ class FitSettings:
     batch_size
         Images per step.
     optimizer
-        "muon": Muon for the kernels that mix channels, AdamW for the rest; halves the epochs.
+        "muon": Muon for the kernels that mix channels, AdamW for the rest.
         "adam": Adam as published or, with a weight decay, AdamW.
     learning_rate
         Of the optimizer, at the end of the warm-up.
