@@ -46,9 +46,7 @@ def material(data: Dataset, settings: FitSettings) -> Material:
     """
     train = data.split("train")
     every = examples_of(train, settings.classes)
-    for number, pattern in enumerate(settings.classes):
-        if not (every.robots[..., CLASS_ID] == number).any():
-            raise SettingError(f"classes: no peer in the train split is {pattern} and none before")
+    _require_classes(train, every, settings.classes)
     sources = np.array(train.table.column("source").to_pylist())
     held = np.zeros(len(every), bool)
     watched = examples_of(data.split("val"), settings.classes) if "val" in data.splits else None
@@ -57,6 +55,17 @@ def material(data: Dataset, settings: FitSettings) -> Material:
         watched = every.select(held) if held.any() else None
     learnt = every.select(~held) if held.any() else every
     return Material(learnt, watched, _shares(sources[~held], settings.shares))
+
+
+def _require_classes(train: Split, every: Examples, classes: Sequence[str]) -> None:
+    for number, pattern in enumerate(classes):
+        if not (every.robots[..., CLASS_ID] == number).any():
+            peers = pc.list_flatten(train.table.column("peers"))
+            names = pc.unique(pc.struct_field(peers, "peer")).to_pylist()
+            raise SettingError(
+                f"classes: {pattern} is left no peer by the patterns before it. Choose among "
+                f"{', '.join(sorted(names))}"
+            )
 
 
 def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
