@@ -25,6 +25,7 @@ from dmrl.learn.network import (
     SPREAD,
     Network,
     build,
+    by_name,
     parameter_count,
     to_input,
 )
@@ -42,7 +43,7 @@ def grids_of(network: Network, images: Tensor) -> Grids:
     device = next(network.parameters()).device
     with torch.inference_mode():
         out = network(to_input(images.to(device))).cpu()
-    named = dict(zip(network.channels, out.unbind(1), strict=True))
+    named = by_name(network.channels, out)
     classes = [named[name] for name in network.channels if name.startswith(CLASS)]
     return Grids(
         named["confidence"].sigmoid().numpy(),

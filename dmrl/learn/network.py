@@ -209,6 +209,11 @@ def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
+def by_name(channels: Sequence[str], output: Tensor) -> dict[str, Tensor]:
+    """(N, rows, cols) of each channel of an output (N, C, rows, cols)."""
+    return dict(zip(channels, output.unbind(1), strict=True))
+
+
 def to_input(images: Tensor) -> Tensor:
     """Network input, x / 128 - 1, of uint8 images; float32, memory order unchanged.
 

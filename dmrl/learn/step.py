@@ -8,7 +8,7 @@ from torch import Tensor
 from dmrl.learn.batches import Batch
 from dmrl.learn.group import Group
 from dmrl.learn.losses import class_loss, confidence_loss, depth_loss, offset_loss, spread_loss
-from dmrl.learn.network import CLASS, SPREAD, Network, to_input
+from dmrl.learn.network import CLASS, SPREAD, Network, by_name, to_input
 from dmrl.learn.settings import FitSettings
 from dmrl.learn.targets import Targets, as_targets, targets
 
@@ -31,7 +31,7 @@ def losses(
         stride_px=network.stride_px,
         label_noise=settings.label_noise,
     )
-    named = dict(zip(network.channels, out.unbind(1), strict=True))
+    named = by_name(network.channels, out)
     parts = _against(named, wanted, settings)
     if teacher is None:
         return parts

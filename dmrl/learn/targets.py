@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dmrl.learn.batches import CLASS_ID, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, U, V
+from dmrl.learn.network import by_name
 
 PRESENT = 0.1
 """Cells where g is below this learn neither depth nor offset."""
@@ -129,7 +130,7 @@ def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Ta
     labelled
         Targets of the same images by their labels.
     """
-    out = dict(zip(channels, output.unbind(1), strict=True))
+    out = by_name(channels, output)
     confidence = out["confidence"].sigmoid()
     near = confidence * (confidence >= PRESENT)
     offset = labelled.offset
