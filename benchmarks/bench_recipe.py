@@ -52,7 +52,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "wider targets": {"target_sigma_cells": 1.0},
     "cross entropy": {"focus": 0.0},
     "squared depth error": {"depth_loss": "squared"},
-    "Adam": {"optimizer": "adam"},
+    "Muon": {"optimizer": "muon"},
     "last weights kept": {"ema_steps": 0},
     "no weight decay": {"weight_decay": 0.0},
     "batches of 8": {"batch_size": 8},

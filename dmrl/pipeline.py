@@ -115,11 +115,12 @@ def _check_order(name: str | Path, pipeline: Pipeline) -> None:
 def _wrong_inputs(step: Step) -> str:
     """What is wrong with the number of a step's inputs; empty: nothing."""
     count, wants = len(step.inputs), STAGES[step.stage]
-    most = wants if wants is None else wants + (step.stage in ONE_MORE)
-    if count >= (1 if wants is None else wants) and (most is None or count <= most):
-        return ""
-    words = "one or more" if wants is None else wants if wants == most else f"{wants} or {most}"
-    return f"({step.stage}) has {count} inputs, not {words}"
+    if wants is None:
+        right, words = count > 0, "one or more"
+    else:
+        counts = (wants, wants + 1) if step.stage in ONE_MORE else (wants,)
+        right, words = count in counts, " or ".join(map(str, counts))
+    return "" if right else f"({step.stage}) has {count} inputs, not {words}"
 
 
 def _claim(out: Path, pipeline: Pipeline) -> None:

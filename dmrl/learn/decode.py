@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 PER_DETECTION = ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m", "class_id")
+"""Columns of `Found`, named as the fields of a Detection."""
 SAME_PX = 8.0
 """Detections closer than this are of one robot."""
 
