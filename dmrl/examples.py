@@ -122,7 +122,7 @@ def examples_of(split: Split, classes: Sequence[str] = ()) -> Examples:
     image = np.repeat(np.arange(len(counts)), counts)
     place = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
     robots[image, place] = flat
-    return Examples(split.pixels, robots.astype(np.float32))
+    return Examples(split.pixels, robots.astype(np.float32), split.masks)
 
 
 def _class_ids(names: pa.Array, classes: Sequence[str]) -> NDArray[np.float32]:

@@ -12,6 +12,7 @@ from dmrl.recording import Provenance
 MEANING = {
     layout.PIXELS: "image, {height} x {width} x 3 bytes, RGB, row by row from the top left",
     layout.IMAGE: "image, {height} x {width} px, PNG, RGB",
+    layout.MASKS: "what each of {height} x {width} pixels shows: 0, or a place in `peers` from 1",
     "peers": "every labelled peer; it may lie outside the image",
     "peers.peer": "name of the robot that is seen",
     "peers.u_px": "px, right from the left edge; pixel-edge coordinates: [0, {width}]",

@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from dmrl.geometry import STRIDE_PX
 
-PIXELS, IMAGE = "pixels", "image"
+PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"
 
 PEER = pa.struct(
@@ -44,7 +44,7 @@ PNG = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 """Storage of the Image feature of ``datasets``."""
 
 
-def schema(height_px: int, width_px: int, *, png: bool = False) -> pa.Schema:
+def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = False) -> pa.Schema:
     """Arrow schema of a dataset of images of one size.
 
     Parameters
@@ -53,6 +53,9 @@ def schema(height_px: int, width_px: int, *, png: bool = False) -> pa.Schema:
         Size of the images, multiples of 8.
     png
         Column ``image`` with PNG bytes in place of ``pixels`` with raw RGB.
+    masks
+        With a column ``masks``: what every pixel shows, one byte each, 0 or the place of the
+        peer in ``peers``, from 1.
 
     Returns
     -------
@@ -63,9 +66,11 @@ def schema(height_px: int, width_px: int, *, png: bool = False) -> pa.Schema:
     picture = (IMAGE, PNG) if png else (PIXELS, pa.binary(height_px * width_px * 3))
     row = pa.list_(pa.float32(), width_px // STRIDE_PX)
     grid = pa.list_(row, height_px // STRIDE_PX)
+    covered = [(MASKS, pa.binary(height_px * width_px))] if masks else []
     plain = pa.schema(
         [
             picture,
+            *covered,
             ("peers", pa.list_(PEER)),
             (CONFIDENCE, grid),
             (DEPTH, grid),

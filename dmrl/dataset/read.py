@@ -62,6 +62,16 @@ class Split:
         return [self._decoded(chunk) for chunk in self.table[layout.IMAGE].chunks]
 
     @cached_property
+    def masks(self) -> list[NDArray[np.uint8]]:
+        """What the pixels of ``pixels`` show, (n_i, H, W): 0 or the place of a peer, from 1.
+
+        Empty where the dataset has no masks.
+        """
+        if layout.MASKS not in self.table.schema.names:
+            return []
+        return [self._view(chunk)[..., 0] for chunk in self.table[layout.MASKS].chunks]
+
+    @cached_property
     def confidence(self) -> NDArray[np.float32]:
         """(N, rows, cols): 1 in the cell of a peer's centre, else 0."""
         return self._grid(layout.CONFIDENCE)
@@ -75,7 +85,7 @@ class Split:
         every = np.frombuffer(chunk.buffers()[1], np.uint8)
         width = chunk.type.byte_width
         mine = every[chunk.offset * width : (chunk.offset + len(chunk)) * width]
-        return mine.reshape(len(chunk), *self.image_shape, 3)
+        return mine.reshape(len(chunk), *self.image_shape, -1)
 
     def _decoded(self, chunk: pa.Array) -> NDArray[np.uint8]:
         out = np.empty((len(chunk), *self.image_shape, 3), np.uint8)

@@ -6,14 +6,16 @@ that has peers, but none from the chosen source, is left out, and so is one with
 label is not OK: as a picture of "nobody there" it would teach the opposite of the truth.
 """
 
+import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.dataset.layout import PEER
@@ -29,6 +31,9 @@ SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
 
 PATTERNS = (topics.camera_image("*"), topics.labels("*"))
+
+Mask = NDArray[np.uint8]
+"""(H, W) what every pixel shows: 0 or the place of a peer among the labels, from 1."""
 
 
 @dataclass(slots=True)
@@ -97,7 +102,7 @@ def label_source(path: Path, wanted: str) -> str:
 
 
 def rows_of(
-    path: Path, source: str, split_of: SplitOf, tally: Tally, *, keep_all: bool
+    path: Path, source: str, split_of: SplitOf, tally: Tally, *, keep_all: bool, masks: bool
 ) -> Iterator[tuple[str, Row] | None]:
     """Split and row of each image of a recording, in time order; None for one left out.
 
@@ -113,8 +118,10 @@ def rows_of(
         Is counted up.
     keep_all
         Labels that are not OK count as well.
+    masks
+        Rows have masks, empty ones where the recording has none.
     """
-    for image, labels in labelled_images(path):
+    for image, labels, covered in labelled_images(path, masks=masks):
         if labels is None:
             tally.without_labels += 1
             yield None
@@ -129,22 +136,48 @@ def rows_of(
             tally.not_ok += 1
         else:
             tally.kept += 1
-            yield split, _row(path, image, [_peer(label) for label in mine])
+            row = _row(path, image, [_peer(label) for label in mine])
+            yield split, replace(row, mask=_mask(path, row, covered)) if masks else row
             continue
         yield None
 
 
-def labelled_images(path: Path) -> Iterator[tuple[Stamped, Any]]:
-    """Each image with the PeerLabels of the same robot and log time, or None."""
-    for _, same_time in groupby(read(path, *PATTERNS), key=lambda stamped: stamped.time_ns):
-        images, labels = [], {}
+def labelled_images(
+    path: Path, *, masks: bool = False
+) -> Iterator[tuple[Stamped, Any, Stamped | None]]:
+    """Each image with PeerLabels and, if asked for, masks of its robot and log time, or None."""
+    patterns = [*PATTERNS]
+    if masks and any(topics.names(topics.MASKS, topic) for topic in summary(path).topics):
+        patterns.append(topics.masks("*"))
+    for _, same_time in groupby(read(path, *patterns), key=lambda stamped: stamped.time_ns):
+        images, labels, covered = [], {}, {}
         for stamped in same_time:
             if found := topics.names(topics.LABELS, stamped.topic):
                 labels[found["robot"]] = stamped.message
+            elif found := topics.names(topics.MASKS, stamped.topic):
+                covered[found["robot"]] = stamped
             else:
                 images.append(stamped)
         for image in images:
-            yield image, labels.get(_robot(image))
+            yield image, labels.get(_robot(image)), covered.get(_robot(image))
+
+
+def _mask(path: Path, row: Row, covered: Stamped | None) -> Mask:
+    """Places of the row's peers in place of the numbers in their names."""
+    shape = row.rgb.shape[:2]
+    if covered is None:
+        return np.zeros(shape, np.uint8)
+    what = f"{path}: {covered.topic} at {covered.time_ns} ns"
+    numbers = decode(covered.message.data, what)[..., 0]
+    if numbers.shape != shape:
+        (height_px, width_px), (rows, cols) = shape, numbers.shape
+        sizes = f"{cols} x {rows} px, its image {width_px} x {height_px} px"
+        raise RecordingError(f"{what} is {sizes}. Leave out --masks")
+    place = np.zeros(256, np.uint8)
+    for k, peer in enumerate(row.peers, 1):
+        if found := re.search(r"\d+$", peer["peer"]):
+            place[int(found[0]) % 256] = k
+    return place[numbers]
 
 
 def _robot(image: Stamped) -> str:

@@ -36,6 +36,9 @@ class Row:
         File name of the recording.
     time_ns
         Log time of the image.
+    mask
+        (H, W) what every pixel shows: 0 or the place of the peer in ``peers``, from 1. None:
+        the dataset has no masks.
     """
 
     rgb: NDArray[np.uint8]
@@ -44,6 +47,7 @@ class Row:
     robot: str
     source: str
     time_ns: int
+    mask: NDArray[np.uint8] | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -191,7 +195,7 @@ def write_dataset(
     writers: dict[str, SplitWriter] = {}
     for split, row in rows:
         if split not in writers:
-            schema = layout.schema(*row.rgb.shape[:2], png=png)
+            schema = layout.schema(*row.rgb.shape[:2], png=png, masks=row.mask is not None)
             writers[split] = SplitWriter(folder, split, schema, parquet, shard_images)
         writers[split].add(row)
     names = sorted(writers, key=lambda name: (name != "train", name))
@@ -213,15 +217,20 @@ def _record_batch(rows: list[Row], schema: pa.Schema, split: str) -> pa.RecordBa
         "split": pa.array([split] * len(rows)),
     }
     if layout.PIXELS in schema.names:
-        pixels = pa.py_buffer(np.stack([row.rgb for row in rows]))
-        kind = schema.field(layout.PIXELS).type
-        columns[layout.PIXELS] = pa.Array.from_buffers(kind, len(rows), [None, pixels])
+        columns[layout.PIXELS] = _bytes_column(np.stack([row.rgb for row in rows]))
     else:
         pictures = [
             {"bytes": encode_png(row.rgb), "path": f"{row.robot}_{row.time_ns}.png"} for row in rows
         ]
         columns[layout.IMAGE] = pa.array(pictures, layout.PNG)
+    if masks := [row.mask for row in rows if row.mask is not None]:
+        columns[layout.MASKS] = _bytes_column(np.stack(masks))
     return pa.record_batch([columns[name] for name in schema.names], schema=schema)
+
+
+def _bytes_column(values: NDArray[np.uint8]) -> pa.Array:
+    kind = pa.binary(values[0].size)
+    return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
 
 
 def _grid_column(grid: NDArray[np.float32]) -> pa.Array:

@@ -28,6 +28,7 @@ from dmrl.learn.layers import (
     parts,
     present,
     sample,
+    under,
 )
 
 MAX_ROBOTS = 12
@@ -169,9 +170,10 @@ class Augmenter:
         return self._show(canvas, rect, source, window, mine, robots, rng)
 
     def _patch(self, canvas: Tensor, robots: Robots, rng: Rng) -> Robots:
-        """Paste a robot of another image with what is close around it, or as much without one.
+        """Paste a robot of another image, or as much without one.
 
-        Without the latter, the edge of a patch would tell that a robot is in it.
+        Along its mask where that is known, else with what is close around it. Without patches
+        that hold no robot, the edge of a patch would tell that one is in it.
         """
         if not len(self._pasteable):
             return robots
@@ -185,13 +187,20 @@ class Augmenter:
             return robots
         left, top = np.floor(rng.uniform(0, room + 1)).astype(int).tolist()
         rect = (left, top, left + int(size[0]), top + int(size[1]))
-        centre = np.array([box[0] + box[2], box[1] + box[3]]) / 2 + rng.uniform(-2, 2, 2)
+        mask = self._examples.mask(source, which)
+        middle = np.array([box[0] + box[2], box[1] + box[3]]) / 2 + rng.uniform(-2, 2, 2)
+        centre = middle
         if rng.random() < DISTRACTOR_SHARE:
             source = int(rng.integers(len(self._examples)))
             centre = rng.uniform((0, 0), (self._width, self._height))
         window = self._window(centre, size, zoom, rng)
+        if mask is None:
+            opacity = feather(int(size[1]), int(size[0]))
+        else:
+            about = window._replace(origin=middle - window.matrix @ (size / 2))
+            opacity = sample(mask[..., None], about, (int(size[1]), int(size[0])))
         mine = present(self._examples.robots[source])
-        return self._show(canvas, rect, source, window, mine, robots, rng, soft=True)
+        return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
 
     def _zoom(self, robot: Robots | None, rng: Rng) -> float:
         """A magnification, log-uniform; the robot's depth stays in the range of the labels."""
@@ -222,20 +231,19 @@ class Augmenter:
         mine: Robots,
         robots: Robots,
         rng: Rng,
-        *,
-        soft: bool = False,
+        opacity: Tensor | None = None,
     ) -> Robots:
         left, top, right, bottom = rect
         pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
         self._tint(pixels, rng)
         place = canvas[top:bottom, left:right]
-        if soft:
-            place.lerp_(pixels, feather(bottom - top, right - left))
-        else:
+        if opacity is None:
             place.copy_(pixels)
+        else:
+            place.lerp_(pixels, opacity)
         seen = moved(mine, window, rect)
-        kept = robots[~inside(robots, rect)]
-        return np.concatenate([kept, seen[inside(seen, rect) & self._in_source(mine)]])
+        kept = robots[~under(robots, rect, opacity)]
+        return np.concatenate([kept, seen[under(seen, rect, opacity) & self._in_source(mine)]])
 
     def _in_source(self, robots: Robots) -> NDArray[np.bool_]:
         return inside(robots, (0, 0, self._width, self._height))

@@ -53,10 +53,14 @@ class Examples:
     robots
         (N, K, 11) float32, ``FIELDS`` of up to K robots in each of the N images, N the sum of
         the n_i. Sigmas are 0 where the label is exact, a box or class NaN where there is none.
+    masks
+        Arrays of (n_i, H, W) uint8, what every pixel shows: 0 or the place of a robot in
+        ``robots``, from 1. Empty: it is not known.
     """
 
     pixels: Sequence[NDArray[np.uint8]]
     robots: Robots
+    masks: Sequence[NDArray[np.uint8]] = ()
 
     def __post_init__(self) -> None:
         count = sum(len(chunk) for chunk in self.pixels)
@@ -64,6 +68,8 @@ class Examples:
             raise ValueError(f"{count} images with robots of {len(self.robots)}")
         if len({chunk.shape[1:] for chunk in self.pixels}) > 1:
             raise ValueError("images of more than one size")
+        if self.masks and [m.shape for m in self.masks] != [p.shape[:3] for p in self.pixels]:
+            raise ValueError("masks that do not fit the images")
 
     @cached_property
     def _ends(self) -> list[int]:
@@ -81,15 +87,30 @@ class Examples:
     def select(self, chosen: NDArray[np.bool_]) -> "Examples":
         """The chosen images, one chunk each, not copied."""
         numbers = np.flatnonzero(chosen)
-        chunks = [self.image(int(index))[None] for index in numbers]
-        return Examples(chunks, self.robots[numbers])
+        places = [self._at(index) for index in numbers.tolist()]
+        chunks = [self.pixels[chunk][place][None] for chunk, place in places]
+        masks = [self.masks[chunk][place][None] for chunk, place in places if self.masks]
+        return Examples(chunks, self.robots[numbers], masks)
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """(H, W, 3) image of a number."""
-        chunk = bisect_right(self._ends, index)
-        first = self._ends[chunk - 1] if chunk else 0
-        found: NDArray[np.uint8] = self.pixels[chunk][index - first]
+        chunk, place = self._at(index)
+        found: NDArray[np.uint8] = self.pixels[chunk][place]
         return found
+
+    def mask(self, index: int, robot: int) -> NDArray[np.uint8] | None:
+        """(H, W) 1 where an image shows one of its robots; None if its centre is not shown."""
+        if not self.masks:
+            return None
+        chunk, place = self._at(index)
+        mine: NDArray[np.uint8] = (self.masks[chunk][place] == robot + 1).view(np.uint8)
+        u, v = self.robots[index, robot, [U, V]]
+        seen = 0 <= u < mine.shape[1] and 0 <= v < mine.shape[0] and mine[int(v), int(u)]
+        return mine if seen else None
+
+    def _at(self, index: int) -> tuple[int, int]:
+        chunk = bisect_right(self._ends, index)
+        return chunk, index - (self._ends[chunk - 1] if chunk else 0)
 
 
 def order(

@@ -77,6 +77,15 @@ def inside(robots: Robots, rect: Rect) -> NDArray[np.bool_]:
     return within
 
 
+def under(robots: Robots, rect: Rect, opacity: Tensor | None) -> NDArray[np.bool_]:
+    """(n,) which robots have their centres under a layer (h, w, 1), None: opaque."""
+    within = inside(robots, rect)
+    if opacity is not None:
+        u, v = (robots[within][:, [U, V]] - rect[:2]).astype(int).T
+        within[within] = opacity[v, u, 0].numpy() > 0.5
+    return within
+
+
 def moved(robots: Robots, window: Window, rect: Rect) -> Robots:
     """Robots of a source where a window puts them on the canvas."""
     back = np.linalg.inv(window.matrix)

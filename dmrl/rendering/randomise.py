@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from dmrl.geometry import Array, Camera, camera_from_horizontal
 from dmrl.rendering.backdrops import Photos, panorama_view, smeared
@@ -137,25 +138,28 @@ def _poses(world: World, rng: Generator, tilt: Array) -> list[Pose]:
 
 
 def _place(world: World, rng: Generator) -> Array:
-    """Uniform in the image as it is seen, distorted."""
-    camera = world.camera
-    uv = rng.uniform((0, 0), (camera.width_px, camera.height_px))
+    """Uniform in a part of the image as it is seen, distorted."""
+    camera, settings = world.camera, world.settings
+    size = np.array([camera.width_px, camera.height_px])
+    low, high = np.transpose([settings.place_u, settings.place_v]) * size
+    uv = rng.uniform(low, high)
     u_px, v_px = pinhole_from_image(uv, camera)
-    draw = _between if world.settings.depth_spacing == "linear" else _factor
-    depth_m = draw(rng, world.settings.depth_m)
+    draw = _between if settings.depth_spacing == "linear" else _factor
+    depth_m = draw(rng, settings.depth_m)
     left = (camera.cx_px - u_px) / camera.fx_px
     up = (camera.cy_px - v_px) / camera.fy_px
     return np.array([depth_m, depth_m * left, depth_m * up])
 
 
 def _attitude(settings: Settings, rng: Generator) -> Array:
-    """Rotation horizontal_from_body: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Rotation horizontal_from_body."""
     tilt_rad = np.radians(settings.robot_tilt_max_deg)
     roll, pitch = rng.uniform(-tilt_rad, tilt_rad, 2).tolist()
     yaw = rng.uniform(-np.pi, np.pi)
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(turn @ camera_from_horizontal(roll, pitch).T)
+    about = {"x": roll, "y": pitch, "z": yaw}
+    order = settings.robot_turns
+    turns = Rotation.from_euler(order.upper(), [about[axis] for axis in order])
+    return np.asarray(turns.as_matrix())
 
 
 def _robot(settings: Settings, rng: Generator, pose: Pose, shutter_s: float) -> Robot:

@@ -18,6 +18,8 @@ LIMITS: dict[str, Range] = {
     "test_share": (0, 1),
     "empty_share": (0, 1),
     "robots_max": (1, 20),
+    "place_u": (0, 1),
+    "place_v": (0, 1),
     "depth_m": (0.08, 50.0),
     "robot_tilt_max_deg": (0, 90),
     "camera_tilt_max_deg": (0, 60),
@@ -90,12 +92,17 @@ class Settings:
         Share of images without a robot, 0 to 1.
     robots_max
         Robots in an image, at most; every number is as likely.
+    place_u, place_v
+        Range of robots' centres across and down the image, shares of its width and height.
     depth_m
         Range of depths.
     depth_spacing
         log: every factor of depth is as likely; linear: every metre.
     robot_tilt_max_deg
         Roll and pitch of the robots, at most.
+    robot_turns
+        Axes of the robots' turns, from the horizontal frame on. zyx: yaw, pitch, roll, as
+        aircraft count. xzy: roll, yaw, pitch, as the authors' script.
     camera_tilt_max_deg
         Roll and pitch of the camera, at most.
     speed_max_mps
@@ -178,9 +185,12 @@ class Settings:
     test_share: float = 0.2
     empty_share: float = 0.1
     robots_max: int = 1
+    place_u: Range = (0.0, 1.0)
+    place_v: Range = (0.0, 1.0)
     depth_m: Range = (0.2, 2.0)
     depth_spacing: Literal["log", "linear"] = "log"
     robot_tilt_max_deg: float = 20.0
+    robot_turns: Literal["zyx", "xzy"] = "zyx"
     camera_tilt_max_deg: float = 20.0
     speed_max_mps: float = 0.0
     shutter_s: Range = (0.0, 0.0)
@@ -262,7 +272,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "robots_max": 1,
         "empty_share": 0.0,
         "scale": 2.0,
+        "place_u": [0.0875, 0.9125],  # y/x to 1.1
+        "place_v": [0.045, 0.955],  # z/x to 0.85
         "depth_m": [0.2, 2.0],
+        "robot_turns": "xzy",
         "rotors_stopped_share": 1.0,
         "background_zoom": [1.0, 1.0],
         "background_blur_px": [0.0, 0.0],

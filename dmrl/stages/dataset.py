@@ -41,6 +41,9 @@ class Settings:
         Share of the recordings that become the test split, 0 to 1.
     seed
         Another seed holds out other recordings.
+    masks
+        Keep the masks of rendered robots: a training can then paste robots without what was
+        around them.
     png
         Store PNG images in place of raw pixels: less disk, but decoded at each opening.
     parquet
@@ -58,6 +61,7 @@ class Settings:
     split: Literal["auto", "recordings", "none"] = "auto"
     test_share: Share = 0.2
     seed: int = 0
+    masks: bool = False
     png: bool = False
     parquet: bool = False
     shard_images: Positive = 2048
@@ -105,7 +109,7 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
         tally = Tally()
         images = write_dataset(
             partial,
-            _rows(sources, splits, tally, total, keep_all=settings.keep_all),
+            _rows(sources, splits, tally, total, settings),
             png=settings.png,
             parquet=settings.parquet,
             shard_images=settings.shard_images,
@@ -157,13 +161,13 @@ def _rows(
     splits: dict[Path, SplitOf],
     tally: Tally,
     total: int,
-    *,
-    keep_all: bool,
+    settings: Settings,
 ) -> Iterator[tuple[str, Row]]:
+    how = {"keep_all": settings.keep_all, "masks": settings.masks}
     rows = (
         (path, row)
         for path, source in sources.items()
-        for row in rows_of(path, source, splits[path], tally, keep_all=keep_all)
+        for row in rows_of(path, source, splits[path], tally, **how)
     )
     size_px: tuple[int, int] | None = None
     for path, kept in track(rows, "Writing images", total):

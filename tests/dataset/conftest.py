@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl import card
+from dmrl import card, topics
 from dmrl.images import encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
@@ -49,6 +49,7 @@ def record(tmp_path: Path) -> Record:
         seed: int = 0,
         split: Mapping[str, str] | None = None,
         sizes_px: Mapping[int, tuple[int, int]] | None = None,
+        masks: Mapping[int, Any] | None = None,
     ) -> Path:
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
@@ -60,6 +61,9 @@ def record(tmp_path: Path) -> Record:
                 data = encode_png(pixels_of(1000 * seed + k, *size_px))
                 picture = message("CompressedImage")(data=data, format="png")
                 sink.write(k * STEP_NS, camera_image("cf1"), picture)
+                if k in (masks or {}):
+                    covered = message("CompressedImage")(data=encode_png(masks[k]), format="png")
+                    sink.write(k * STEP_NS, topics.masks("cf1"), covered)
                 if listed is not None:
                     sink.write(k * STEP_NS, labels("cf1"), message("PeerLabels")(peers=listed))
         return path

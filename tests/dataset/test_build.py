@@ -48,6 +48,41 @@ def test_a_label_makes_its_cell_and_keeps_its_numbers(record: Record, tmp_path: 
     assert (got["sigma_u_px"], got["box_px"], got["status"]) == (2.0, [1, 2, 30, 40], "OK")
 
 
+def test_masks_are_kept_by_the_place_of_the_peer(record: Record, tmp_path: Path) -> None:
+    numbers = np.zeros((48, 64), np.uint8)
+    numbers[3, 4], numbers[5, 6], numbers[7, 8] = 2, 3, 9
+    peers = [peer(peer="cf3"), peer(peer="painted2", u_px=40.0)]
+    path = record(peers=[peers, peers], masks={0: numbers})
+    other = record("other.mcap", seed=1)
+    for png, parquet in ((False, False), (True, True)):
+        out = tmp_path / f"out-{parquet}"
+        run(
+            [path, other],
+            out,
+            Settings(masks=True, png=png, parquet=parquet, split="none"),
+        )
+        got = np.concatenate(open_dataset(out).split("train").masks)
+        assert got.shape == (8, 48, 64)
+        assert {tuple(place): got[tuple(place)] for place in np.argwhere(got).tolist()} == {
+            (0, 3, 4): 2,
+            (0, 5, 6): 1,
+        }
+
+
+def test_without_being_asked_for_masks_are_left_out(record: Record, tmp_path: Path) -> None:
+    run([record(masks={0: np.ones((48, 64), np.uint8)})], tmp_path / "out", PLAIN)
+    split = open_dataset(tmp_path / "out").split("train")
+    assert "masks" not in split.table.schema.names
+    assert split.masks == []
+
+
+def test_a_mask_of_another_size_is_refused_by_topic(record: Record, tmp_path: Path) -> None:
+    path = record(masks={0: np.ones((24, 32), np.uint8)})
+    with pytest.raises(RecordingError, match=r"masks at 0 ns is 32 x 24 px, its image 64 x 48"):
+        run([path], tmp_path / "out", Settings(masks=True))
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("fields", [{"u_px": 64.0}, {"v_px": -0.1}, {"depth_m": -1.0}])
 def test_a_peer_out_of_sight_is_listed_but_makes_no_cell(
     record: Record, tmp_path: Path, fields: dict[str, float]

@@ -6,6 +6,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from dmrl.learn import augment
 from dmrl.learn.augment import Augmentation, Augmenter
 from dmrl.learn.batches import FIELDS, Batch, Examples
 
@@ -72,6 +73,33 @@ def test_pasted_robots_are_labelled_and_covered_ones_are_not() -> None:
                 u, v = np.clip(robot[:2].astype(int), 0, (159, 111))
                 near = image[max(v - 2, 0) : v + 3, max(u - 2, 0) : u + 3]
                 assert near.max() > 120
+
+
+def test_a_robot_with_a_mask_is_pasted_without_what_was_around_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.0)
+    plain = squares()
+    grey = np.maximum(plain.pixels[0], 60)
+    masks = (grey[..., 0] == 255).astype(np.uint8)
+    settings = replace(Augmentation(), paste=1.0)
+    canvases = []
+    for known in ([], [masks, np.zeros_like(masks)]):
+        examples = Examples([grey, np.zeros_like(grey)], squares_and_nothing(plain), known)
+        canvases.append(
+            Augmenter(examples, settings, seed=0).batch(range(24, 48), epoch=0, index=0)
+        )
+    around, cut = (batch.images[:, 0].numpy() for batch in canvases)
+    assert ((around > 50) & (around < 70)).sum() > 500
+    # Between robot and canvas there is only the pixel of the mask's edge.
+    assert ((cut > 50) & (cut < 70)).sum() < 0.1 * (cut > 200).sum()
+    for image, robots in zip(cut, canvases[1].robots.numpy(), strict=True):
+        for robot in robots[np.isfinite(robots[:, 0])]:
+            assert image[int(robot[1]), int(robot[0])] > 200
+
+
+def squares_and_nothing(plain: Examples) -> NDArray[np.float32]:
+    return np.concatenate([plain.robots, np.full_like(plain.robots, np.nan)])
 
 
 def test_depths_stay_in_the_range_of_the_labels() -> None:

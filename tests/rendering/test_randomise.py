@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl.geometry import PUBLISHED_RENDER
+from dmrl.geometry import PUBLISHED_RENDER, project
 from dmrl.images import encode_png
 from dmrl.rendering.backdrops import Photos
 from dmrl.rendering.crazyflie import MATERIALS
@@ -67,6 +67,26 @@ def test_colours_of_a_photo_are_exchanged(tmp_path: Path) -> None:
     scenes = world(Settings(recoloured_share=1.0, pasted=True), tmp_path)
     seen = {tuple(draw_scene(scenes, k).look.backdrop[0, 0].argsort()) for k in range(40)}
     assert len(seen) == 6
+
+
+def test_places_stay_in_their_part_of_the_image(tmp_path: Path) -> None:
+    settings = Settings(place_u=(0.25, 0.5), place_v=(0.5, 1.0), empty_share=0.0)
+    robots = [draw_scene(world(settings, tmp_path), k).robots[0] for k in range(200)]
+    xyz = np.array([robot.pose.xyz_camera for robot in robots])
+    (u, v), _ = np.transpose(project(xyz, PUBLISHED_RENDER.image_from_optical)[0]), None
+    assert [u.min(), u.max(), v.min(), v.max()] == pytest.approx([80, 160, 112, 224], abs=3)
+
+
+@pytest.mark.parametrize(("order", "level"), [("zyx", 1), ("xzy", 0)])
+def test_robots_turn_about_their_axes_in_the_order_asked_for(
+    tmp_path: Path, order: Any, level: int
+) -> None:
+    """Roll last, about the horizontal's x axis, leaves that axis' elevation to the pitch."""
+    settings = Settings(robot_turns=order, camera_tilt_max_deg=0, empty_share=0.0)
+    robots = [draw_scene(world(settings, tmp_path), k).robots[0] for k in range(300)]
+    up = np.array([robot.pose.camera_from_body[:, 2] for robot in robots])
+    ahead, aside = up[:, 0].std(), up[:, 1].std()
+    assert ahead / aside == pytest.approx((0.57, 1.0)[level], abs=0.12)
 
 
 def test_depths_are_spread_by_factor_or_by_metre(tmp_path: Path) -> None:
