@@ -19,15 +19,20 @@ from torch import Tensor
 
 from dmrl.learn.batches import BOX, DEPTH, FIELDS, Batch, Examples, Robots, U, V
 from dmrl.learn.layers import (
+    CORNERS,
+    Intrinsics,
+    Point,
     Rect,
     Rng,
     Window,
     feather,
+    flat,
     inside,
     moved,
     parts,
     present,
     sample,
+    turned,
     under,
 )
 
@@ -39,6 +44,8 @@ DISTRACTOR_SHARE = 0.4
 """Share of patches that show any place of any image."""
 FOCUS_SHARE = 0.8
 """Share of mosaic windows that hold a robot of their image; the rest fall where they may."""
+LEAST_AHEAD = 0.25
+"""Least over greatest depth, along the source's axis, of what a turned camera's corners see."""
 DEPTH_SLACK = 1.1
 """How far beyond the nearest and the farthest label zooming may bring a robot."""
 
@@ -66,6 +73,9 @@ class Augmentation:
         Greatest sigma of sensor noise, 0 to 1 of full scale.
     blur_share
         Share of images that are slightly out of focus.
+    intrinsics
+        Of the camera, undistorted. With them a window is what the camera would have seen had it
+        been turned; without, it is cut out.
     """
 
     flip_share: float = 0.0
@@ -76,6 +86,7 @@ class Augmentation:
     colour: float = 0.0
     noise: float = 0.0
     blur_share: float = 0.0
+    intrinsics: Intrinsics | None = None
 
     @property
     def plain(self) -> "Augmentation":
@@ -166,7 +177,13 @@ class Augmenter:
         if focus is not None and rng.random() < FOCUS_SHARE:
             nearest, farthest = (focus[[U, V]] + sign * half for sign in (-1, 1))
             low, high = np.clip(nearest, low, high), np.clip(farthest, low, high)
-        window = self._window(rng.uniform(low, high), np.array([width, height]), zoom, rng)
+        seen, shown = rng.uniform(low, high), np.array([width, height]) / 2
+        turn = self._turn(zoom, rng)
+        if focus is not None:  # a camera is turned about where the robot comes to be
+            at = np.linalg.inv(turn) @ (focus[[U, V]] - seen) + shown
+            if (at >= 0).all() and (at < (width, height)).all():
+                seen, shown = focus[[U, V]], at
+        window = self._window(turn, zoom, seen, shown, rect)
         return self._show(canvas, rect, source, window, mine, robots, rng)
 
     def _patch(self, canvas: Tensor, robots: Robots, rng: Rng) -> Robots:
@@ -193,11 +210,12 @@ class Augmenter:
         if rng.random() < DISTRACTOR_SHARE:
             source = int(rng.integers(len(self._examples)))
             centre = rng.uniform((0, 0), (self._width, self._height))
-        window = self._window(centre, size, zoom, rng)
+        turn = self._turn(zoom, rng)
+        window = self._window(turn, zoom, centre, size / 2, rect)
         if mask is None:
             opacity = feather(int(size[1]), int(size[0]))
         else:
-            about = window._replace(origin=middle - window.matrix @ (size / 2))
+            about = self._window(turn, zoom, middle, size / 2, rect)
             opacity = sample(mask[..., None], about, (int(size[1]), int(size[0])))
         mine = present(self._examples.robots[source])
         return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
@@ -211,16 +229,27 @@ class Augmenter:
             high = max(min(high, max(depth_m / self._depths[0], 1.0)), low)
         return math.exp(rng.uniform(math.log(low), math.log(high)))
 
-    def _window(
-        self, centre: NDArray[np.float64], size: NDArray[np.float64], zoom: float, rng: Rng
-    ) -> Window:
-        """The window of a rectangle of this size that looks at a source's point."""
+    def _turn(self, zoom: float, rng: Rng) -> NDArray[np.float64]:
+        """(2, 2) from steps on the canvas to steps in the source."""
         most = math.radians(self._settings.rotation_deg)
         angle = rng.uniform(-most, most)
         mirror = -1.0 if rng.random() < self._settings.flip_share else 1.0
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        matrix = turn @ np.diag([mirror, 1.0]) / zoom
-        return Window(matrix, centre - matrix @ (np.asarray(size) / 2), zoom)
+        return turn @ np.diag([mirror, 1.0]) / zoom
+
+    def _window(
+        self, turn: NDArray[np.float64], zoom: float, seen: Point, shown: Point, rect: Rect
+    ) -> Window:
+        """The window of a rectangle that shows a source's point at one of its own."""
+        camera = self._settings.intrinsics
+        if camera:
+            corner = np.array(rect[:2], float)
+            matrix = turned(camera, turn, seen, shown, corner)
+            size = np.array([rect[2] - rect[0], rect[3] - rect[1]])
+            ahead = np.column_stack([CORNERS * size, np.ones(4)]) @ matrix[2]
+            if ahead.min() > LEAST_AHEAD * ahead.max():
+                return Window(matrix, zoom, camera)
+        return Window(flat(turn, seen, shown), zoom)
 
     def _show(
         self,

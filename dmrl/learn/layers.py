@@ -1,6 +1,7 @@
 """Windows of images and the rectangles that show them: the geometry of ``augment``."""
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,28 +13,100 @@ from dmrl.learn.batches import BOX, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, Robots
 
 FEATHER_PX = 3.0
 """Width of a pasted patch's soft border."""
-LEFT_RIGHT, TOP_BOTTOM = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
+CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 
 Rng = np.random.Generator
+Point = NDArray[np.float64]
+"""(2,) u and v, pixels."""
 Rect = tuple[int, int, int, int]
 """Left, top, right, bottom on the canvas, whole pixels."""
 
 
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy, pixels."""
+
+
 class Window(NamedTuple):
-    """Where a canvas rectangle looks: source = matrix @ (canvas - corner) + origin, pixels."""
+    """Where a canvas rectangle looks.
+
+    ``matrix`` (3, 3) is the homography from pixels of the rectangle, from its corner, to those of
+    the source. ``camera``: of both, where it is known and the window is that of a turned camera.
+    """
 
     matrix: NDArray[np.float64]
-    origin: NDArray[np.float64]
     zoom: float
+    camera: Intrinsics | None = None
+
+
+def flat(turn: NDArray[np.float64], seen: Point, shown: Point) -> NDArray[np.float64]:
+    """(3, 3) window that shows a source's point somewhere in its rectangle, as scissors would.
+
+    Parameters
+    ----------
+    turn
+        (2, 2) from steps on the canvas to steps in the source.
+    seen, shown
+        Point of the source, and where in the rectangle it comes, pixels.
+    """
+    out = np.eye(3)
+    out[:2, :2], out[:2, 2] = turn, seen - turn @ shown
+    return out
+
+
+def turned(
+    camera: Intrinsics, turn: NDArray[np.float64], seen: Point, shown: Point, corner: Point
+) -> NDArray[np.float64]:
+    """(3, 3) window of a camera that was turned until a point of the source is elsewhere.
+
+    What a pinhole camera sees is stretched away from its centre. Scissors carry that along; a
+    turn of the camera about its own centre, which is a homography, does not.
+
+    Parameters
+    ----------
+    camera
+        Of source and canvas.
+    turn, seen, shown
+        See `flat`.
+    corner
+        Of the rectangle, on the canvas.
+    """
+    fx, fy, cx, cy = camera
+    k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    about = np.eye(3)
+    about[:2, :2] = turn
+    rays = facing(camera, seen) @ about @ facing(camera, shown + corner).T
+    return np.asarray(k @ rays @ np.linalg.inv(k) @ flat(np.eye(2), corner, np.zeros(2)))
+
+
+def facing(camera: Intrinsics, uv: Point) -> NDArray[np.float64]:
+    """(3, 3) rotation of the optical axis onto a pixel's ray: tilted, then panned."""
+    fx, fy, cx, cy = camera
+    x, y = (uv[0] - cx) / fx, (uv[1] - cy) / fy
+    across, whole = math.hypot(1, x), math.sqrt(1 + x * x + y * y)
+    tilt = np.array([[1, 0, 0], [0, across / whole, y / whole], [0, -y / whole, across / whole]])
+    pan = np.array([[1 / across, 0, x / across], [0, 1, 0], [-x / across, 0, 1 / across]])
+    return np.asarray(pan @ tilt)
+
+
+def slant(camera: Intrinsics, uv: NDArray[Any]) -> NDArray[Any]:
+    """(n,) distance over depth of what is seen at pixels (n, 2)."""
+    fx, fy, cx, cy = camera
+    return np.asarray(np.sqrt(1 + ((uv[:, 0] - cx) / fx) ** 2 + ((uv[:, 1] - cy) / fy) ** 2))
+
+
+def through(matrix: NDArray[Any], points: NDArray[Any]) -> NDArray[np.float64]:
+    """(n, 2) where a homography takes points (n, 2); NaN behind the camera."""
+    u, v, w = matrix @ np.column_stack([points, np.ones(len(points))]).T
+    ahead = np.where(w > 0, w, np.nan)
+    return np.column_stack([u / ahead, v / ahead])
 
 
 def sample(raw: NDArray[np.uint8], window: Window, shape: tuple[int, int]) -> Tensor:
-    """(h, w, 3) float32 pixels that a rectangle of this shape shows of an image (H, W, 3)."""
-    if shape == raw.shape[:2] and window.zoom == 1 and (window.matrix == np.eye(2)).all():
+    """(h, w, C) float32 pixels that a rectangle of this shape shows of an image (H, W, C)."""
+    if shape == raw.shape[:2] and window.zoom == 1 and (window.matrix == np.eye(3)).all():
         return torch.from_numpy(raw.astype(np.float32))
     # Only what the window looks at is made float.
-    corners = window.matrix @ (shape[1] * LEFT_RIGHT, shape[0] * TOP_BOTTOM)
-    seen = corners + window.origin[:, None]
+    seen = through(window.matrix, CORNERS * shape[::-1]).T
     size = np.array([raw.shape[1], raw.shape[0]])
     low = np.clip(np.floor(seen.min(axis=1)).astype(int) - 1, 0, size - 2)
     high = np.clip(np.ceil(seen.max(axis=1)).astype(int) + 1, low + 2, size)
@@ -41,15 +114,21 @@ def sample(raw: NDArray[np.uint8], window: Window, shape: tuple[int, int]) -> Te
     image = torch.from_numpy(part).permute(2, 0, 1)[None]
     # grid_sample counts from -1 to 1 over the image's edges.
     scale = 2 / (high - low)
-    step = (window.matrix * scale[:, None]).astype(np.float32)
-    start = ((window.origin - low) * scale - 1).astype(np.float32)
+    matrix = flat(np.diag(scale), -1 - low * scale, np.zeros(2)) @ window.matrix
     down, across = (torch.arange(n, dtype=torch.float32) + 0.5 for n in shape)
     grid = torch.empty(1, *shape, 2)
     for axis in range(2):
-        rows = down * float(step[axis, 1]) + float(start[axis])
-        torch.add(rows[:, None], across * float(step[axis, 0]), out=grid[0, ..., axis])
+        torch.add(*_plane(matrix[axis], down, across), out=grid[0, ..., axis])
+    if window.camera:
+        grid /= torch.add(*_plane(matrix[2], down, across))[..., None]
     out = grid_sample(image, grid, padding_mode="border", align_corners=False)
     return out[0].permute(1, 2, 0)
+
+
+def _plane(row: NDArray[np.float64], down: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
+    """Two terms, whose sum is a row of a homography at every pixel."""
+    x, y, start = row.tolist()
+    return (down * y + start)[:, None], across * x
 
 
 def parts(whole: Rect, rng: Rng) -> list[Rect]:
@@ -88,14 +167,15 @@ def under(robots: Robots, rect: Rect, opacity: Tensor | None) -> NDArray[np.bool
 
 def moved(robots: Robots, window: Window, rect: Rect) -> Robots:
     """Robots of a source where a window puts them on the canvas."""
-    back = np.linalg.inv(window.matrix)
     out = robots.copy()
     out[:, BOX] = np.nan  # not carried along: nothing asks for it
-    corner = np.array(rect[:2])
-    out[:, [U, V]] = (robots[:, [U, V]] - window.origin) @ back.T + corner
-    out[:, DEPTH] = robots[:, DEPTH] / window.zoom
-    out[:, SIGMA_DEPTH] = robots[:, SIGMA_DEPTH] / window.zoom
-    out[:, [SIGMA_U, SIGMA_V]] = robots[:, [SIGMA_U, SIGMA_V]] * window.zoom
+    before = robots[:, [U, V]]
+    out[:, [U, V]] = through(np.linalg.inv(window.matrix), before) + np.array(rect[:2])
+    nearer = np.full(len(robots), window.zoom)
+    if window.camera:  # a turn keeps the distance, not the depth
+        nearer *= slant(window.camera, out[:, [U, V]]) / slant(window.camera, before)
+    out[:, [DEPTH, SIGMA_DEPTH]] /= nearer[:, None]
+    out[:, [SIGMA_U, SIGMA_V]] *= nearer[:, None]
     return out
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dmrl.learn.augment import Augmentation
+from dmrl.learn.layers import Intrinsics
 from dmrl.learn.losses import DepthLoss
 from dmrl.learn.network import CLASS, SPREAD
 from dmrl.learn.optimizer import OptimizerName
@@ -89,6 +90,10 @@ class FitSettings:
         Greatest sigma of sensor noise, 0 to 1 of full scale.
     blur_share
         Share of images slightly out of focus, 0 to 1.
+    intrinsics
+        fx, fy, cx and cy of the camera, pixels, of images without distortion. With them windows
+        of images are what the camera would have seen had it been turned; without, they are cut
+        out, and carry along the stretch of where they were.
     precision
         What the network is trained in. "bfloat16": the body in bfloat16, weights, head and
         losses in float32; half as long again as fast on CPUs that have it.
@@ -130,6 +135,7 @@ class FitSettings:
     colour: float = 0.05
     noise: float = 0.01
     blur_share: float = 0.1
+    intrinsics: Intrinsics | None = None
     precision: Literal["float32", "bfloat16"] = "float32"
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -151,6 +157,8 @@ class FitSettings:
             raise ValueError("validation_share: must be at most 0.5")
         if not 0 < self.zoom[0] <= self.zoom[1]:
             raise ValueError("zoom: must be over 0, the lesser first")
+        if self.intrinsics and min(self.intrinsics[:2]) <= 0:
+            raise ValueError("intrinsics: fx and fy must be over 0")
         if any(share < 0 for share in self.shares.values()):
             raise ValueError("shares: must not be negative")
 
@@ -171,6 +179,7 @@ class FitSettings:
             self.colour,
             self.noise,
             self.blur_share,
+            self.intrinsics,
         )
         return whole if epoch < self.epochs - self.plain_epochs else whole.plain
 

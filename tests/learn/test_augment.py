@@ -65,8 +65,11 @@ def test_labels_stay_at_the_robots_and_depth_follows_the_zoom() -> None:
     assert checked > 100
 
 
-def test_pasted_robots_are_labelled_and_covered_ones_are_not() -> None:
-    for batch in batches(replace(GEOMETRY, rotation_deg=0.0, paste=2.0)):
+@pytest.mark.parametrize("intrinsics", [None, (70.0, 70.0, 80.0, 56.0)])
+def test_pasted_robots_are_labelled_and_covered_ones_are_not(
+    intrinsics: tuple[float, float, float, float] | None,
+) -> None:
+    for batch in batches(replace(GEOMETRY, rotation_deg=0.0, paste=2.0, intrinsics=intrinsics)):
         bright = batch.images[:, 0].numpy()
         for image, robots in zip(bright, batch.robots.numpy(), strict=True):
             for robot in robots[np.isfinite(robots[:, 0])]:

@@ -1,0 +1,83 @@
+"""Windows of a turned camera, against points in space."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from dmrl.learn.batches import FIELDS
+from dmrl.learn.layers import Window, facing, flat, moved, sample, turned
+
+CAMERA = (120.0, 118.0, 160.0, 100.0)
+WHOLE = (0, 0, 320, 224)
+
+
+def seen_at(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of points (n, 3) to the right, below and ahead of the camera."""
+    fx, fy, cx, cy = CAMERA
+    x, y, z = points.T
+    return np.column_stack([fx * x / z + cx, fy * y / z + cy])
+
+
+def robots_at(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    out = np.full((len(points), len(FIELDS)), np.nan, np.float32)
+    out[:, :2], out[:, 2], out[:, 3:6] = seen_at(points), points[:, 2], (1.0, 1.0, 0.1)
+    return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = np.array([0.3, -0.2, 1.0]) * rng.uniform(0.7, 1.3, (20, 3))
+    source = seen_at(points[:1])[0]
+    shown = rng.uniform((60, 40), (260, 180))
+    corner = np.array([7.0, 5.0])
+    matrix = turned(CAMERA, np.eye(2), source, shown - corner, corner)
+    got = moved(robots_at(points), Window(matrix, 1.0, CAMERA), (7, 5, 320, 224))
+    then = points @ (facing(CAMERA, source) @ facing(CAMERA, shown).T)
+    np.testing.assert_allclose(got[:, :2], seen_at(then), atol=1e-3)
+    np.testing.assert_allclose(got[:, 2], then[:, 2], rtol=1e-5)
+    np.testing.assert_allclose(got[0, :2], shown, atol=1e-4)
+    np.testing.assert_allclose(got[:, 5] / got[:, 2], 0.1 / points[:, 2], rtol=1e-5)
+
+
+def test_what_is_straight_above_stays_straight_above() -> None:
+    post = np.array([[0.5, y, 1.0] for y in (-0.4, 0.0, 0.3)])
+    matrix = turned(CAMERA, np.eye(2), seen_at(post)[1], np.array([90.0, 100.0]), np.zeros(2))
+    got = moved(robots_at(post), Window(matrix, 1.0, CAMERA), WHOLE)
+    np.testing.assert_allclose(got[:, 0], 90.0, atol=1e-3)
+
+
+def test_a_zoom_brings_the_point_it_is_about_nearer_by_as_much() -> None:
+    point = np.array([[0.4, 0.1, 1.2]])
+    at = seen_at(point)[0]
+    matrix = turned(CAMERA, np.eye(2) / 1.5, at, at, np.zeros(2))
+    got = moved(robots_at(point), Window(matrix, 1.5, CAMERA), WHOLE)
+    np.testing.assert_allclose(got[0, :3], [*at, 1.2 / 1.5], rtol=1e-5)
+
+
+def test_what_is_behind_a_turned_camera_is_nowhere() -> None:
+    away = np.array([[-3.0, 0.0, 1.0]])
+    matrix = turned(CAMERA, np.eye(2), np.array([318.0, 100]), np.array([0.0, 100]), np.zeros(2))
+    got = moved(robots_at(away), Window(matrix, 1.0, CAMERA), WHOLE)
+    assert np.isnan(got[0, :2]).all()
+
+
+def test_pixels_go_where_labels_go() -> None:
+    point = np.array([[0.35, 0.15, 1.0]])
+    u, v = seen_at(point)[0]
+    down, across = np.indices((224, 320)) + 0.5
+    spot = 255 * np.exp(-((across - u) ** 2 + (down - v) ** 2) / 50)
+    shown = np.array([180.0, 90.0])
+    window = Window(turned(CAMERA, np.eye(2), np.array([u, v]), shown, np.zeros(2)), 1.0, CAMERA)
+    image = sample(spot[..., None].astype(np.uint8), window, (224, 320))[..., 0].numpy()
+    centre = np.array([(image * across).sum(), (image * down).sum()]) / image.sum()
+    # A spot of 5 px is stretched a little to one side.
+    np.testing.assert_allclose(centre, shown, atol=0.7)
+    assert image[90, 180] > 240
+
+
+def test_without_a_camera_a_window_is_cut_out() -> None:
+    picture = torch.arange(40 * 60 * 3).reshape(40, 60, 3).remainder(251).to(torch.uint8).numpy()
+    window = Window(flat(np.eye(2), np.array([20.0, 10.0]), np.array([0.0, 0.0])), 1.0)
+    assert np.allclose(sample(picture, window, (15, 25)), picture[10:25, 20:45], atol=1e-3)
