@@ -144,7 +144,10 @@ def _columns(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
 
 
 def ancestry(made: Provenance, depth: int = 0) -> Iterator[str]:
-    """Nested list of stages: settings, versions, and the hash of every input."""
+    """Nested list of stages: settings, versions, and the hash of every input.
+
+    For a provenance that is told once, as `Provenance.told_once` has it.
+    """
     pad = "  " * depth
     seed = "" if made.seed is None else f", seed {made.seed}"
     libraries = "".join(f", {name} {version}" for name, version in made.libraries.items())

@@ -67,9 +67,14 @@ def ancestry_lines(made: Provenance | None) -> list[str]:
     if made is None:
         return ["made by: not known (no dmrl.provenance metadata)"]
     lines = [f"made by: {_made_by(made)}"]
-    for depth, name, own in made.ancestry():
-        source = f", made by: {_made_by(own)}" if own else ""
-        lines.append(f"{'  ' * (depth + 1)}from {name}{source}")
+    told: set[str] = set()
+    for depth, source in made.ancestry():
+        how = ", as above" if source.sha256 in told else ""
+        if source.provenance is not None:
+            told.add(source.sha256)
+            how = f", made by: {_made_by(source.provenance)}"
+        name = f"{source.name} sha256:{source.sha256[:12]}"
+        lines.append(f"{'  ' * (depth + 1)}from {name}{how}")
     return lines
 
 

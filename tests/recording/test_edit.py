@@ -43,11 +43,11 @@ def test_a_merge_tells_its_whole_ancestry(tmp_path: Path, flight: Path) -> None:
     merge([flight, tmp_path / "b.mcap"], tmp_path / "out.mcap")
     made = summary(tmp_path / "out.mcap").provenance
     assert made is not None
-    assert [(depth, p.stage if p else "") for depth, _, p in made.ancestry()] == [
-        (0, "test"),
-        (0, "trim"),
-        (1, "test"),
-    ]
+    told = [(depth, s.provenance and s.provenance.stage) for depth, s in made.ancestry()]
+    assert told == [(0, "test"), (0, "trim"), (1, None)]
+    last = made.inputs[1].provenance
+    assert last is not None
+    assert last.inputs[0].provenance == made.inputs[0].provenance
 
 
 def test_a_recording_merged_with_itself_is_refused(tmp_path: Path, flight: Path) -> None:

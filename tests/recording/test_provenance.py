@@ -1,0 +1,56 @@
+"""Ancestors that many inputs share."""
+
+import json
+from pathlib import Path
+
+from dmrl.recording import Provenance
+from dmrl.recording.provenance import Input
+from dmrl.stages.info import ancestry_lines
+
+
+def rounds(count: int, flights: int) -> Provenance:
+    """A model that learned from flights that the model before had labelled, and so on."""
+    model = Provenance("train", {"round": 0})
+    for k in range(1, count + 1):
+        before = Input(f"model-{k - 1}", f"{k - 1:064d}", model)
+        seen = (
+            Input(f"seen-{n}.mcap", f"{k:032d}{n:032d}", Provenance("predict", {}, None, (before,)))
+            for n in range(flights)
+        )
+        model = Provenance("train", {"round": k}, None, tuple(seen))
+    return model
+
+
+def test_many_rounds_are_no_more_text_than_their_sum() -> None:
+    text = json.dumps(rounds(12, 20).to_json())
+    assert len(text) < 14 * len(json.dumps(rounds(1, 20).to_json()))
+
+
+def test_what_is_told_once_is_known_of_all() -> None:
+    made = rounds(2, 3)
+    again = Provenance.from_json(json.loads(json.dumps(made.to_json())))
+    assert again == made
+    assert Provenance.from_metadata(made.to_metadata()) == made
+
+
+def test_an_ancestry_told_every_time_is_read_as_well() -> None:
+    """As dmrl wrote it at first."""
+    made = rounds(1, 2)
+    document = made.to_json()
+    document["inputs"][1]["provenance"]["inputs"] = document["inputs"][0]["provenance"]["inputs"]
+    assert Provenance.from_json(document) == made
+
+
+def test_info_says_where_it_told_it_before() -> None:
+    lines = ancestry_lines(rounds(1, 2))
+    assert [line.rpartition(", ")[2] for line in lines if "model-0" in line] == [
+        f"made by: dmrl {Provenance('x').dmrl_version} train round=0",
+        "as above",
+    ]
+
+
+def test_it_is_written_to_a_folder(tmp_path: Path) -> None:
+    made = rounds(2, 2)
+    made.write(tmp_path)
+    text = (tmp_path / "provenance.json").read_text()
+    assert Provenance.from_json(json.loads(text)) == made
