@@ -91,13 +91,16 @@ def rows(
 
 
 def shortened(title: str, name: str, epochs: int) -> Settings:
-    """The settings of a row; epochs of whole images are as large a part as in the recipe."""
+    """The settings of a row; whole images and averaging are as large a part as in the recipe."""
     if title == PUBLISHED:
         settings = recipe.load("locanet", "train", Settings)
         return replace(settings, epochs=PUBLISHED_EPOCHS, validation_share=HELD_OUT)
     settings = recipe.load(name, "train", Settings)
-    plain = round(epochs * settings.plain_epochs / settings.epochs)
-    short = {"epochs": epochs, "plain_epochs": plain, "validation_share": HELD_OUT}
+    parts = {
+        name: round(epochs * getattr(settings, name) / settings.epochs)
+        for name in ("plain_epochs", "ema_steps")
+    }
+    short = {"epochs": epochs, "validation_share": HELD_OUT, **parts}
     return replace(settings, **{**short, **VARIANTS[title]})
 
 

@@ -20,8 +20,6 @@ Point = NDArray[np.float64]
 """(2,) u and v, pixels."""
 Rect = tuple[int, int, int, int]
 """Left, top, right, bottom on the canvas, whole pixels."""
-
-
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, pixels."""
 
