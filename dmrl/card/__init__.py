@@ -56,7 +56,7 @@ def write_card(folder: Path, *, title: str | None = None, license_id: str | None
     text += sections.about(splits, str(title), made)
     text += sections.loading(splits, parquet=dataset.parquet)
     text += [*sections.numbers(counts), *figures, *sections.features(splits)]
-    text += ["## Provenance", "", *sections.ancestry(made.told_once())]
+    text += ["## Provenance", "", *sections.ancestry(made)]
     partial_of(readme).write_text("\n".join(text) + "\n", encoding="utf-8")
     partial_of(readme).replace(readme)
     return readme

@@ -143,19 +143,20 @@ def _columns(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
             yield from ((f"peers.{f.name}", f.type) for f in column.type.value_type)
 
 
-def ancestry(made: Provenance, depth: int = 0) -> Iterator[str]:
-    """Nested list of stages: settings, versions, and the hash of every input.
+def ancestry(made: Provenance) -> Iterator[str]:
+    """Nested list of stages: settings, versions, and the hash of every input."""
+    yield from _stage(made, "")
+    for depth, source in made.ancestry():
+        pad = "  " * (2 * depth + 1)
+        yield f"{pad}- input `{source.name}`, SHA-256 `{source.sha256}`"
+        if source.provenance is not None:
+            yield from _stage(source.provenance, pad + "  ")
 
-    For a provenance that is told once, as `Provenance.told_once` has it.
-    """
-    pad = "  " * depth
+
+def _stage(made: Provenance, pad: str) -> Iterator[str]:
     seed = "" if made.seed is None else f", seed {made.seed}"
     libraries = "".join(f", {name} {version}" for name, version in made.libraries.items())
     yield f"{pad}- **{made.stage}**, dmrl {made.dmrl_version}{seed}{libraries}"
     if made.settings:
         settings = ", ".join(f"{key} = {value!r}" for key, value in made.settings.items())
         yield f"{pad}  - settings: `{settings}`"
-    for source in made.inputs:
-        yield f"{pad}  - input `{source.name}`, SHA-256 `{source.sha256}`"
-        if source.provenance is not None:
-            yield from ancestry(source.provenance, depth + 2)

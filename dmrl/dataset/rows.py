@@ -175,8 +175,9 @@ def _mask(path: Path, row: Row, covered: Stamped | None) -> Mask:
         raise RecordingError(f"{what} is {sizes}. Leave out --masks")
     place = np.zeros(256, np.uint8)
     for k, peer in enumerate(row.peers, 1):
-        if found := re.search(r"\d+$", peer["peer"]):
-            place[int(found[0]) % 256] = k
+        found = re.search(r"\d+$", peer["peer"])
+        if found and int(found[0]) < len(place):
+            place[int(found[0])] = k
     return place[numbers]
 
 

@@ -67,9 +67,9 @@ class Provenance:
 
     def to_json(self) -> dict[str, Any]:
         """Plain dictionaries, lists and values, inputs' provenance nested, each told once."""
-        return asdict(self.told_once())
+        return asdict(self._told_once())
 
-    def told_once(self) -> "Provenance":
+    def _told_once(self) -> "Provenance":
         """The same, but with no provenance for an input that was there before, by its hash."""
         told: set[str] = set()
 
@@ -126,7 +126,7 @@ class Provenance:
 
     def ancestry(self) -> Iterator[tuple[int, Input]]:
         """Depth of every input, and of theirs, nearest first; each with its provenance once."""
-        yield from _nested(self.told_once(), 0)
+        yield from _nested(self._told_once(), 0)
 
     def write(self, folder: Path) -> None:
         """Write ``provenance.json`` into a dataset or run folder."""

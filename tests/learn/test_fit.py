@@ -275,6 +275,7 @@ def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
         ("validation_share", 0.6),
         ("zoom", (0.0, 1.0)),
         ("zoom", (2.0, 1.0)),
+        ("intrinsics", (120.0, 0.0, 160.0, 112.0)),
         ("shares", {"*": -1.0}),
     ],
 )

@@ -73,7 +73,7 @@ def test_places_stay_in_their_part_of_the_image(tmp_path: Path) -> None:
     settings = Settings(place_u=(0.25, 0.5), place_v=(0.5, 1.0), empty_share=0.0)
     robots = [draw_scene(world(settings, tmp_path), k).robots[0] for k in range(200)]
     xyz = np.array([robot.pose.xyz_camera for robot in robots])
-    (u, v), _ = np.transpose(project(xyz, PUBLISHED_RENDER.image_from_optical)[0]), None
+    u, v = project(xyz, PUBLISHED_RENDER.image_from_optical)[0].T
     assert [u.min(), u.max(), v.min(), v.max()] == pytest.approx([80, 160, 112, 224], abs=3)
 
 
