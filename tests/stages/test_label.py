@@ -7,6 +7,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, OutputError, RecordingError
+from dmrl.flight import NOISE
 from dmrl.geometry import pixels_from_horizontal
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
 from dmrl.recording import (
@@ -218,6 +219,15 @@ def test_a_robot_without_logs_is_left_out_with_a_word(changed: Callable[[Change]
         return [stamped, Stamped(stamped.time_ns, "/cf1/range/cf3", stamped.message)]
 
     assert "cf3: no /cf3/attitude and no /cf3/velocity" in warnings_of(changed(third))
+
+
+def test_the_noise_of_heights_is_smoothed_away(labelled: Path) -> None:
+    """What is left are the sensors' biases, which are the same through a flight."""
+    found = read_table(labelled, "/cf1/peer/cf2/position")
+    truth = read_table(labelled, "/cf1/peer/cf2/truth")
+    time_ns, truth_ns = found["log_time"].to_numpy(), truth["log_time"].to_numpy()
+    off_m = found["z"].to_numpy() - np.interp(time_ns, truth_ns, truth["z"].to_numpy())
+    assert off_m.std() < 2**0.5 * NOISE["calibrated"].height_white_m / 3
 
 
 def test_silence_is_bridged_with_a_word(changed: Callable[[Change], Path]) -> None:
