@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -14,9 +15,11 @@ from dmrl import topics
 from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, open_detector
 from dmrl.errors import MissingTopic
 from dmrl.images import Rgb, decode
-from dmrl.learn.decode import PER_DETECTION, Found
+from dmrl.learn.decode import PER_DETECTION, Found, Grids
 from dmrl.learn.decode import decode as find
 from dmrl.learn.pretrained import resolved
+from dmrl.learn.views import VIEWS, agreed, returned
+from dmrl.learn.views import seen as viewed
 from dmrl.messages import message
 from dmrl.progress import track
 from dmrl.recording import (
@@ -56,6 +59,10 @@ class Settings:
         Leave out detections below this, 0 to 1; the best of each image stays.
     most
         Keep at most this many detections per image.
+    views
+        Look at every image so many times, 1 to 12, mirrored and shifted by parts of a cell, and
+        take the medians. For dmrl label --detections: a third less error in pixels, and so many
+        times the work. Maps are of the first.
     batch_size
         Images that go through the network together.
     """
@@ -64,6 +71,7 @@ class Settings:
     threshold: Share | None = None
     min_confidence: Share = 0.01
     most: Positive = 20
+    views: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=len(VIEWS)))] = 1
     batch_size: Positive = 16
 
 
@@ -174,17 +182,25 @@ def _seen(pictures: list[Rgb], detector: Detector, settings: Settings) -> list[_
     """What the network finds in each picture."""
     out = []
     for _, same_size in groupby(pictures, key=np.shape):
-        grids = detector.grids(np.stack(list(same_size)))
-        found = find(
-            *grids,
-            stride_px=detector.stride_px,
-            most=settings.most,
-            min_confidence=settings.min_confidence,
-        )
+        images = np.stack(list(same_size))
+        grids = detector.grids(images)
+        found = _found(images, grids, detector, settings)
         for k in range(len(found.count)):
             grid = _grid(grids.confidence[k], grids.depth_m[k], detector.stride_px)
             out.append(_Seen(_detections(found, k, detector.threshold), grid))
     return out
+
+
+def _found(images: Rgb, grids: Grids, detector: Detector, settings: Settings) -> Found:
+    """Detections in these images, whose grids are known, over all views."""
+    stride_px, width_px = detector.stride_px, images.shape[2]
+    most, least = settings.most, settings.min_confidence
+    decoded = partial(find, stride_px=stride_px, most=most, min_confidence=least)
+    found = [decoded(*grids)]
+    for view in VIEWS[1 : settings.views]:
+        again = decoded(*detector.grids(viewed(images, view, stride_px)))
+        found.append(returned(again, view, stride_px, width_px))
+    return agreed(found, most=most, min_confidence=least) if len(found) > 1 else found[0]
 
 
 def _detections(found: Found, image: int, threshold: float) -> Any:

@@ -88,6 +88,26 @@ def test_the_grid_is_what_the_network_says_and_detections_are_its_peaks(
     assert best.depth_m == pytest.approx(depth_m[0, row, col], rel=1e-5)
 
 
+def test_two_views_see_the_same_in_an_image_and_its_mirror_image(tmp_path: Path) -> None:
+    model = tmp_path / "model"
+    model.mkdir()
+    save_model(Model(build("dmrl-nano", seed=1).eval(), "dmrl-nano"), model)
+    image = np.random.default_rng(5).integers(0, 255, (48, 64, 3), np.uint8)
+    with RecordingWriter(tmp_path / "in.mcap", Provenance("test")) as sink:
+        for k, picture in enumerate((image, image[:, ::-1].copy())):
+            data = message("CompressedImage")(data=encode_png(picture), format="png")
+            sink.write(k, "/cf1/camera/image", data)
+    run(model, tmp_path / "in.mcap", tmp_path / "one.mcap", Settings())
+    run(model, tmp_path / "in.mcap", tmp_path / "two.mcap", Settings(views=2))
+    here, mirrored = (s.message.detections for s in read(tmp_path / "two.mcap", OWN[0]))
+    assert len(here) == len(mirrored) > 1
+    for one, other in zip(here, mirrored, strict=True):
+        assert (one.u_px, one.v_px) == pytest.approx((64 - other.u_px, other.v_px), abs=1e-3)
+        assert one.depth_m == pytest.approx(other.depth_m, rel=1e-4)
+    alone = next(read(tmp_path / "one.mcap", OWN[0])).message.detections
+    assert alone[0].u_px != here[0].u_px or alone[0].confidence != here[0].confidence
+
+
 def test_detections_of_before_are_replaced(dots: Path, model: Path, tmp_path: Path) -> None:
     run(model, dots, tmp_path / "once.mcap", Settings())
     run(model, tmp_path / "once.mcap", tmp_path / "twice.mcap", Settings(threshold=0.9))
