@@ -32,7 +32,7 @@ VIEWS = tuple(View(mirrored, *shift) for shift in SHIFTS for mirrored in (False,
 """The first is the image as it is."""
 
 
-def seen(images: Rgb, view: View, stride_px: int) -> Rgb:
+def shown(images: Rgb, view: View, stride_px: int) -> Rgb:
     """(N, H, W, 3) images in a view; what it shifts in repeats the rim."""
     right_px, down_px = _shift_px(view, stride_px)
     reach = stride_px

@@ -18,8 +18,7 @@ from dmrl.images import Rgb, decode
 from dmrl.learn.decode import PER_DETECTION, Found, Grids
 from dmrl.learn.decode import decode as find
 from dmrl.learn.pretrained import resolved
-from dmrl.learn.views import VIEWS, agreed, returned
-from dmrl.learn.views import seen as viewed
+from dmrl.learn.views import VIEWS, agreed, returned, shown
 from dmrl.messages import message
 from dmrl.progress import track
 from dmrl.recording import (
@@ -198,7 +197,7 @@ def _found(images: Rgb, grids: Grids, detector: Detector, settings: Settings) ->
     decoded = partial(find, stride_px=stride_px, most=most, min_confidence=least)
     found = [decoded(*grids)]
     for view in VIEWS[1 : settings.views]:
-        again = decoded(*detector.grids(viewed(images, view, stride_px)))
+        again = decoded(*detector.grids(shown(images, view, stride_px)))
         found.append(returned(again, view, stride_px, width_px))
     return agreed(found, most=most, min_confidence=least) if len(found) > 1 else found[0]
 

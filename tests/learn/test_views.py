@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.learn.decode import PER_DETECTION, Found
-from dmrl.learn.views import VIEWS, View, agreed, returned, seen
+from dmrl.learn.views import VIEWS, View, agreed, returned, shown
 
 STRIDE_PX = 8
 
@@ -27,16 +27,16 @@ def found(*images: Sequence[tuple[float, ...]]) -> Found:
 def test_a_point_is_found_where_it_is_whatever_the_view(view: View) -> None:
     images = np.zeros((1, 48, 64, 3), np.uint8)
     images[0, 20, 13] = 255
-    row, col = np.argwhere(seen(images, view, STRIDE_PX)[0, :, :, 0])[0]
+    row, col = np.argwhere(shown(images, view, STRIDE_PX)[0, :, :, 0])[0]
     back = returned(found([(col + 0.5, row + 0.5, 1.0, 0.9)]), view, STRIDE_PX, 64)
     assert (back.u_px[0, 0], back.v_px[0, 0]) == (13.5, 20.5)
 
 
 def test_views_differ_and_the_first_is_the_image() -> None:
     images = np.random.default_rng(0).integers(0, 255, (1, 48, 64, 3), np.uint8)
-    shown = [seen(images, view, STRIDE_PX) for view in VIEWS]
-    assert (shown[0] == images).all()
-    assert len({one.tobytes() for one in shown}) == len(VIEWS)
+    all_shown = [shown(images, view, STRIDE_PX) for view in VIEWS]
+    assert (all_shown[0] == images).all()
+    assert len({one.tobytes() for one in all_shown}) == len(VIEWS)
 
 
 def test_several_views_agree_on_the_median() -> None:
