@@ -8,7 +8,6 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from dmrl import topics
 from dmrl.estimation.pair import RATE_HZ, Array, Pair, Track, resample, usable_ranges
@@ -61,8 +60,8 @@ class RobotLog:
         attitude, turn_gap = resample(*self.attitude, grid_s)
         velocity, gap = resample(*self.velocity, grid_s)
         height, _ = resample(*self.height, grid_s)
-        smooth = savgol_filter(height[:, 0], int(SMOOTHED_S * RATE_HZ) | 1, polyorder=2)
-        return Track(velocity[:, 0], velocity[:, 1], attitude[:, 2], smooth, gap | turn_gap)
+        smooth_m = _smoothed(height[:, 0], int(SMOOTHED_S * RATE_HZ / 2))
+        return Track(velocity[:, 0], velocity[:, 1], attitude[:, 2], smooth_m, gap | turn_gap)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +170,13 @@ def _signals(
         warnings.append(f"{topic}: nothing to use; its pairs are left out")
         return None
     return (time_ns[good] - held.start_ns) * 1e-9, values[good]
+
+
+def _smoothed(values: Array, reach: int) -> Array:
+    """Each of (N,) values on the parabola through those within reach (Savitzky and Golay 1964)."""
+    weights = np.linalg.pinv(np.vander(np.arange(-reach, reach + 1), 3))[-1]
+    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
+    return np.convolve(padded, weights, mode="valid")
 
 
 def _pair(

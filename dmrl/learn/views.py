@@ -1,7 +1,7 @@
 """One image seen many times, shifted by parts of a cell and mirrored. NumPy only.
 
 What a network errs by depends on where in its cell a robot lies, and on left and right: the median
-over views errs by a third less or better. A camera in flight has no time for it; labels have.
+over views errs less. A camera in flight has no time for it; labels have.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,13 +43,14 @@ def shown(images: Rgb, view: View, stride_px: int) -> Rgb:
     return np.ascontiguousarray(padded[:, rows, cols])
 
 
-def returned(found: Found, view: View, stride_px: int, width_px: int) -> Found:
-    """Detections in a view of N images, where they are in the images."""
+def returned(found: Found, view: View, stride_px: int, size_px: tuple[int, int]) -> Found:
+    """Detections in a view of N images, where they are in the images of this height and width."""
+    height_px, width_px = size_px
     right_px, down_px = _shift_px(view, stride_px)
-    u_px = found.u_px - right_px
-    u_px = np.clip(width_px - u_px if view.mirrored else u_px, 0, width_px)
+    u_px, v_px = found.u_px - right_px, found.v_px - down_px
+    u_px = width_px - u_px if view.mirrored else u_px
     columns = {name: getattr(found, name) for name in PER_DETECTION}
-    columns |= {"u_px": u_px, "v_px": np.maximum(found.v_px - down_px, 0)}
+    columns |= {"u_px": np.clip(u_px, 0, width_px), "v_px": np.clip(v_px, 0, height_px)}
     return Found(**columns, count=found.count)
 
 

@@ -28,7 +28,7 @@ def test_a_point_is_found_where_it_is_whatever_the_view(view: View) -> None:
     images = np.zeros((1, 48, 64, 3), np.uint8)
     images[0, 20, 13] = 255
     row, col = np.argwhere(shown(images, view, STRIDE_PX)[0, :, :, 0])[0]
-    back = returned(found([(col + 0.5, row + 0.5, 1.0, 0.9)]), view, STRIDE_PX, 64)
+    back = returned(found([(col + 0.5, row + 0.5, 1.0, 0.9)]), view, STRIDE_PX, (48, 64))
     assert (back.u_px[0, 0], back.v_px[0, 0]) == (13.5, 20.5)
 
 
