@@ -174,6 +174,7 @@ def _signals(
 
 def _smoothed(values: Array, reach: int) -> Array:
     """Each of (N,) values on the parabola through those within reach (Savitzky and Golay 1964)."""
+    # SciPy's savgol_filter, whose package takes a second to import.
     weights = np.linalg.pinv(np.vander(np.arange(-reach, reach + 1), 3))[-1]
     padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
     return np.convolve(padded, weights, mode="valid")

@@ -46,6 +46,14 @@ def test_several_views_agree_on_the_median() -> None:
     assert [getattr(both, n)[0, 0] for n in PER_DETECTION[:4]] == pytest.approx([10, 20, 1, 0.8])
 
 
+def test_one_view_agrees_with_itself() -> None:
+    alone = found([(10, 20, 1, 0.8), (19, 20, 1.5, 0.7), (60, 40, 2, 0.1)], [(30, 20, 1, 0.6)])
+    again = agreed([alone])
+    assert again.count.tolist() == [3, 1]
+    for name in PER_DETECTION:
+        assert (getattr(again, name) == getattr(alone, name)).all()
+
+
 def test_what_one_view_alone_sees_is_believed_less() -> None:
     ghost = (60.0, 40.0, 2.0, 0.9)
     both = agreed([found([ghost, (10, 20, 1, 0.8)]), *[found([(10, 20, 1, 0.8)])] * 2])
