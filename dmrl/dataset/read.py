@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -60,6 +61,13 @@ class Split:
         if layout.PIXELS in self.table.schema.names:
             return [self._view(chunk) for chunk in self.table[layout.PIXELS].chunks]
         return [self._decoded(chunk) for chunk in self.table[layout.IMAGE].chunks]
+
+    def images(self, rows: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
+        """The images of these rows, (H, W, 3) each."""
+        ends = np.cumsum([len(chunk) for chunk in self.pixels])
+        for row in rows:
+            chunk = int(np.searchsorted(ends, row, side="right"))
+            yield self.pixels[chunk][row - int(ends[chunk])]
 
     @cached_property
     def masks(self) -> list[NDArray[np.uint8]]:

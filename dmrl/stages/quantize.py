@@ -1,7 +1,7 @@
 """``dmrl quantize``: a trained network to int8, and what that costs."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from cyclopts import Parameter, validators
-from numpy.typing import NDArray
 
 from dmrl.dataset import Dataset, Split, open_dataset
 from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
@@ -43,8 +42,6 @@ try:
     from dmrl import plots
 except MissingExtra:
     plots = None
-
-Image = NDArray[np.uint8]
 
 REPORT_NAME = "quantisation.json"
 LAYER_IMAGES = 20
@@ -144,18 +141,18 @@ def run(model: Path, dataset: Path, out: Path, settings: Settings) -> Result:
     graph = graph_of(operations(trained.network))
     graph = graph.grey() if settings.grey else graph
     rows = _spread(len(seen), settings.images)
-    calibration = track(_images(seen, rows), "Calibrating", len(rows))
+    calibration = track(seen.images(rows), "Calibrating", len(rows))
     ranges = calibrate(graph, (image[None] for image in calibration))
     graph, ranges = equalise(graph, ranges)
     rows = _spread(len(seen), min(settings.images, ROUNDING_IMAGES))
-    moments = moments_of(graph, track(_images(seen, rows), "Rounding", len(rows)))
+    moments = moments_of(graph, track(seen.images(rows), "Rounding", len(rows)))
     network = quantise(graph, ranges, _about(trained), moments)
     made = provenance("quantize", settings, (model, dataset), libraries=("torch", "numpy"))
     with partial_folder(out) as folder:
         result = _judge(trained, graph, network, judged, settings, ranges.images, folder)
         save_model(trained, folder)
         save(network, folder / INTEGER_NAME)
-        save_samples(np.stack(list(_images(seen, _spread(len(seen), SAMPLES)))), folder)
+        save_samples(np.stack(list(seen.images(_spread(len(seen), SAMPLES)))), folder)
         text = json.dumps(document(result), indent=1, allow_nan=False)
         (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8")
         made.write(folder)
@@ -184,14 +181,6 @@ def _spread(count: int, most: int) -> list[int]:
     """At most ``most`` numbers below ``count``, ascending, evenly spread."""
     numbers: list[int] = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
     return numbers
-
-
-def _images(split: Split, rows: Iterable[int]) -> Iterator[Image]:
-    """(height, width, 3) images of ascending rows."""
-    ends = np.cumsum([len(chunk) for chunk in split.pixels])
-    for row in rows:
-        chunk = int(np.searchsorted(ends, row, side="right"))
-        yield split.pixels[chunk][row - int(ends[chunk])]
 
 
 def _about(model: Model) -> About:
@@ -224,7 +213,7 @@ def _judge(
         _draw(split, rows, outputs, folder)
     return Result(
         network,
-        layer_figures(graph, network, _images(split, few)),
+        layer_figures(graph, network, split.images(few)),
         calibration_images,
         split.name,
         len(rows),
@@ -239,7 +228,7 @@ def _judge(
 def _outputs(backends: Mapping[str, Backend], split: Split, rows: list[int]) -> dict[str, Outputs]:
     """Output of every backend for the images of these rows."""
     each: dict[str, list[Outputs]] = {name: [] for name in backends}
-    for image in track(_images(split, rows), "Comparing", len(rows)):
+    for image in track(split.images(rows), "Comparing", len(rows)):
         for name, backend in backends.items():
             each[name].append(backend.outputs(image[None]))
     return {
@@ -258,7 +247,7 @@ def _draw(split: Split, rows: list[int], outputs: dict[str, Outputs], folder: Pa
             image,
             {name: (each.confidence[k], each.depth_m[k]) for name, each in grids.items()},
         )
-        for k, image in zip(shown, _images(split, [rows[k] for k in shown]), strict=True)
+        for k, image in zip(shown, split.images([rows[k] for k in shown]), strict=True)
     ]
     plots.map_pairs(pictures, folder / "maps")
 

@@ -57,6 +57,14 @@ def test_datasets_reads_the_same_rows(built: Path) -> None:
     assert row["peers"] == split.table["peers"][5].as_py()
 
 
+def test_images_of_rows_come_from_every_shard_in_the_order_asked(built: Path) -> None:
+    split = open_dataset(built).split("train")
+    rows = [5, 0, 3]
+    asked = np.stack(list(split.images(rows)))
+    assert len(split.pixels) > 1
+    assert np.array_equal(asked, np.concatenate(split.pixels)[rows])
+
+
 @LINUX
 def test_datasets_does_not_copy(built: Path) -> None:
     table = datasets.load_from_disk(str(built), keep_in_memory=False)["train"].data
