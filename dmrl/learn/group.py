@@ -1,17 +1,33 @@
-"""Several processes that train one network, as ``torchrun`` starts them.
+"""Several processes that train one network: those of ``torchrun``, or started here.
 
 Every process computes its part of each batch; gradients, losses and the running statistics of
 the normalisations are then averaged, so that all hold the same network after every step.
 """
 
+import multiprocessing
 import os
+import signal
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, distributed
 
+from dmrl.errors import DmrlError, SettingError
 from dmrl.learn.network import Network
+
+Made = TypeVar("Made")
+Work = Callable[["Group"], Made]
+"""What each process of a group does."""
+SPAWN = multiprocessing.get_context("spawn")
+LAST_WORDS_S = 5.0
+"""How long a process that is done, or killed, may take to be gone."""
 
 
 class Group:
@@ -59,20 +75,100 @@ def _gradient(parameter: torch.nn.Parameter) -> Tensor:
     return parameter.grad
 
 
-def join_group() -> Group:
-    """The group that ``torchrun`` put this process in, or one of this process alone."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return Group()
-    if not distributed.is_initialized():
-        cuda = torch.cuda.is_available()
-        if cuda:
-            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-        distributed.init_process_group("nccl" if cuda else "gloo")
-    return Group(distributed.get_rank(), distributed.get_world_size())
+def in_group(processes: int, work: Work[Made]) -> Made:
+    """What ``work(group)`` returns in the process that leads a group.
+
+    Under ``torchrun`` the group is the one that this process was put in. Else this process leads,
+    and starts the others on this machine's CPU; they end with it.
+
+    Parameters
+    ----------
+    processes
+        How many, where ``torchrun`` does not say.
+    work
+        A function of a module, or a part of one: fit to be pickled.
+
+    Raises
+    ------
+    SettingError
+        If one of the others does not start, or is killed.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        return _by_torchrun(work)
+    if processes == 1:
+        return work(Group())
+    threads = torch.get_num_threads()
+    torch.set_num_threads(max(threads // processes, 1))
+    try:
+        with _others(processes, work) as meeting:
+            return _member(meeting, 0, processes, work)
+    finally:
+        torch.set_num_threads(threads)
 
 
-def leave_group() -> None:
-    """Undo ``join_group``."""
-    if distributed.is_available() and distributed.is_initialized():
+def _by_torchrun(work: Work[Made]) -> Made:
+    cuda = torch.cuda.is_available()
+    if cuda:
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+    distributed.init_process_group("nccl" if cuda else "gloo")
+    return _until_all_are_done(work)
+
+
+def _member(meeting: str, rank: int, size: int, work: Work[Made]) -> Made:
+    distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=size)
+    return _until_all_are_done(work)
+
+
+def _until_all_are_done(work: Work[Made]) -> Made:
+    try:
+        made = work(Group(distributed.get_rank(), distributed.get_world_size()))
+        # Not after an error: whoever fails alone would wait for those who wait for it.
         distributed.barrier()
+        return made
+    finally:
         distributed.destroy_process_group()
+
+
+@contextmanager
+def _others(size: int, work: Work[Any]) -> Iterator[str]:
+    """Where the group meets; all but the first of its processes run meanwhile."""
+    with tempfile.TemporaryDirectory() as folder:
+        meeting = (Path(folder) / "meeting").as_uri()
+        started = [_start(meeting, rank, size, work) for rank in range(1, size)]
+        try:
+            for ready, _ in started:
+                ready.recv()
+            yield meeting
+            for _, process in started:
+                process.join(LAST_WORDS_S)
+        except (EOFError, RuntimeError) as e:
+            for _, process in started:
+                process.join(LAST_WORDS_S / size)
+            codes = [process.exitcode for _, process in started if process.exitcode]
+            if not codes:
+                raise
+            raise SettingError(
+                f"one of the {size} processes ended with {codes[0]}, for want of memory perhaps. "
+                "Go on with --resume, or begin again with fewer --processes"
+            ) from e
+        finally:
+            for _, process in started:
+                process.kill()
+                process.join()
+
+
+def _start(meeting: str, rank: int, size: int, work: Work[Any]) -> tuple[Connection, Any]:
+    here, there = SPAWN.Pipe(duplex=False)
+    process = SPAWN.Process(target=_follow, args=(there, meeting, rank, size, work), daemon=True)
+    process.start()
+    there.close()  # so that the other end knows if the process is gone
+    return here, process
+
+
+def _follow(ready: Connection, meeting: str, rank: int, size: int, work: Work[Any]) -> None:
+    """What a process does that does not lead."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the one that leads ends it
+    torch.set_num_threads(max(torch.get_num_threads() // size, 1))
+    ready.send(True)
+    with suppress(DmrlError):  # the one that leads says so
+        _member(meeting, rank, size, work)

@@ -101,6 +101,9 @@ class FitSettings:
         Of the first weights, the order of the images and their augmentation.
     device
         Where to compute; auto takes CUDA where there is one.
+    processes
+        That share every batch, on a CPU: one for each core is faster than one with as many
+        threads. As many give the same weights, byte for byte. torchrun says how many itself.
     """
 
     architecture: str = "dmrl-nano"
@@ -139,9 +142,10 @@ class FitSettings:
     precision: Literal["float32", "bfloat16"] = "float32"
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    processes: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size"):
+        for name in ("epochs", "batch_size", "processes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: must be at least 1")
         if self.learning_rate <= 0 or not 0 <= self.final_learning_rate <= self.learning_rate:

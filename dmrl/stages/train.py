@@ -4,6 +4,7 @@ import shutil
 import time
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -23,8 +24,8 @@ try:
     from dmrl.examples import material
     from dmrl.learn.batches import Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
-    from dmrl.learn.fit import Step, Training, new_network
-    from dmrl.learn.group import Group, join_group, leave_group
+    from dmrl.learn.fit import Step, Training, device_of, new_network
+    from dmrl.learn.group import Group, in_group
     from dmrl.learn.model import (
         PUBLISHED_THRESHOLD,
         Model,
@@ -96,11 +97,8 @@ def run(
         longer a number.
     """
     given = Given(init and resolved(init), teacher and resolved(teacher))
-    group = join_group()
-    try:
-        return _run(dataset, out, settings, given, group, resume=resume)
-    finally:
-        leave_group()
+    processes = settings.processes if device_of(settings.device).type == "cpu" else 1
+    return in_group(processes, partial(_run, dataset, out, settings, given, resume=resume))
 
 
 class Given(NamedTuple):
@@ -138,10 +136,11 @@ def _run(
             group=group,
             resume=resume and has_checkpoint(folder),
         )
+        if group.leads:
+            made.write(folder)
+        result = _train(training, settings, len(examples), group)
         if not group.leads:
-            return _train(training, settings, len(examples))
-        made.write(folder)
-        result = _train(training, settings, len(examples))
+            return result
         threshold = _threshold(training.network, held_out, settings)
         save_model(_model(training, settings, train, len(examples), threshold), folder)
         remove_checkpoint(folder)
@@ -185,12 +184,13 @@ def _teacher(path: Path, network: Network) -> Network:
     return teacher
 
 
-def _train(training: Training, settings: Settings, images: int) -> Result:
+def _train(training: Training, settings: Settings, images: int, group: Group) -> Result:
     def words(step: Step) -> str:
         return f"Epoch {step.epoch}/{settings.epochs}, loss {step.loss:.3f}"
 
     left, begun = training.steps_left, time.perf_counter()
-    for _ in track(training.steps(), "Training", left, describe=words):
+    steps = training.steps()
+    for _ in track(steps, "Training", left, describe=words) if group.leads else steps:
         pass
     seconds = time.perf_counter() - begun
     seen = left * settings.batch_size
@@ -230,6 +230,8 @@ class Flags:
         Of the first weights and the order of the images. Without it, the recipe's.
     device
         Where to compute. Without it, the recipe's.
+    processes
+        That share every batch, on a CPU. Without it, the recipe's.
     """
 
     epochs: int | None = None
@@ -237,6 +239,7 @@ class Flags:
     learning_rate: float | None = None
     seed: int | None = None
     device: Literal["auto", "cpu", "cuda"] | None = None
+    processes: int | None = None
 
     def over(self, settings: Settings) -> Settings:
         """The settings, with the flags that were given in their place.
