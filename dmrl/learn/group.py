@@ -91,7 +91,7 @@ def in_group(processes: int, work: Work[Made]) -> Made:
     Raises
     ------
     SettingError
-        If one of the others does not start, or is killed.
+        If one of the others is killed.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         return _by_torchrun(work)
@@ -144,11 +144,11 @@ def _others(size: int, work: Work[Any]) -> Iterator[str]:
         except (EOFError, RuntimeError) as e:
             for _, process in started:
                 process.join(LAST_WORDS_S / size)
-            codes = [process.exitcode for _, process in started if process.exitcode]
-            if not codes:
+            # One that raised has said so itself, or fails because this one did.
+            if all((process.exitcode or 0) >= 0 for _, process in started):
                 raise
             raise SettingError(
-                f"one of the {size} processes ended with {codes[0]}, for want of memory perhaps. "
+                f"one of the {size} processes was killed, for want of memory perhaps. "
                 "Go on with --resume, or begin again with fewer --processes"
             ) from e
         finally:
