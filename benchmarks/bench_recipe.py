@@ -100,6 +100,7 @@ def shortened(title: str, name: str, epochs: int) -> Settings:
         name: round(epochs * getattr(settings, name) / settings.epochs)
         for name in ("plain_epochs", "ema_steps")
     }
+    # One process: the CPU time is that of this one.
     short = {"epochs": epochs, "validation_share": HELD_OUT, "processes": 1, **parts}
     return replace(settings, **{**short, **VARIANTS[title]})
 

@@ -131,7 +131,11 @@ def _until_all_are_done(work: Work[Made]) -> Made:
 
 @contextmanager
 def _others(size: int, work: Work[Any]) -> Iterator[str]:
-    """Where the group meets; all but the first of its processes run meanwhile."""
+    """Where the group meets; all but the first of its processes run meanwhile.
+
+    torch's launchers would start the first as well; here, its progress, its errors and Ctrl-C are
+    those of a training alone.
+    """
     with tempfile.TemporaryDirectory() as folder:
         meeting = (Path(folder) / "meeting").as_uri()
         started = [_start(meeting, rank, size, work) for rank in range(1, size)]
