@@ -7,6 +7,7 @@ import errno
 import os
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -19,6 +20,7 @@ from dmrl.viewer.show import Show, stream_of
 
 LOOPBACK = "127.0.0.1"
 PATIENCE_S = 60.0
+POLL_S = 0.1
 
 # CI=1 turns rerun's usage statistics off; its look-up of newer versions has no switch, so the
 # web is put out of its reach, at a port where nobody listens. Its warnings would be drawn over
@@ -39,11 +41,22 @@ class Viewer:
         # Lives as long as the viewer.
         self._errors = TemporaryFile()  # noqa: SIM115
         self.process = subprocess.Popen(command, env=environment(), stderr=self._errors)
+        self.ended = threading.Event()
 
     @property
     def alive(self) -> bool:
         """Whether it has not ended."""
         return self.process.poll() is None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether it has not ended, nor been told to: `ended` is set."""
+        return self.alive and not self.ended.is_set()
+
+    def wait(self) -> None:
+        """Nothing, once it is wanted no more."""
+        while self.wanted:
+            self.ended.wait(POLL_S)
 
     def said(self) -> str:
         """All that it has said on standard error."""
@@ -68,9 +81,9 @@ def running(words: list[str]) -> Iterator[Viewer]:
 
 
 def listens(viewer: Viewer, host: str, port: int) -> bool:
-    """Whether the viewer is there to be talked to, or has ended."""
+    """Whether the viewer can be talked to, once it can or is wanted no more."""
     deadline = time.monotonic() + PATIENCE_S
-    while viewer.alive and time.monotonic() < deadline:
+    while viewer.wanted and time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection((host, port), timeout=1):
             return True
         time.sleep(0.02)
@@ -78,15 +91,15 @@ def listens(viewer: Viewer, host: str, port: int) -> bool:
 
 
 def stream_to(show: Show, viewer: Viewer, port: int, host: str = LOOPBACK) -> None:
-    """Send everything, unless the viewer is closed meanwhile."""
+    """Send everything, unless the viewer is closed meanwhile, or told to end."""
     stream = stream_of()
     stream.connect_grpc(url_of(port, host), default_blueprint=show.blueprint)
     try:
-        log(show, stream, wanted=lambda: viewer.alive)
-        if viewer.alive:
+        log(show, stream, wanted=lambda: viewer.wanted)
+        if viewer.wanted:
             stream.flush(timeout_sec=PATIENCE_S)
     except RuntimeError:
-        if viewer.alive:
+        if viewer.wanted:
             raise
     finally:
         stream.disconnect()

@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 from cyclopts import Parameter, validators
 
+from dmrl.ending import ended_by_signal
 from dmrl.errors import SettingError
 from dmrl.progress import say
 from dmrl.viewer.process import (
@@ -62,9 +63,7 @@ def serve(paths: Sequence[Path], settings: Settings, web: Web = WEB) -> None:
         If nothing lies in the time asked for, or the port is in use.
     """
     with suppress(KeyboardInterrupt), page(paths, settings, web) as shown:
-        say(f"{shown.url} (Ctrl-C ends it)")
-        shown.fill()
-        shown.wait()
+        shown.serve()
 
 
 @contextmanager
@@ -126,9 +125,13 @@ class Page:
         """Send everything that is shown; the page can be looked at meanwhile."""
         stream_to(self._show, self._viewer, self._data_port, self._host)
 
-    def wait(self) -> None:
-        """Nothing, once the server has ended."""
-        self._viewer.process.wait()
+    def serve(self) -> None:
+        """Print the address, fill the page and wait for Ctrl-C, or a kill."""
+        # An exception would be lost in a destructor of rerun's, which talks to the server.
+        with ended_by_signal(self._viewer.ended):
+            say(f"{self.url} (Ctrl-C ends it)")
+            self.fill()
+            self._viewer.wait()
 
     def close(self) -> None:
         """End the server."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rerun.experimental import ViewerClient
 
+from dmrl.ending import ended_by_signal
 from dmrl.errors import OutputError, SettingError
 from dmrl.output import partial_file
 from dmrl.viewer.process import (
@@ -51,13 +52,13 @@ def view(paths: Sequence[Path], settings: Settings) -> None:
     # The viewer wakes up while the recording's index is read.
     with running(command(LOOPBACK, "--port", str(port))) as viewer:
         show = prepare(paths, settings)
-        try:
+        with ended_by_signal(viewer.ended):
             if listens(viewer, LOOPBACK, port):
                 stream_to(show, viewer, port)
-            viewer.process.wait()
-        except KeyboardInterrupt:
-            return
+            viewer.wait()
         said = viewer.said()
+    if viewer.ended.is_set():
+        return
     if NO_SCREEN in said:
         raise SettingError("no screen for a window. Use --save, --screenshot or --serve")
     if viewer.process.returncode:

@@ -1,10 +1,7 @@
 """Links and cameras of the robots that are recorded: made, ended, and what to say of them."""
 
-import signal
-import threading
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 from dmrl.errors import SettingError
 from dmrl.formats.camera_toml import read_camera
@@ -15,8 +12,6 @@ from dmrl.live.crazyflie import Link
 from dmrl.live.feed import Feed
 from dmrl.live.pictures import Colours, Stored
 from dmrl.live.robots import Robot, peers_of
-
-ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def check(robots: Sequence[Robot]) -> None:
@@ -94,20 +89,6 @@ def cameras_of(
         for robot in robots
         if robot.camera
     ]
-
-
-@contextmanager
-def ended_by_signal(ended: threading.Event) -> Iterator[None]:
-    """Set when the user wants an end: an exception amid a write would spoil the file."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in ENDING}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def end_all(threads: Sequence[Link | CameraClient]) -> None:

@@ -12,13 +12,14 @@ from typing import Annotated
 from cyclopts import Parameter, validators
 
 from dmrl.bayer import load_opencv
+from dmrl.ending import ended_by_signal
 from dmrl.errors import OutputError, RecordingError
 from dmrl.live.camera import CameraClient
 from dmrl.live.cflib_session import load_cflib
 from dmrl.live.clocks import HostTime
 from dmrl.live.crazyflie import Link
 from dmrl.live.feed import Feed, Health, Received
-from dmrl.live.links import cameras_of, check, end_all, ended_by_signal, links_of, nothing_came
+from dmrl.live.links import cameras_of, check, end_all, links_of, nothing_came
 from dmrl.live.pictures import Colours, Stored
 from dmrl.live.robots import Robot, robot_of
 from dmrl.live.table import LiveTable

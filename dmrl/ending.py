@@ -1,0 +1,30 @@
+"""Ctrl-C and kills as an event: an exception comes anywhere, and can do harm or be lost."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def ended_by_signal(ended: threading.Event) -> Iterator[None]:
+    """Set when the user wants an end, as long as the block lasts.
+
+    An exception amid a write would spoil the file, and one in a destructor Python drops.
+
+    Parameters
+    ----------
+    ended
+        Looked at often by what the block does.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

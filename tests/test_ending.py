@@ -1,0 +1,41 @@
+"""The user's wish to end, as an event."""
+
+import signal
+import threading
+
+import pytest
+
+from dmrl.ending import ended_by_signal
+
+
+class Destroyed:
+    """Gets a signal when it is destroyed, where Python drops exceptions."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
+
+    def __del__(self) -> None:
+        signal.raise_signal(self.number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_amid_a_destructor_is_not_lost(number: signal.Signals) -> None:
+    ended, before = threading.Event(), signal.getsignal(number)
+    with ended_by_signal(ended):
+        assert not ended.is_set()
+        Destroyed(number)
+        assert ended.is_set()
+    assert signal.getsignal(number) is before
+
+
+def test_outside_the_main_thread_signals_are_left_alone() -> None:
+    before, seen = signal.getsignal(signal.SIGINT), []
+
+    def block() -> None:
+        with ended_by_signal(threading.Event()):
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=block)
+    thread.start()
+    thread.join()
+    assert seen == [before]
