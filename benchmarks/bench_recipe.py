@@ -40,6 +40,8 @@ PLAIN: dict[str, Any] = {
 }
 PUBLISHED = "the published recipe"
 PUBLISHED_EPOCHS = 15
+TEACHER = "dmrl-large"
+TAUGHT = f"taught by {TEACHER}"
 VARIANTS: dict[str, dict[str, Any]] = {
     "the recipe": {},
     "no whole images at the end": {"plain_epochs": 0},
@@ -59,6 +61,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "batches of 8": {"batch_size": 8},
     "float32": {"precision": "float32"},
     "locanet": {"architecture": "locanet"},
+    "depth with its spread": {"spread_weight": 1.0},
+    TAUGHT: {},
     PUBLISHED: {},
 }
 HELD_OUT = 0.1
@@ -70,13 +74,17 @@ def rows(
     """One row per variant: mean and spread over the seeds of each figure."""
     for title in only or VARIANTS:
         settings = shortened(title, name, epochs)
-        histories, spent = [], 0.0
-        for seed in range(seeds):
-            with tempfile.TemporaryDirectory() as folder:
-                begun = time.process_time()
-                run(dataset, Path(folder) / "run", replace(settings, seed=seed))
-                spent += time.process_time() - begun
-                histories.append(load_model(Path(folder) / "run").training["history"])
+        begun = time.process_time()
+        with tempfile.TemporaryDirectory() as folder:
+            runs, teacher = Path(folder), None
+            if title == TAUGHT:
+                # One for all seeds. The row's CPU time includes its own.
+                teacher = runs / "teacher"
+                run(dataset, teacher, replace(settings, architecture=TEACHER))
+            for seed in range(seeds):
+                run(dataset, runs / str(seed), replace(settings, seed=seed), teacher=teacher)
+            histories = [load_model(runs / str(seed)).training["history"] for seed in range(seeds)]
+        spent = time.process_time() - begun
         said = [history[-1] for history in histories]
         row: dict[str, Any] = {"variant": title, "cpu_s": spent / seeds, "epochs": settings.epochs}
         row["within_20_px_by_epoch"] = np.mean(
