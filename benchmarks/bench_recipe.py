@@ -45,6 +45,7 @@ TAUGHT = f"taught by {TEACHER}"
 VARIANTS: dict[str, dict[str, Any]] = {
     "the recipe": {},
     "no whole images at the end": {"plain_epochs": 0},
+    "norms never frozen": {"frozen_norm_epochs": 0},
     "no augmentation": PLAIN,
     "no paste": {"paste": 0.0},
     "no mosaic": {"mosaic_share": 0.0},
@@ -99,14 +100,14 @@ def rows(
 
 
 def shortened(title: str, name: str, epochs: int) -> Settings:
-    """The settings of a row; whole images and averaging are as large a part as in the recipe."""
+    """The settings of a row; the end of the training is as large a part as in the recipe."""
     if title == PUBLISHED:
         settings = recipe.load("locanet", "train", Settings)
         return replace(settings, epochs=PUBLISHED_EPOCHS, validation_share=HELD_OUT)
     settings = recipe.load(name, "train", Settings)
     parts = {
         name: round(epochs * getattr(settings, name) / settings.epochs)
-        for name in ("plain_epochs", "ema_steps")
+        for name in ("plain_epochs", "frozen_norm_epochs", "ema_steps")
     }
     # One process: the CPU time is that of this one.
     short = {"epochs": epochs, "validation_share": HELD_OUT, "processes": 1, **parts}

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 
 from dmrl.errors import SettingError
@@ -177,7 +177,9 @@ class Training:
         first = self._state.epochs_done
         with self._board(first * self._steps_per_epoch + 1) as board:
             for epoch in range(first, self._settings.epochs):
-                self._learning.train()
+                left = self._settings.epochs - epoch
+                frozen = left <= self._settings.frozen_norm_epochs
+                _for_training(self._learning, frozen_norms=frozen)
                 said = yield from self._epoch(epoch, board)
                 self._learning.eval()
                 if self._validation is not None and self._group.leads:
@@ -259,6 +261,15 @@ class Training:
             share,
             self._teacher,
         )
+
+
+def _for_training(network: Network, *, frozen_norms: bool) -> None:
+    """Have a network learn, its normalisations by the batch or by their running statistics."""
+    network.train()
+    if frozen_norms:
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
 
 
 def _require_finite(loss: float, epoch: int, step: int) -> None:

@@ -84,6 +84,9 @@ class FitSettings:
     plain_epochs
         The last epochs, in which images stay whole: mirrored and tinted, but not zoomed, turned
         or put together (Ge et al. 2021).
+    frozen_norm_epochs
+        The last epochs, in which batch normalisation takes its running statistics, as the
+        network will when it is used, in place of each batch's.
     colour
         Spread (one sigma) of contrast, brightness and white balance, 0 to 1.
     noise
@@ -135,6 +138,7 @@ class FitSettings:
     mosaic_share: float = 0.5
     paste: float = 0.0
     plain_epochs: int = 0
+    frozen_norm_epochs: int = 0
     colour: float = 0.05
     noise: float = 0.01
     blur_share: float = 0.1
@@ -196,5 +200,5 @@ NOT_NEGATIVE = (
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
     *("confidence_weight", "depth_weight", "offset_weight", "spread_weight", "class_weight"),
     *("rotation_deg", "paste"),
-    "plain_epochs",
+    *("plain_epochs", "frozen_norm_epochs"),
 )

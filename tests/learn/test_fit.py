@@ -29,6 +29,7 @@ EVERYTHING = FitSettings(
     ema_steps=20,
     paste=1.0,
     plain_epochs=1,
+    frozen_norm_epochs=1,
     label_noise="weight",
     precision="bfloat16",
     device="cpu",
@@ -148,6 +149,27 @@ def test_the_last_epochs_keep_images_whole() -> None:
     assert (plain.mosaic_share, plain.paste, plain.rotation_deg) == (0, 0, 0)
     assert plain.zoom == (1.0, 1.0)
     assert (plain.flip_share, plain.colour) == (settings.flip_share, settings.colour)
+
+
+@pytest.mark.parametrize("frozen", [0, 1])
+def test_frozen_norms_are_learnt_but_not_measured(
+    examples: Examples, tmp_path: Path, frozen: int
+) -> None:
+    settings = replace(SETTINGS, epochs=2, frozen_norm_epochs=frozen)
+    training = Training(new_network(settings, examples), examples, settings, tmp_path)
+    seen: list[dict[str, torch.Tensor]] = []
+    for number, _ in enumerate(training.steps(), start=1):
+        if number % 7 == 0:
+            seen.append({k: v.clone() for k, v in training.network.state_dict().items()})
+    first, second = seen
+    statistics = {name for name in first if "running_" in name}
+    assert statistics
+    for name in first:
+        if name in statistics:
+            assert torch.equal(first[name], second[name]) == bool(frozen)
+    scales = [name for name in first if "norms" in name and name.endswith("weight")]
+    assert scales
+    assert not any(torch.equal(first[name], second[name]) for name in scales)
 
 
 def test_a_teacher_that_says_the_same_leaves_nothing_to_learn(examples: Examples) -> None:
