@@ -159,7 +159,7 @@ def test_frozen_norms_are_learnt_but_not_measured(
     training = Training(new_network(settings, examples), examples, settings, tmp_path)
     seen: list[dict[str, torch.Tensor]] = []
     for number, _ in enumerate(training.steps(), start=1):
-        if number % 7 == 0:
+        if number % 7 == 0:  # the end of an epoch: 20 images by threes
             seen.append({k: v.clone() for k, v in training.network.state_dict().items()})
     first, second = seen
     statistics = {name for name in first if "running_" in name}
