@@ -17,13 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.lens import distort, undistort
+
 Array = NDArray[np.float64]
 
 STRIDE_PX = 8
 """Image pixels per grid cell, both ways."""
-
-UNDISTORT_ROUNDS = 8
-"""Newton steps; the lenses of small cameras settle in 4 to 1e-9."""
 
 # camera (x forward, y left, z up) -> optical (x right, y down, z forward); paper eq. 1.
 OPTICAL_FROM_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -247,64 +246,6 @@ def pixels_from_horizontal(
     jacobian[:, :2] = focal[:, None] * (by_plane @ by_camera @ by_state)
     jacobian[:, 2] = by_state[:, 0]
     return uv, depth, jacobian
-
-
-def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Where a lens puts points of the plane at unit depth, and the derivatives.
-
-    Parameters
-    ----------
-    plane
-        (N, 2) right and down over depth.
-    distortion
-        k1, k2, p1, p2, k3 of the plumb-bob model; fewer: the rest are zero.
-
-    Returns
-    -------
-    bent : Array
-        (N, 2) in the same plane; NaN so far out that the model folds back.
-    jacobian : Array
-        (N, 2, 2).
-    """
-    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * (5 - len(distortion)))
-    x, y = plane.T
-    square = x**2 + y**2
-    radial = 1 + square * (k1 + square * (k2 + square * k3))
-    slope = k1 + square * (2 * k2 + square * 3 * k3)
-    radial = np.where(radial + 2 * square * slope > 0, radial, np.nan)
-    bent = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2),
-            y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-    across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    along_x = radial + 2 * x**2 * slope + 2 * p1 * y + 6 * p2 * x
-    along_y = radial + 2 * y**2 * slope + 6 * p1 * y + 2 * p2 * x
-    return bent, np.stack([along_x, across, across, along_y], axis=-1).reshape(-1, 2, 2)
-
-
-def undistort(bent: Array, distortion: tuple[float, ...]) -> Array:
-    """(N, 2) points of the plane at unit depth that ``distort`` takes to ``bent``.
-
-    Parameters
-    ----------
-    bent
-        (N, 2) right and down over depth, as the lens shows them.
-    distortion
-        As in ``distort``.
-
-    Returns
-    -------
-    Array
-        NaN where the lens shows nothing: beyond the fold of its model.
-    """
-    plane = np.array(bent, float)
-    for _ in range(UNDISTORT_ROUNDS if any(distortion) else 0):
-        shown, jacobian = distort(plane, distortion)
-        plane = plane - np.linalg.solve(jacobian, (shown - bent)[..., None])[..., 0]
-    return plane
 
 
 def horizontal_from_pixels(

@@ -64,9 +64,9 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
 
 
 def _peers(scene: Drawn, shot: Shot) -> Iterator[dict[str, Any]]:
-    """Labels of the robots of which anything is seen."""
+    """Labels of the robots of which anything is seen, their centres by the lens at least."""
     for k, share in enumerate(shot.visible_share.tolist()):
-        if share <= 0 or np.isnan(shot.box_px[k]).any():
+        if share <= 0 or np.isnan([*shot.box_px[k], *shot.uv_px[k]]).any():
             continue
         yield {
             "peer": peer(k, scene.robots[k]),

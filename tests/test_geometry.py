@@ -15,13 +15,11 @@ from dmrl.geometry import (
     PUBLISHED_RENDER,
     Array,
     camera_from_horizontal,
-    distort,
     grid_label,
     horizontal_from_pixels,
     inside,
     pixels_from_horizontal,
     project,
-    undistort,
 )
 
 K = np.array([[184.0, 0.0, 160.0], [0.0, 184.0, 112.0], [0.0, 0.0, 1.0]])
@@ -232,12 +230,6 @@ def test_behind_the_camera_there_is_no_pixel() -> None:
     assert depth_m[0] == -1.0
 
 
-def test_a_lens_that_folds_back_gives_no_pixel_out_there() -> None:
-    bent, _ = geometry.distort(np.array([[0.1, 0.0], [3.0, 0.0]]), (-0.3,))
-    assert np.isfinite(bent[0]).all()
-    assert np.isnan(bent[1]).any()
-
-
 def test_pixels_and_depth_go_back_to_the_horizontal_frame() -> None:
     rng = np.random.default_rng(3)
     camera = replace(AIDECK, mount_rad=(0.05, -0.1, 0.2))
@@ -261,9 +253,3 @@ def test_a_camera_turned_to_the_left_sees_things_further_right() -> None:
     (u, v), (u0, v0) = (pixels_from_horizontal(xyz, zero, zero, c)[0][0] for c in (turned, AIDECK))
     assert u - u0 == pytest.approx(AIDECK.fx_px * np.tan(0.1), rel=0.02)
     assert v == pytest.approx(v0, abs=0.5)
-
-
-def test_undistorting_undoes_the_lens() -> None:
-    plane = np.random.default_rng(0).uniform(-0.9, 0.9, (100, 2))
-    bent, _ = distort(plane, AIDECK.distortion)
-    assert np.allclose(undistort(bent, AIDECK.distortion), plane, atol=1e-9)

@@ -5,7 +5,10 @@ from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
 from dmrl.errors import SourceError
-from dmrl.geometry import Camera
+from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
+
+KNOWN = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
+"""Cameras that have a name."""
 
 INTEGERS = ("width_px", "height_px")
 POSITIVE = (*INTEGERS, "fx_px", "fy_px")
@@ -23,6 +26,22 @@ def write_camera(camera: Camera) -> str:
     )
 
 
+def camera_named(name: Path) -> Camera:
+    """The camera of that name, or that a TOML file describes.
+
+    Parameters
+    ----------
+    name
+        One of `KNOWN`, or a file.
+
+    Raises
+    ------
+    SourceError
+        As `read_camera`.
+    """
+    return KNOWN.get(str(name)) or read_camera(name)
+
+
 def read_camera(path: Path) -> Camera:
     """The camera that a TOML file describes.
 
@@ -34,7 +53,9 @@ def read_camera(path: Path) -> Camera:
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise SourceError(f"no calibration {path}. Name a TOML file, aideck or published") from None
+        raise SourceError(
+            f"no calibration {path}. Name a TOML file, {' or '.join(KNOWN)}"
+        ) from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
         raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
     wrong = [key for key in values if key not in KEYS]

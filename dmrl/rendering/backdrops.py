@@ -11,7 +11,8 @@ from numpy.random import Generator
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry import Array, Camera
 from dmrl.images import Rgb, crop_and_scale, decode, size
-from dmrl.rendering.lens import Picture, between, undistort
+from dmrl.lens import undistort
+from dmrl.rendering.lens import Picture, between
 
 PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm")
 KEPT = 64

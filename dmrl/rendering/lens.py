@@ -1,4 +1,4 @@
-"""Lens distortion, the plumb-bob model, and resampling of pictures through it."""
+"""A camera's image, the pinhole image behind it, and resampling from one to the other."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -6,42 +6,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.errors import SettingError
 from dmrl.geometry import Array, Camera, inside
+from dmrl.lens import distort, undistort
 
 Picture = NDArray[np.float32]
-
-# The inverse has no closed form; the lenses of small cameras settle in 5 rounds to 1e-6 px.
-ROUNDS = 20
-
-
-def distort(xy: Array, distortion: tuple[float, ...]) -> Array:
-    """(..., 2) places in the image plane at distance 1 as the lens shows them.
-
-    Parameters
-    ----------
-    xy
-        (..., 2) undistorted places: right and down, per unit of depth.
-    distortion
-        k1, k2, p1, p2, k3; empty for none.
-    """
-    if not distortion:
-        return xy
-    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * (5 - len(distortion)))
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    right = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    down = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.stack([right, down], axis=-1)
-
-
-def undistort(xy: Array, distortion: tuple[float, ...]) -> Array:
-    """(..., 2) places that ``distort`` takes to ``xy``."""
-    guess = xy
-    if distortion:
-        for _ in range(ROUNDS):
-            guess = guess + (xy - distort(guess, distortion))
-    return guess
 
 
 def _scale(camera: Camera) -> tuple[Array, Array]:
@@ -49,9 +18,13 @@ def _scale(camera: Camera) -> tuple[Array, Array]:
 
 
 def image_from_pinhole(uv: Array, camera: Camera) -> Array:
-    """(..., 2) pixels in the camera's image from those that it would have without distortion."""
+    """(..., 2) pixels in the camera's image from those that it would have without distortion.
+
+    NaN where the lens shows nothing.
+    """
     focal, centre = _scale(camera)
-    return np.asarray(distort((uv - centre) / focal, camera.distortion) * focal + centre)
+    bent, _ = distort((uv - centre) / focal, camera.distortion)
+    return np.asarray(bent * focal + centre)
 
 
 def pinhole_from_image(uv: Array, camera: Camera) -> Array:
@@ -85,12 +58,24 @@ class Canvas:
 
 @cache
 def canvas_of(camera: Camera) -> Canvas:
-    """The canvas of a camera, worked out once."""
+    """The canvas of a camera, worked out once.
+
+    Raises
+    ------
+    SettingError
+        If its distortion folds the image back before its corners.
+    """
     if not any(camera.distortion):
         everywhere = np.ones((camera.height_px, camera.width_px), bool)
         return Canvas(replace(camera, distortion=()), np.zeros(2), None, everywhere)
     v, u = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     places = pinhole_from_image(np.stack([u, v], axis=-1), camera)
+    if np.isnan(places).any():
+        raise SettingError(
+            f"a lens with distortion {list(camera.distortion)} cannot fill an image of "
+            f"{camera.width_px}x{camera.height_px}: it folds back before the corners. Calibrate "
+            "it with boards there, or give fewer coefficients"
+        )
     low = np.minimum(np.floor(places.min(axis=(0, 1))) - 2, 0)
     high = np.ceil(places.max(axis=(0, 1))) + 2
     width, height = np.maximum(high, (camera.width_px, camera.height_px)) - low

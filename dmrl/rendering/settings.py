@@ -65,7 +65,8 @@ class Settings:
     samples
         Light paths per pixel.
     camera
-        aideck: the paper's calibration. published: that of the published renders.
+        aideck: the paper's calibration. published: that of the published renders. Else a TOML
+        file as ``dmrl calibrate`` writes, of any size; its mount and delay are left out.
     distorted
         Whether images have the camera's lens distortion.
     model
@@ -171,7 +172,7 @@ class Settings:
     seed: int = 0
     workers: int = 0
     samples: int = 8
-    camera: Literal["aideck", "published"] = "aideck"
+    camera: Path = Path("aideck")
     distorted: bool = True
     model: Path | None = None
     model_up: Literal["y", "z"] = "z"

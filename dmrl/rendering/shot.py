@@ -114,7 +114,8 @@ class Shot:
     rgb
         (H, W, 3) uint8.
     uv_px
-        (N, 2) pixels of the robots' centres, with the camera's distortion.
+        (N, 2) pixels of the robots' centres, with the camera's distortion; NaN where its lens
+        shows nothing.
     depth_m
         (N,) distance of the centres along camera x.
     box_px

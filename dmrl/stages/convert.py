@@ -15,17 +15,15 @@ from cyclopts import Parameter, validators
 from dmrl.errors import SettingError
 from dmrl.export.ros2 import write_bag
 from dmrl.export.tables import write_tables
-from dmrl.formats.camera_toml import read_camera
+from dmrl.formats.camera_toml import camera_named
 from dmrl.formats.known import format_of
 from dmrl.formats.sample import Content, Options
-from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import track
 from dmrl.recording import SPLIT_METADATA, RecordingWriter, provenance
 from dmrl.tables import print_json, print_table
 
-CAMERAS = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
@@ -136,7 +134,7 @@ def _options(settings: Settings) -> Options:
         names=_names(settings.names),
         rate_hz=settings.rate_hz,
         labels=settings.labels,
-        camera=_camera(settings.camera),
+        camera=None if settings.camera is None else camera_named(settings.camera),
         size_px=None if width_px is None or height_px is None else (width_px, height_px),
         raw=settings.raw,
     )
@@ -150,10 +148,6 @@ def _names(text: str | None) -> dict[str, str]:
             raise SettingError(f"--names {part.strip()!r} is not OLD=NEW. Try: 0=cf2,1=cf3")
         found[old] = new
     return found
-
-
-def _camera(name: Path | None) -> Camera | None:
-    return None if name is None else CAMERAS.get(str(name)) or read_camera(name)
 
 
 DEFAULTS = Settings()

@@ -14,8 +14,9 @@ from cyclopts import Parameter, validators
 from dmrl import recipe as recipes
 from dmrl import topics
 from dmrl.errors import RecipeError, SettingError
+from dmrl.formats.camera_toml import KNOWN, camera_named
 from dmrl.formats.sample import Sample, calibration, intervals
-from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
+from dmrl.geometry import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
@@ -29,13 +30,13 @@ from dmrl.recording import (
 )
 from dmrl.rendering.backdrops import Photos
 from dmrl.rendering.environment import ensure
+from dmrl.rendering.lens import canvas_of
 from dmrl.rendering.randomise import Drawn, World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer, Scene
 from dmrl.rendering.settings import PRESETS, Settings
 from dmrl.shots import ROBOT, samples
 from dmrl.tables import print_json, print_table
 
-CAMERAS = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
 PANORAMA_KINDS = (".exr", ".hdr")
 
 Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
@@ -78,9 +79,20 @@ def settings_of(name: str, **changes: Any) -> Settings:
 
 
 def camera_of(settings: Settings) -> Camera:
-    """The camera that the images are taken with."""
-    camera = CAMERAS[settings.camera]
-    return camera if settings.distorted else replace(camera, distortion=())
+    """The camera that the images are taken with: level with its robot, its clock exact.
+
+    Raises
+    ------
+    SourceError
+        If its file cannot be read.
+    SettingError
+        If its lens does not fill the image.
+    """
+    camera = camera_named(settings.camera)
+    distortion = camera.distortion if settings.distorted else ()
+    camera = replace(camera, distortion=distortion, mount_rad=(0.0, 0.0, 0.0), delay_s=0.0)
+    canvas_of(camera)  # Says so now rather than after the first image.
+    return camera
 
 
 def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
@@ -100,7 +112,9 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     OutputError
         If ``out`` exists, or an interrupted rendering is in the way.
     SettingError
-        If model, scale or backgrounds cannot be used.
+        If model, scale, backgrounds or the camera's lens cannot be used.
+    SourceError
+        If the camera's file cannot be read.
     BlenderError
         If Blender cannot be set up, or does not start.
     RecordingError
@@ -108,6 +122,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     """
     refuse_existing(out)
     before = interrupted(out, resume=resume)
+    camera = camera_of(settings)
     photos = None if settings.backgrounds is None else Photos(settings.backgrounds)
     lights = None if settings.lights is None else _panoramas(settings.lights)
     model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre)
@@ -128,7 +143,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
         done = before.copy(sink)
         world = World(
             settings,
-            camera_of(settings),
+            camera,
             renderer.radius_m,
             tuple(renderer.lights),
             cache(renderer.panorama),
@@ -153,6 +168,8 @@ def _counts(out: Path) -> tuple[int, int]:
 def _provenance(settings: Settings, blender: str) -> Provenance:
     """How the recording is made; the number of workers changes nothing, so it is left out."""
     inputs = [path for path in (settings.model, settings.backgrounds, settings.lights) if path]
+    if str(settings.camera) not in KNOWN:
+        inputs.append(settings.camera)
     plain = replace(settings, workers=0)
     made = provenance("render", plain, inputs, seed=settings.seed, libraries=("numpy", "pillow"))
     return replace(made, libraries={**made.libraries, "blender": blender})
@@ -210,6 +227,7 @@ def command(
     seed: int | None = None,
     workers: int | None = None,
     backgrounds: Path | None = None,
+    camera: Path | None = None,
     model: Path | None = None,
     scale: float | None = None,
     resume: Annotated[bool, Parameter(negative=())] = False,
@@ -232,6 +250,8 @@ def command(
         Blender processes; 0: as many as there are cores. Changes no byte of the output.
     backgrounds
         Folder of photos to put behind the robots.
+    camera
+        Calibration of the camera, a TOML file as dmrl calibrate writes, or aideck or published.
     model
         .blend, .glb, .obj or .stl of the robot.
     scale
@@ -255,6 +275,7 @@ def command(
         seed=seed,
         workers=workers,
         backgrounds=backgrounds,
+        camera=camera,
         model=model,
         scale=scale,
     )

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.formats.camera_toml import read_camera, write_camera
+from dmrl.formats.camera_toml import camera_named, read_camera, write_camera
 from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
 
 
@@ -12,6 +12,13 @@ def test_a_camera_comes_back_as_written(camera: Camera, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(write_camera(camera))
     assert read_camera(path) == camera
+
+
+def test_a_camera_has_a_name_or_a_file(tmp_path: Path) -> None:
+    assert camera_named(Path("published")) == PUBLISHED_RENDER
+    path = tmp_path / "camera.toml"
+    path.write_text(write_camera(AIDECK))
+    assert camera_named(path) == AIDECK
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import BlenderError, OutputError, RecordingError, SettingError
+from dmrl.formats.camera_toml import write_camera
 from dmrl.geometry import Array, Camera, project
 from dmrl.images import decode
 from dmrl.recording import check, read, read_table, summary
@@ -160,6 +161,31 @@ def _mesh_box(robot: Robot, camera: Camera) -> Array:
     uv = image_from_pinhole(project(xyz, camera.image_from_optical)[0], camera)
     box = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
     return np.clip(box, 0, (camera.width_px, camera.height_px) * 2)
+
+
+OWN = Camera(160, 120, 100.0, 101.0, 81.0, 58.0, (-0.28, 0.09, 0.0, 0.0, 0.0))
+
+
+def test_renders_are_taken_with_a_camera_of_the_user_s(blender: Path, tmp_path: Path) -> None:
+    path, out = tmp_path / "mine.toml", tmp_path / "out.mcap"
+    path.write_text(write_camera(replace(OWN, mount_rad=(0.0, 0.1, 0.0), delay_s=0.03)))
+    settings = Settings(images=3, camera=path, empty_share=0.0, samples=2, workers=1)
+    run(out, settings)
+    calibration = next(iter(read(out, "/cf1/camera/calibration"))).message
+    assert list(calibration.D)[:2] == [-0.28, 0.09]
+    assert camera_of(settings) == OWN
+    pictures = [decode(sample.message.data) for sample in read(out, "/cf1/camera/image")]
+    assert {picture.shape for picture in pictures} == {(120, 160, 3)}
+    made = summary(out).provenance
+    assert made is not None
+    assert [source.name for source in made.inputs] == ["mine.toml"]
+
+
+def test_a_lens_that_cannot_fill_its_image_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(write_camera(replace(OWN, distortion=(-0.9,))))
+    with pytest.raises(SettingError, match="folds back before the corners"):
+        camera_of(Settings(camera=path))
 
 
 CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
