@@ -1,4 +1,4 @@
-"""Labels and detections of a recording, joined by robot and log time.
+"""Labels and detections of recordings, joined by robot and log time.
 
 The images are those that a dataset would take: with labels from the source that is asked
 for, all of them OK, or with labels that name no peer at all. See ``dmrl.dataset.rows``.
@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,10 +21,19 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.images import size
 from dmrl.learn.matching import Points
 from dmrl.messages import STATUS_OK
+from dmrl.progress import track
 from dmrl.recording import read, read_table, splits, summary
 
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
+
+
+class At(NamedTuple):
+    """Which image: of whom, and its log time, nanoseconds."""
+
+    recording: Path
+    robot: str
+    time_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +43,7 @@ class Pairs:
     Parameters
     ----------
     at
-        Robot and log time of each image.
+        Which images.
     labels
         Those inside the image, from one source.
     detections
@@ -44,7 +54,7 @@ class Pairs:
         Why images and labels were left out, and how many.
     """
 
-    at: list[tuple[str, int]]
+    at: list[At]
     labels: Points
     detections: Points
     threshold: float = 0.0
@@ -56,25 +66,31 @@ class Pairs:
         return len(self.at)
 
 
-def join(recording: Path, against: str, split: str | None = None) -> Pairs:
-    """Labels and detections of every image that can be judged.
+def join(recordings: Sequence[Path], against: str, split: str | None = None) -> Pairs:
+    """Labels and detections of every image that can be judged, one recording after another.
 
     Parameters
     ----------
-    recording
+    recordings
         With labels and detections.
     against
         Source of the labels.
     split
-        Only this split of the recording's source. None: all images.
+        Only this split of each recording's source. None: all images.
 
     Raises
     ------
     RecordingError
-        If the recording cannot be read, or has no detections, labels or images.
+        If a recording cannot be read, has no detections, labels or images, or is given twice.
     SettingError
-        If it has no labels of that source, no such split, or no image to judge.
+        If one has no labels of that source, no such split, or no image to judge.
     """
+    if len({path.resolve() for path in recordings}) != len(recordings):
+        raise RecordingError(f"{recordings[0]}: a recording is given twice. Name each once")
+    return _together([_join(path, against, split) for path in track(recordings, "Reading")])
+
+
+def _join(recording: Path, against: str, split: str | None) -> Pairs:
     held = summary(recording)
     robots = topics.robots(list(held.topics), topics.DETECTIONS)
     if not robots:
@@ -149,7 +165,7 @@ def _join_robot(
     every = _column(detected, "detections")
     detections = _points(every, None, in_detections, len(detected))
     threshold = float(np.max(_column(detected, "threshold").to_numpy(), initial=0.0))
-    at = [(robot, int(time_ns)) for time_ns in judged]
+    at = [At(recording, robot, int(time_ns)) for time_ns in judged]
     return Pairs(at, labels.select(inside), detections, threshold, left_out)
 
 
@@ -191,7 +207,7 @@ def _points(entries: pa.Array, mine: Mask | None, rows: Times, count: int) -> Po
 
 
 def _together(parts: list[Pairs]) -> Pairs:
-    """The images of several robots, one after another."""
+    """The images of several robots or recordings, one after another."""
     first = np.cumsum([0, *(part.images for part in parts)])
     left_out: Counter[str] = Counter()
     for part in parts:

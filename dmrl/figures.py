@@ -14,7 +14,7 @@ from dmrl.images import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored
 from dmrl.plots import Example
-from dmrl.recording import read
+from dmrl.recording import read, summary
 
 Array = NDArray[np.float64]
 
@@ -41,19 +41,15 @@ def draw_errors(folder: Path, judged: Sequence[HasErrors]) -> None:
         plots.error_trace(trace.title, trace.time_s, trace.sigma_m, trace.errors_m, stem)
 
 
-def draw(
-    folder: Path, recording: Path, pairs: Pairs, scored: Scored, source: str, threshold: float
-) -> None:
+def draw(folder: Path, pairs: Pairs, scored: Scored, source: str, threshold: float) -> None:
     """Write every figure of an evaluation into a folder.
 
     Parameters
     ----------
     folder
         Gets error-violins, error-by-distance and examples, as PNG and SVG.
-    recording
-        With images, and network maps where there are any.
     pairs
-        Its judged images.
+        The judged images.
     scored
         Their labels and detections, matched.
     source
@@ -64,13 +60,11 @@ def draw(
     error, depth_m = scored.label_error, scored.labels.depth_m
     plots.error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
     plots.error_by_distance(depth_m, error.norm_px, error.depth_m, folder / "error-by-distance")
-    if shown := _examples(recording, pairs, error.norm_px, source, threshold):
+    if shown := _examples(pairs, error.norm_px, source, threshold):
         plots.examples(shown, folder / "examples")
 
 
-def _examples(
-    recording: Path, pairs: Pairs, error_px: Array, source: str, threshold: float
-) -> list[Example]:
+def _examples(pairs: Pairs, error_px: Array, source: str, threshold: float) -> list[Example]:
     """Images whose worst label has an error at fixed places of the order, best first."""
     worst_px = np.full(pairs.images, -1.0)
     np.maximum.at(worst_px, pairs.labels.image, error_px)
@@ -78,23 +72,21 @@ def _examples(
     order = labelled[np.argsort(worst_px[labelled], kind="stable")]
     places = dict.fromkeys(int(share * (len(order) - 1)) for share in SHARES if len(order))
     return [
-        _example(recording, pairs, order[place], worst_px[order[place]], source, threshold)
-        for place in places
+        _example(pairs, order[place], worst_px[order[place]], source, threshold) for place in places
     ]
 
 
-def _example(
-    recording: Path, pairs: Pairs, image: int, worst_px: float, source: str, threshold: float
-) -> Example:
-    robot, time_ns = pairs.at[image]
+def _example(pairs: Pairs, image: int, worst_px: float, source: str, threshold: float) -> Example:
+    recording, robot, time_ns = pairs.at[image]
     topic = topics.camera_image(robot)
     taken = next(read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1))
     rgb = decode(taken.message.data, what=f"{recording}: {topic} at {time_ns} ns")
     maps = _maps(recording, robot, time_ns)
     labels = pairs.labels.select(pairs.labels.image == image)
     labels_px = np.column_stack([labels.u_px, labels.v_px])
+    several = len({at.recording for at in pairs.at}) > 1
     return Example(
-        title=f"{time_ns / 1e9:.2f} s, error {worst_px:.1f} px",
+        title=f"{recording.stem}, " * several + f"{time_ns / 1e9:.2f} s, error {worst_px:.1f} px",
         rgb=rgb,
         confidence=maps["confidence"],
         depth_m=maps["depth_m"],
@@ -108,6 +100,8 @@ def _maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
     """Grid maps by channel; all NaN where the recording has none."""
     out = {name: np.full((1, 1), np.nan) for name in ("confidence", "depth_m")}
     topic = topics.grid(robot)
+    if topic not in summary(recording).topics:
+        return out
     for grid in read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1):
         values = np.frombuffer(grid.message.data, "<f4")
         shape = (len(grid.message.channels), grid.message.rows, grid.message.cols)

@@ -31,7 +31,7 @@ STAGES: dict[str, int | None] = {
     "dataset": None,
     "train": 1,
     "predict": 2,
-    "evaluate": 1,
+    "evaluate": None,
     "quantize": 2,
     "export": 1,
     "view": None,

@@ -87,13 +87,13 @@ def _judged(path: Path, robot: str, selection: Selection) -> Judged | None:
     """How far off a model was; None, and a line, if nothing can judge it."""
     try:
         source = label_source(path, "best")
-        pairs = evaluation.join(path, source)
+        pairs = evaluation.join([path], source)
     except DmrlError as e:
         say(f"no errors of {path.stem}: {e}")
         return None
     found = errors(pairs.labels, pairs.detections)
-    whose = np.array([name for name, _ in pairs.at], object)[pairs.labels.image]
-    time_ns = np.array([time for _, time in pairs.at], np.int64)[pairs.labels.image]
+    whose = np.array([at.robot for at in pairs.at], object)[pairs.labels.image]
+    time_ns = np.array([at.time_ns for at in pairs.at], np.int64)[pairs.labels.image]
     first_ns, end_ns = selection.shown_ns
     own = (whose == robot) & (time_ns >= first_ns) & (time_ns < end_ns)
     return Judged(source, time_ns[own], found.norm_px[own], found.depth_m[own])

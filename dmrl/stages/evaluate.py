@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter, validators
 
 from dmrl import positions, topics, tracks
-from dmrl.errors import MissingExtra
+from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import Pairs, join
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
 from dmrl.output import partial_folder, refuse_existing
@@ -86,13 +86,13 @@ class Evaluation:
     threshold: float
 
 
-def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation | Document:
-    """Judge the detections of ``recording``, or its positions or tracks: then as JSON values.
+def run(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Evaluation | Document:
+    """Judge detections together, or one recording's positions or tracks: then as JSON values.
 
     Parameters
     ----------
-    recording
-        With images, labels and detections; or with true positions and tracks or estimates.
+    recordings
+        With images, labels and detections; or one with true positions and tracks or estimates.
     out
         Folder to write plots and ``evaluation.json``, ``positions.json`` or ``tracks.json`` to.
         None: nothing is written.
@@ -102,9 +102,10 @@ def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation | D
     Raises
     ------
     RecordingError
-        If the recording cannot be read, or has nothing to judge, or nothing to judge it by.
+        If a recording cannot be read, or has nothing to judge, or nothing to judge it by.
     SettingError
-        If it has no labels of that source, no such split, or no image to judge.
+        If one has no labels of that source, no such split, or no image to judge; if several are
+        given of which positions or tracks are to be judged.
     MissingExtra
         If plots are wanted and matplotlib is not installed.
     OutputError
@@ -114,10 +115,14 @@ def run(recording: Path, out: Path | None, settings: Settings) -> Evaluation | D
         refuse_existing(out)
         if figures is None:
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
-    what = settings.what if settings.what != "auto" else _what(recording)
+    what = settings.what if settings.what != "auto" else _what(recordings[0])
     if what == "detections":
-        return run_detections(recording, out, settings)
-    return _run_document(KINDS[what], f"{what}.json", recording, out, settings.settle_s)
+        return run_detections(recordings, out, settings)
+    if len(recordings) > 1:
+        raise SettingError(
+            f"{what} are judged one recording at a time. Name one, or give --what detections"
+        )
+    return _run_document(KINDS[what], f"{what}.json", recordings[0], out, settings.settle_s)
 
 
 def _what(recording: Path) -> str:
@@ -149,9 +154,9 @@ def _folder(out: Path, name: str, made: Document) -> Iterator[Path]:
         yield folder
 
 
-def run_detections(recording: Path, out: Path | None, settings: Settings) -> Evaluation:
-    """Judge the detections of ``recording``, robot by robot and image by image; see `run`."""
-    pairs = join(recording, settings.against, settings.split)
+def run_detections(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Evaluation:
+    """Judge the detections of all recordings, image by image; see `run`."""
+    pairs = join(recordings, settings.against, settings.split)
     threshold = settings.threshold
     if threshold is None:
         threshold = pairs.threshold or FALLBACK_THRESHOLD
@@ -159,19 +164,24 @@ def run_detections(recording: Path, out: Path | None, settings: Settings) -> Eva
     bands = by_band(scored, threshold=threshold, draws=settings.draws, seed=settings.seed)
     evaluation = Evaluation(pairs, scored, bands, threshold)
     if out is not None:
-        made = document(recording, settings, evaluation)
+        made = document(recordings, settings, evaluation)
         with _folder(out, "evaluation.json", made) as folder:
             assert figures is not None
-            figures.draw(folder, recording, pairs, scored, settings.against, threshold)
+            figures.draw(folder, pairs, scored, settings.against, threshold)
     return evaluation
 
 
-def document(recording: Path, settings: Settings, evaluation: Evaluation) -> dict[str, Any]:
-    """Everything that was measured, as JSON values; null where there was nothing to measure."""
-    source = input_of(recording)
+def document(
+    recordings: Sequence[Path], settings: Settings, evaluation: Evaluation
+) -> dict[str, Any]:
+    """Everything that was measured, as JSON values; null where there was nothing to measure.
+
+    One recording is ``recording``, several are ``recordings``.
+    """
+    sources = [{"name": s.name, "sha256": s.sha256} for s in map(input_of, recordings)]
     overall, *bands = [_band(band) for band in evaluation.bands]
     return {
-        "recording": {"name": source.name, "sha256": source.sha256},
+        **({"recordings": sources} if len(sources) > 1 else {"recording": sources[0]}),
         "against": settings.against,
         "split": settings.split,
         "threshold": evaluation.threshold,
@@ -224,7 +234,9 @@ ROWS = (
 )
 
 
-def print_evaluation(recording: Path, settings: Settings, evaluation: Evaluation) -> None:
+def print_evaluation(
+    recordings: Sequence[Path], settings: Settings, evaluation: Evaluation
+) -> None:
     """Print the figures, one column per band that holds labels."""
     overall, *others = evaluation.bands
     shown = [overall, *(band for band in others if band.labels)]
@@ -234,7 +246,8 @@ def print_evaluation(recording: Path, settings: Settings, evaluation: Evaluation
         cells = [_cell(band.figures[name], form) for band in shown]
         rows.append([words, *cells])
     split = f", split {settings.split}" if settings.split else ""
-    title = f"{recording}: {evaluation.pairs.images} images against {settings.against}{split}"
+    name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
+    title = f"{name}: {evaluation.pairs.images} images against {settings.against}{split}"
     print_table(title, ["label minus detection", *headers], rows)
     notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
     if overall.unmatched:
@@ -271,7 +284,7 @@ DEFAULTS = Settings()
 
 
 def command(
-    recording: Annotated[Path, Parameter(name="IN")],
+    recordings: Annotated[list[Path], Parameter(name="IN")],
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
@@ -282,22 +295,22 @@ def command(
 
     Parameters
     ----------
-    recording
-        Recording with images, labels and detections; or with true positions and tracks or
-        estimates.
+    recordings
+        Recordings with images, labels and detections, judged together; or one with true
+        positions and tracks or estimates.
     plots_to
         Folder to write plots to, and evaluation.json, positions.json or tracks.json. Must not
         exist.
     as_json
         Print one JSON document in place of the table.
     """
-    evaluation = run(recording, plots_to, settings)
+    evaluation = run(recordings, plots_to, settings)
     if isinstance(evaluation, dict):
         if as_json:
             print_json(evaluation)
         else:
-            print_document(recording, evaluation)
+            print_document(recordings[0], evaluation)
     elif as_json:
-        print_json(document(recording, settings, evaluation))
+        print_json(document(recordings, settings, evaluation))
     else:
-        print_evaluation(recording, settings, evaluation)
+        print_evaluation(recordings, settings, evaluation)

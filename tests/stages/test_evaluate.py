@@ -38,8 +38,9 @@ def write(tmp_path: Path) -> Callable[..., Path]:
         robots: Mapping[str, Sequence[tuple[Peers | None, Peers | None]]],
         split: Mapping[str, str] | None = None,
         threshold: float = 0.0,
+        name: str = "flight.mcap",
     ) -> Path:
-        path = tmp_path / "flight.mcap"
+        path = tmp_path / name
         with RecordingWriter(path, Provenance("test")) as sink:
             if split:
                 sink.add_metadata(SPLIT_METADATA, dict(split))
@@ -57,7 +58,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
 
 
 def figures(path: Path, settings: Settings = FAST) -> dict[str, Any]:
-    document_ = document(path, settings, run(path, None, settings))
+    document_ = document([path], settings, run([path], None, settings))
     overall: dict[str, Any] = document_["overall"]
     return {k: v["value"] if isinstance(v, dict) else v for k, v in overall.items()}
 
@@ -75,6 +76,24 @@ def test_robots_are_not_mixed(write: Callable[..., Path]) -> None:
     path = write({"cf1": [([here], [found(10, 10)])], "cf2": [([there], [found(50, 40)])]})
     assert figures(path)["mean_px"] == 0
     assert figures(path)["labels"] == 2
+
+
+def test_recordings_are_judged_together(
+    write: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The same robot at the same times: only the recording tells the images apart.
+    near = write({"cf1": [([peer(10, 10)], [found(13, 14)])] * 2}, name="near.mcap")
+    far = write({"cf1": [([peer(50, 40)], [found(50, 10)])]}, name="far.mcap")
+    evaluate.command([near, far], settings=FAST, plots_to=tmp_path / "plots", as_json=True)
+    said = json.loads(capsys.readouterr().out)
+    assert [source["name"] for source in said["recordings"]] == ["near.mcap", "far.mcap"]
+    assert (said["images"], said["overall"]["median_px"]["value"]) == (3, 5)
+    assert said["overall"]["mean_px"]["value"] == pytest.approx(40 / 3)
+    assert (tmp_path / "plots" / "examples.png").is_file()
+    evaluate.command([near, far], settings=FAST)
+    assert "2 recordings: 3 images against truth" in capsys.readouterr().out
+    with pytest.raises(RecordingError, match="given twice"):
+        run([near, far, near], None, FAST)
 
 
 def test_only_the_chosen_source_counts(write: Callable[..., Path]) -> None:
@@ -101,7 +120,7 @@ def test_images_that_cannot_be_judged_are_left_out_and_counted(
             ]
         }
     )
-    evaluation = run(path, None, FAST)
+    evaluation = run([path], None, FAST)
     assert evaluation.pairs.images == 3
     assert len(evaluation.pairs.labels) == 2
     assert evaluation.pairs.left_out == {
@@ -119,7 +138,7 @@ def test_the_split_of_the_source_is_kept_apart(write: Callable[..., Path]) -> No
     assert figures(path, Settings(split="test", draws=5))["mean_px"] == 30
     assert figures(path, Settings(split="train", draws=5))["mean_px"] == 10
     with pytest.raises(SettingError, match=r"has no split val\. It has: test, train"):
-        run(path, None, Settings(split="val"))
+        run([path], None, Settings(split="val"))
 
 
 def test_the_threshold_is_the_detectors_unless_one_is_given(write: Callable[..., Path]) -> None:
@@ -131,15 +150,15 @@ def test_the_threshold_is_the_detectors_unless_one_is_given(write: Callable[...,
 def test_what_is_missing_is_named(write: Callable[..., Path], dots: Path) -> None:
     path = write({"cf1": [([peer(10, 10, source="hand")], [found(10, 10)])]})
     with pytest.raises(SettingError, match=r"no labels from truth\. Give --against one of: hand"):
-        run(path, None, FAST)
+        run([path], None, FAST)
     with pytest.raises(RecordingError, match=r"has no detections\. Try: dmrl predict MODEL"):
-        run(dots, None, FAST)
+        run([dots], None, FAST)
 
 
 def test_labels_and_detections_at_other_times_are_not_judged(write: Callable[..., Path]) -> None:
     path = write({"cf1": [([peer(10, 10)], None), (None, [found(10, 10)])]})
     with pytest.raises(SettingError, match="has no image with labels from truth and detections"):
-        run(path, None, FAST)
+        run([path], None, FAST)
 
 
 def test_the_json_document_is_complete_and_clean(
@@ -162,7 +181,7 @@ def test_the_table_has_a_column_for_each_band_with_labels(
     dots: Path, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
-    evaluate.command(tmp_path / "out.mcap", settings=FAST)
+    evaluate.command([tmp_path / "out.mcap"], settings=FAST)
     text = capsys.readouterr().out
     assert "30 images against truth" in text
     assert "1 to 1.5 m" in text
@@ -172,7 +191,7 @@ def test_the_table_has_a_column_for_each_band_with_labels(
 def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: Path) -> None:
     predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
     for name in ("a", "b"):
-        run(tmp_path / "out.mcap", tmp_path / name, FAST)
+        run([tmp_path / "out.mcap"], tmp_path / name, FAST)
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
     plots = ("error-by-distance", "error-violins", "examples")
     assert names == sorted(
@@ -183,7 +202,7 @@ def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: P
     with Image.open(tmp_path / "a" / "error-violins.png") as picture:
         assert len(np.unique(np.asarray(picture.convert("L")))) > 50
     with pytest.raises(OutputError, match="exists"):
-        run(tmp_path / "out.mcap", tmp_path / "a", FAST)
+        run([tmp_path / "out.mcap"], tmp_path / "a", FAST)
 
 
 def test_plots_without_matplotlib_name_the_extra(
@@ -191,7 +210,7 @@ def test_plots_without_matplotlib_name_the_extra(
 ) -> None:
     monkeypatch.setattr(evaluate, "figures", None)
     with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[plot\]'"):
-        run(dots, tmp_path / "plots", FAST)
+        run([dots], tmp_path / "plots", FAST)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl import pipeline, positions
-from dmrl.errors import OutputError, RecordingError
+from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.evaluate import Settings, command, run
@@ -45,7 +45,7 @@ def test_positions_are_judged_pair_by_pair(labelled: Path) -> None:
     assert one.without_truth == 1  # after the last truth
     assert other.judged.error_m == pytest.approx(np.zeros((800, 2)))
     assert np.isnan(other.judged.covariance).all()
-    made = run(labelled, None, Settings())
+    made = run([labelled], None, Settings())
     assert isinstance(made, dict)
     first, second = made["pairs"]
     assert first["rmse_m"] == pytest.approx(0.1)
@@ -58,21 +58,21 @@ def test_positions_are_judged_pair_by_pair(labelled: Path) -> None:
 
 def test_figures_and_plots_are_written(labelled: Path, tmp_path: Path) -> None:
     out = tmp_path / "judged"
-    made = run(labelled, out, Settings(settle_s=5.0))
+    made = run([labelled], out, Settings(settle_s=5.0))
     assert json.loads((out / "positions.json").read_text()) == made
     names = {path.name for path in out.iterdir()}
     assert {"position-error-cf1-cf2.png", "position-error-cf2-cf1.svg"} <= names
     with pytest.raises(OutputError):
-        run(labelled, out, Settings())
+        run([labelled], out, Settings())
 
 
 def test_the_table_has_a_row_per_pair_and_one_for_all(
     labelled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command(labelled)
+    command([labelled])
     text = capsys.readouterr().out
     assert [row in text for row in ("cf1 sees cf2", "cf2 sees cf1", "all")] == [True] * 3
-    command(labelled, as_json=True)
+    command([labelled], as_json=True)
     assert json.loads(capsys.readouterr().out)["settle_s"] == 20.0
 
 
@@ -93,18 +93,20 @@ def test_recordings_with_nothing_to_judge_are_refused(tmp_path: Path) -> None:
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(0, "/cf1/peer/cf2/truth", position(1, 0, 0.0))
     with pytest.raises(RecordingError, match=r"has no positions\. Try: dmrl label"):
-        run(path, None, Settings(what="positions"))
+        run([path], None, Settings(what="positions"))
+    with pytest.raises(SettingError, match="positions are judged one recording at a time"):
+        run([path, path], None, Settings(what="positions"))
     other = tmp_path / "estimate.mcap"
     with RecordingWriter(other, Provenance("test")) as sink:
         sink.write(0, "/cf1/peer/cf2/position", position(1, 0))
     with pytest.raises(RecordingError, match="no true position for any"):
-        run(other, None, Settings())
+        run([other], None, Settings())
 
 
 def test_a_pipeline_shows_judged_positions(
     labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(labelled, tmp_path / "positions", Settings())
+    run([labelled], tmp_path / "positions", Settings())
     done = [pipeline.Done("evaluate", tmp_path / "positions", 1.0, skipped=False)]
     pipeline.report(done)
     assert "cf1 sees cf2" in capsys.readouterr().out

@@ -41,7 +41,7 @@ def test_every_image_gets_its_tracks_in_the_observers_frame(tracked: Path) -> No
 
 
 def test_tracks_are_better_than_single_images_and_honest(tracked: Path) -> None:
-    made = evaluate.run(tracked, None, evaluate.Settings(settle_s=3.0))
+    made = evaluate.run([tracked], None, evaluate.Settings(settle_s=3.0))
     assert isinstance(made, dict)
     (one,) = made["robots"]
     assert one["robot"] == "cf1"
@@ -116,12 +116,12 @@ def test_tracks_without_truth_cannot_be_judged(tracked: Path, tmp_path: Path) ->
     kept = [t for t in summary(tracked).topics if not topics.names(topics.TRUTH, t)]
     trim(tracked, short, topics=kept)
     with pytest.raises(RecordingError, match="no true position"):
-        evaluate.run(short, None, evaluate.Settings(what="tracks"))
+        evaluate.run([short], None, evaluate.Settings(what="tracks"))
 
 
 def test_the_plots_show_the_errors_of_both(tracked: Path, tmp_path: Path) -> None:
     out = tmp_path / "plots"
-    evaluate.run(tracked, out, evaluate.Settings(what="tracks"))
+    evaluate.run([tracked], out, evaluate.Settings(what="tracks"))
     assert {path.name for path in out.iterdir()} == {
         "tracks.json",
         "track-error-cf1.png",
