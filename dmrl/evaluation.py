@@ -1,7 +1,7 @@
 """Labels and detections of recordings, joined by robot and log time.
 
 The images are those that a dataset would take: with labels from the source that is asked
-for, all of them OK, or with labels that name no peer at all. See ``dmrl.dataset.rows``.
+for, all of them OK, or without any, if it looked. See ``dmrl.dataset.rows``.
 """
 
 from collections import Counter
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.dataset import Split
+from dmrl.dataset.rows import LOOKED, sources_in
 from dmrl.errors import RecordingError, SettingError
 from dmrl.images import size
 from dmrl.learn.matching import Points
@@ -137,28 +138,27 @@ def _spans(
 def _require_source(recording: Path, robots: Iterable[str], against: str) -> None:
     present: set[str] = set()
     for robot in robots:
-        peers = _column(read_table(recording, topics.labels(robot), fields=("peers",)), "peers")
-        present.update(pc.unique(pc.struct_field(peers.flatten(), "source")).to_pylist())
-    if against not in present:
-        has = (
-            f"Give --against one of: {', '.join(sorted(present))}" if present else "Label it first"
+        table = read_table(recording, topics.labels(robot), fields=LOOKED)
+        present |= sources_in(*(_column(table, name) for name in LOOKED))
+    if present and against not in present:
+        has = ", ".join(sorted(present))
+        raise SettingError(
+            f"{recording} has no labels from {against}. Give --against one of: {has}"
         )
-        raise SettingError(f"{recording} has no labels from {against}. {has}")
 
 
 def _join_robot(
     recording: Path, robot: str, against: str, spans: list[tuple[int, int]] | None
 ) -> Pairs:
     left_out: Counter[str] = Counter()
-    labelled = read_table(recording, topics.labels(robot), fields=("peers",))
+    labelled = read_table(recording, topics.labels(robot), fields=LOOKED)
     detected = read_table(recording, topics.detections(robot))
-    times = _column(labelled, "log_time").to_numpy()
+    times, (peers, looked) = _by_time(labelled)
     seen_at = _column(detected, "log_time").to_numpy()
-    peers = _column(labelled, "peers")
-    mine, usable = _usable(peers, against, _within(times, spans), left_out)
+    mine, usable = _usable(peers, looked, against, _within(times, spans), left_out)
     left_out["images without detections"] += int((usable & ~np.isin(times, seen_at)).sum())
     judged, in_usable, in_detections = np.intersect1d(times[usable], seen_at, return_indices=True)
-    labels = _points(peers, mine, np.flatnonzero(usable)[in_usable], len(labelled))
+    labels = _points(peers, mine, np.flatnonzero(usable)[in_usable], len(times))
     width_px, height_px = _image_size(recording, robot)
     inside = _inside(labels, width_px, height_px)
     left_out["labels outside their image"] += int((~inside).sum())
@@ -169,8 +169,20 @@ def _join_robot(
     return Pairs(at, labels.select(inside), detections, threshold, left_out)
 
 
+def _by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
+    """Log times, each once, and what all messages of a time say, by `LOOKED`."""
+    times, first = np.unique(_column(labelled, "log_time").to_numpy(), return_index=True)
+    found = []
+    for name in LOOKED:
+        entries = _column(labelled, name)
+        ends = entries.offsets.to_numpy()
+        starts = np.append(ends[first], ends[-1]) - ends[0]
+        found.append(pa.ListArray.from_arrays(starts, entries.flatten()))
+    return times, found
+
+
 def _usable(
-    peers: pa.Array, against: str, within: Mask, left_out: Counter[str]
+    peers: pa.Array, looked: pa.Array, against: str, within: Mask, left_out: Counter[str]
 ) -> tuple[Mask, Mask]:
     """Which peers are from the source, and which of the images can be judged by them."""
     image = _image_of(peers)
@@ -180,7 +192,10 @@ def _usable(
     count = np.bincount(image, minlength=len(peers))
     own = np.bincount(image[mine], minlength=len(peers))
     not_ok = np.bincount(image[bad], minlength=len(peers)) > 0
-    foreign = (count > 0) & (own == 0)
+    asked = pc.equal(looked.flatten(), against).to_numpy(zero_copy_only=False)
+    own += np.bincount(_image_of(looked)[asked], minlength=len(peers))
+    known = count + np.diff(looked.offsets.to_numpy()) > 0
+    foreign = known & (own == 0)
     left_out["images with labels from other sources only"] += int((within & foreign).sum())
     left_out["images with a label that is not OK"] += int((within & not_ok).sum())
     return mine, within & ~foreign & ~not_ok

@@ -47,7 +47,7 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         else encode_png(shot.rgb)
     )
     yield image(time_ns, ROBOT, data, settings.image_format)
-    yield labels(time_ns, ROBOT, list(_peers(scene, shot)))
+    yield labels(time_ns, ROBOT, list(_peers(scene, shot)), ["truth"])
     attitude = {"roll_rad": scene.roll_rad, "pitch_rad": scene.pitch_rad}
     yield Sample(time_ns, topics.attitude(ROBOT), "Attitude", attitude)
     horizontal_from_camera = camera_from_horizontal(scene.roll_rad, scene.pitch_rad).T

@@ -1,9 +1,10 @@
 """Recordings to rows: images joined with their labels by robot and log time.
 
 Of each image one source of labels is used. An image without any PeerLabels is left out:
-nobody looked. One whose PeerLabels names no peer stays: somebody looked, and saw none. One
-that has peers, but none from the chosen source, is left out, and so is one with a peer whose
-label is not OK: as a picture of "nobody there" it would teach the opposite of the truth.
+nobody looked. One at which the chosen source looked and saw no peer stays, and so does one
+that nobody saw any peer in. One that only other sources looked at is left out, and so is one with
+a peer whose label is not OK: as a picture of "nobody there" it would teach the opposite of the
+truth.
 """
 
 import re
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
@@ -29,6 +31,9 @@ from dmrl.recording import Stamped, columns, matching, read, summary
 
 SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
+
+LOOKED = ("peers", "sources")
+"""Fields of PeerLabels that say who looked."""
 
 PATTERNS = (topics.camera_image("*"), topics.labels("*"))
 
@@ -50,7 +55,7 @@ class Tally:
         """Why images were left out, and how many."""
         return {
             "had no labels": self.without_labels,
-            "had peers, but none from the chosen source (--labels)": self.of_other_sources,
+            "were not looked at by the chosen source (--labels)": self.of_other_sources,
             "had a label that is not OK (--keep-all keeps them)": self.not_ok,
             "belong to no split of their source (--split)": self.in_no_split,
         }
@@ -89,9 +94,8 @@ def label_source(path: Path, wanted: str) -> str:
     present: set[str] = set()
     for topic in summary(path).topics:
         if topics.names(topics.LABELS, topic):
-            for batch in columns(path, topic, fields=("peers",)):
-                peers = batch.column("peers").flatten()
-                present.update(pc.unique(pc.struct_field(peers, "source")).to_pylist())
+            for batch in columns(path, topic, fields=LOOKED):
+                present.update(sources_in(*(batch.column(name) for name in LOOKED)))
     if not present:
         return SOURCES[0] if wanted == "best" else wanted
     usable = [source for source in SOURCES if source in present and wanted in (source, "best")]
@@ -99,6 +103,17 @@ def label_source(path: Path, wanted: str) -> str:
         has = ", ".join(sorted(present))
         raise SettingError(f"{path} has no labels from {wanted}. Try one of --labels {has}")
     return usable[0]
+
+
+def sources_in(peers: pa.Array, sources: pa.Array) -> set[str]:
+    """Who looked at any image, by the columns of PeerLabels that `LOOKED` names."""
+    named = pc.struct_field(peers.flatten(), "source")
+    return {*pc.unique(named).to_pylist(), *pc.unique(sources.flatten()).to_pylist()}
+
+
+def looked_at(labels: Any) -> set[str]:
+    """Who looked at the image of a PeerLabels; empty: not known."""
+    return {*labels.sources, *(label.source for label in labels.peers)}
 
 
 def rows_of(
@@ -130,7 +145,7 @@ def rows_of(
         split = split_of(image.time_ns)
         if split is None:
             tally.in_no_split += 1
-        elif labels.peers and not mine:
+        elif source not in (looked_at(labels) or {source}):
             tally.of_other_sources += 1
         elif not keep_all and any(label.status != STATUS_OK for label in mine):
             tally.not_ok += 1
@@ -150,10 +165,15 @@ def labelled_images(
     if masks and any(topics.names(topics.MASKS, topic) for topic in summary(path).topics):
         patterns.append(topics.masks("*"))
     for _, same_time in groupby(read(path, *patterns), key=lambda stamped: stamped.time_ns):
-        images, labels, covered = [], {}, {}
+        images: list[Stamped] = []
+        labels: dict[str, Any] = {}
+        covered: dict[str, Stamped] = {}
         for stamped in same_time:
             if found := topics.names(topics.LABELS, stamped.topic):
-                labels[found["robot"]] = stamped.message
+                # Two recordings of the same images, merged, each with its own source.
+                labels.setdefault(found["robot"], type(stamped.message)()).MergeFrom(
+                    stamped.message
+                )
             elif found := topics.names(topics.MASKS, stamped.topic):
                 covered[found["robot"]] = stamped
             else:

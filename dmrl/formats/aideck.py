@@ -16,6 +16,7 @@ from dmrl.geometry import Camera, pixels_from_horizontal
 from dmrl.messages import LogType
 
 VARIABLES = ("roll", "pitch", "x", "y", "z", "d")
+SOURCE = "estimate"
 LOG = LogType("aideck", tuple((name, "f") for name in VARIABLES))
 NEAREST_M = 0.05
 FARTHEST_M = 60.0
@@ -61,7 +62,7 @@ def samples(
     if values[5] > 0:
         yield Sample(time_ns, topics.uwb_range(robot, peer), "UwbRange", {"range_m": values[5]})
     if camera is not None:
-        yield labels(time_ns, robot, _seen(peer, values[2:5], roll, pitch, camera))
+        yield labels(time_ns, robot, _seen(peer, values[2:5], roll, pitch, camera), [SOURCE])
 
 
 def _seen(
@@ -74,4 +75,4 @@ def _seen(
     (u, v), depth = uv[0].tolist(), float(depth_m[0])
     if not (depth > NEAREST_M and 0 <= u < camera.width_px and 0 <= v < camera.height_px):
         return []
-    return [{"peer": peer, "u_px": u, "v_px": v, "depth_m": depth, "source": "estimate"}]
+    return [{"peer": peer, "u_px": u, "v_px": v, "depth_m": depth, "source": SOURCE}]

@@ -172,7 +172,8 @@ def _samples(
         yield image(time_ns, options.robot, data, kind)
         if path.name in rows:
             peers = [crop.label(row) for row in rows[path.name] if row.peer]
-            yield labels(time_ns, options.robot, [row.fields() for row in peers])
+            sources = {row.source for row in rows[path.name]}
+            yield labels(time_ns, options.robot, [row.fields() for row in peers], sources)
         if path.name in states:
             known = options.camera if path.name not in rows else None
             camera = crop.camera(known) if known else None

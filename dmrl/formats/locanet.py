@@ -257,7 +257,8 @@ def _samples(items: list[LocanetImage], robot: str) -> Iterator[Sample]:
         time_ns = item.number * STEP_NS
         names = _peer_names(robot, len(item.xyz_camera))
         yield image(time_ns, robot, _jpeg(item.path), "jpeg")
-        yield labels(time_ns, robot, _peers(item, names))
+        sources = ["truth", *(["published"] if len(item.published) else [])]
+        yield labels(time_ns, robot, _peers(item, names), sources)
         roll, pitch = attitude_zyx(item.roll_rad, item.pitch_rad)
         fields = {"roll_rad": roll, "pitch_rad": pitch}
         yield Sample(time_ns, topics.attitude(robot), "Attitude", fields)

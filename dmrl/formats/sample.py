@@ -183,6 +183,9 @@ def calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
     return Sample(time_ns, topics.calibration(robot), "CameraCalibration", fields)
 
 
-def labels(time_ns: int, robot: str, peers: Sequence[Mapping[str, Any]]) -> Sample:
-    """All peers of one picture as PeerLabels; none: "no peer in view"."""
-    return Sample(time_ns, topics.labels(robot), "PeerLabels", {"peers": list(peers)})
+def labels(
+    time_ns: int, robot: str, peers: Sequence[Mapping[str, Any]], sources: Iterable[str]
+) -> Sample:
+    """All peers of one picture as PeerLabels, and who looked; no peers: "none in view"."""
+    fields = {"peers": list(peers), "sources": sorted(sources)}
+    return Sample(time_ns, topics.labels(robot), "PeerLabels", fields)

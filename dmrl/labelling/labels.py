@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dmrl.estimation.pair import Array
 from dmrl.geometry import Camera, pixels_from_horizontal
-from dmrl.messages import STATUS_OK
+from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED
 
 SOURCE = "estimate"
 MARGIN_SIGMAS = 3.0
@@ -103,10 +103,30 @@ def image_labels(
         if near[k]:
             yield _label(peer, status, [*uv[k], depth_m[k]], sigma[k])
         elif status != STATUS_OK:
-            middle = [*size / 2, max(float(distance[k]), NEAREST_M)]
-            yield _label(peer, status, middle, [*size, distance[k]])
+            yield anywhere(peer, camera, float(distance[k]), status)
         else:
             yield None
+
+
+def anywhere(
+    peer: str, camera: Camera, distance_m: float, status: int = STATUS_UNCONVERGED
+) -> dict[str, Any]:
+    """Fields of the PeerLabel of a peer that may be in the image or not.
+
+    Parameters
+    ----------
+    peer
+        Its name.
+    camera
+        The observer's.
+    distance_m
+        How far it may be.
+    status
+        Why it is not located.
+    """
+    size = np.array([camera.width_px, camera.height_px])
+    middle = [*size / 2, max(distance_m, NEAREST_M)]
+    return _label(peer, status, middle, [*size, distance_m])
 
 
 def _label(peer: str, status: int, value: Any, sigma: Any) -> dict[str, Any]:

@@ -76,6 +76,9 @@ class Logs:
         By name.
     pairs
         By (robot, peer) in the order of their names; both directions' ranges together.
+    flying
+        Robots with a log of any kind, in a pair or not: they may be in view. (What only stands
+        in ranges may be an anchor.)
     warnings
         One line for each thing that was left out or looks wrong.
     """
@@ -83,6 +86,7 @@ class Logs:
     start_ns: int
     robots: dict[str, RobotLog]
     pairs: dict[tuple[str, str], Pair]
+    flying: frozenset[str]
     warnings: list[str]
 
 
@@ -122,7 +126,14 @@ def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
         pair = _pair(robots, one, other, usable, warnings)
         if pair is not None:
             pairs[one, other] = pair
-    return Logs(held.start_ns, robots, pairs, warnings)
+    kinds = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT)
+    flying = frozenset(name for kind in kinds for name in topics.robots(list(held.topics), kind))
+    paired = {name for pair in pairs for name in pair}
+    warnings += [
+        f"{name}: it has a log but no position, so no image counts as one without it"
+        for name in sorted(flying - paired if pairs else ())
+    ]
+    return Logs(held.start_ns, robots, pairs, flying, warnings)
 
 
 def _robot(path: Path, held: Summary, name: str, warnings: list[str]) -> RobotLog | None:

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.dataset.rows import looked_at
 from dmrl.estimation.pair import Array
 from dmrl.geometry import Camera
-from dmrl.labelling.labels import SOURCE, Look, Positions, image_labels
+from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
 from dmrl.labelling.logs import Logs
 from dmrl.messages import message
 from dmrl.recording import Summary, Timed, read, read_table
@@ -47,6 +48,9 @@ def label_messages(
 ) -> Iterator[Timed]:
     """PeerLabels of every image that has a position or had labels, in time order.
 
+    Where any peer is located, every other that has a log is named too, as one that may be anywhere:
+    else the image would be one without it.
+
     Parameters
     ----------
     recording, held
@@ -60,30 +64,55 @@ def label_messages(
     look
         How positions become pixels.
     """
-    kept = _of_other_sources(recording, held, topics.labels(robot))
-    fresh: dict[int, list[Any]] = defaultdict(list)
+    kept, looked = _of_other_sources(recording, held, topics.labels(robot))
     camera = look.cameras.get(robot) or camera_of(recording, held, robot)
     images_ns = image_times(recording, held, robot)
-    exposures_ns = look.exposures_ns(robot, images_ns)
-    for peer, found in positions.items() if camera else ():
-        at = np.isin(found.time_ns, exposures_ns)
-        mine = Positions(found.time_ns[at], found.xyz_m[at], found.covariance[at], found.status[at])
-        attitude = _attitude(logs, robot, mine.time_ns)
-        labels = image_labels(peer, mine, attitude, camera, look) if camera else iter(())
-        stamps = images_ns[np.searchsorted(exposures_ns, mine.time_ns)].tolist()
-        for time_ns, label in zip(stamps, labels, strict=True):
-            fresh[time_ns] += [message("PeerLabel")(**label)] if label else []
+    fresh = _fresh(logs, robot, positions, look, camera, images_ns) if camera else {}
     for time_ns in sorted({*kept, *fresh}):
         peers = [*kept.get(time_ns, []), *fresh.get(time_ns, [])]
-        yield Timed(time_ns, topics.labels(robot), message("PeerLabels")(peers=peers))
+        sources = sorted(looked[time_ns] | ({SOURCE} if time_ns in fresh else set()))
+        made = message("PeerLabels")(peers=peers, sources=sources)
+        yield Timed(time_ns, topics.labels(robot), made)
 
 
-def _of_other_sources(recording: Path, held: Summary, topic: str) -> dict[int, list[Any]]:
-    """Entries of the labels that are there, by log time, without earlier estimates."""
+def _fresh(
+    logs: Logs,
+    robot: str,
+    positions: Mapping[str, Positions],
+    look: Look,
+    camera: Camera,
+    images_ns: Times,
+) -> dict[int, list[Any]]:
+    """Entries of the images at which any peer has a position, by log time."""
+    exposures_ns = look.exposures_ns(robot, images_ns)
+    made: dict[int, list[Any]] = defaultdict(list)
+    unknown: dict[int, set[str]] = defaultdict(lambda: {*logs.flying} - {robot})
+    for peer, found in positions.items():
+        at = np.isin(found.time_ns, exposures_ns)
+        mine = Positions(found.time_ns[at], found.xyz_m[at], found.covariance[at], found.status[at])
+        labels = image_labels(peer, mine, _attitude(logs, robot, mine.time_ns), camera, look)
+        stamps = images_ns[np.searchsorted(exposures_ns, mine.time_ns)].tolist()
+        for time_ns, label in zip(stamps, labels, strict=True):
+            made[time_ns] += [label] if label else []
+            unknown[time_ns] -= {peer}
+    for time_ns, peers in unknown.items():
+        made[time_ns] += [anywhere(peer, camera, NEAREST_M) for peer in sorted(peers)]
+    return {t: [message("PeerLabel")(**label) for label in labels] for t, labels in made.items()}
+
+
+def _of_other_sources(
+    recording: Path, held: Summary, topic: str
+) -> tuple[dict[int, list[Any]], dict[int, set[str]]]:
+    """Entries of the labels that are there, and who looked, without earlier estimates."""
     kept: dict[int, list[Any]] = defaultdict(list)
-    for stamped in read(recording, topic) if topic in held.topics else ():
-        kept[stamped.time_ns] += [p for p in stamped.message.peers if p.source != SOURCE]
-    return kept
+    looked: dict[int, set[str]] = defaultdict(set)
+    for time_ns, labels in (
+        (stamped.time_ns, stamped.message)
+        for stamped in (read(recording, topic) if topic in held.topics else ())
+    ):
+        kept[time_ns] += [peer for peer in labels.peers if peer.source != SOURCE]
+        looked[time_ns] |= looked_at(labels) - {SOURCE}
+    return kept, looked
 
 
 def _attitude(logs: Logs, robot: str, time_ns: Times) -> Array:

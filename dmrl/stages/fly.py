@@ -224,7 +224,7 @@ def _camera(
     stamps = _stamps(flight.clocks[robot], time_s).tolist()
     for time_ns, seen, picture in zip(stamps, views, draw(CAMERA, views), strict=True):
         yield image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
-        yield labels(time_ns, robot, list(_labels(list(seen.poses), picture)))
+        yield labels(time_ns, robot, list(_labels(list(seen.poses), picture)), ["truth"])
 
 
 def _labels(peers: Sequence[str], picture: Sketch | Shot) -> Iterator[dict[str, Any]]:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
+from dmrl.formats.camera_toml import KNOWN
 from dmrl.formats.image_folder import SUFFIXES
 from dmrl.formats.known import FORMATS
 from dmrl.formats.label_table import COLUMNS
 from dmrl.formats.sample import Options
 from dmrl.geometry import Camera
-from dmrl.stages.convert import CAMERAS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "sources.md").read_text(encoding="utf-8")
 
@@ -24,7 +24,7 @@ def test_every_kind_is_documented(kind: str) -> None:
 def test_every_column_key_and_suffix_is_documented() -> None:
     keys = [field.name for field in fields(Camera)]
     assert [name for name in (*COLUMNS, *keys) if f"`{name}`" not in TEXT] == []
-    assert all(name in TEXT for name in CAMERAS)
+    assert all(name in TEXT for name in KNOWN)
     assert " ".join(SUFFIXES) in TEXT
 
 

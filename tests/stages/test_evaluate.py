@@ -12,7 +12,7 @@ from dmrl.errors import MissingExtra, OutputError, RecordingError, SettingError
 from dmrl.images import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, message
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
-from dmrl.stages import convert, evaluate, predict
+from dmrl.stages import convert, evaluate, merge, predict
 from dmrl.stages.evaluate import Settings, document, run
 
 Peers = Sequence[Mapping[str, Any]]
@@ -39,6 +39,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
         split: Mapping[str, str] | None = None,
         threshold: float = 0.0,
         name: str = "flight.mcap",
+        looked: Sequence[str] = (),
     ) -> Path:
         path = tmp_path / name
         with RecordingWriter(path, Provenance("test")) as sink:
@@ -48,7 +49,8 @@ def write(tmp_path: Path) -> Callable[..., Path]:
                 for k, (peers, detections) in enumerate(images):
                     sink.write(k, f"/{robot}/camera/image", PICTURE)
                     if peers is not None:
-                        sink.write(k, f"/{robot}/labels", message("PeerLabels")(peers=peers))
+                        labels = message("PeerLabels")(peers=peers, sources=looked)
+                        sink.write(k, f"/{robot}/labels", labels)
                     if detections is not None:
                         own = message("Detections")(detections=detections, threshold=threshold)
                         sink.write(k, f"/{robot}/detections", own)
@@ -76,6 +78,37 @@ def test_robots_are_not_mixed(write: Callable[..., Path]) -> None:
     path = write({"cf1": [([here], [found(10, 10)])], "cf2": [([there], [found(50, 40)])]})
     assert figures(path)["mean_px"] == 0
     assert figures(path)["labels"] == 2
+
+
+def test_who_looked_and_saw_nobody_is_believed(write: Callable[..., Path]) -> None:
+    other = ([peer(40, 10, source="estimate")], [found(40, 10)])
+    images = {"cf1": [([peer(10, 10)], [found(10, 10)]), other]}
+    assert figures(write(images))["precision"] == 1
+    assert figures(write(images, looked=["truth"], name="b.mcap"))["precision"] == 0.5
+
+
+def test_a_recording_in_which_nobody_is_seen_can_be_judged(write: Callable[..., Path]) -> None:
+    empty = write({"cf1": [([], [found(10, 10)])]}, name="empty.mcap")
+    assert run([empty], None, FAST).pairs.images == 1
+    good = write({"cf1": [([peer(10, 10)], [found(10, 10)])]})
+    both = run([empty, good], None, FAST)
+    assert both.bands[0].figures["precision"].value == 0.5
+
+
+def test_two_messages_of_one_image_count_together(
+    write: Callable[..., Path], tmp_path: Path
+) -> None:
+    true = write({"cf1": [([peer(10, 10)], [found(13, 14)])] * 3}, looked=["truth"])
+    hand = tmp_path / "hand.mcap"
+    with RecordingWriter(hand, Provenance("test")) as sink:
+        for k in range(3):
+            marks = [peer(13, 14, source="hand")]
+            sink.write(k, "/cf1/labels", message("PeerLabels")(peers=marks, sources=["hand"]))
+    for first, second in ((true, hand), (hand, true)):
+        both = tmp_path / f"{first.stem}-first.mcap"
+        merge.run([first, second], both, merge.Settings())
+        assert figures(both)["median_px"] == 5
+        assert figures(both, Settings(against="hand", draws=5))["median_px"] == 0
 
 
 def test_recordings_are_judged_together(

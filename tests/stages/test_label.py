@@ -9,7 +9,7 @@ from dmrl import topics
 from dmrl.errors import MissingTopic, OutputError, RecordingError
 from dmrl.flight import NOISE
 from dmrl.geometry import pixels_from_horizontal
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
@@ -219,6 +219,31 @@ def test_a_robot_without_logs_is_left_out_with_a_word(changed: Callable[[Change]
         return [stamped, Stamped(stamped.time_ns, "/cf1/range/cf3", stamped.message)]
 
     assert "cf3: no /cf3/attitude and no /cf3/velocity" in warnings_of(changed(third))
+
+
+def test_a_robot_with_a_log_but_no_position_may_be_in_any_image(
+    flight: Path, tmp_path: Path
+) -> None:
+    third, out = tmp_path / "third.mcap", tmp_path / "labelled.mcap"
+    with RecordingWriter(third, Provenance("test")) as sink:
+        for stamped in read(flight):
+            sink.write(stamped.time_ns, stamped.topic, stamped.message)
+            if stamped.topic == "/cf2/attitude":
+                sink.write(stamped.time_ns, "/cf3/attitude", stamped.message)
+    said = label.run(third, out, LENIENT).warnings
+    assert "cf3: it has a log but no position, so no image counts as one without it" in said
+    looked = [m for s in read(out, "/cf1/labels") if "estimate" in (m := s.message).sources]
+    assert len(looked) > 40
+    for message_ in looked:
+        (entry,) = [p for p in message_.peers if (p.peer, p.source) == ("cf3", "estimate")]
+        assert (entry.status, entry.sigma_u_px) == (STATUS_UNCONVERGED, 320)
+
+
+def test_who_looked_is_written_where_nobody_is_in_view(flight: Path, labelled: Path) -> None:
+    assert {tuple(s.message.sources) for s in read(flight, "/cf1/labels")} == {("truth",)}
+    looked = [set(s.message.sources) for s in read(labelled, "/cf1/labels")]
+    assert all("truth" in sources for sources in looked)
+    assert sum("estimate" in sources for sources in looked) > 40
 
 
 def test_the_noise_of_heights_is_smoothed_away(labelled: Path) -> None:
