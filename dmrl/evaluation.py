@@ -98,7 +98,7 @@ def _join(recording: Path, against: str, split: str | None) -> Pairs:
         raise RecordingError(
             f"{recording} has no detections. Try: dmrl predict MODEL {recording} OUT.mcap"
         )
-    spans = _spans(recording, splits(held), split)
+    spans = _spans(recording, splits(recording, held), split)
     _require_source(recording, robots, against)
     pairs = _together([_join_robot(recording, robot, against, spans) for robot in robots])
     if not pairs.images:

@@ -12,15 +12,20 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError
-from dmrl.estimation.score import DEFINITIONS, ErrorTrace, Figures, Judged, figures, overall
+from dmrl.estimation.score import (
+    DEFINITIONS,
+    ErrorTrace,
+    Figures,
+    Judged,
+    figures,
+    inside_truth,
+    overall,
+)
 from dmrl.geometry import Array
 from dmrl.messages import STATUS_OK
 from dmrl.recording import input_of, read_table, summary
 
 TITLE, EACH = "estimated positions against truth", "pair"
-GAP_S = 0.25
-"""Truth is not interpolated over longer gaps."""
-
 Times = NDArray[np.int64]
 
 
@@ -130,18 +135,6 @@ def _covariance(table: pa.Table) -> Array:
     rows = table.column("covariance").to_pylist()
     full = np.array([row if len(row) == 9 else [np.nan] * 9 for row in rows]).reshape(-1, 3, 3)
     return np.asarray(full[:, :2, :2], float)
-
-
-def inside_truth(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
-    """(N,) whether truth lies close on both sides of a time."""
-    if not len(true_ns):
-        return np.zeros(len(time_ns), bool)
-    after = np.searchsorted(true_ns, time_ns)
-    exact = true_ns[np.minimum(after, len(true_ns) - 1)] == time_ns
-    between = (after > 0) & (after < len(true_ns))
-    low = true_ns[np.maximum(after - 1, 0)]
-    high = true_ns[np.minimum(after, len(true_ns) - 1)]
-    return np.asarray(exact | (between & (high - low <= GAP_S * 1e9)))
 
 
 def document(recording: Path, pairs: list[Pair], settle_s: float) -> dict[str, Any]:

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
+from dmrl.estimation.score import inside_truth
 from dmrl.estimation.track_score import DEFINITIONS, NEAR_M, Judged, assigned, figures
 from dmrl.geometry import Array, horizontal_from_pixels, inside, pixels_from_horizontal
 from dmrl.labelling.sight import Sight, read_sight
 from dmrl.labelling.write import camera_of
-from dmrl.positions import inside_truth
 from dmrl.recording import input_of, read, read_table, summary
 
 TITLE, EACH = "tracks against truth", "observer"

@@ -10,8 +10,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.estimation.score import GAP_S
 from dmrl.geometry import Array
-from dmrl.positions import GAP_S
 from dmrl.recording import Summary, glance
 from dmrl.viewer.entity import WORLD, horizontal_frame
 

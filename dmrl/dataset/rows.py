@@ -178,8 +178,21 @@ def labelled_images(
                 covered[found["robot"]] = stamped
             else:
                 images.append(stamped)
+        _refuse_two_of_one_time(path, images)
         for image in images:
             yield image, labels.get(_robot(image)), covered.get(_robot(image))
+
+
+def _refuse_two_of_one_time(path: Path, images: list[Stamped]) -> None:
+    """Refuse two pictures of one camera at one time: the labels are of one of them."""
+    seen: set[str] = set()
+    for image in images:
+        if image.topic in seen:
+            raise RecordingError(
+                f"{path}: {image.topic} has two images at {image.time_ns} ns, as when flights of "
+                "the same robots are merged. Give the recordings one by one"
+            )
+        seen.add(image.topic)
 
 
 def _mask(path: Path, row: Row, covered: Stamped | None) -> Mask:

@@ -5,7 +5,6 @@ train and the other in test measures memory, not skill.
 """
 
 import hashlib
-import json
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -42,22 +41,22 @@ def held_out(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Pa
     return set(sorted(sha256, key=rank)[:count])
 
 
-def of_source(path: Path, metadata: Mapping[str, str]) -> SplitOf:
-    """The split that a recording's own metadata gives each log time.
+def of_source(path: Path, own: Mapping[str, Sequence[tuple[int, int]]]) -> SplitOf:
+    """The split that a recording itself gives each log time.
 
     Parameters
     ----------
     path
         The recording, for errors.
-    metadata
-        Split to JSON: a list of [start_ns, end_ns], both inclusive.
+    own
+        By split: [start_ns, end_ns], both inclusive; see `dmrl.recording.splits`.
 
     Raises
     ------
     RecordingError
-        If the metadata is not that, or two splits share a time.
+        If two splits share a time.
     """
-    spans = sorted(_spans(path, metadata))
+    spans = sorted((start, end, name) for name, parts in own.items() for start, end in parts)
     starts = [start for start, _, _ in spans]
     for (_, end, name), (start, _, other) in pairwise(spans):
         if start <= end and name != other:
@@ -73,17 +72,3 @@ def of_source(path: Path, metadata: Mapping[str, str]) -> SplitOf:
         return spans[index][2]
 
     return split_of
-
-
-def _spans(path: Path, metadata: Mapping[str, str]) -> Sequence[tuple[int, int, str]]:
-    try:
-        return [
-            (int(start), int(end), name)
-            for name, text in metadata.items()
-            for start, end in json.loads(text)
-        ]
-    except (ValueError, TypeError) as e:
-        raise RecordingError(
-            f"{path}: its split is not a list of [start_ns, end_ns] ({e}). "
-            "Convert it again, or ignore it with --split recordings"
-        ) from None

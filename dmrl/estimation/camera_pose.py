@@ -139,6 +139,8 @@ def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibr
         Of detections and attitude.
     """
     views = [(flight, peer) for flight in flights for peer in flight.peers.values()]
+    if not views:
+        return None
     start = np.array([*camera.mount_rad, camera.delay_s])
     found, matched = start, None
     for radius_px in RADII_PX:

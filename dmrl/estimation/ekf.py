@@ -67,7 +67,10 @@ class Steps:
 
 
 def pair_steps(pair: Pair, preset: Preset) -> Steps:
-    """Inputs of the filter for one pair, B = 1. Ranges go to the nearest step."""
+    """Inputs of the filter for one pair, B = 1.
+
+    Ranges go to the nearest step; of several in one, as where both robots range, the last counts.
+    """
     own, peer = pair.own, pair.peer
     inputs = np.column_stack(
         [peer.vx_mps, peer.vy_mps, peer.yaw_rate_radps, own.vx_mps, own.vy_mps, own.yaw_rate_radps]

@@ -117,7 +117,7 @@ def usable_ranges(time_s: Array, range_m: Array) -> Mask:
 
 
 def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:
-    """A signal on a time grid, averaged or interpolated, and where it was silent.
+    """A signal on a time grid, interpolated, and where it was silent.
 
     Samples that are not finite, or do not go forward in time, are left out.
 

@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from dmrl.geometry import Array
 
 Mask = NDArray[np.bool_]
+Times = NDArray[np.int64]
 
 GOOD_M = 0.3
 """A label that is off by more than this is a bad one."""
 WRONG_SHARE = 0.5
 """A pair is in the wrong basin when half of its errors are over this share of the distance."""
 CHI2_95_OF_2 = 5.991
+GAP_S = 0.25
+"""Truth is not interpolated over longer gaps."""
 
 DEFINITIONS = {
     "rmse_m": "root of the mean squared horizontal error, after the settling time",
@@ -198,3 +201,15 @@ def _median(values: list[float]) -> float:
 
 def _root(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def inside_truth(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
+    """(N,) whether truth lies close on both sides of a time."""
+    if not len(true_ns):
+        return np.zeros(len(time_ns), bool)
+    after = np.searchsorted(true_ns, time_ns)
+    exact = true_ns[np.minimum(after, len(true_ns) - 1)] == time_ns
+    between = (after > 0) & (after < len(true_ns))
+    low = true_ns[np.maximum(after - 1, 0)]
+    high = true_ns[np.minimum(after, len(true_ns) - 1)]
+    return np.asarray(exact | (between & (high - low <= GAP_S * 1e9)))

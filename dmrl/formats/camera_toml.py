@@ -14,6 +14,9 @@ INTEGERS = ("width_px", "height_px")
 POSITIVE = (*INTEGERS, "fx_px", "fy_px")
 NEEDED = tuple(field.name for field in fields(Camera) if field.default is MISSING)
 LISTS = ("distortion", "mount_rad")
+COEFFICIENTS = 5
+"""Of the lens at most: k1, k2, p1, p2, k3."""
+
 KEYS = (*NEEDED, *LISTS, "delay_s")
 
 
@@ -72,7 +75,7 @@ def read_camera(path: Path) -> Camera:
 def _is_list(key: str, value: object) -> bool:
     if not isinstance(value, list) or not all(_is_number("", one) for one in value):
         return False
-    return key != "mount_rad" or len(value) == 3
+    return len(value) == 3 if key == "mount_rad" else len(value) <= COEFFICIENTS
 
 
 def _is_number(key: str, value: object) -> bool:

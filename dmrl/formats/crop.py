@@ -79,4 +79,6 @@ class Crop:
             cx_px=(camera.cx_px - left) * self.scale,
             cy_px=(camera.cy_px - top) * self.scale,
             distortion=camera.distortion,
+            mount_rad=camera.mount_rad,
+            delay_s=camera.delay_s,
         )

@@ -26,13 +26,19 @@ ERASED = b"\xff" * RECORD.itemsize
 
 
 def recognises(source: Path) -> bool:
-    """Whether a file is long enough and its first record holds plausible numbers."""
+    """Whether a file is whole records, or those and erased flash, the first of them plausible.
+
+    Six floats of anything may be plausible; of a dump that was cut short one has to say what
+    it is.
+    """
     if not source.is_file() or source.stat().st_size < RECORD.itemsize:
         return False
     with source.open("rb") as stream:
         stream.seek(PIXELS)
         values = np.frombuffer(stream.read(RECORD.itemsize - PIXELS), "<f4").tolist()
-    return aideck.is_plausible(values) and any(values)
+        stream.seek(source.stat().st_size // RECORD.itemsize * RECORD.itemsize)
+        rest = stream.read().strip(b"\xff")
+    return aideck.is_plausible(values) and any(values) and not rest
 
 
 def records(stream: BinaryIO, what: object) -> Iterator[np.void]:

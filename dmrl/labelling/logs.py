@@ -150,9 +150,6 @@ def _robot(path: Path, held: Summary, name: str, warnings: list[str]) -> RobotLo
     if attitude is None or velocity is None or height is None:
         return None
     _warn_of_degrees(name, attitude[1], warnings)
-    images = held.topics.get(topics.camera_image(name))
-    if images and topics.calibration(name) not in held.topics:
-        warnings.append(f"{name}: no {topics.calibration(name)}; its images get no labels")
     return RobotLog(attitude, velocity, height)
 
 

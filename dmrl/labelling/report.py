@@ -9,6 +9,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.estimation.estimate import Estimate
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
+from dmrl.estimation.score import inside_truth
 from dmrl.labelling.labels import Positions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 from dmrl.recording import Summary, read_table
@@ -108,7 +109,7 @@ def _errors(recording: Path, held: Summary, pair: tuple[str, str], positions: Po
     truth = read_table(recording, topic, fields=("x", "y"))
     time_ns = truth["log_time"].to_numpy()
     offsets = [
-        np.interp(positions.time_ns, time_ns, truth[axis].to_numpy(), np.nan, np.nan) - values
+        np.interp(positions.time_ns, time_ns, truth[axis].to_numpy()) - values
         for axis, values in zip(("x", "y"), positions.xyz_m.T[:2], strict=True)
     ]
-    return np.hypot(*offsets)
+    return np.where(inside_truth(positions.time_ns, time_ns), np.hypot(*offsets), np.nan)

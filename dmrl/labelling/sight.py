@@ -155,13 +155,14 @@ def camera_flight(
     def seconds(at_ns: Times) -> Array:
         return np.asarray((at_ns - held.start_ns) * 1e-9)
 
+    paths = ((peer, _known(recording, topic, held.start_ns)) for peer, topic in peers.items())
     return Flight(
         seconds(time_ns),
         np.repeat(np.arange(len(time_ns)), np.diff(first)),
         detections[:, :2],
         seconds(attitude_ns),
         attitude[:, :2],
-        {peer: _known(recording, topic, held.start_ns) for peer, topic in peers.items()},
+        {peer: path for peer, path in paths if len(path.time_s) > 1},
     )
 
 

@@ -10,14 +10,19 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.dataset.rows import looked_at
+from dmrl.errors import RecordingError, SettingError
 from dmrl.estimation.pair import Array
+from dmrl.formats.camera_toml import read_camera
 from dmrl.geometry import Camera
+from dmrl.images import size
 from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
 from dmrl.labelling.logs import Logs
 from dmrl.messages import message
 from dmrl.recording import Summary, Timed, read, read_table
 
 Times = NDArray[np.int64]
+LENSES = ("", "plumb_bob", "rational_polynomial")
+"""Models of a lens that are the plumb bob's, the last if its further coefficients are 0."""
 
 
 def image_times(recording: Path, held: Summary, robot: str) -> Times:
@@ -123,10 +128,45 @@ def _attitude(logs: Logs, robot: str, time_ns: Times) -> Array:
 
 
 def camera_of(recording: Path, held: Summary, robot: str) -> Camera | None:
-    """A robot's camera; None where the recording has no calibration."""
+    """A robot's camera; None where the recording has no calibration.
+
+    Raises
+    ------
+    RecordingError
+        If its lens is of a model that dmrl does not know.
+    """
     topic = topics.calibration(robot)
-    if topic not in held.topics:
+    first = next(read(recording, topic), None) if topic in held.topics else None
+    if first is None:
         return None
-    found = next(read(recording, topic)).message
+    found = first.message
+    if found.distortion_model not in LENSES or any(found.D[5:]):
+        raise RecordingError(
+            f"{recording}: {topic} has a lens of model {found.distortion_model!r} with "
+            f"{len(found.D)} coefficients, dmrl knows plumb_bob with 5. Give another calibration: "
+            "dmrl calibrate --board, then --camera"
+        )
     fx, _, cx, _, fy, cy, *_ = found.K
-    return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D))
+    return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D[:5]))
+
+
+def camera_given(recording: Path, held: Summary, robot: str, path: Path) -> Camera:
+    """The camera of a TOML file, for a robot's images.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read.
+    SettingError
+        If it is of images of another size.
+    """
+    camera, topic = read_camera(path), topics.camera_image(robot)
+    first = next(read(recording, topic), None) if topic in held.topics else None
+    if first is not None:
+        taken = size(first.message.data, f"{recording}: the first image of {robot}")[:2]
+        if taken != (camera.width_px, camera.height_px):
+            raise SettingError(
+                f"{path} is for images of {camera.width_px}x{camera.height_px}, those of {robot} "
+                f"in {recording} are {taken[0]}x{taken[1]}. Calibrate with such images"
+            )
+    return camera

@@ -12,6 +12,7 @@ from dmrl.live.crazyflie import Link
 from dmrl.live.feed import Feed
 from dmrl.live.pictures import Colours, Stored
 from dmrl.live.robots import Robot, peers_of
+from dmrl.progress import say
 
 
 def check(robots: Sequence[Robot]) -> None:
@@ -48,10 +49,14 @@ def links_of(
         As of `Link`.
     """
     names, period_ms = [robot.name for robot in robots], 10 * max(round(100 / rate_hz), 1)
-    return {
-        r.name: Link(r.name, r.uri, peers_of(r.name, names, peer), period_ms, feed, now)
-        for r in robots
-    }
+    peers = {name: peers_of(name, names, peer) for name in names}
+    for name in names if len(names) > 1 else ():
+        if not peers[name]:
+            say(
+                f"{name}: whose ranging.distance<N> is, nobody knows: no other robot's name ends "
+                "with a number. Its ranges are not recorded. Say whose: --peer N=NAME"
+            )
+    return {r.name: Link(r.name, r.uri, peers[r.name], period_ms, feed, now) for r in robots}
 
 
 def cameras_of(

@@ -2,22 +2,28 @@
 
 import heapq
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 
 from dmrl.errors import RecordingError
+from dmrl.progress import say
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import summary
 from dmrl.recording.inputs import provenance
-from dmrl.recording.reader import matching, read_raw
+from dmrl.recording.reader import matching, read_raw, read_table
 from dmrl.recording.writer import RecordingWriter
-from dmrl.topics import CALIBRATION, names
+from dmrl.topics import ATTITUDE, CALIBRATION, CAMERA_IMAGE, HEIGHT, RANGE, VELOCITY, names
+
+SENSORS = (CAMERA_IMAGE, ATTITUDE, VELOCITY, HEIGHT, RANGE)
+"""Topics of which a robot has one stream."""
 
 
 def merge(paths: Sequence[Path], out: Path) -> int:
     """Write one recording with the messages of several, by log time; how many.
 
     Messages are copied bit for bit; of equal times, those of the first recording come
-    first. Metadata and attachments of all are kept.
+    first. Metadata and attachments of all are kept. Two that have a robot's sensor at the same
+    time are mixed with a word.
 
     Raises
     ------
@@ -28,6 +34,8 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     """
     if len({path.resolve() for path in paths}) != len(paths):
         raise RecordingError(f"{paths[0]}: a recording is given twice. Name each once")
+    for one, other in combinations(paths, 2):
+        _warn_of_overlap(one, other)
     count = 0
     with RecordingWriter(out, provenance("merge", inputs=paths)) as sink:
         for path in paths:
@@ -37,6 +45,28 @@ def merge(paths: Sequence[Path], out: Path) -> int:
             sink.write_raw(raw)
             count += 1
     return count
+
+
+def _warn_of_overlap(one: Path, other: Path) -> None:
+    """Say so if two recordings are of other flights by the same robots: their messages mix."""
+    first, second = summary(one).topics, summary(other).topics
+    for topic in sorted(set(first) & set(second)):
+        if not any(names(pattern, topic) for pattern in SENSORS):
+            continue
+        (start, end), (from_, to) = (_span(path, topic) for path in (one, other))
+        if start < to and from_ < end:
+            say(
+                f"{one} and {other} both have {topic} at the same time: different flights, or one "
+                "made of the other? Their messages mix now. dataset and evaluate take several "
+                "recordings"
+            )
+            return
+
+
+def _span(path: Path, topic: str) -> tuple[int, int]:
+    """First and last log time of a topic, nanoseconds."""
+    times = read_table(path, topic, fields=())["log_time"]
+    return (times[0].as_py(), times[-1].as_py()) if len(times) else (0, 0)
 
 
 def trim(

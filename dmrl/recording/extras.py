@@ -1,7 +1,9 @@
 """What copying stages carry over besides messages: metadata and attachments."""
 
 import json
+from pathlib import Path
 
+from dmrl.errors import RecordingError
 from dmrl.recording.index import SPLIT_METADATA, Summary
 from dmrl.recording.provenance import METADATA_NAME
 from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
@@ -21,10 +23,29 @@ def copy_extras(found: Summary, out: RecordingWriter) -> None:
             out.add_attachment(name, "application/octet-stream", data)
 
 
-def splits(found: Summary) -> dict[str, list[tuple[int, int]]]:
-    """The source's own split: by name, log times in [first, last], nanoseconds."""
+def splits(path: Path, found: Summary) -> dict[str, list[tuple[int, int]]]:
+    """The source's own split: by name, log times in [first, last], nanoseconds.
+
+    Parameters
+    ----------
+    path
+        The recording, for errors.
+    found
+        Its summary.
+
+    Raises
+    ------
+    RecordingError
+        If its metadata is not that.
+    """
     out: dict[str, list[tuple[int, int]]] = {}
-    for record in found.metadata.get(SPLIT_METADATA, []):
-        for name, ranges in record.items():
-            out.setdefault(name, []).extend((int(a), int(b)) for a, b in json.loads(ranges))
+    try:
+        for record in found.metadata.get(SPLIT_METADATA, []):
+            for name, ranges in record.items():
+                out.setdefault(name, []).extend((int(a), int(b)) for a, b in json.loads(ranges))
+    except (ValueError, TypeError) as e:
+        raise RecordingError(
+            f"{path}: its split is not a list of [start_ns, end_ns] ({e}). "
+            "Convert it again, or ignore it with --split recordings"
+        ) from None
     return out

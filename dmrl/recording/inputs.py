@@ -12,7 +12,7 @@ from dmrl.errors import RecordingError
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
 
-CARD = ("README.md", "figures")
+NO_CONTENT = ("README.md", "figures", "tensorboard")
 
 
 def provenance(
@@ -88,12 +88,13 @@ def sha256_of_file(path: Path) -> str:
 def sha256_of_folder(folder: Path) -> str:
     """SHA-256 over the sorted relative names and contents of a folder's files.
 
-    The card of a folder that dmrl wrote is left out: it may be written again at any time.
+    Of a folder that dmrl wrote, the card is left out, which may be written again at any time, and
+    the log of a training, which tells when it ran.
     """
-    card = CARD if (folder / FILE_NAME).is_file() else ()
+    left_out = NO_CONTENT if (folder / FILE_NAME).is_file() else ()
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        if path.relative_to(folder).parts[0] in card:
+        if path.relative_to(folder).parts[0] in left_out:
             continue
         digest.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of_file(path)}\n".encode())
     return digest.hexdigest()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.records import Channel as McapChannel
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
@@ -30,6 +31,8 @@ class Recovery:
         Messages written, bit-exact.
     damaged_chunks
         Chunks within the file that failed their CRC and were left out.
+    nameless
+        Messages left out because the definition of their topic was in a damaged chunk.
     lost_bytes
         Bytes after the last whole record.
     whole
@@ -38,6 +41,7 @@ class Recovery:
 
     messages: int = 0
     damaged_chunks: int = 0
+    nameless: int = 0
     lost_bytes: int = 0
     whole: bool = False
 
@@ -81,8 +85,9 @@ def recover(path: Path, out: Path) -> Recovery:
             raise RecordingError(
                 f"{path} does not begin as a recording: nothing to recover. Make it again"
             )
-        stream.seek(0)
         walk = _Walk(path, recovery)
+        _take_summary(stream, walk)
+        stream.seek(0)
         messages = _messages(stream, walk)
         # Our provenance stands before the first message: it is known once that is reached.
         first = next(messages, None)
@@ -109,6 +114,22 @@ def _provenance(walk: _Walk) -> Provenance:
     return Provenance("recover", inputs=(source,))
 
 
+def _take_summary(stream: BinaryIO, walk: _Walk) -> None:
+    """Definitions of topics as the end of a whole file repeats them.
+
+    A topic is defined in the chunk that has its first message. If that is damaged, all later ones
+    would be nameless.
+    """
+    stream.seek(0)
+    try:
+        found = make_reader(stream).get_summary()
+    except (McapError, CRCValidationError, struct.error, OSError, MemoryError, ValueError):
+        return  # cut short: there is none
+    for record in (*found.schemas.values(), *found.channels.values()) if found else ():
+        for _ in _take(record, walk):
+            pass
+
+
 def _messages(stream: BinaryIO, walk: _Walk) -> Iterator[RawMessage]:
     for record in _records(stream, walk):
         if not isinstance(record, Chunk):
@@ -130,7 +151,8 @@ def _records(stream: BinaryIO, walk: _Walk) -> Iterator[McapRecord]:
         for record in StreamReader(stream, emit_chunks=True).records:
             good = stream.tell()
             if isinstance(record, Footer):
-                walk.recovery.whole = not walk.recovery.damaged_chunks
+                lost = walk.recovery.damaged_chunks or walk.recovery.nameless
+                walk.recovery.whole = not lost
                 return
             yield record
     except (McapError, CRCValidationError, struct.error, OSError, MemoryError, ValueError):
@@ -149,5 +171,7 @@ def _take(record: McapRecord, walk: _Walk) -> Iterator[RawMessage]:
             walk.attachments[record.name] = record.data
         case Message():
             channel = walk.channels.get(record.channel_id)
-            if channel is not None:  # its definition was in a damaged chunk otherwise
+            if channel is None:
+                walk.recovery.nameless += 1
+            else:
                 yield RawMessage(record.log_time, record.publish_time, channel, record.data)

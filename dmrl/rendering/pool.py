@@ -141,6 +141,7 @@ class Pool:
         self._start = start
         self._count = count
         self._all: list[Worker] = []
+        self._lock, self._closed = threading.Lock(), False
         self._idle: SimpleQueue[Worker | None] = SimpleQueue()
         first = self._new()
         self.version, self.points = first.version, first.points
@@ -152,7 +153,11 @@ class Pool:
 
     def _new(self) -> Worker:
         worker = Worker(self._start)
-        self._all.append(worker)
+        with self._lock:
+            self._all.append(worker)
+            closed = self._closed
+        if closed:
+            worker.close()
         return worker
 
     @property
@@ -176,8 +181,11 @@ class Pool:
                     worker = worker or self._new()
                     return job(worker)
                 except (EOFError, OSError):
+                    if self._closed:
+                        raise
                     if worker is not None:
-                        self._all.remove(worker)
+                        with self._lock:
+                            self._all.remove(worker)
                         worker.close()
                         why = worker.why()
                     worker = None
@@ -210,6 +218,9 @@ class Pool:
 
     def __exit__(self, *_: object) -> None:
         self._threads.shutdown(wait=False, cancel_futures=True)
-        for worker in self._all:
+        with self._lock:
+            self._closed = True  # who starts one from now on ends it itself
+            workers = list(self._all)
+        for worker in workers:
             worker.close()
         self._threads.shutdown(wait=True)

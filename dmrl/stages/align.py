@@ -85,7 +85,7 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
     """
     refuse_existing(out)
     held = summary(recording)
-    if splits(held):
+    if splits(recording, held):
         raise SettingError(f"{recording} has a split by time already. Align before that")
     steady = _steady(recording, held) if settings.steady_cameras else {}
     clocks = {}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError, SourceError
-from dmrl.formats.camera_toml import read_camera, write_camera
+from dmrl.formats.camera_toml import write_camera
 from dmrl.geometry import Camera
 from dmrl.images import decode
 from dmrl.output import partial_file, refuse_existing
@@ -23,7 +23,7 @@ try:
     from dmrl.estimation import board
     from dmrl.estimation.camera_pose import LEAST, Calibration, Noise, calibrate
     from dmrl.labelling.sight import camera_flight
-    from dmrl.labelling.write import camera_of
+    from dmrl.labelling.write import camera_given, camera_of
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "calibrate", "dmrl calibrate") from e
 
@@ -180,10 +180,12 @@ def _robot(source: Path, settings: Settings, pattern: str) -> str:
 def _flights(sources: list[Path], settings: Settings) -> Result:
     robots = [_robot(source, settings, topics.DETECTIONS) for source in sources]
     positions = topics.POSITION if settings.against == "estimate" else topics.TRUTH
-    camera = read_camera(settings.camera) if settings.camera else None
+    camera = None
     flights = []
     for source, robot in zip(track(sources, "Reading"), robots, strict=True):
         held = summary(source)
+        if settings.camera:
+            camera = camera_given(source, held, robot, settings.camera)
         camera = camera or camera_of(source, held, robot)
         if camera is None:
             raise MissingTopic(topics.calibration(robot), held.topics, source)

@@ -16,7 +16,7 @@ from dmrl.dataset.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
 from dmrl.output import partial_folder
 from dmrl.progress import say, track
-from dmrl.recording import SPLIT_METADATA, Provenance, provenance, summary
+from dmrl.recording import Provenance, provenance, splits, summary
 from dmrl.tables import print_json, print_table
 
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
@@ -105,11 +105,11 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
             "dataset", settings, recordings, seed=settings.seed, libraries=("pyarrow", "pillow")
         )
         sources = {path: label_source(path, settings.labels) for path in recordings}
-        splits = _splits(recordings, made, settings)
+        split_of = _splits(recordings, made, settings)
         tally = Tally()
         images = write_dataset(
             partial,
-            _rows(sources, splits, tally, total, settings),
+            _rows(sources, split_of, tally, total, settings),
             png=settings.png,
             parquet=settings.parquet,
             shard_images=settings.shard_images,
@@ -126,9 +126,9 @@ def _splits(
     recordings: Sequence[Path], made: Provenance, settings: Settings
 ) -> dict[Path, SplitOf]:
     hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=True)}
-    _refuse_twins(recordings, hashes)
-    own = {path: summary(path).metadata.get(SPLIT_METADATA) for path in recordings}
-    by_source = {p: o[0] for p, o in own.items() if o and settings.split == "auto"}
+    _refuse_twins(recordings, made)
+    own = {path: splits(path, summary(path)) for path in recordings if settings.split == "auto"}
+    by_source = {path: parts for path, parts in own.items() if parts}
     whole = {path: hashes[path] for path in recordings if path not in by_source}
     share = 0.0 if settings.split == "none" else settings.test_share
     test = held_out(whole, share, settings.seed)
@@ -144,21 +144,26 @@ def _constant(name: str) -> SplitOf:
     return lambda time_ns: name
 
 
-def _refuse_twins(recordings: Sequence[Path], hashes: dict[Path, str]) -> None:
+def _refuse_twins(recordings: Sequence[Path], made: Provenance) -> None:
     names: dict[str, Path] = {}
     contents: dict[str, Path] = {}
-    for path in recordings:
+    for path, source in zip(recordings, made.inputs, strict=True):
         if (twin := names.setdefault(path.name, path)) is not path:
             raise SettingError(
                 f"{twin} and {path} have one name, so rows could not be traced. Rename one"
             )
-        if (twin := contents.setdefault(hashes[path], path)) is not path:
+        if (twin := contents.setdefault(source.sha256, path)) is not path:
             raise SettingError(f"{twin} and {path} hold the same bytes. Name only one of them")
+    for path, source in zip(recordings, made.inputs, strict=True):
+        # Its images are the other's: one would be in train, the other in test.
+        older = source.provenance.ancestry() if source.provenance else ()
+        for twin in (contents[s.sha256] for _, s in older if s.sha256 in contents):
+            raise SettingError(f"{path} is made from {twin}. Name only one of them")
 
 
 def _rows(
     sources: dict[Path, str],
-    splits: dict[Path, SplitOf],
+    split_of: dict[Path, SplitOf],
     tally: Tally,
     total: int,
     settings: Settings,
@@ -167,7 +172,7 @@ def _rows(
     rows = (
         (path, row)
         for path, source in sources.items()
-        for row in rows_of(path, source, splits[path], tally, **how)
+        for row in rows_of(path, source, split_of[path], tally, **how)
     )
     size_px: tuple[int, int] | None = None
     for path, kept in track(rows, "Writing images", total):

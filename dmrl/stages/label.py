@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
-from dmrl.formats.camera_toml import read_camera
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
 from dmrl.recording import Summary, provenance, rewrite, summary
@@ -27,6 +26,7 @@ try:
     from dmrl.labelling.sight import read_sight
     from dmrl.labelling.sighted import sighted
     from dmrl.labelling.write import (
+        camera_given,
         camera_of,
         image_times,
         label_messages,
@@ -123,10 +123,18 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
         raise RecordingError(f"{recording}: no pair can be estimated: {why}. Try: dmrl info")
     if unknown := set(settings.camera) - set(logs.robots):
         raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(logs.robots)}")
-    cameras = {robot: read_camera(path) for robot, path in settings.camera.items()}
+    cameras = {
+        robot: camera_given(recording, held, robot, path) for robot, path in settings.camera.items()
+    }
     look = Look(settings.attitude_std_rad, not settings.undistorted, cameras)
     estimates = _estimates(logs.pairs, settings)
     images = {robot: image_times(recording, held, robot) for robot in logs.robots}
+    warnings = [
+        f"{robot}: no {topics.calibration(robot)}; its images get no labels. Give one: "
+        f"--camera.{robot} FILE"
+        for robot, times in images.items()
+        if len(times) and robot not in cameras and topics.calibration(robot) not in held.topics
+    ]
     exposures = {robot: look.exposures_ns(robot, times) for robot, times in images.items()}
     positions = {
         pair: _positions(logs.start_ns, _oriented(logs.pairs, pair), estimate, exposures[pair[0]])
@@ -149,7 +157,7 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     inputs = [recording, *settings.camera.values()]
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     rewrite(recording, out, origin, without=replaced, fresh=fresh)
-    return Result(reports, labels, logs.warnings)
+    return Result(reports, labels, [*logs.warnings, *warnings])
 
 
 def _correct(

@@ -134,6 +134,8 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
 def _provenance(model: Path, recording: Path, settings: Settings, detector: Detector) -> Provenance:
     libraries = LIBRARIES[settings.backend]
     made = provenance("predict", settings, (model, recording), libraries=libraries)
+    # It stands beside the weights, and in every message.
+    made = replace(made, settings={**made.settings, "model_threshold": detector.threshold})
     if model.is_dir() and detector.file is not None:
         # The log of a training tells when it ran; the weights alone decide what is predicted.
         weights = replace(made.inputs[0], sha256=sha256_of_file(detector.file))

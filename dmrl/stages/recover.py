@@ -38,7 +38,8 @@ def command(
     lost = "nothing was lost"
     if not result.whole:
         lost = (
-            f"{result.damaged_chunks} damaged chunks left out, "
+            f"{result.damaged_chunks} damaged chunks left out, {result.nameless} messages of "
+            "topics that only those define, "
             f"{result.lost_bytes} bytes after the last whole record lost"
         )
     print(f"{out}: {result.messages} messages brought back; {lost}")

@@ -9,7 +9,6 @@ from cyclopts import Parameter, validators
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, SettingError
-from dmrl.formats.camera_toml import read_camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
@@ -20,7 +19,7 @@ try:
     from dmrl.estimation.identity import Identity
     from dmrl.estimation.tracker import Track, Tracker, Tuning
     from dmrl.labelling.sight import Sight, read_sight
-    from dmrl.labelling.write import camera_of
+    from dmrl.labelling.write import camera_given, camera_of
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 
@@ -126,7 +125,9 @@ def _follow(
 ) -> tuple[list[Timed], RobotReport]:
     """Tracks messages of one robot, one per image, and what they hold."""
     given = settings.camera.get(robot)
-    camera = read_camera(given) if given else camera_of(recording, held, robot)
+    camera = (
+        camera_given(recording, held, robot, given) if given else camera_of(recording, held, robot)
+    )
     if camera is None:
         raise MissingTopic(topics.calibration(robot), held.topics, recording)
     if settings.undistorted:

@@ -193,7 +193,7 @@ def _train(training: Training, settings: Settings, images: int, group: Group) ->
     for _ in track(steps, "Training", left, describe=words) if group.leads else steps:
         pass
     seconds = time.perf_counter() - begun
-    seen = left * settings.batch_size
+    seen = left * min(settings.batch_size, images)
     return Result(images, training.history[-1]["loss"], seconds, seen / seconds)
 
 

@@ -1,10 +1,12 @@
 """trim: a stretch of a recording, or some of its topics."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
+from dmrl.errors import SettingError
 from dmrl.recording import summary, trim
 
 
@@ -34,6 +36,9 @@ def command(
     topic
         Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
     """
+    for flag, value in (("--from", from_s), ("--to", to_s)):
+        if value is not None and not math.isfinite(value):
+            raise SettingError(f"{flag} {value} is no time. Give seconds from the start")
     start_ns = summary(recording).start_ns
     count = trim(
         recording,

@@ -5,6 +5,16 @@ import pytest
 from dmrl.dataset import open_dataset
 from dmrl.dataset.splits import held_out, of_source
 from dmrl.errors import RecordingError, SettingError
+from dmrl.recording import (
+    SPLIT_METADATA,
+    Provenance,
+    RecordingWriter,
+    Summary,
+    merge,
+    read,
+    splits,
+    trim,
+)
 from dmrl.stages.dataset import Settings, run
 
 from .conftest import STEP_NS, Record
@@ -75,18 +85,49 @@ def test_the_choice_depends_on_content_and_seed_only() -> None:
 @pytest.mark.parametrize("text", ["[[0]]", "[1, 2]", "train", "null", '[["a", 2]]'])
 def test_a_split_that_is_no_list_of_spans_is_refused(text: str) -> None:
     with pytest.raises(RecordingError, match=r"x.mcap: its split is not a list of \[start_ns"):
-        of_source(Path("x.mcap"), {"train": text})
+        splits(Path("x.mcap"), Summary({}, 0, 0, {SPLIT_METADATA: [{"train": text}]}, {}))
 
 
 def test_splits_that_share_a_time_are_refused() -> None:
     with pytest.raises(RecordingError, match=r"splits train and test share the time 5 ns"):
-        of_source(Path("x.mcap"), {"train": "[[0, 5]]", "test": "[[5, 9]]"})
+        of_source(Path("x.mcap"), {"train": [(0, 5)], "test": [(5, 9)]})
 
 
 def test_two_recordings_of_one_name_are_refused(record: Record, tmp_path: Path) -> None:
     flights = [record("a/x.mcap"), record("b/x.mcap", seed=1)]
     with pytest.raises(SettingError, match="have one name"):
         run(flights, tmp_path / "out", Settings())
+
+
+def test_a_recording_beside_one_made_of_it_is_refused(record: Record, tmp_path: Path) -> None:
+    flight, copy = record("x.mcap"), tmp_path / "copy.mcap"
+    trim(flight, copy)
+    for both in ([flight, copy], [copy, flight]):
+        with pytest.raises(
+            SettingError, match=r"copy\.mcap is made from .*x\.mcap\. Name only one"
+        ):
+            run(both, tmp_path / "out", Settings())
+
+
+def test_every_split_of_a_merged_recording_counts(record: Record, tmp_path: Path) -> None:
+    # Two flights one after the other, each with a split of its own.
+    first = record(
+        "a.mcap",
+        split={"train": f"[[0, {2 * STEP_NS}]]", "test": f"[[{3 * STEP_NS}, {5 * STEP_NS}]]"},
+    )
+    second, both = tmp_path / "b.mcap", tmp_path / "both.mcap"
+    with RecordingWriter(second, Provenance("test")) as sink:
+        sink.add_metadata(SPLIT_METADATA, {"train": f"[[{10 * STEP_NS}, {15 * STEP_NS}]]"})
+        for stamped in read(first):
+            sink.write(stamped.time_ns + 10 * STEP_NS, stamped.topic, stamped.message)
+    merge([first, second], both)
+    assert run([both], tmp_path / "out", Settings()).images == {"train": 9, "test": 3}
+
+
+def test_two_images_at_one_time_are_refused(record: Record, tmp_path: Path) -> None:
+    merge([record("a.mcap"), record("b.mcap", seed=1)], tmp_path / "both.mcap")
+    with pytest.raises(RecordingError, match="two images at 0 ns, as when flights of the same"):
+        run([tmp_path / "both.mcap"], tmp_path / "out", Settings())
 
 
 def test_a_copy_of_a_recording_is_refused(record: Record, tmp_path: Path) -> None:

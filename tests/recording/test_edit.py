@@ -2,6 +2,7 @@ from math import sin
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from dmrl.errors import MissingTopic, OutputError, RecordingError
 from dmrl.messages import message
@@ -32,7 +33,7 @@ def test_merging_interleaves_by_time_and_keeps_every_bit(tmp_path: Path, flight:
     merged = list(read_raw(tmp_path / "out.mcap"))
     assert [r.time_ns for r in merged] == sorted(r.time_ns for r in merged)
     assert [r for r in merged if r.topic == "/cf1/height"] == list(read_raw(other))
-    assert splits(summary(tmp_path / "out.mcap")) == {
+    assert splits(tmp_path, summary(tmp_path / "out.mcap")) == {
         "train": [(0, 10)],
         "test": [(15_000_000, 25_000_000)],
     }
@@ -106,7 +107,39 @@ def test_recover_steps_over_a_damaged_chunk(tmp_path: Path) -> None:
     times_ns = [r.time_ns for r in read_raw(tmp_path / "b.mcap")]
     assert 15_000 < len(times_ns) < 30_000
     assert times_ns[-1] == 29_999
-    assert splits(summary(tmp_path / "b.mcap")) == {"train": [(0, 29_999)]}
+    assert splits(tmp_path, summary(tmp_path / "b.mcap")) == {"train": [(0, 29_999)]}
+
+
+def test_a_topic_whose_definition_is_damaged_is_not_lost(tmp_path: Path) -> None:
+    path = heights(tmp_path / "a.mcap", list(range(60_000)), "train")
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    first = found.chunk_indexes[0]
+    assert len(found.chunk_indexes) > 1
+    data[first.chunk_start_offset + first.chunk_length // 2] ^= 255
+    path.write_bytes(data)
+    result = recover(path, tmp_path / "b.mcap")
+    assert (result.damaged_chunks, result.nameless, result.whole) == (1, 0, False)
+    assert 0 < result.messages < 60_000
+    # Cut short as well, nothing tells the topic of what is left: it is counted.
+    end = found.chunk_indexes[-1]
+    (tmp_path / "c.mcap").write_bytes(data[: end.chunk_start_offset])
+    with pytest.raises(RecordingError, match="nothing to recover"):
+        recover(tmp_path / "c.mcap", tmp_path / "d.mcap")
+
+
+def test_a_merge_of_two_flights_by_the_same_robots_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = heights(tmp_path / "a.mcap", [0, 10], "train")
+    other = heights(tmp_path / "b.mcap", [5, 15], "train")
+    later = heights(tmp_path / "c.mcap", [20, 30], "train")
+    merge([one, other], tmp_path / "mixed.mcap")
+    assert "both have /cf1/height at the same time" in capsys.readouterr().err
+    merge([one, later], tmp_path / "good.mcap")
+    assert capsys.readouterr().err == ""
 
 
 def test_recovering_a_whole_recording_loses_nothing(tmp_path: Path, flight: Path) -> None:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.errors import MissingTopic, OutputError, RecordingError
+from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
 from dmrl.flight import NOISE
-from dmrl.geometry import pixels_from_horizontal
+from dmrl.formats.camera_toml import write_camera
+from dmrl.geometry import AIDECK, pixels_from_horizontal
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import (
     Provenance,
@@ -244,6 +245,24 @@ def test_who_looked_is_written_where_nobody_is_in_view(flight: Path, labelled: P
     looked = [set(s.message.sources) for s in read(labelled, "/cf1/labels")]
     assert all("truth" in sources for sources in looked)
     assert sum("estimate" in sources for sources in looked) > 40
+
+
+def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path: Path) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_text(write_camera(replace(AIDECK, width_px=160)))
+    with pytest.raises(SettingError, match="is for images of 160x224, those of cf1 in .* are 320x"):
+        label.run(flight, tmp_path / "out.mcap", replace(LENIENT, camera={"cf1": path}))
+    path.write_text(write_camera(replace(AIDECK, distortion=(0.1,) * 8)))
+    with pytest.raises(SourceError, match="wrong keys distortion"):
+        label.run(flight, tmp_path / "out.mcap", replace(LENIENT, camera={"cf1": path}))
+    fisheye = tmp_path / "fisheye.mcap"
+    with RecordingWriter(fisheye, Provenance("test")) as sink:
+        for stamped in read(flight):
+            if stamped.topic == "/cf1/camera/calibration":
+                stamped.message.distortion_model = "equidistant"
+            sink.write(stamped.time_ns, stamped.topic, stamped.message)
+    with pytest.raises(RecordingError, match="a lens of model 'equidistant' with 0 coefficients"):
+        label.run(fisheye, tmp_path / "out.mcap", LENIENT)
 
 
 def test_the_noise_of_heights_is_smoothed_away(labelled: Path) -> None:
