@@ -90,4 +90,7 @@ def require_c(folder: Path) -> None:
     for name in (f"{NAME}.c", f"{NAME}.h"):
         file = folder / name
         if not file.is_file() or not file.stat().st_size:
-            raise ModelError(f"no {name} in {folder}. Export the model again: dmrl export")
+            raise ModelError(
+                f"no {name} in {folder}: it is of a float model. Make it "
+                "int8 first: dmrl quantize, then dmrl export"
+            )

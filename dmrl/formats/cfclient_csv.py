@@ -66,7 +66,8 @@ def content(source: Path, options: Options) -> Content:
     if not robots:
         raise SourceError(f"no CSV file that begins with {TIME} in {source}. Name another source")
     streams: list[crazyflie_log.Stream] = []
-    for robot, paths in robots.items():
+    for name, paths in robots.items():
+        robot = options.names.get(name, name)
         blocks = [read_block(path) for path in paths]
         streams += crazyflie_log.streams(robot, blocks, options.names, source)
     return Content(in_order(streams))

@@ -154,7 +154,8 @@ def content(source: Path, options: Options) -> Content:
     source
         The file or folder.
     options
-        ``robot`` names the robot of a single file; ``names`` the robots ranged to.
+        ``robot`` names the robot of a single file; ``names`` the robots ranged to, and those of a
+        folder.
 
     Raises
     ------
@@ -174,7 +175,7 @@ def _files(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
         if path.stat().st_size == 0:
             say(f"{path} is empty; left out")
         elif recognises(path):
-            yield path.stem, path
+            yield options.names.get(path.stem, path.stem), path
         else:
             say(f"{path} is no micro-SD log; left out")
     if not any(path.stat().st_size and recognises(path) for path in paths):

@@ -14,7 +14,7 @@ Pictures of a robot lie in a folder ``<robot>/``, named by their time in nanosec
 """
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -84,13 +84,15 @@ def _header(path: Path) -> list[str]:
         return []
 
 
-def content(source: Path, _options: Options | None = None) -> Content:
+def content(source: Path, options: Options | None = None) -> Content:
     """Samples of a flight, in time order. Says on stderr what is odd but can be used.
 
     Parameters
     ----------
     source
         The folder.
+    options
+        ``names`` of robots; ``camera`` and ``size_px`` of the pictures.
 
     Raises
     ------
@@ -103,8 +105,9 @@ def content(source: Path, _options: Options | None = None) -> Content:
         raise SourceError(f"no <robot>.csv in {source}. Name a folder with a file per robot")
     logs = [read_log(path) for path in paths]
     _check_together(logs)
-    streams = [stream for log in logs for stream in _streams(log)]
-    streams += [stream for log in logs for stream in _pictures(source / log.robot)]
+    options = options or Options()
+    streams = [stream for log in logs for stream in _streams(log, options.names)]
+    streams += [stream for log in logs for stream in _pictures(source / log.robot, options)]
     return Content(in_order(streams))
 
 
@@ -183,23 +186,26 @@ def _check_together(logs: list[Log]) -> None:
                 say(f"{log.path} has ranges to {peer}, but there is no {peer}.csv beside it")
 
 
-def _streams(log: Log) -> Iterator[Iterator[Sample]]:
-    time_ns = nanoseconds(log.time_s)
-    yield flight_sample.robot_log(log.robot, time_ns, log.columns)
+def _streams(log: Log, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
+    def name(robot: str) -> str:
+        return names.get(robot, robot)
+
+    own, time_ns = name(log.robot), nanoseconds(log.time_s)
+    yield flight_sample.robot_log(own, time_ns, log.columns)
     for peer in log.ranged:
         range_m = log.columns[f"range_{peer}_m"]
         given = ~np.isnan(range_m)
         usable = given & (range_m > 0) & (range_m < RANGE_MAX_M)
         if refused := int((given & ~usable).sum()):
             say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
-        yield flight_sample.ranges(log.robot, peer, time_ns[usable], range_m[usable])
+        yield flight_sample.ranges(own, name(peer), time_ns[usable], range_m[usable])
     for peer in log.seen:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
         known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
-        yield flight_sample.truth(log.robot, peer, time_ns[known], xyz[known])
+        yield flight_sample.truth(own, name(peer), time_ns[known], xyz[known])
 
 
-def _pictures(folder: Path) -> Iterator[Iterator[Sample]]:
+def _pictures(folder: Path, options: Options) -> Iterator[Iterator[Sample]]:
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
@@ -209,7 +215,9 @@ def _pictures(folder: Path) -> Iterator[Iterator[Sample]]:
                 f"{path} is not named by its time in nanoseconds, {image_folder.TIME_DIGITS} "
                 "digits or more. Rename it"
             )
-    yield image_folder.content(folder, Options(robot=folder.name)).samples
+    robot = options.names.get(folder.name, folder.name)
+    own = Options(robot=robot, camera=options.camera, size_px=options.size_px)
+    yield image_folder.content(folder, own).samples
 
 
 FORMAT = Format("csv", "a folder of flight logs", recognises, content)

@@ -19,12 +19,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dmrl import topics
 from dmrl.errors import DmrlError, MissingExtra, SourceError
 from dmrl.formats.ros_messages import HANDLERS, OWN, Placed, own
 from dmrl.formats.sample import Content, Format, Options, Sample
 from dmrl.progress import say
 
 SUFFIXES = (".db3", ".bag", ".mcap")
+NO_PICTURES = (topics.MASKS, topics.DEPTHS)
+"""Images that are no pictures of a camera: of a render that was exported."""
 CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
 PAIR = re.compile(r"/(?P<robot>[^/]+)/(?:range/)?(?P<peer>[^/]+)(?:/(?:distance|range|uwb))?$")
 # Parts of a topic that say what it is, not whose.
@@ -127,7 +130,7 @@ def _line(topic: str, kind: str, count: int, options: Options) -> Line | None:
 
     if kind.startswith(OWN):
         return Line(topic, kind, count, "")
-    if kind not in HANDLERS:
+    if kind not in HANDLERS or any(topics.names(one, topic) for one in NO_PICTURES):
         return None
     if kind == "sensor_msgs/msg/Range":
         match = PAIR.search(topic)

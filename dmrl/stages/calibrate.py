@@ -130,6 +130,7 @@ def _board(source: Path, settings: Settings) -> Result:
         raise SourceError(
             f"{source}: a board of {columns}x{rows} inner corners in {len(views)} of {pictures} "
             f"pictures; {board.LEAST_BOARDS} are needed. Check --board, and light and focus"
+            + (", or look at more: --every 1" if source.is_file() and settings.every > 1 else "")
         )
     found = board.intrinsics(views, (columns, rows), size_px)
     figures = {

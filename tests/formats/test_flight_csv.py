@@ -6,6 +6,8 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats import flight_csv
 from dmrl.formats.flight_sample import LOG_COLUMNS, from_poses
+from dmrl.formats.sample import Options
+from dmrl.geometry import AIDECK
 from dmrl.images import encode_png
 
 HEADER = ["time_s", *LOG_COLUMNS]
@@ -71,6 +73,17 @@ def test_pictures_beside_the_log_come_along(flight: Path) -> None:
     (flight / "cf1" / "001005000000.png").write_bytes(picture)
     images = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/camera/image"]
     assert [(s.time_ns, s.fields["data"]) for s in images] == [(1_005_000_000, picture)]
+
+
+def test_robots_get_the_names_that_are_asked_for(flight: Path) -> None:
+    folder = flight / "cf1"
+    folder.mkdir()
+    (folder / "0000001050000000.png").write_bytes(encode_png(np.zeros((224, 320, 3), np.uint8)))
+    options = Options(names={"cf1": "left", "cf2": "right"}, camera=AIDECK)
+    found = {sample.topic for sample in flight_csv.content(flight, options).samples}
+    own = {"/left/range/right", "/left/peer/right/truth", "/left/camera/calibration"}
+    assert own | {"/left/camera/image", "/right/height"} < found
+    assert not [topic for topic in found if "cf" in topic]
 
 
 def test_pictures_that_are_not_named_by_time_are_refused(flight: Path) -> None:

@@ -250,7 +250,7 @@ def test_who_looked_is_written_where_nobody_is_in_view(flight: Path, labelled: P
 def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(write_camera(replace(AIDECK, width_px=160)))
-    with pytest.raises(SettingError, match="is for images of 160x224, those of cf1 in .* are 320x"):
+    with pytest.raises(SettingError, match="is for images of 160x224, those of cf1"):
         label.run(flight, tmp_path / "out.mcap", replace(LENIENT, camera={"cf1": path}))
     path.write_text(write_camera(replace(AIDECK, distortion=(0.1,) * 8)))
     with pytest.raises(SourceError, match="wrong keys distortion"):
