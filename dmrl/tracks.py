@@ -12,12 +12,15 @@ from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.estimation.score import inside_truth
 from dmrl.estimation.track_score import DEFINITIONS, NEAR_M, Judged, assigned, figures
-from dmrl.geometry import Array, horizontal_from_pixels, inside, pixels_from_horizontal
+from dmrl.formats.camera_toml import parse_camera
+from dmrl.geometry import Array, Camera, horizontal_from_pixels, inside, pixels_from_horizontal
 from dmrl.labelling.sight import Sight, read_sight
 from dmrl.labelling.write import camera_of
-from dmrl.recording import input_of, read, read_table, summary
+from dmrl.recording import Summary, input_of, read, read_table, summary
 
 TITLE, EACH = "tracks against truth", "observer"
+CAMERAS_METADATA = "dmrl.cameras"
+"""Metadata of tracks: by robot, the camera that they were made with, as TOML."""
 
 
 def can_judge(recording: Path) -> bool:
@@ -57,6 +60,15 @@ def judge(recording: Path) -> list[Judged]:
     return judged
 
 
+def _camera(recording: Path, held: Summary, robot: str) -> Camera:
+    """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
+    used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
+    camera = parse_camera(used, recording) if used else camera_of(recording, held, robot)
+    if camera is None:
+        raise MissingTopic(topics.calibration(robot), held.topics, recording)
+    return camera
+
+
 class _Row(NamedTuple):
     """One peer in view of one image; see `Judged`."""
 
@@ -70,10 +82,7 @@ class _Row(NamedTuple):
 
 def _judge(recording: Path, robot: str, peers: list[str]) -> Judged:
     held = summary(recording)
-    camera = camera_of(recording, held, robot)
-    if camera is None:
-        raise MissingTopic(topics.calibration(robot), held.topics, recording)
-    sight = read_sight(recording, held, robot, camera, 0.0)
+    sight = read_sight(recording, held, robot, _camera(recording, held, robot), 0.0)
     truth, shown = _truth(recording, sight, peers)
     rows: list[_Row] = []
     lives: Counter[int] = Counter()

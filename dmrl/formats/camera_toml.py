@@ -54,12 +54,25 @@ def read_camera(path: Path) -> Camera:
         If the file is not TOML, or a key is unknown, missing or of the wrong kind.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise SourceError(
-            f"no calibration {path}. Name a TOML file, {' or '.join(KNOWN)}"
-        ) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
+        raise SourceError(f"no calibration {path}. Name a TOML file, aideck or published") from None
+    except (OSError, UnicodeDecodeError) as e:
+        raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
+    return parse_camera(text, path)
+
+
+def parse_camera(text: str, path: Path) -> Camera:
+    """The camera that a TOML document describes; ``path`` is where it stands, for errors.
+
+    Raises
+    ------
+    SourceError
+        As `read_camera`.
+    """
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as e:
         raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
     wrong = [key for key in values if key not in KEYS]
     wrong += [f"{key} (missing)" for key in NEEDED if key not in values]

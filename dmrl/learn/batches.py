@@ -133,6 +133,7 @@ def order(
         return rng.permutation(count)
     # Systematic sampling: every image comes floor or ceil of its share, and the sum is exact.
     ticks = np.floor(np.cumsum(shares[rng.permutation(count)]) * count / shares.sum() + 1e-9)
+    ticks[-1] = count  # not one less, as a sum of floats may have it
     times = np.diff(ticks, prepend=0).astype(np.int64)
     rng = np.random.default_rng([seed, epoch])
     return rng.permutation(np.repeat(rng.permutation(count), times))

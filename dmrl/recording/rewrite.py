@@ -1,7 +1,7 @@
 """A recording written again, with some topics in place of those it had."""
 
 import heapq
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ def rewrite(
     *,
     without: Collection[str],
     fresh: Iterable[Iterable[Timed]],
+    metadata: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
     """Copy a recording bit for bit, but for some topics, with new messages among the rest.
 
@@ -41,6 +42,8 @@ def rewrite(
         Topics that are left out.
     fresh
         Streams of new messages, each in time order.
+    metadata
+        Records to add, by name.
 
     Raises
     ------
@@ -55,6 +58,8 @@ def rewrite(
     streams: list[Iterable[Any]] = [track(read_raw(recording, *kept), "Writing", total), *fresh]
     with RecordingWriter(out, made) as sink:
         copy_extras(held, sink)
+        for name, values in (metadata or {}).items():
+            sink.add_metadata(name, values)
         for item in heapq.merge(*streams, key=lambda m: m.time_ns):
             if isinstance(item, Timed):
                 sink.write(*item)

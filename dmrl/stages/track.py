@@ -9,6 +9,8 @@ from cyclopts import Parameter, validators
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, SettingError
+from dmrl.formats.camera_toml import write_camera
+from dmrl.geometry import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.progress import say, track
@@ -20,6 +22,7 @@ try:
     from dmrl.estimation.tracker import Track, Tracker, Tuning
     from dmrl.labelling.sight import Sight, read_sight
     from dmrl.labelling.write import camera_given, camera_of
+    from dmrl.tracks import CAMERAS_METADATA
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 
@@ -116,22 +119,27 @@ def run(recording: Path, out: Path, settings: Settings) -> list[RobotReport]:
     inputs = [recording, *settings.camera.values()]
     made = provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
     fresh = [found for found, _ in followed.values()]
-    rewrite(recording, out, made, without=replaced, fresh=fresh)
+    cameras = {robot: write_camera(_camera(recording, held, robot, settings)) for robot in robots}
+    metadata = {CAMERAS_METADATA: cameras}
+    rewrite(recording, out, made, without=replaced, fresh=fresh, metadata=metadata)
     return [report for _, report in followed.values()]
 
 
-def _follow(
-    recording: Path, held: Summary, robot: str, settings: Settings
-) -> tuple[list[Timed], RobotReport]:
-    """Tracks messages of one robot, one per image, and what they hold."""
+def _camera(recording: Path, held: Summary, robot: str, settings: Settings) -> Camera:
     given = settings.camera.get(robot)
     camera = (
         camera_given(recording, held, robot, given) if given else camera_of(recording, held, robot)
     )
     if camera is None:
         raise MissingTopic(topics.calibration(robot), held.topics, recording)
-    if settings.undistorted:
-        camera = replace(camera, distortion=())
+    return replace(camera, distortion=()) if settings.undistorted else camera
+
+
+def _follow(
+    recording: Path, held: Summary, robot: str, settings: Settings
+) -> tuple[list[Timed], RobotReport]:
+    """Tracks messages of one robot, one per image, and what they hold."""
+    camera = _camera(recording, held, robot, settings)
     sight = read_sight(recording, held, robot, camera, settings.threshold)
     for warning in sight.warnings:
         say(f"{recording}: {warning}")

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +6,9 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
-from dmrl.recording import read, read_raw, summary, trim
+from dmrl.formats.camera_toml import write_camera
+from dmrl.labelling.write import camera_of
+from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary, trim
 from dmrl.recording.inputs import sha256_of_file
 from dmrl.stages import evaluate, fly, track
 from dmrl.stages.track import Settings
@@ -49,6 +52,27 @@ def test_tracks_are_better_than_single_images_and_honest(tracked: Path) -> None:
     assert one["coverage_95"] > 0.85
     assert one["named_right"] > 0.9
     assert one["false_tracks_per_min"] <= 4
+
+
+def test_tracks_are_judged_with_the_camera_that_made_them(
+    detected: Path, tracked: Path, tmp_path: Path
+) -> None:
+    late, out, path = (tmp_path / name for name in ("late.mcap", "out.mcap", "camera.toml"))
+    with RecordingWriter(late, Provenance("test")) as sink:
+        for one in read(detected):
+            seen = one.topic in (topics.detections("cf1"), topics.camera_image("cf1"))
+            sink.write(one.time_ns + seen * 200_000_000, one.topic, one.message)
+    camera = camera_of(detected, summary(detected), "cf1")
+    assert camera is not None
+    path.write_text(write_camera(replace(camera, delay_s=0.2)))
+    track.run(late, out, Settings(camera={"cf1": path}))
+    now, before = (
+        evaluate.run([one], None, evaluate.Settings(settle_s=3.0)) for one in (out, tracked)
+    )
+    assert isinstance(now, dict)
+    assert isinstance(before, dict)
+    for figure in ("rmse_m", "single_rmse_m", "coverage_95"):
+        assert now["robots"][0][figure] == pytest.approx(before["robots"][0][figure], rel=0.05)
 
 
 def test_other_messages_stay_and_old_tracks_go(
