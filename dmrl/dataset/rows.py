@@ -238,6 +238,8 @@ def _row(path: Path, image: Stamped, peers: list[dict[str, Any]]) -> Row:
             f"{what} is {width_px} x {height_px} px, not a multiple of {STRIDE_PX} both ways. "
             "Scale it: dmrl convert --from images --width-px 320 --height-px 224"
         )
+    # A label as unsure as the image is wide says only that the peer may be there.
+    peers = [peer for peer in peers if peer["sigma_u_px"] < width_px]
     uv_depth = np.array([[p["u_px"], p["v_px"], p["depth_m"]] for p in peers]).reshape(-1, 3)
     ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & (uv_depth[:, 2] > 0)]
     shape = (height_px // STRIDE_PX, width_px // STRIDE_PX)

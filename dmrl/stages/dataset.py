@@ -4,11 +4,13 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
+from dmrl import topics
 from dmrl.card import write_card
 from dmrl.dataset.rows import Tally, count_images, label_source, one_size, rows_of
 from dmrl.dataset.splits import SplitOf, held_out, of_source
@@ -16,11 +18,15 @@ from dmrl.dataset.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
 from dmrl.output import partial_folder
 from dmrl.progress import say, track
-from dmrl.recording import Provenance, provenance, splits, summary
+from dmrl.recording import Provenance, provenance, read, splits, summary
 from dmrl.tables import print_json, print_table
 
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
+
+
+SAME_LENS = 1.05
+"""Most that the focal lengths of one dataset may differ by without a word, a ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +112,7 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
         )
         sources = {path: label_source(path, settings.labels) for path in recordings}
         split_of = _splits(recordings, made, settings)
+        _warn_of_lenses(recordings)
         tally = Tally()
         images = write_dataset(
             partial,
@@ -138,6 +145,21 @@ def _splits(
         else _constant("test" if path in test else "train")
         for path in recordings
     }
+
+
+def _warn_of_lenses(recordings: Sequence[Path]) -> None:
+    """Say so if the cameras differ: from the size of a drone alone its depth is not known then."""
+    focal_px = []
+    for path in recordings:
+        for topic in summary(path).topics:
+            if topics.names(topics.CALIBRATION, topic):
+                focal_px += [one.message.K[0] for one in islice(read(path, topic), 1)]
+    if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
+        say(
+            f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "
+            "a drone looks larger through the longer one, and a network takes it for nearer. Make "
+            "one dataset for each"
+        )
 
 
 def _constant(name: str) -> SplitOf:

@@ -8,14 +8,14 @@ import pytest
 from dmrl.dataset import open_dataset
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images import encode_png
-from dmrl.messages import STATUS_AMBIGUOUS, message, schema_bytes
-from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message, schema_bytes
+from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter, read
 from dmrl.stages import convert
 from dmrl.stages import dataset as stage
 from dmrl.stages.dataset import Settings, run
 from dmrl.topics import camera_image, labels
 
-from .conftest import STEP_NS, Record, peer, pixels_of
+from .conftest import STEP_NS, WIDTH_PX, Record, peer, pixels_of
 
 PLAIN = Settings()
 
@@ -117,6 +117,29 @@ def test_an_image_whose_peers_another_source_labelled_is_no_negative(
     flight = record(peers=[[peer(source="hand")], [peer(source="estimate")], []])
     result = run([flight], tmp_path / "out", Settings(labels="hand"))
     assert (result.images, result.tally.of_other_sources) == ({"train": 2}, 1)
+
+
+def test_a_peer_that_may_be_anywhere_is_nowhere(record: Record, tmp_path: Path) -> None:
+    anywhere = peer(status=STATUS_UNCONVERGED, sigma_u_px=WIDTH_PX, peer="cf3")
+    run([record(peers=[[peer(), anywhere]])], tmp_path / "out", Settings(keep_all=True))
+    (row,) = open_dataset(tmp_path / "out").split("train").table["peers"].to_pylist()
+    assert [one["peer"] for one in row] == ["cf2"]
+
+
+def test_cameras_of_other_focal_lengths_are_said(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flights = []
+    for name, focal_px in (("wide.mcap", 180.0), ("tele.mcap", 400.0)):
+        flights.append(tmp_path / name)
+        bare = record(f"of-{name}", seed=len(flights))
+        with RecordingWriter(flights[-1], Provenance("test")) as sink:
+            made = message("CameraCalibration")(K=[focal_px, 0, 32, 0, focal_px, 24, 0, 0, 1])
+            sink.write(0, "/cf1/camera/calibration", made)
+            for stamped in read(bare):
+                sink.write(stamped.time_ns, stamped.topic, stamped.message)
+    run(flights, tmp_path / "out", Settings())
+    assert "focal lengths from 180 to 400 px" in capsys.readouterr().err
 
 
 def test_a_source_nobody_used_is_refused_with_those_that_are_there(
