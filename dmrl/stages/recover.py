@@ -37,9 +37,9 @@ def command(
         return
     lost = "nothing was lost"
     if not result.whole:
+        nameless = f"{result.nameless} messages left out whose topic they defined, "
         lost = (
-            f"{result.damaged_chunks} damaged chunks left out, {result.nameless} messages of "
-            "topics that only those define, "
+            f"{result.damaged_chunks} damaged chunks left out, {nameless * bool(result.nameless)}"
             f"{result.lost_bytes} bytes after the last whole record lost"
         )
     print(f"{out}: {result.messages} messages brought back; {lost}")
