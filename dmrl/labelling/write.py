@@ -111,12 +111,10 @@ def _of_other_sources(
     """Entries of the labels that are there, and who looked, without earlier estimates."""
     kept: dict[int, list[Any]] = defaultdict(list)
     looked: dict[int, set[str]] = defaultdict(set)
-    for time_ns, labels in (
-        (stamped.time_ns, stamped.message)
-        for stamped in (read(recording, topic) if topic in held.topics else ())
-    ):
-        kept[time_ns] += [peer for peer in labels.peers if peer.source != SOURCE]
-        looked[time_ns] |= looked_at(labels) - {SOURCE}
+    for stamped in read(recording, topic) if topic in held.topics else ():
+        labels = stamped.message
+        kept[stamped.time_ns] += [peer for peer in labels.peers if peer.source != SOURCE]
+        looked[stamped.time_ns] |= looked_at(labels) - {SOURCE}
     return kept, looked
 
 
