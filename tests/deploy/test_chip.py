@@ -9,9 +9,11 @@ BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "bench_chip.py"
 def test_int8_agrees_with_the_chip_as_float_does(data: Path) -> None:
     found, pictures = runpy.run_path(str(BENCHMARK))["compare"](data)
     assert len(pictures) == 2
-    for (_, channel, _), agreement in found.items():
+    for (name, channel, who), agreement in found.items():
         assert agreement.correlation > 0.949
+        # Sums of floats end differently on other processors, and roundings of weights with them.
+        assert agreement.mean_steps <= 1.02 * found[name, channel, "float"].mean_steps, who
         if channel == "confidence":
-            assert agreement.mean_steps <= 1.1
+            assert agreement.mean_steps <= 1.15
         else:
             assert agreement.most_levels <= 1
