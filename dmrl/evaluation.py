@@ -24,6 +24,7 @@ from dmrl.learn.matching import Points
 from dmrl.messages import STATUS_OK
 from dmrl.progress import track
 from dmrl.recording import read, read_table, splits, summary
+from dmrl.recording.inputs import refuse_twice
 
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
@@ -86,8 +87,7 @@ def join(recordings: Sequence[Path], against: str, split: str | None = None) -> 
     SettingError
         If one has no labels of that source, no such split, or no image to judge.
     """
-    if len({path.resolve() for path in recordings}) != len(recordings):
-        raise RecordingError(f"{recordings[0]}: a recording is given twice. Name each once")
+    refuse_twice(recordings)
     return _together([_join(path, against, split) for path in track(recordings, "Reading")])
 
 

@@ -91,6 +91,6 @@ def require_c(folder: Path) -> None:
         file = folder / name
         if not file.is_file() or not file.stat().st_size:
             raise ModelError(
-                f"no {name} in {folder}: it is of a float model. Make it "
-                "int8 first: dmrl quantize, then dmrl export"
+                f"no {name} in {folder}; a float model has none. Export an int8 one: "
+                "dmrl quantize, then dmrl export"
             )

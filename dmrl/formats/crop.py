@@ -71,14 +71,12 @@ class Crop:
     def camera(self, camera: Camera) -> Camera:
         """The camera that would have taken the result."""
         left, top = self.corner_px
-        return Camera(
+        return replace(
+            camera,
             width_px=self.width_px,
             height_px=self.height_px,
             fx_px=camera.fx_px * self.scale,
             fy_px=camera.fy_px * self.scale,
             cx_px=(camera.cx_px - left) * self.scale,
             cy_px=(camera.cy_px - top) * self.scale,
-            distortion=camera.distortion,
-            mount_rad=camera.mount_rad,
-            delay_s=camera.delay_s,
         )

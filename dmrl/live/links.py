@@ -53,8 +53,8 @@ def links_of(
     for name in names if len(names) > 1 else ():
         if not peers[name]:
             say(
-                f"{name}: whose ranging.distance<N> is, nobody knows: no other robot's name ends "
-                "with a number. Its ranges are not recorded. Say whose: --peer N=NAME"
+                f"{name}: nothing says whose its ranging.distance<N> is, so no range of it is "
+                "recorded. Say: --peer N=NAME"
             )
     return {r.name: Link(r.name, r.uri, peers[r.name], period_ms, feed, now) for r in robots}
 

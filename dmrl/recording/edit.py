@@ -9,7 +9,7 @@ from dmrl.errors import RecordingError
 from dmrl.progress import say
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import summary
-from dmrl.recording.inputs import provenance
+from dmrl.recording.inputs import provenance, refuse_twice
 from dmrl.recording.reader import matching, read_raw, read_table
 from dmrl.recording.writer import RecordingWriter
 from dmrl.topics import ATTITUDE, CALIBRATION, CAMERA_IMAGE, HEIGHT, RANGE, VELOCITY, names
@@ -32,8 +32,7 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     OutputError
         If ``out`` exists or cannot be written.
     """
-    if len({path.resolve() for path in paths}) != len(paths):
-        raise RecordingError(f"{paths[0]}: a recording is given twice. Name each once")
+    refuse_twice(paths)
     for one, other in combinations(paths, 2):
         _warn_of_overlap(one, other)
     count = 0

@@ -15,6 +15,18 @@ from dmrl.recording.provenance import FILE_NAME, Input, Provenance
 NO_CONTENT = ("README.md", "figures", "tensorboard")
 
 
+def refuse_twice(paths: Sequence[Path]) -> None:
+    """Nothing, if every recording is named once.
+
+    Raises
+    ------
+    RecordingError
+        If one is named twice.
+    """
+    if len({path.resolve() for path in paths}) != len(paths):
+        raise RecordingError(f"{paths[0]}: a recording is given twice. Name each once")
+
+
 def provenance(
     stage: str,
     settings: Any = None,

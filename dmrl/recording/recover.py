@@ -32,7 +32,7 @@ class Recovery:
     damaged_chunks
         Chunks within the file that failed their CRC and were left out.
     nameless
-        Messages left out because the definition of their topic was in a damaged chunk.
+        Messages left out because what defines their topic was in a damaged chunk.
     lost_bytes
         Bytes after the last whole record.
     whole
@@ -151,8 +151,7 @@ def _records(stream: BinaryIO, walk: _Walk) -> Iterator[McapRecord]:
         for record in StreamReader(stream, emit_chunks=True).records:
             good = stream.tell()
             if isinstance(record, Footer):
-                lost = walk.recovery.damaged_chunks or walk.recovery.nameless
-                walk.recovery.whole = not lost
+                walk.recovery.whole = not walk.recovery.damaged_chunks
                 return
             yield record
     except (McapError, CRCValidationError, struct.error, OSError, MemoryError, ValueError):
@@ -163,7 +162,7 @@ def _take(record: McapRecord, walk: _Walk) -> Iterator[RawMessage]:
     match record:
         case Schema():
             walk.schemas[record.id] = record
-        case McapChannel():
+        case McapChannel() if not record.schema_id or record.schema_id in walk.schemas:
             walk.channels[record.id] = channel_of(record.id, {record.id: record}, walk.schemas)
         case Metadata():
             walk.metadata.setdefault(record.name, []).append(dict(record.metadata))

@@ -114,13 +114,16 @@ def run(recording: Path, out: Path, settings: Settings) -> list[RobotReport]:
         raise MissingTopic(topics.detections("*"), held.topics, recording)
     if unknown := set(settings.camera) - set(robots):
         raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(robots)}")
-    followed = {robot: _follow(recording, held, robot, settings) for robot in robots}
+    cameras = {robot: _camera(recording, held, robot, settings) for robot in robots}
+    followed = {
+        robot: _follow(recording, held, robot, camera, settings)
+        for robot, camera in cameras.items()
+    }
     replaced = [topic for topic in held.topics if topics.names(topics.TRACKS, topic)]
     inputs = [recording, *settings.camera.values()]
     made = provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
     fresh = [found for found, _ in followed.values()]
-    cameras = {robot: write_camera(_camera(recording, held, robot, settings)) for robot in robots}
-    metadata = {CAMERAS_METADATA: cameras}
+    metadata = {CAMERAS_METADATA: {robot: write_camera(c) for robot, c in cameras.items()}}
     rewrite(recording, out, made, without=replaced, fresh=fresh, metadata=metadata)
     return [report for _, report in followed.values()]
 
@@ -136,10 +139,9 @@ def _camera(recording: Path, held: Summary, robot: str, settings: Settings) -> C
 
 
 def _follow(
-    recording: Path, held: Summary, robot: str, settings: Settings
+    recording: Path, held: Summary, robot: str, camera: Camera, settings: Settings
 ) -> tuple[list[Timed], RobotReport]:
     """Tracks messages of one robot, one per image, and what they hold."""
-    camera = _camera(recording, held, robot, settings)
     sight = read_sight(recording, held, robot, camera, settings.threshold)
     for warning in sight.warnings:
         say(f"{recording}: {warning}")

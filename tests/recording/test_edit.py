@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from dmrl.errors import MissingTopic, OutputError, RecordingError
+from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.messages import message
 from dmrl.recording import (
     Provenance,
@@ -16,6 +16,7 @@ from dmrl.recording import (
     summary,
     trim,
 )
+from dmrl.stages import trim as stage
 
 
 def heights(path: Path, times_ns: list[int], split: str) -> Path:
@@ -123,11 +124,34 @@ def test_a_topic_whose_definition_is_damaged_is_not_lost(tmp_path: Path) -> None
     result = recover(path, tmp_path / "b.mcap")
     assert (result.damaged_chunks, result.nameless, result.whole) == (1, 0, False)
     assert 0 < result.messages < 60_000
-    # Cut short as well, nothing tells the topic of what is left: it is counted.
-    end = found.chunk_indexes[-1]
-    (tmp_path / "c.mcap").write_bytes(data[: end.chunk_start_offset])
-    with pytest.raises(RecordingError, match="nothing to recover"):
-        recover(tmp_path / "c.mcap", tmp_path / "d.mcap")
+
+
+def test_messages_without_a_definition_are_counted(tmp_path: Path) -> None:
+    # Cut short as well, nothing tells the topic of what stands behind the damage.
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for time_ns in range(60_000):
+            sink.write(time_ns, "/cf1/height", message("Height")(height_m=sin(time_ns)))
+            if time_ns > 30_000:
+                # The second shares its schema with what is lost.
+                sink.write(time_ns, "/cf1/attitude", message("Attitude")(roll_rad=sin(time_ns)))
+                sink.write(time_ns, "/cf2/height", message("Height")(height_m=sin(time_ns)))
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    first, last = found.chunk_indexes[0], found.chunk_indexes[-1]
+    data[first.chunk_start_offset + first.chunk_length // 2] ^= 255
+    path.write_bytes(data[: last.chunk_start_offset])
+    result = recover(path, tmp_path / "b.mcap")
+    assert result.nameless > 0
+    assert {raw.topic for raw in read_raw(tmp_path / "b.mcap")} == {"/cf1/attitude"}
+
+
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf")])
+def test_a_time_that_is_none_trims_nothing(tmp_path: Path, flight: Path, seconds: float) -> None:
+    with pytest.raises(SettingError, match="is no time"):
+        stage.command(flight, tmp_path / "b.mcap", to_s=seconds)
 
 
 def test_a_merge_of_two_flights_by_the_same_robots_is_said(
