@@ -1,0 +1,30 @@
+"""Who is linked to, and whose ranges are recorded."""
+
+import pytest
+
+from dmrl.live.clocks import HostTime
+from dmrl.live.feed import Feed
+from dmrl.live.links import links_of
+from dmrl.live.robots import Robot
+
+
+@pytest.mark.parametrize(
+    ("names", "peer", "said"),
+    [
+        (["left", "right"], [], ["left: nothing says", "right: nothing says"]),
+        (["left", "right"], ["1=left", "2=right"], []),
+        (["cf1", "cf2"], [], []),
+        (["left"], [], []),
+    ],
+)
+def test_ranges_that_are_nobodys_are_said(
+    names: list[str], peer: list[str], said: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    robots = [
+        Robot(name, f"udp://127.0.0.1:{k}", None, None) for k, name in enumerate(names, 19850)
+    ]
+    links = links_of(robots, peer, 100.0, Feed(), HostTime())
+    assert list(links) == names
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if "nothing says" in line] == lines
+    assert [line[: len(start)] for line, start in zip(lines, said, strict=True)] == said
