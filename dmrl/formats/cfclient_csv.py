@@ -6,6 +6,7 @@ folder of such files. In a folder of folders, each of them is a robot, named aft
 
 import csv
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ def content(source: Path, options: Options) -> Content:
     streams: list[crazyflie_log.Stream] = []
     for name, paths in robots.items():
         robot = options.names.get(name, name)
-        blocks = [read_block(path) for path in paths]
+        blocks = _of_one_clock([read_block(path) for path in paths])
         streams += crazyflie_log.streams(robot, blocks, options.names, source)
     return Content(in_order(streams))
 
@@ -101,6 +102,16 @@ def read_block(path: Path) -> Block:
     time_ns = unwrap(values[0], TIME_BITS) * NS_PER_MS
     columns = dict(zip(names[1:], values[1:], strict=True))
     return Block(STAMP.sub("", path.stem), time_ns, columns)
+
+
+def _of_one_clock(blocks: list[Block]) -> list[Block]:
+    """Blocks with the wraps added that one of them began before and another after."""
+    period_ns, start_ns = NS_PER_MS << TIME_BITS, blocks[0].time_ns[0]
+    wraps = [round((start_ns - block.time_ns[0]) / period_ns) for block in blocks]
+    return [
+        replace(block, time_ns=block.time_ns + count * period_ns)
+        for block, count in zip(blocks, wraps, strict=True)
+    ]
 
 
 def _row(line: str, width: int) -> list[float] | None:

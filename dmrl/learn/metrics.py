@@ -240,6 +240,8 @@ def average_precision(
 ) -> Array:
     """(b,) areas under the precision envelope over recall.
 
+    No threshold lies between equal confidences: they count together, whatever their order.
+
     Parameters
     ----------
     confidence, right, wrong
@@ -252,14 +254,14 @@ def average_precision(
     judged = np.flatnonzero(right | wrong)
     order = judged[np.argsort(-confidence[judged], kind="stable")]
     mass = weights[:, order]
-    claims = np.cumsum(mass, axis=1)
     # Precision peaks at right detections, so the envelope needs no other.
     at = np.flatnonzero(right[order])
     true = mass[:, at]
-    claimed = claims[:, at]
-    precision = np.divide(
-        np.cumsum(true, axis=1), claimed, out=np.zeros_like(claimed), where=claimed > 0
-    )
+    falling = -confidence[order]
+    last = np.searchsorted(falling, falling[at], side="right") - 1
+    claimed = np.cumsum(mass, axis=1)[:, last]
+    found = np.cumsum(mass * right[order], axis=1)[:, last]
+    precision = np.divide(found, claimed, out=np.zeros_like(claimed), where=claimed > 0)
     envelope = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
     area: Array = (envelope * true).sum(axis=1) / total
     return area

@@ -182,7 +182,8 @@ class Link(threading.Thread):
         self.health.last_arrival_ns = self._now()
         while not self._stop_wanted.wait(0.1):
             if self._fault is not None:
-                raise self._fault
+                fault, self._fault = self._fault, None
+                return f"a packet could not be read ({fault!r})"
             if session.lost:
                 return "lost"
             if session.refused:

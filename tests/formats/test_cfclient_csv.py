@@ -73,6 +73,16 @@ def test_units_signs_and_the_clock_s_wrap(swarm: Path) -> None:
     assert [s.fields["range_m"] for s in found["/cf1/range/cf2"]] == [1.5, 2.5]
 
 
+def test_blocks_before_and_after_the_clock_s_wrap_are_of_one_flight(tmp_path: Path) -> None:
+    before = [f"{2**24 - 30 + 10 * k},{k}" for k in range(3)]
+    after = [f"{5 + 10 * k},{k}.5" for k in range(3)]
+    (tmp_path / "a.csv").write_text("\n".join(["Timestamp,gyro.z", *before]) + "\n")
+    (tmp_path / "b.csv").write_text("\n".join(["Timestamp,ranging.distance2", *after]) + "\n")
+    found = samples(tmp_path)
+    first = found["/cf1/log/a"][0].time_ns
+    assert [s.time_ns - first for s in found["/cf1/range/cf2"]] == [35e6, 45e6, 55e6]
+
+
 def test_a_last_line_that_was_cut_is_left_out_and_said(
     swarm: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

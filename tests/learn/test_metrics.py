@@ -105,6 +105,15 @@ def test_average_precision_of_a_ranked_list_by_hand() -> None:
     assert area[0] == pytest.approx(1 / 4 + 1 / 4 * 2 / 3)
 
 
+def test_equal_confidences_count_together_whatever_their_order() -> None:
+    confidence = np.array([0.9, 0.5, 0.5, 0.5])
+    for right in ([True, True, False, False], [True, False, False, True]):
+        is_right = np.array(right)
+        area = average_precision(confidence, is_right, ~is_right, np.ones((1, 4)), np.array([2.0]))
+        # The second label is found by a threshold that lets four detections through.
+        assert area[0] == pytest.approx(1 / 2 + 1 / 2 * 2 / 4)
+
+
 def test_intervals_cover_the_value_and_shrink_with_more_images() -> None:
     rng = np.random.default_rng(0)
     widths = []

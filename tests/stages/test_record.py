@@ -7,7 +7,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,6 +146,28 @@ def test_dropped_packets_are_counted_and_a_dead_drone_stops_nobody(
     assert cf1.dropped - 3 <= lost <= cf1.dropped and cf1.dropped > 10
     assert by_source(result)["cf2"][0] == cf2.sent
     assert result.messages["/cf1/attitude"] > 250 and result.messages["/cf2/attitude"] < 150
+
+
+def test_a_packet_that_cannot_be_read_costs_a_connection_not_the_recording(
+    flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    samples, packets = crazyflie.Reading.samples, count()
+
+    def once_wrong(self: crazyflie.Reading, *packet: Any) -> Any:
+        if next(packets) == 20:
+            raise ValueError("no such number")
+        return samples(self, *packet)
+
+    monkeypatch.setattr(crazyflie, "RETRY_S", 0.1)
+    monkeypatch.setattr(crazyflie.Reading, "samples", once_wrong)
+    with fake_drone.fleet(flight, ANY[:1], (), fake_drone.Settings(speed=0.5)) as fleet:
+        result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
+    said = "cf1: a packet could not be read (ValueError('no such number')) at udp://"
+    assert said in capsys.readouterr().err
+    assert result.healths[0].connections == 2 and result.messages["/cf1/attitude"] > 50
 
 
 def test_a_drone_that_starts_anew_is_connected_again(
