@@ -11,6 +11,8 @@ from dmrl.geometry import Array, Camera, inside
 from dmrl.lens import distort, undistort
 
 Picture = NDArray[np.float32]
+LONGEST_SIDE_PX = 4096
+"""Of an image to render: four times the widest camera's that a small drone carries."""
 
 
 def _scale(camera: Camera) -> tuple[Array, Array]:
@@ -63,8 +65,14 @@ def canvas_of(camera: Camera) -> Canvas:
     Raises
     ------
     SettingError
-        If its distortion folds the image back before its corners.
+        If its images are too large to render, or its distortion folds them back before their
+        corners.
     """
+    if max(camera.width_px, camera.height_px) > LONGEST_SIDE_PX:
+        raise SettingError(
+            f"images of {camera.width_px}x{camera.height_px} px are too large to render: at most "
+            f"{LONGEST_SIDE_PX} px a side. Give a calibration of smaller ones"
+        )
     if not any(camera.distortion):
         everywhere = np.ones((camera.height_px, camera.width_px), bool)
         return Canvas(replace(camera, distortion=()), np.zeros(2), None, everywhere)

@@ -70,6 +70,9 @@ def command(
     """
     # A kill ends rerun's viewer too, as Ctrl-C does; it would be left behind.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for path, suffix in ((save_to, ".rrd"), (screenshot_to, ".png")):
+        if path is not None and path.suffix != suffix:
+            raise SettingError(f"{path}: --save writes .rrd, --screenshot .png. Name it so")
     if save_to is not None:
         count = save(recording, save_to, settings)
         print(f"{save_to}: {count} images")

@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from dmrl.errors import SettingError
 from dmrl.geometry import AIDECK
 from dmrl.rendering.lens import between, canvas_of, image_from_pinhole, pinhole_from_image, sample
 
@@ -45,3 +47,8 @@ def test_the_first_column_follows_the_last_around_a_panorama() -> None:
     places = np.array([[[5.5, 0.0], [-0.5, 0.0], [5.5, 0.5]]], np.float32)
     found = between(picture, places, around=True)[0, :, 0]
     assert found.tolist() == [2.5, 2.5, 5.5]
+
+
+def test_a_slip_of_the_pen_is_no_image_size() -> None:
+    with pytest.raises(SettingError, match="100000x224 px are too large to render"):
+        canvas_of(replace(AIDECK, width_px=100_000, height_px=224))

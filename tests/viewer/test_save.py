@@ -11,6 +11,7 @@ from dmrl.colours import RGB
 from dmrl.errors import OutputError, RecordingError, SettingError, SourceError
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read_table
+from dmrl.stages import view
 from dmrl.viewer import Settings, save
 
 from .rrd import column, logged, panels
@@ -208,3 +209,10 @@ def test_an_image_that_is_none_is_named(tmp_path: Path, rrd: Path) -> None:
         sink.write(0, IMAGES, message("CompressedImage")(data=b"no picture", format="png"))
     with pytest.raises(SourceError, match="the first image of /cf1/camera/image"):
         save([tmp_path / "bad.mcap"], rrd, Settings())
+
+
+def test_a_picture_is_not_what_save_writes(make: Make, tmp_path: Path) -> None:
+    recording = make()
+    for to, other in (("save_to", "found.png"), ("screenshot_to", "found.rrd")):
+        with pytest.raises(SettingError, match=rf"{other}: --save writes \.rrd"):
+            view.command([recording], **{to: tmp_path / other})
