@@ -40,7 +40,7 @@ STAGES: dict[str, int | None] = {
 ONE_MORE = {"train": "init"}
 # These go on with what a killed run has left.
 RESUMABLE = ("train", "render")
-RECIPE_FILE = "recipe.toml"
+RECIPE_FILE, DATA_FILE = "recipe.toml", "data.txt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def run(name: str | Path, out: Path, data: Path | None = None) -> list[Done]:
     RecipeError
         If the recipe is wrong; before anything is done.
     SettingError
-        If the recipe needs ``data`` and has none, or ``out`` belongs to another recipe.
+        If the recipe needs ``data`` and has none, or ``out`` belongs to another recipe or data.
     DmrlError
         What a stage raises.
     """
@@ -78,7 +78,7 @@ def run(name: str | Path, out: Path, data: Path | None = None) -> list[Done]:
     if pipeline.needs_data and data is None:
         raise SettingError(f"{name} reads data that does not ship with dmrl. Say where: --data DIR")
     _check_order(name, pipeline)
-    _claim(out, pipeline)
+    _claim(out, pipeline, data if pipeline.needs_data else None)
     return [
         _do(step, out, data, f"[{k}/{len(pipeline.steps)}]")
         for k, step in enumerate(pipeline.steps, start=1)
@@ -123,8 +123,8 @@ def _wrong_inputs(step: Step) -> str:
     return "" if right else f"({step.stage}) has {count} inputs, not {words}"
 
 
-def _claim(out: Path, pipeline: Pipeline) -> None:
-    """Make ``out`` this recipe's folder, or see that it is."""
+def _claim(out: Path, pipeline: Pipeline, data: Path | None) -> None:
+    """Make ``out`` the folder of this recipe and its data, or see that it is."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
@@ -137,6 +137,16 @@ def _claim(out: Path, pipeline: Pipeline) -> None:
     if not known.exists() and any(out.iterdir()):
         raise SettingError(f"{out} is not empty. Remove it or name another: --out DIR")
     known.write_text(pipeline.text, encoding="utf-8")
+    if data is None:
+        return
+    whence, here = out / DATA_FILE, str(data.resolve())
+    before = whence.read_text(encoding="utf-8") if whence.exists() else here
+    if before != here and any((out / step.out).exists() for step in pipeline.steps):
+        raise SettingError(
+            f"{out} was made of the data in {before}. Name another folder: --out DIR, or, if it is "
+            f"the same data elsewhere, remove {whence}"
+        )
+    whence.write_text(here, encoding="utf-8")
 
 
 def _do(step: Step, folder: Path, data: Path | None, count: str) -> Done:

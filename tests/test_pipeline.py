@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from dmrl import pipeline
-from dmrl.errors import DmrlError, RecipeError, SettingError
+from dmrl.errors import DmrlError, RecipeError, SettingError, SourceError
 
 SMALL = """
 kind = "pipeline"
@@ -114,6 +114,21 @@ def test_data_that_does_not_ship_is_asked_for(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--data DIR"):
         pipeline.run("published", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_what_was_made_of_other_data_is_not_reused(tmp_path: Path) -> None:
+    log = '[[step]]\nstage = "convert"\ninputs = ["{data}/a.csv"]\nout = "a.mcap"\n'
+    recipe, out = write(tmp_path, 'kind = "pipeline"\n' + log), tmp_path / "out"
+    for name in ("wrong", "mine", "yours"):
+        (tmp_path / name).mkdir()
+        if name != "wrong":
+            (tmp_path / name / "a.csv").write_text("Timestamp,gyro.z\n0,1\n10,2\n")
+    with pytest.raises(SourceError):
+        pipeline.run(recipe, out, tmp_path / "wrong")
+    assert not pipeline.run(recipe, out, tmp_path / "mine")[0].skipped
+    assert pipeline.run(recipe, out, tmp_path / "mine")[0].skipped
+    with pytest.raises(SettingError, match=r"made of the data in .*mine\. Name another folder"):
+        pipeline.run(recipe, out, tmp_path / "yours")
 
 
 @pytest.mark.parametrize(
