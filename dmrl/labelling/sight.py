@@ -17,6 +17,8 @@ from dmrl.recording import Summary, read_table
 
 LONGEST_GAP_S = 0.1
 """A range further from an image than this says nothing about it."""
+UNSAID = np.diag([0.1, 0.1, 0.1]) ** 2
+"""(3, 3) m^2, covariance of a position that comes without: about what ranges and flow reach."""
 
 Times = NDArray[np.int64]
 
@@ -170,7 +172,8 @@ def _known(recording: Path, topic: str, start_ns: int) -> PeerPath:
     """The positions of a topic that are OK."""
     table = read_table(recording, topic)
     table = table.filter(pc.equal(table["status"], STATUS_OK))
-    covariance = [row if len(row) == 9 else [0.0] * 9 for row in table["covariance"].to_pylist()]
+    rows = table["covariance"].to_pylist()
+    covariance = [row if len(row) == 9 else UNSAID.ravel() for row in rows]
     return PeerPath(
         (table["log_time"].to_numpy() - start_ns) * 1e-9,
         np.column_stack([table[axis].to_numpy() for axis in "xyz"]),

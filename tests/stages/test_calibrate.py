@@ -136,6 +136,22 @@ def test_detections_of_something_else_are_refused(seen: Path, tmp_path: Path) ->
         calibrate.run([wrong], tmp_path / "camera.toml", Settings(against="truth"))
 
 
+def test_positions_without_covariance_are_not_exact(seen: Path, tmp_path: Path) -> None:
+    unsaid = tmp_path / "unsaid.mcap"
+    with RecordingWriter(unsaid, Provenance("test")) as sink:
+        for one in read(seen):
+            if one.topic.endswith("/truth"):
+                del one.message.covariance[:]
+            sink.write(one.time_ns, one.topic, one.message)
+    exact, unknown = (
+        calibrate.run([source], tmp_path / f"{source.stem}.toml", Settings(against="truth"))
+        for source in (seen, unsaid)
+    )
+    assert unknown.camera.mount_rad != exact.camera.mount_rad
+    errors = np.degrees(np.subtract(unknown.camera.mount_rad, CROOKED.mount_rad))
+    assert np.abs(errors).max() < 0.3
+
+
 def test_an_existing_output_is_refused(seen: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.toml"
     out.write_text("")
