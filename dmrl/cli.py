@@ -29,7 +29,7 @@ COMMANDS = {
     "align": "Set clocks by each other: from ranges of pairs, images, or motion capture.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
-    "card": "Write a dataset's card and figures again.",
+    "card": "Write a dataset's card and figures again; your own words below its last line stay.",
     "train": "Train a network on a dataset.",
     "predict": "Run a network on every image of a recording.",
     "track": "Follow detected peers over time: 3D tracks with covariance.",

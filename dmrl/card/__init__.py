@@ -1,7 +1,7 @@
 """The card of a dataset: README.md and figures/ in its folder.
 
 Everything on it is counted from the data or read from provenance.json, so it can be written
-again at any time. Title and license are kept from the card before.
+again at any time. Kept from the card before: title, license, and what stands below ``YOURS``.
 """
 
 import json
@@ -20,6 +20,8 @@ from dmrl.output import partial_of
 from dmrl.progress import say
 from dmrl.recording import Provenance
 from dmrl.recording.provenance import FILE_NAME
+
+YOURS = "<!-- What you write below this line stays when dmrl writes the card again. -->"
 
 plots: ModuleType | None
 try:
@@ -56,10 +58,16 @@ def write_card(folder: Path, *, title: str | None = None, license_id: str | None
     text += sections.about(splits, str(title), made)
     text += sections.loading(splits, parquet=dataset.parquet)
     text += [*sections.numbers(counts), *figures, *sections.features(splits)]
-    text += ["## Provenance", "", *sections.ancestry(made)]
-    partial_of(readme).write_text("\n".join(text) + "\n", encoding="utf-8")
+    text += ["## Provenance", "", *sections.ancestry(made), "", YOURS]
+    written = "\n".join(text) + (_yours(readme) or "\n")
+    partial_of(readme).write_text(written, encoding="utf-8")
     partial_of(readme).replace(readme)
     return readme
+
+
+def _yours(readme: Path) -> str:
+    """What a hand has written below the line of a card; empty where there is none."""
+    return readme.read_text(encoding="utf-8").partition(YOURS)[2] if readme.is_file() else ""
 
 
 def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> list[str]:

@@ -45,7 +45,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
 ) -> None:
-    """Write a dataset's card and figures again.
+    """Write a dataset's card and figures again; your own words below its last line stay.
 
     Parameters
     ----------

@@ -97,6 +97,17 @@ def test_writing_it_again_gives_the_same_bytes(built: Path) -> None:
     assert {p: p.read_bytes() for p in built.rglob("*") if p.is_file()} == before
 
 
+def test_what_a_hand_wrote_below_the_line_stays(built: Path) -> None:
+    readme = built / "README.md"
+    before = readme.read_text(encoding="utf-8")
+    readme.write_text(before + "\nFlown in hall 3.\n", encoding="utf-8")
+    write_card(built, title="Hall 3")
+    after = readme.read_text(encoding="utf-8")
+    assert after.endswith("-->\n\nFlown in hall 3.\n") and 'pretty_name: "Hall 3"' in after
+    write_card(built)
+    assert readme.read_text(encoding="utf-8") == after
+
+
 def test_title_and_license_can_be_given_and_stay(built: Path) -> None:
     run_card(built, CardSettings(title='A "new" name', license="mit"))
     readme = built / "README.md"
