@@ -3,12 +3,14 @@
 ``/cf1/attitude`` becomes ``cf1.attitude.csv``. The first columns are ``log_time`` and
 ``publish_time``, nanoseconds. A field of a sub-message is ``pose.position.x``. Of a list of
 sub-messages, such as the peers of ``PeerLabels``, each is a row; a message without any has one
-row with empty cells. Pictures lie in ``cf1.camera.image/<log_time>.png``, and ``data`` names them.
+row with empty cells. Pictures lie in ``cf1.camera.image/<log_time>.png``, the second of a time in
+``<log_time>-2.png``, and ``data`` names them.
 In CSV, lists are JSON and other bytes base64; in Parquet both stay what they are.
 """
 
 import base64
 import json
+from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -67,10 +69,14 @@ def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
 def _pictures(recording: Path, topic: str, folder: Path) -> pa.Table:
     """Pictures to files; the table names them in place of their bytes."""
     folder.mkdir()
-    batches = []
+    batches, seen = [], Counter[str]()
     for batch in columns(recording, topic):
-        times, kinds = batch["log_time"].to_pylist(), batch["format"].to_pylist()
-        names = [f"{t:0{TIME_DIGITS}d}.{_suffix(k)}" for t, k in zip(times, kinds, strict=True)]
+        names = []
+        for time_ns, kind in zip(batch["log_time"], batch["format"], strict=True):
+            stem = f"{time_ns.as_py():0{TIME_DIGITS}d}"
+            seen[stem] += 1
+            again = f"-{seen[stem]}" if seen[stem] > 1 else ""
+            names.append(f"{stem}{again}.{_suffix(kind.as_py())}")
         for name, data in zip(names, batch["data"], strict=True):
             (folder / name).write_bytes(data.as_buffer())
         at = batch.schema.get_field_index("data")

@@ -63,6 +63,16 @@ def test_tables_hold_what_the_recording_holds(recording: Path, tmp_path: Path, k
     assert (base64.b64decode(data) if kind == "csv" else data) == b"\0\1"
 
 
+def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:
+    path, pictures = tmp_path / "in.mcap", [PNG, encode_png(np.zeros((4, 4, 3), np.uint8))]
+    with RecordingWriter(path, provenance("test")) as sink:
+        for data in pictures:
+            sink.write(5, "/cf1/camera/image", message("CompressedImage")(data=data, format="png"))
+    write_tables(path, tmp_path / "out", "csv")
+    names = pd.read_csv(tmp_path / "out" / "cf1.camera.image.csv")["data"]
+    assert [(tmp_path / "out" / name).read_bytes() for name in names] == pictures
+
+
 def test_numbers_come_back_to_the_bit(tmp_path: Path) -> None:
     path, values = tmp_path / "in.mcap", np.random.default_rng(0).normal(size=50)
     with RecordingWriter(path, provenance("test")) as sink:
