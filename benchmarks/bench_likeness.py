@@ -1,17 +1,21 @@
 """How like the published images renders are that stand at the same poses.
 
     python benchmarks/bench_likeness.py DATA/locanet-synthetic --model crazyflie-published.blend
-        [--images 60] [--plot OUT.png]
+        [--images 60] [--plot OUT.png] [--renders RENDERS.mcap]
 
 Every published image says where its drone is and how it is turned. The drone is taken out of the
 picture (OpenCV's inpainting), rendered again in its place, and compared: mean absolute difference
 of luma and of both colour channels, of 256 levels, where the drone is. The rest of the difference
 is what inpainting got wrong behind a drone's gaps, so each row is one thing changed.
+
+With ``--renders`` a second table says how sharp whole images are: means of the difference from a
+pixel to the next, and to the mean of its four neighbours.
 """
 
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -23,6 +27,7 @@ from dmrl.formats.locanet import LocanetImage, read
 from dmrl.geometry import PUBLISHED_RENDER
 from dmrl.images import Rgb, decode, encode_jpeg
 from dmrl.progress import say
+from dmrl.recording import read as read_messages
 from dmrl.rendering.backdrops import LIGHT_OF
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.renderer import Model, Renderer
@@ -35,6 +40,7 @@ SCALE = 0.002
 YAW_OF_MODEL_RAD = np.radians(270.0)  # dmrl's x is forward, the authors' model looks aside
 LUMA = np.array([[0.299, 0.587, 0.114], [-0.1687, -0.3313, 0.5], [0.5, -0.4187, -0.0813]])
 AROUND_PX = 3
+IMAGES = "/cf1/camera/image"
 LIGHT = Light("", (0.0, 0.0, 0.0), 0.12, np.array([-1.0, 0, 0]), 1.7, (1.0, 1.0, 1.0), 0.19, False)
 LOOK = Look(np.zeros((224, 320, 3), np.float32), LIGHT, Sensor(brightness=None), robot_blur_px=0.45)
 
@@ -106,6 +112,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--images", type=int, default=60)
     parser.add_argument("--plot", type=Path)
+    parser.add_argument("--renders", type=Path)
     args = parser.parse_args()
     items = [item for item in read(args.data) if item.split == "train"]
     chosen = np.random.default_rng(0).permutation(len(items))[: args.images]
@@ -129,6 +136,21 @@ def main() -> None:
     print_table(f"{len(items)} images", ("rendered", "luma", "blue", "red"), rows)
     if args.plot:
         args.plot.write_bytes(sheet(shown))
+    if args.renders:
+        rendered = (decode(one.message.data) for one in read_messages(args.renders, IMAGES))
+        compared = {"published": pictures, "renders": list(islice(rendered, len(pictures)))}
+        sharp = [(name, *sharpness(images)) for name, images in compared.items()]
+        print_table("", ("images", "to the next pixel", "to the mean of four"), sharp)
+
+
+def sharpness(pictures: list[Rgb]) -> tuple[float, float]:
+    """Mean differences of luma from pixels to the next on the right, and to all four around."""
+    luma = np.array([rgb @ LUMA[0] for rgb in pictures])
+    around = luma[:, :-2, 1:-1] + luma[:, 2:, 1:-1] + luma[:, 1:-1, :-2] + luma[:, 1:-1, 2:]
+    return (
+        round(float(np.abs(np.diff(luma, axis=2)).mean()), 2),
+        round(float(np.abs(luma[:, 1:-1, 1:-1] - around / 4).mean()), 2),
+    )
 
 
 def sheet(shown: list[tuple[Rgb, Rgb, NDArray[np.uint8]]], columns: int = 6) -> bytes:
