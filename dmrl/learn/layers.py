@@ -106,8 +106,8 @@ def sample(raw: NDArray[np.uint8], window: Window, shape: tuple[int, int]) -> Te
     # Only what the window looks at is made float.
     seen = through(window.matrix, CORNERS * shape[::-1]).T
     size = np.array([raw.shape[1], raw.shape[0]])
-    low = np.clip(np.floor(seen.min(axis=1)).astype(int) - 2, 0, size - 2)
-    high = np.clip(np.ceil(seen.max(axis=1)).astype(int) + 2, low + 2, size)
+    low = np.clip(np.floor(seen.min(axis=1)).astype(int) - 1, 0, size - 2)
+    high = np.clip(np.ceil(seen.max(axis=1)).astype(int) + 1, low + 2, size)
     part = raw[low[1] : high[1], low[0] : high[0]].astype(np.float32)
     image = torch.from_numpy(part).permute(2, 0, 1)[None]
     # grid_sample counts from -1 to 1 over the image's edges.
@@ -119,9 +119,8 @@ def sample(raw: NDArray[np.uint8], window: Window, shape: tuple[int, int]) -> Te
         torch.add(*_plane(matrix[axis], down, across), out=grid[0, ..., axis])
     if window.camera:
         grid /= torch.add(*_plane(matrix[2], down, across))[..., None]
-    # Bilinear blurs: images would be half as sharp as those that the network is to see.
-    out = grid_sample(image, grid, mode="bicubic", padding_mode="border", align_corners=False)
-    return out[0].permute(1, 2, 0).clamp(0, 255)
+    out = grid_sample(image, grid, padding_mode="border", align_corners=False)
+    return out[0].permute(1, 2, 0)
 
 
 def _plane(row: NDArray[np.float64], down: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
