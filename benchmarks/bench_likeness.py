@@ -1,7 +1,7 @@
 """How like the published images renders are that stand at the same poses.
 
     python benchmarks/bench_likeness.py DATA/locanet-synthetic --model crazyflie-published.blend
-        [--images 60] [--plot OUT.png] [--renders RENDERS.mcap]
+        [--images 60] [--plot OUT.jpg] [--renders RENDERS.mcap]
 
 Every published image says where its drone is and how it is turned. The drone is taken out of the
 picture (OpenCV's inpainting), rendered again in its place, and compared: mean absolute difference
