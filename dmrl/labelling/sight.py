@@ -17,8 +17,8 @@ from dmrl.recording import Summary, read_table
 
 LONGEST_GAP_S = 0.1
 """A range further from an image than this says nothing about it."""
-UNSAID = np.diag([0.1, 0.1, 0.1]) ** 2
-"""(3, 3) m^2, covariance of a position that comes without: about what ranges and flow reach."""
+UNSAID = np.eye(3) * 0.1**2
+"""(3, 3) m^2, covariance of a position that comes without: a decimetre each way."""
 
 Times = NDArray[np.int64]
 

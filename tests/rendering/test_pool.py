@@ -76,6 +76,7 @@ def test_no_worker_outlives_a_pool_that_is_left_early(start: Start) -> None:
                 if k == 2:
                     started = workers.pids
                     raise KeyError
+        assert started
         assert not [pid for pid in {*started, *workers.pids} if Path(f"/proc/{pid}").exists()]
 
 
