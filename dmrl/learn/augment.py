@@ -2,7 +2,7 @@
 
 An image is made of layers. A layer shows a window of one source image, turned, mirrored and
 zoomed, in a rectangle of the canvas: the whole canvas, the parts of a mosaic, or a patch cut
-out around one robot. One bilinear sampling a layer does all of the geometry.
+out around one robot. One bicubic sampling a layer does all of the geometry.
 
 A camera of fixed intrinsics sees a robot z times as large when it is z times as near, so a
 zoom by z divides the depth by z. A turn about the optical axis keeps it.
@@ -216,7 +216,7 @@ class Augmenter:
             opacity = feather(int(size[1]), int(size[0]))
         else:
             about = self._window(turn, zoom, middle, size / 2, rect)
-            opacity = sample(mask[..., None], about, (int(size[1]), int(size[0])))
+            opacity = sample(255 * mask, about, (int(size[1]), int(size[0]))) / 255
         mine = present(self._examples.robots[source])
         return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
 

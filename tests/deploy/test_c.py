@@ -218,7 +218,9 @@ def test_without_a_compiler_the_package_to_install_is_named(
         Compiled(quantised_network(0))
 
 
-@pytest.mark.parametrize(("name", "bytes_"), [("locanet", 32_000), ("dmrl-nano", 128_000)])
+@pytest.mark.parametrize(
+    ("name", "bytes_"), [("locanet", 32_000), ("dmrl-nano", 128_000), ("dmrl-nano-fine", 164_000)]
+)
 def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
     with torch.random.fork_rng(devices=[]):
         network = build(name).eval()

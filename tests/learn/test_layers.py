@@ -81,3 +81,25 @@ def test_without_a_camera_a_window_is_cut_out() -> None:
     picture = torch.arange(40 * 60 * 3).reshape(40, 60, 3).remainder(251).to(torch.uint8).numpy()
     window = Window(flat(np.eye(2), np.array([20.0, 10.0]), np.array([0.0, 0.0])), 1.0)
     assert np.allclose(sample(picture, window, (15, 25)), picture[10:25, 20:45], atol=1e-3)
+
+
+def test_a_window_is_nearly_as_sharp_as_its_image() -> None:
+    rng = np.random.default_rng(0)
+    picture = rng.integers(60, 200, (112, 160, 1), np.uint8)
+    window = Window(flat(np.eye(2), np.array([10.5, 10.5]), np.zeros(2)), 1.0)
+    shown = sample(picture, window, (80, 80)).numpy()[..., 0]
+    # Halfway between pixels: the mean of four, as a bilinear window is, halves the spread.
+    assert shown.std() > 0.6 * picture.std()
+
+
+def test_beyond_an_image_its_border_goes_on() -> None:
+    picture = np.arange(40, dtype=np.uint8).reshape(4, 10)[..., None].repeat(3, axis=2)
+    window = Window(flat(np.eye(2), np.array([-5.0, 0.0]), np.zeros(2)), 1.0)
+    shown = sample(picture, window, (4, 10)).numpy()
+    assert (shown[:, :6] == picture[:, :1]).all()
+    assert (shown[:, 5:] == picture[:, :5]).all()
+
+
+def test_pixels_without_channels_have_one() -> None:
+    window = Window(flat(np.eye(2) / 2, np.zeros(2), np.zeros(2)), 2.0)
+    assert sample(np.full((4, 6), 255, np.uint8), window, (8, 12)).shape == (8, 12, 1)

@@ -16,14 +16,17 @@ def test_locanet_has_the_published_number_of_parameters() -> None:
     assert parameter_count(build("locanet")) == 24_778
 
 
-def test_dmrl_nano_keeps_to_its_budget() -> None:
+def test_the_small_networks_keep_to_their_budget() -> None:
     assert parameter_count(build("dmrl-nano")) == 24_836
     assert product_count(build("dmrl-nano")) == 57_720_320
+    assert parameter_count(build("dmrl-nano-fine")) == 24_740
+    assert product_count(build("dmrl-nano-fine")) == 75_102_720
     assert product_count(build("locanet")) == 77_557_760
 
 
-def test_dmrl_nano_sees_287_pixels_far() -> None:
-    network = build("dmrl-nano").eval()
+@pytest.mark.parametrize(("name", "wide_px"), [("dmrl-nano", 287), ("dmrl-nano-fine", 311)])
+def test_how_far_a_network_sees(name: str, wide_px: int) -> None:
+    network = build(name).eval()
     for layer in network.modules():
         if isinstance(layer, torch.nn.Conv2d):
             layer.weight.data.abs_()
@@ -31,7 +34,7 @@ def test_dmrl_nano_sees_287_pixels_far() -> None:
     network(image)[0, 0, 20, 40].backward()  # type: ignore[no-untyped-call]
     assert image.grad is not None
     seen = image.grad.abs().sum(dim=(0, 1, 2)).nonzero()
-    assert int(seen.max() - seen.min()) + 1 == 287
+    assert int(seen.max() - seen.min()) + 1 == wide_px
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
@@ -83,6 +86,6 @@ def test_input_is_scaled_to_about_one_and_stays_channels_last() -> None:
 
 def test_an_unknown_architecture_is_answered_with_the_known_ones() -> None:
     with pytest.raises(
-        SettingError, match=r"no architecture resnet\. Choose one of: dmrl-large, dmrl-nano, loc"
+        SettingError, match=r"no architecture resnet\. Choose one of: dmrl-large, dmrl-nano, "
     ):
         build("resnet")
