@@ -61,6 +61,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no weight decay": {"weight_decay": 0.0},
     "batches of 8": {"batch_size": 8},
     "float32": {"precision": "float32"},
+    "dmrl-nano": {"architecture": "dmrl-nano"},
     "locanet": {"architecture": "locanet"},
     "depth with its spread": {"spread_weight": 1.0},
     TAUGHT: {},
