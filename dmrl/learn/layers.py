@@ -14,8 +14,7 @@ from dmrl.learn.batches import BOX, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, Robots
 FEATHER_PX = 3.0
 """Width of a pasted patch's soft border."""
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-# Bicubic: a bilinear window is half as sharp as its image, and what is lost is what tells a
-# robot far away from its background.
+# Bicubic: a bilinear window is half as sharp as the whole images that a network will see.
 _HOW = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
 _BEYOND = cv2.BORDER_REPLICATE
 _MIDDLE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
