@@ -109,12 +109,12 @@ def sample(raw: NDArray[np.uint8], window: Window, shape: tuple[int, int]) -> Te
 
     What lies beyond the image is as its border.
     """
-    if shape == raw.shape[:2] and window.zoom == 1 and (window.matrix == np.eye(3)).all():
-        return torch.from_numpy(raw.astype(np.float32))
-    # OpenCV counts pixels from their middles.
-    matrix = np.linalg.inv(_MIDDLE) @ window.matrix @ _MIDDLE
-    out = cv2.warpPerspective(raw, matrix, shape[::-1], flags=_HOW, borderMode=_BEYOND)
-    return torch.from_numpy(out.reshape(*shape, -1).astype(np.float32))
+    if shape != raw.shape[:2] or (window.matrix != np.eye(3)).any():
+        # OpenCV counts pixels from their middles.
+        matrix = np.linalg.inv(_MIDDLE) @ window.matrix @ _MIDDLE
+        seen = cv2.warpPerspective(raw, matrix, shape[::-1], flags=_HOW, borderMode=_BEYOND)
+        raw = np.asarray(seen, np.uint8)
+    return torch.from_numpy(raw.reshape(*shape, -1).astype(np.float32))
 
 
 def parts(whole: Rect, rng: Rng) -> list[Rect]:

@@ -83,7 +83,7 @@ def test_without_a_camera_a_window_is_cut_out() -> None:
     assert np.allclose(sample(picture, window, (15, 25)), picture[10:25, 20:45], atol=1e-3)
 
 
-def test_a_window_is_nearly_as_sharp_as_its_image() -> None:
+def test_a_window_is_sharper_than_a_bilinear_one() -> None:
     rng = np.random.default_rng(0)
     picture = rng.integers(60, 200, (112, 160, 1), np.uint8)
     window = Window(flat(np.eye(2), np.array([10.5, 10.5]), np.zeros(2)), 1.0)
@@ -101,5 +101,8 @@ def test_beyond_an_image_its_border_goes_on() -> None:
 
 
 def test_pixels_without_channels_have_one() -> None:
-    window = Window(flat(np.eye(2) / 2, np.zeros(2), np.zeros(2)), 2.0)
-    assert sample(np.full((4, 6), 255, np.uint8), window, (8, 12)).shape == (8, 12, 1)
+    mask = np.full((4, 6), 255, np.uint8)
+    for zoom in (1, 2):
+        window = Window(flat(np.eye(2) / zoom, np.zeros(2), np.zeros(2)), zoom)
+        shape = (4 * zoom, 6 * zoom)
+        assert sample(mask, window, shape).shape == (*shape, 1)
