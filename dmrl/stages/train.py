@@ -169,8 +169,13 @@ def _threshold(network: Network, held_out: Examples | None, settings: Settings) 
 def _first_network(settings: Settings, examples: Examples, init: Path | None) -> Network:
     network = new_network(settings, examples)
     if init is not None:
-        known = load_model(init).network
-        set_weights(network, with_channels(known, network), init)
+        known = load_model(init)
+        if known.architecture != settings.architecture:
+            raise SettingError(
+                f"{init} is a {known.architecture}, not the {settings.architecture} to train. "
+                f'Set architecture = "{known.architecture}" in the recipe, or give another --init'
+            )
+        set_weights(network, with_channels(known.network, network), init)
     return network
 
 

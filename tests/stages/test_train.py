@@ -146,6 +146,13 @@ def test_what_cannot_be_trained_is_said_in_one_line(dataset: Path, tmp_path: Pat
         run(tmp_path / "nothing", tmp_path / "run", SETTINGS)
     with pytest.raises(ModelError, match="no model"):
         run(dataset, tmp_path / "run", SETTINGS, init=tmp_path / "nothing")
+    with pytest.raises(SettingError, match="is a dmrl-nano, not the locanet to train"):
+        run(
+            dataset,
+            tmp_path / "run",
+            replace(SETTINGS, architecture="locanet"),
+            init=Path("dmrl-nano"),
+        )
     with pytest.raises(SettingError, match="no architecture resnet"):
         run(dataset, tmp_path / "run", replace(SETTINGS, architecture="resnet"))
     (tmp_path / "taken").mkdir()
