@@ -230,7 +230,7 @@ class Flags:
     batch_size
         Images per step. Without it, the recipe's.
     learning_rate
-        Of Adam, at the end of the warm-up. Without it, the recipe's.
+        At the end of the warm-up. Without it, the recipe's.
     seed
         Of the first weights and the order of the images. Without it, the recipe's.
     device
