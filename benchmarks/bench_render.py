@@ -26,7 +26,7 @@ import numpy as np
 from dmrl.geometry import Array, Camera, project
 from dmrl.progress import say
 from dmrl.rendering import crazyflie
-from dmrl.rendering.backdrops import Photos
+from dmrl.rendering.backdrops import photos_in
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.lens import Picture, image_from_pinhole
 from dmrl.rendering.randomise import World, draw_scene
@@ -125,7 +125,7 @@ def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
         Folder of photos.
     """
     settings = settings_of(recipe, images=images, robots_max=1, empty_share=0.0)
-    photos = Photos(backgrounds)
+    photos = photos_in(backgrounds)
     camera = camera_of(settings)
     shots: dict[str, list[Shot]] = {}
     for samples in (MANY_SAMPLES, 4, 8, 16):

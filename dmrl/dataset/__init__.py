@@ -4,6 +4,6 @@
 `write` and `read` store and open them.
 """
 
-from dmrl.dataset.read import Dataset, Split, open_dataset
+from dmrl.dataset.read import Dataset, Split, is_dataset, open_dataset
 
-__all__ = ["Dataset", "Split", "open_dataset"]
+__all__ = ["Dataset", "Split", "is_dataset", "open_dataset"]

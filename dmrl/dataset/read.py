@@ -155,6 +155,11 @@ class Dataset:
         return [(path, None) for path in paths]
 
 
+def is_dataset(path: Path) -> bool:
+    """Whether a folder looks like a dataset; it may be damaged all the same."""
+    return (path / "dataset_dict.json").is_file() or bool(_parquet_names(path))
+
+
 def open_dataset(path: Path) -> Dataset:
     """A dataset that ``dmrl dataset`` wrote, or ``datasets`` saved with the same columns.
 

@@ -1,7 +1,7 @@
 """What is behind the robots: photos, or what a panorama shows in the camera's direction."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -30,38 +30,27 @@ LIGHT_OF = _table()
 
 
 class Photos:
-    """A folder of photos, fitted to an image.
+    """Photos, fitted to an image.
 
     Parameters
     ----------
-    folder
-        Every picture in it counts, in order of names.
-
-    Raises
-    ------
-    SettingError
-        If it holds none that can be read.
+    load
+        Gives the photo of a number, from 0; raises SourceError if it is broken.
+    count
+        How many there are.
+    broken
+        How many more were left out as broken.
     """
 
-    def __init__(self, folder: Path) -> None:
-        if not folder.is_dir():
-            raise SettingError(f"no folder {folder} of backgrounds. Check --backgrounds")
-        found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_KINDS)
-        self.broken = [path for path in found if not _begins(path)]
-        self.paths = [path for path in found if path not in set(self.broken)]
-        self._load = lru_cache(KEPT)(self._decoded)
-        if not self.paths:
-            why = f", {len(self.broken)} are broken" if self.broken else ""
-            raise SettingError(
-                f"{folder} holds no photo that can be read{why} "
-                f"({', '.join(PHOTO_KINDS)}). Choose another --backgrounds"
-            )
+    def __init__(self, load: Callable[[int], Rgb], count: int, broken: int = 0) -> None:
+        self._count, self._left_out = count, broken
+        self._broken: set[int] = set()
+        self._load = lru_cache(KEPT)(load)
 
-    def _decoded(self, number: int) -> Rgb | None:
-        try:
-            return decode(self.paths[number].read_bytes(), self.paths[number])
-        except SourceError:
-            return None
+    @property
+    def broken(self) -> int:
+        """Photos that turned out to be broken, so far."""
+        return self._left_out + len(self._broken)
 
     def photo(self, number: int) -> Rgb:
         """Photo of that number, or the next one that is whole.
@@ -71,13 +60,14 @@ class Photos:
         SettingError
             If none is.
         """
-        for step in range(len(self.paths)):
-            here = (number + step) % len(self.paths)
-            photo = self._load(here)
-            if photo is not None:
-                return photo
-            if self.paths[here] not in self.broken:
-                self.broken.append(self.paths[here])
+        for step in range(self._count):
+            here = (number + step) % self._count
+            if here in self._broken:
+                continue
+            try:
+                return self._load(here)
+            except SourceError:
+                self._broken.add(here)
         raise SettingError("every photo is broken. Choose another --backgrounds")
 
     def backdrop(
@@ -97,7 +87,7 @@ class Photos:
             Whether a pixel is the mean of what it covers of the photo, or what is in its middle.
         """
         number, place_u, place_v, mirrored = rng.random(4)
-        photo = self.photo(int(number * len(self.paths)))
+        photo = self.photo(int(number * self._count))
         height, width, _ = photo.shape
         fit = min(width / camera.width_px, height / camera.height_px) / zoom
         part_u, part_v = camera.width_px * fit, camera.height_px * fit
@@ -108,6 +98,28 @@ class Photos:
         else:
             rgb = _middles(photo, (left, top), fit, camera)
         return np.take(LIGHT_OF, rgb[:, ::-1] if mirrored < 0.5 else rgb)
+
+
+def photos_in(folder: Path) -> Photos:
+    """The photos of a folder: every picture in it, in order of names.
+
+    Raises
+    ------
+    SettingError
+        If it holds none that can be read.
+    """
+    if not folder.is_dir():
+        raise SettingError(f"no folder {folder} of backgrounds. Check --backgrounds")
+    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_KINDS)
+    paths = [path for path in found if _begins(path)]
+    broken = len(found) - len(paths)
+    if not paths:
+        why = f", {broken} are broken" if broken else ""
+        raise SettingError(
+            f"{folder} holds no photo that can be read{why} "
+            f"({', '.join(PHOTO_KINDS)}). Choose another --backgrounds"
+        )
+    return Photos(lambda k: decode(paths[k].read_bytes(), paths[k]), len(paths), broken)
 
 
 def _middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera) -> Rgb:

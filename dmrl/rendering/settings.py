@@ -78,7 +78,7 @@ class Settings:
     scale
         Metres per unit of the model; without a model, times life size.
     backgrounds
-        Folder of photos. Without it, what the panoramas show.
+        Folder of photos, or a dataset. Without it, what the panoramas show.
     lights
         Folder of panoramas (.exr, .hdr). Without it, those that come with Blender.
     masks

@@ -13,6 +13,7 @@ from cyclopts import Parameter, validators
 
 from dmrl import recipe as recipes
 from dmrl import topics
+from dmrl.backgrounds import photos_of
 from dmrl.errors import RecipeError, SettingError
 from dmrl.formats.camera_toml import KNOWN, camera_named
 from dmrl.formats.sample import Sample, calibration, intervals
@@ -28,7 +29,6 @@ from dmrl.recording import (
     interrupted,
     provenance,
 )
-from dmrl.rendering.backdrops import Photos
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.lens import canvas_of
 from dmrl.rendering.randomise import Drawn, World, draw_scene
@@ -123,7 +123,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     refuse_existing(out)
     before = interrupted(out, resume=resume)
     camera = camera_of(settings)
-    photos = None if settings.backgrounds is None else Photos(settings.backgrounds)
+    photos = None if settings.backgrounds is None else photos_of(settings.backgrounds)
     lights = None if settings.lights is None else _panoramas(settings.lights)
     model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre)
     with ExitStack() as stack:
@@ -151,7 +151,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
         )
         _render(world, renderer, sink, done)
     before.forget()
-    broken = len(photos.broken) if photos is not None else 0
+    broken = photos.broken if photos is not None else 0
     return Result(settings.images, *_counts(out), broken, done)
 
 
@@ -249,7 +249,8 @@ def command(
     workers
         Blender processes; 0: as many as there are cores. Changes no byte of the output.
     backgrounds
-        Folder of photos to put behind the robots.
+        What to put behind the robots: a folder of photos, or a dataset whose train images are
+        put there, their robots painted over.
     camera
         Calibration of the camera, a TOML file as dmrl calibrate writes, or aideck or published.
     model

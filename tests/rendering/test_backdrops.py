@@ -1,4 +1,4 @@
-"""Photos and panoramas behind the robots."""
+"""photos_in and panoramas behind the robots."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.geometry import AIDECK
 from dmrl.images import encode_jpeg, encode_png
-from dmrl.rendering.backdrops import LIGHT_OF, Photos, panorama_view, smeared
+from dmrl.rendering.backdrops import LIGHT_OF, panorama_view, photos_in, smeared
 
 CAMERA = replace(AIDECK, distortion=())
 
@@ -27,18 +27,18 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_broken_photos_are_skipped_and_counted(folder: Path) -> None:
-    photos = Photos(folder)
+    photos = photos_in(folder)
     for seed in range(6):
         backdrop = photos.backdrop(np.random.default_rng(seed), CAMERA, zoom=1.5)
         assert backdrop.shape == (224, 320, 3)
-    assert sorted(path.name for path in photos.broken) == ["a.jpg", "c.jpg"]
+    assert photos.broken == 2
 
 
 def test_a_photo_is_averaged_or_sampled_in_the_middles_of_pixels(tmp_path: Path) -> None:
     stripes = np.zeros((448, 640, 3), np.uint8)
     stripes[:, 1::4] = 252
     (tmp_path / "stripes.png").write_bytes(encode_png(stripes))
-    photos, levels = Photos(tmp_path), []
+    photos, levels = photos_in(tmp_path), []
     for averaged in (True, False):
         rng = np.random.default_rng(0)
         light = photos.backdrop(rng, CAMERA, zoom=1.0, averaged=averaged)
@@ -50,9 +50,9 @@ def test_a_photo_is_averaged_or_sampled_in_the_middles_of_pixels(tmp_path: Path)
 
 def test_a_folder_without_a_photo_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"holds no photo .*Choose another --backgrounds"):
-        Photos(tmp_path)
+        photos_in(tmp_path)
     with pytest.raises(SettingError, match="no folder"):
-        Photos(tmp_path / "none")
+        photos_in(tmp_path / "none")
 
 
 def test_the_light_of_a_photo_follows_the_curve_of_screens() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from dmrl.geometry import PUBLISHED_RENDER, project
 from dmrl.images import encode_png
-from dmrl.rendering.backdrops import Photos
+from dmrl.rendering.backdrops import photos_in
 from dmrl.rendering.crazyflie import MATERIALS
 from dmrl.rendering.randomise import PALETTE, World, draw_scene, strong_colours
 from dmrl.rendering.sensor import expose
@@ -38,7 +38,7 @@ def world(settings: Settings, folder: Path) -> World:
         0.1,
         ("sky",),
         lambda _: np.ones((8, 16, 3), np.float32),
-        Photos(folder),
+        photos_in(folder),
     )
 
 
