@@ -18,7 +18,7 @@ from dmrl.dataset.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
 from dmrl.output import partial_folder
 from dmrl.progress import say, track
-from dmrl.recording import Provenance, provenance, read, splits, summary
+from dmrl.recording import Input, Provenance, provenance, read, splits, summary
 from dmrl.tables import print_json, print_table
 
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
@@ -178,9 +178,21 @@ def _refuse_twins(recordings: Sequence[Path], made: Provenance) -> None:
             raise SettingError(f"{twin} and {path} hold the same bytes. Name only one of them")
     for path, source in zip(recordings, made.inputs, strict=True):
         # Its images are the other's: one would be in train, the other in test.
-        older = source.provenance.ancestry() if source.provenance else ()
-        for twin in (contents[s.sha256] for _, s in older if s.sha256 in contents):
+        for twin in (contents[sha] for sha in _shown_by(source) if sha in contents):
             raise SettingError(f"{path} is made from {twin}. Name only one of them")
+
+
+def _shown_by(recording: Input) -> Iterator[str]:
+    """Hashes of what a recording has its images from.
+
+    Not of what went through a dataset: renders over its images, labels of a model that learned
+    from them, show other images.
+    """
+    made = recording.provenance
+    if made is not None and made.stage != "dataset":
+        for source in made.inputs:
+            yield source.sha256
+            yield from _shown_by(source)
 
 
 def _rows(

@@ -11,6 +11,7 @@ from dmrl.recording import (
     RecordingWriter,
     Summary,
     merge,
+    provenance,
     read,
     splits,
     trim,
@@ -107,6 +108,18 @@ def test_a_recording_beside_one_made_of_it_is_refused(record: Record, tmp_path: 
             SettingError, match=r"copy\.mcap is made from .*x\.mcap\. Name only one"
         ):
             run(both, tmp_path / "out", Settings())
+
+
+def test_a_recording_beside_one_that_knows_it_through_a_dataset(
+    record: Record, tmp_path: Path
+) -> None:
+    # As a render over its images does, or labels of a model that learned from it.
+    flight, other = record("x.mcap"), tmp_path / "over.mcap"
+    run([flight], tmp_path / "set", Settings())
+    with RecordingWriter(other, provenance("render", {}, [tmp_path / "set"])) as sink:
+        for stamped in read(flight):
+            sink.write(stamped.time_ns, stamped.topic, stamped.message)
+    assert sum(run([flight, other], tmp_path / "out", Settings()).images.values()) == 12
 
 
 def test_every_split_of_a_merged_recording_counts(record: Record, tmp_path: Path) -> None:
