@@ -23,7 +23,10 @@ def test_robots_of_a_dataset_are_painted_over(record: Record, tmp_path: Path) ->
     changed = (photos.photo(0) != pixels_of(0)).any(axis=-1)
     assert changed[9:16, 16:25].mean() > 0.95
     v, u = np.nonzero(changed)
-    assert (u.min() > 8, u.max() < 34, v.min() > 2, v.max() < 24) == (True,) * 4
+    assert u.min() > 8
+    assert u.max() < 34
+    assert v.min() > 2
+    assert v.max() < 24
     # Nobody in the second image; the third is all robot, and the robot of the fourth has no box.
     assert (photos.photo(1) == pixels_of(1)).all()
     assert (photos.photo(2) == photos.photo(0)).all()
@@ -40,17 +43,11 @@ def test_what_is_hidden_is_painted_with_what_is_around_it() -> None:
     hidden = np.zeros((64, 96), bool)
     hidden[20:40, 30:60] = True
     rgb[hidden] = 255
-    assert (
-        np.abs(painted_over(rgb, hidden).astype(int) - (20, 120, 220)).max() <= 4
-    )  # it rounds as it goes inwards
+    off = np.abs(painted_over(rgb, hidden).astype(int) - (20, 120, 220))
+    assert off.max() <= 4  # it rounds as it goes inwards
 
 
 def test_a_folder_of_photos_is_what_it_was(tmp_path: Path) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
     (tmp_path / "a.png").write_bytes(encode_png(photo))
     assert (photos_of(tmp_path).photo(0) == photo).all()
-
-
-def test_a_folder_of_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="no photo"):
-        photos_of(tmp_path)

@@ -1,4 +1,4 @@
-"""photos_in and panoramas behind the robots."""
+"""Photos and panoramas behind the robots."""
 
 from dataclasses import replace
 from pathlib import Path
