@@ -21,7 +21,7 @@ from dmrl.deploy.graph import graph_of
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.deploy.rounding import moments_of
-from dmrl.images import decode
+from dmrl.images.codec import decode
 from dmrl.learn.model import load_model
 from dmrl.learn.trace import operations
 

@@ -19,13 +19,13 @@ import numpy as np
 import torch
 
 from dmrl.dataset import Split, open_dataset
-from dmrl.examples import examples_of
-from dmrl.images import encode_jpeg
+from dmrl.dataset.for_training import examples_of
+from dmrl.images.codec import encode_jpeg
 from dmrl.learn.batches import gathered, order
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
-from dmrl.tables import print_table
+from dmrl.terminal.tables import print_table
 from dmrl.topics import camera_image, labels
 
 HEIGHT_PX, WIDTH_PX, BATCH, PASSES = 224, 320, 32, 3

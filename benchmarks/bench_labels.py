@@ -20,7 +20,7 @@ from dmrl.estimation.gate import AMBIGUOUS, OK, probability_beyond
 from dmrl.estimation.pair import Mask, Pair, Track, resample, usable_ranges
 from dmrl.estimation.score import GOOD_M, Figures, Judged, figures, overall
 from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 SETTLE_S = 20.0
 EKF = "published-sim"

@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dmrl.formats.locanet import LocanetImage, read
-from dmrl.geometry import PUBLISHED_RENDER
-from dmrl.images import Rgb, decode, encode_jpeg
-from dmrl.progress import say
+from dmrl.geometry.frames import PUBLISHED_RENDER
+from dmrl.images.codec import Rgb, decode, encode_jpeg
 from dmrl.recording import read as read_messages
 from dmrl.rendering.backdrops import LIGHT_OF
 from dmrl.rendering.environment import ensure
@@ -34,7 +33,8 @@ from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.sensor import Sensor
 from dmrl.rendering.shot import Light, Look, Robot, Shot
 from dmrl.rendering.sketch import Pose
-from dmrl.tables import print_table
+from dmrl.terminal.progress import say
+from dmrl.terminal.tables import print_table
 
 SCALE = 0.002
 YAW_OF_MODEL_RAD = np.radians(270.0)  # dmrl's x is forward, the authors' model looks aside

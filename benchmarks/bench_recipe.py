@@ -26,7 +26,7 @@ from dmrl import recipe
 from dmrl.learn.model import load_model
 from dmrl.learn.validate import WATCHED
 from dmrl.stages.train import Settings, run
-from dmrl.tables import print_table
+from dmrl.terminal.tables import print_table
 
 PLAIN: dict[str, Any] = {
     "zoom": (1.0, 1.0),

@@ -23,8 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.geometry import Array, Camera, project
-from dmrl.progress import say
+from dmrl.geometry.frames import Array, Camera, project
 from dmrl.rendering import crazyflie
 from dmrl.rendering.backdrops import photos_in
 from dmrl.rendering.environment import ensure
@@ -35,6 +34,7 @@ from dmrl.rendering.sensor import Sensor
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch import Pose
 from dmrl.stages.render import camera_of, run, settings_of
+from dmrl.terminal.progress import say
 
 PUBLISHED_WAY = Path(__file__).parent / "published_way.py"
 SAMPLES, FEW = 16, 4

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dmrl import plots
 from dmrl.dataset import Dataset, Split, open_dataset
+from dmrl.dataset.for_training import examples_of
 from dmrl.deploy.accuracy import figures_of, points_of
 from dmrl.deploy.backends import integer
 from dmrl.deploy.c import write_c
@@ -29,9 +30,8 @@ from dmrl.deploy.measure import rates, state_bytes
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.deploy.rounding import moments_of
-from dmrl.evaluation import labels_of_split
-from dmrl.examples import examples_of
-from dmrl.images import crop_and_scale
+from dmrl.evaluation.detections import labels_of_split
+from dmrl.images.codec import crop_and_scale
 from dmrl.learn.batches import FIELDS, Examples
 from dmrl.learn.fit import Training, new_network
 from dmrl.learn.matching import Points

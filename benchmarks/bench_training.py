@@ -19,8 +19,8 @@ import torch
 
 from dmrl import recipe
 from dmrl.dataset import open_dataset
-from dmrl.examples import examples_of
-from dmrl.images import encode_png
+from dmrl.dataset.for_training import examples_of
+from dmrl.images.codec import encode_png
 from dmrl.learn.augment import Augmenter
 from dmrl.learn.batches import Batch, Examples, gathered, order
 from dmrl.learn.depthwise import Depthwise
@@ -31,7 +31,7 @@ from dmrl.learn.step import train_step
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
-from dmrl.tables import print_table
+from dmrl.terminal.tables import print_table
 from dmrl.topics import camera_image, labels
 
 HEIGHT_PX, WIDTH_PX = 224, 320

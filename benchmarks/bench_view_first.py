@@ -19,7 +19,7 @@ from statistics import median
 import numpy as np
 import psutil
 
-from dmrl.images import Rgb, decode, encode_png
+from dmrl.images.codec import Rgb, decode, encode_png
 from dmrl.viewer import process, window
 
 SHOWS_COLOURS = 2000

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from dmrl.images import crop_and_scale, decode
+from dmrl.images.codec import crop_and_scale, decode
 from dmrl.recording import read
 
 COLUMNS = 8

@@ -4,20 +4,17 @@ A stage is done when its output stands under its final name, which no stage give
 an output; so a pipeline that was stopped goes on where it was.
 """
 
-import json
 import time
-from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dmrl import positions
 from dmrl import recipe as recipes
 from dmrl.errors import DmrlError, RecipeError, SettingError
+from dmrl.evaluation.report import Done
 from dmrl.output import partial_of
-from dmrl.progress import say
 from dmrl.recipe import Pipeline, Step
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say
 
 # Stages that a step may name, and how many inputs each takes; None: a list of any length.
 # They are loaded by name, because stages stand above this module and not below it.
@@ -41,16 +38,6 @@ ONE_MORE = {"train": "init"}
 # These go on with what a killed run has left.
 RESUMABLE = ("train", "render")
 RECIPE_FILE, DATA_FILE = "recipe.toml", "data.txt"
-
-
-@dataclass(frozen=True, slots=True)
-class Done:
-    """One step that is done: its stage, its output, and whether it was there already."""
-
-    stage: str
-    out: Path
-    seconds: float
-    skipped: bool
 
 
 def run(name: str | Path, out: Path, data: Path | None = None) -> list[Done]:
@@ -182,69 +169,3 @@ def _call(step: Step, inputs: list[Path], out: Path) -> None:
         extra[ONE_MORE[step.stage]] = inputs.pop()
     sources = [inputs] if wants is None else inputs
     module.run(*sources, out, settings, **extra)
-
-
-EVALUATION_NAME, POSITIONS_NAME = "evaluation.json", "positions.json"
-COLUMNS = {
-    "median_px": ("median, px", ".1f"),
-    "within_8_px": ("within 8 px", ".1%"),
-    "within_20_px": ("within 20 px", ".1%"),
-    "depth_mae_m": ("depth MAE, m", ".3f"),
-    "f1": ("F1", ".3f"),
-    "ap_16_px": ("AP at 16 px", ".3f"),
-}
-
-
-def report(done: list[Done], *, as_json: bool = False) -> None:
-    """Print what a pipeline came to: a row per evaluation, and where the pictures are.
-
-    Parameters
-    ----------
-    done
-        What ``run`` gave.
-    as_json
-        Print one JSON document instead: seconds per step, evaluations, pictures.
-    """
-    evaluations, judged = _documents(done, EVALUATION_NAME), _documents(done, POSITIONS_NAME)
-    # What a stage drew for training is data, not a picture of the result.
-    pictures = [picture for d in done if d.stage != "sketch" for picture in _pictures(d.out)]
-    if as_json:
-        print_json(
-            {
-                "steps": [asdict(d) for d in done],
-                "evaluations": evaluations,
-                "positions": judged,
-                "pictures": pictures,
-            }
-        )
-        return
-    for name, document in judged.items():
-        headers = [words for _, words, _ in positions.COLUMNS]
-        print_table(name, ["pair", *headers], positions.rows(document))
-    rows = [(name, *_row(document)) for name, document in evaluations.items()]
-    headers = [words for words, _ in COLUMNS.values()]
-    print_table("", ["evaluation", "against", "images", *headers], rows)
-    for picture in pictures:
-        print(picture)
-
-
-def _documents(done: list[Done], name: str) -> dict[str, dict[str, Any]]:
-    """JSON documents of this name, by the output they stand in."""
-    return {
-        d.out.name: json.loads((d.out / name).read_text(encoding="utf-8"))
-        for d in done
-        if (d.out / name).is_file()
-    }
-
-
-def _row(document: dict[str, Any]) -> list[str]:
-    figures = document["overall"]
-    values = [(figures[name]["value"], form) for name, (_, form) in COLUMNS.items()]
-    cells = ["-" if value is None else format(value, form) for value, form in values]
-    return [document["against"], str(document["images"]), *cells]
-
-
-def _pictures(out: Path) -> list[Path]:
-    if out.is_dir():
-        return sorted(out.rglob("*.png"))
-    return [out] if out.suffix == ".png" and out.exists() else []

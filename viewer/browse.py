@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dmrl.colours import RGB
 from dmrl.dataset import layout, open_dataset
 from dmrl.errors import DatasetError, SettingError
-from dmrl.geometry import STRIDE_PX
+from dmrl.geometry.frames import STRIDE_PX
 from dmrl.viewer import entities, layouts, plots
 from dmrl.viewer.entities import Scale
 from dmrl.viewer.entity import Entity, image_frame

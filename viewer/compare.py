@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from dmrl import evaluation, topics
+from dmrl import topics
 from dmrl.colours import RGB, SECOND_DETECTION
 from dmrl.dataset.rows import label_source
 from dmrl.errors import DmrlError, RecordingError, SettingError
-from dmrl.geometry import Array
+from dmrl.evaluation import detections
+from dmrl.geometry.frames import Array
 from dmrl.learn.matching import errors
-from dmrl.progress import say
+from dmrl.terminal.progress import say
 from dmrl.viewer import entities, layouts, plots
 from dmrl.viewer.entities import Colour
 from dmrl.viewer.entity import Entity
@@ -87,7 +88,7 @@ def _judged(path: Path, robot: str, selection: Selection) -> Judged | None:
     """How far off a model was; None, and a line, if nothing can judge it."""
     try:
         source = label_source(path, "best")
-        pairs = evaluation.join([path], source)
+        pairs = detections.join([path], source)
     except DmrlError as e:
         say(f"no errors of {path.stem}: {e}")
         return None

@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.geometry import inside
+from dmrl.geometry.frames import inside
 from dmrl.viewer.entity import (
     ELLIPSE_SIGMAS,
     FAINT_POINT_UI,

@@ -7,7 +7,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.colours import RGB
-from dmrl.progress import say
+from dmrl.terminal.progress import say
 from dmrl.viewer import layouts, plots, space
 from dmrl.viewer.entity import WORLD, Entity, camera_frame, horizontal_frame, optical_frame
 from dmrl.viewer.follow import Follower

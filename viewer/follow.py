@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from dmrl import topics
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.viewer import plots, space
 from dmrl.viewer.entity import WORLD, Entity, horizontal_frame
 from dmrl.viewer.motion import (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError
-from dmrl.geometry import Array, inside
+from dmrl.geometry.frames import Array, inside
 from dmrl.learn.matching import Points, errors
 from dmrl.recording import Provenance, stretches, summary
 

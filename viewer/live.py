@@ -13,8 +13,8 @@ import rerun.blueprint as rrb
 
 from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.formats.sample import Sample
 from dmrl.live.feed import Received
+from dmrl.samples.sample import Sample
 from dmrl.viewer.entity import escaped
 from dmrl.viewer.layouts import BACKGROUND, TIMELINE
 from dmrl.viewer.window import open_window

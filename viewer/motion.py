@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.estimation.score import GAP_S
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.recording import Summary, glance
 from dmrl.viewer.entity import WORLD, horizontal_frame
 

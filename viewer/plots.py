@@ -11,7 +11,7 @@ import pyarrow as pa
 import rerun as rr
 
 from dmrl.colours import OWN, PEER, RGB, STATUS_RGB
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.messages import descriptor
 from dmrl.viewer.entities import Colour
 from dmrl.viewer.entity import Entity

@@ -10,10 +10,11 @@ import numpy as np
 import pyarrow as pa
 import rerun.blueprint as rrb
 
-from dmrl import images, topics
+from dmrl import topics
 from dmrl.colours import RGB
-from dmrl.progress import track
+from dmrl.images import codec
 from dmrl.recording import stretches
+from dmrl.terminal.progress import track
 from dmrl.viewer import entities
 from dmrl.viewer.entities import Colour, Scale
 from dmrl.viewer.entity import Entity, image_frame
@@ -218,9 +219,7 @@ def eyes_of(
     eyes = []
     for robot in robots:
         picture, grid = topics.camera_image(robot), topics.grid(robot)
-        width_px, height_px, _ = images.size(
-            first[picture]["data"], f"the first image of {picture}"
-        )
+        width_px, height_px, _ = codec.size(first[picture]["data"], f"the first image of {picture}")
         channels = grids[grid]["channels"] if grid in grids else ()
         eyes.append(
             Eye(

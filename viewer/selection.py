@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
-from dmrl.progress import say
 from dmrl.recording import Summary, log_times, summary
+from dmrl.terminal.progress import say
 
 # Log times below this do not count from 1970 but from the start of a simulation.
 DURATION_BELOW_NS = 10 * 365 * 86400 * 10**9

@@ -13,7 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import OWN, RGB, STATUS_RGB
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.rendering import crazyflie
 from dmrl.viewer.entity import (
     ELLIPSE_SIGMAS,

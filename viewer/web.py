@@ -13,9 +13,9 @@ from urllib.parse import quote
 
 from cyclopts import Parameter, validators
 
-from dmrl.ending import ended_by_signal
 from dmrl.errors import SettingError
-from dmrl.progress import say
+from dmrl.terminal.ending import ended_by_signal
+from dmrl.terminal.progress import say
 from dmrl.viewer.process import (
     LOOPBACK,
     Viewer,

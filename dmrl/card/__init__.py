@@ -15,11 +15,11 @@ from dmrl.card.counts import Counts, count
 from dmrl.card.front import front_matter, read_front
 from dmrl.dataset import Split, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
-from dmrl.geometry import STRIDE_PX
+from dmrl.geometry.frames import STRIDE_PX
 from dmrl.output import partial_of
-from dmrl.progress import say
 from dmrl.recording import Provenance
 from dmrl.recording.provenance import FILE_NAME
+from dmrl.terminal.progress import say
 
 YOURS = "<!-- What you write below this line stays when dmrl writes the card again. -->"
 

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl.dataset import Split
-from dmrl.geometry import inside
+from dmrl.geometry.frames import inside
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import pyarrow as pa
 
 from dmrl.card.counts import Counts
 from dmrl.dataset import Split, layout
-from dmrl.geometry import STRIDE_PX
+from dmrl.geometry.frames import STRIDE_PX
 from dmrl.recording import Provenance
 
 MEANING = {

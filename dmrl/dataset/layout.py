@@ -18,7 +18,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from dmrl.geometry import STRIDE_PX
+from dmrl.geometry.frames import STRIDE_PX
 
 PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"

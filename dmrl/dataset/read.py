@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from dmrl.dataset import layout
 from dmrl.errors import DatasetError
-from dmrl.geometry import STRIDE_PX
-from dmrl.images import decode
+from dmrl.geometry.frames import STRIDE_PX
+from dmrl.images.codec import decode
 
 PARQUET_NAME = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")
 

@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl import topics
@@ -24,16 +22,14 @@ from dmrl.dataset.layout import PEER
 from dmrl.dataset.splits import SplitOf
 from dmrl.dataset.write import Row
 from dmrl.errors import RecordingError, SettingError
-from dmrl.geometry import STRIDE_PX, grid_label
-from dmrl.images import decode
+from dmrl.geometry.frames import STRIDE_PX, grid_label
+from dmrl.images.codec import decode
 from dmrl.messages import STATUS_OK, descriptor
 from dmrl.recording import Stamped, columns, matching, read, summary
+from dmrl.recording.sources import LOOKED, looked_at, sources_in
 
 SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
-
-LOOKED = ("peers", "sources")
-"""Fields of PeerLabels that say who looked."""
 
 PATTERNS = (topics.camera_image("*"), topics.labels("*"))
 
@@ -103,17 +99,6 @@ def label_source(path: Path, wanted: str) -> str:
         has = ", ".join(sorted(present))
         raise SettingError(f"{path} has no labels from {wanted}. Try one of --labels {has}")
     return usable[0]
-
-
-def sources_in(peers: pa.Array, sources: pa.Array) -> set[str]:
-    """Who looked at any image, by the columns of PeerLabels that `LOOKED` names."""
-    named = pc.struct_field(peers.flatten(), "source")
-    return {*pc.unique(named).to_pylist(), *pc.unique(sources.flatten()).to_pylist()}
-
-
-def looked_at(labels: Any) -> set[str]:
-    """Who looked at the image of a PeerLabels; empty: not known."""
-    return {*labels.sources, *(label.source for label in labels.peers)}
 
 
 def rows_of(

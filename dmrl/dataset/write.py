@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from dmrl.dataset import layout
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 
 BATCH_IMAGES = 64
 """Rows per record batch: 14 MB of 320 x 224 pixels, all that a split keeps in memory."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import MissingExtra
-from dmrl.geometry import Camera
+from dmrl.geometry.frames import Camera
 
 try:
     import cv2

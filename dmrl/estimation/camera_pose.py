@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dmrl.geometry import Array, Camera, inside, pixels_from_horizontal
+from dmrl.geometry.frames import Array, Camera, inside, pixels_from_horizontal
 
 RADII_PX = (60.0, 40.0, 25.0)
 """How far a detection may be from where its peer is expected, round by round."""

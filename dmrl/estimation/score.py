@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]

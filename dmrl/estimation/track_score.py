@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from dmrl.estimation.score import ErrorTrace
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 NEAR_M = 1.0
 """A track further from every peer than this is nobody's."""

@@ -18,7 +18,13 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from dmrl.estimation.view import Motion, View
-from dmrl.geometry import Array, Camera, horizontal_from_pixels, inside, pixels_from_horizontal
+from dmrl.geometry.frames import (
+    Array,
+    Camera,
+    horizontal_from_pixels,
+    inside,
+    pixels_from_horizontal,
+)
 
 P, V, BIAS = slice(0, 3), slice(3, 6), 6
 DEPTH_SPAN = np.log(20.0)

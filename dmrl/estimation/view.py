@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 
 @dataclass(frozen=True, slots=True)

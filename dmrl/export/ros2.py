@@ -15,8 +15,8 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from dmrl.errors import MissingExtra, RecordingError
 from dmrl.formats.ros_messages import HALF_PX, OWN
 from dmrl.output import partial_folder
-from dmrl.progress import track
 from dmrl.recording import Stamped, read, summary
+from dmrl.terminal.progress import track
 
 F = FieldDescriptor
 SCALARS = {

@@ -21,8 +21,8 @@ import pyarrow.parquet as pq
 
 from dmrl.errors import MissingExtra
 from dmrl.output import partial_folder
-from dmrl.progress import track
 from dmrl.recording import columns, read_table, summary
+from dmrl.terminal.progress import track
 
 Kind = Literal["csv", "parquet"]
 TIME_DIGITS = 12  # as a folder of pictures wants its names

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 RATE_HZ = 100.0
 """Samples per second of logs and truth."""

@@ -14,7 +14,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from dmrl.flight.arrays import RATE_HZ, Truth
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 Plane = NDArray[np.complex128]
 Signal = TypeVar("Signal", Plane, Array)

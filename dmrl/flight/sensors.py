@@ -7,7 +7,7 @@ from numpy.random import Generator
 
 from dmrl.flight.arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
 from dmrl.flight.noise import Noise
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 
 def coloured(rng: Generator, samples: int, std: float, tau_s: float) -> Array:

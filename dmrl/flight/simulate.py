@@ -11,7 +11,7 @@ from dmrl.flight import motion, sensors
 from dmrl.flight.arrays import RATE_HZ, Clock, Flight
 from dmrl.flight.motion import TRAJECTORIES, Motion, Start, Trajectory
 from dmrl.flight.noise import Noise
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 ROBOTS_MAX = 20
 HEIGHT_M = 1.0

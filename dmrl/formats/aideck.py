@@ -11,9 +11,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from dmrl import topics
-from dmrl.formats.sample import Sample, labels
-from dmrl.geometry import Camera, pixels_from_horizontal
+from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.messages import LogType
+from dmrl.samples.sample import Sample, labels
 
 VARIABLES = ("roll", "pitch", "x", "y", "z", "d")
 SOURCE = "estimate"

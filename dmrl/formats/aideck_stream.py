@@ -10,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl import images
-from dmrl.bayer import rgb_of
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.cpx import Image, ImageReader
 from dmrl.formats.cpx_state import State
-from dmrl.formats.flight_sample import in_order
+from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.log_block import Block
-from dmrl.formats.sample import Content, Format, Options, Sample, calibration, image
-from dmrl.progress import say
+from dmrl.images import codec
+from dmrl.images.bayer import rgb_of
+from dmrl.samples.flight import in_order
+from dmrl.samples.sample import Sample, calibration, image
+from dmrl.terminal.progress import say
 
 PIECE_BYTES = 1 << 16
 LOOK_BYTES = 1 << 18
@@ -92,7 +93,7 @@ def _pictures(source: Path, time_ns: Sequence[int], options: Options) -> Iterato
             yield image(moment, options.robot, found.data, "jpeg")
             continue
         raw = np.frombuffer(found.data, np.uint8).reshape(found.height_px, found.width_px)
-        yield image(moment, options.robot, images.encode_png(rgb_of(raw)), "png")
+        yield image(moment, options.robot, codec.encode_png(rgb_of(raw)), "png")
 
 
 def _states(states: Sequence[State], options: Options, source: Path) -> list[crazyflie_log.Stream]:

@@ -14,10 +14,10 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
-from dmrl.formats.flight_sample import in_order
+from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.log_block import Block
-from dmrl.formats.sample import Content, Format, Options
-from dmrl.progress import say
+from dmrl.samples.flight import in_order
+from dmrl.terminal.progress import say
 
 TIME = "Timestamp"
 NS_PER_MS = 1_000_000

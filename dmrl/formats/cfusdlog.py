@@ -18,11 +18,11 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
-from dmrl.formats.flight_sample import in_order
+from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.log_block import Block
 from dmrl.formats.mixed_records import Event, Rows, records_of
-from dmrl.formats.sample import Content, Format, Options
-from dmrl.progress import say
+from dmrl.samples.flight import in_order
+from dmrl.terminal.progress import say
 
 MAGIC = 0xBC
 VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}

@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.formats import flight_sample
-from dmrl.formats.flight_sample import Placed, Times
 from dmrl.formats.log_block import (
     Block,
     Series,
@@ -30,10 +28,12 @@ from dmrl.formats.log_block import (
     series,
     unpacked_quaternion,
 )
-from dmrl.formats.sample import Sample
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.messages import LogType
-from dmrl.progress import say
+from dmrl.samples import flight
+from dmrl.samples.flight import Placed, Times
+from dmrl.samples.sample import Sample
+from dmrl.terminal.progress import say
 
 RANGE_MAX_M = 60.0
 ZRANGE_MAX_MM = 8000.0  # the sensor says 32766 and the like where it sees no floor
@@ -208,7 +208,7 @@ def ranges_of(
             say(f"{where}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
         if peer == robot or not usable.any():
             continue
-        yield flight_sample.ranges(robot, peer, time_ns[usable], range_m[usable])
+        yield flight.ranges(robot, peer, time_ns[usable], range_m[usable])
 
 
 def _distances(blocks: Sequence[Block]) -> Iterator[tuple[int, Times, Array]]:
@@ -285,4 +285,4 @@ def _transforms(robot: str, time_ns: Times, rows: Array) -> Stream:
     for moment, row, (roll, pitch, yaw) in zip(
         time_ns[first].tolist(), rows[first], angles.tolist(), strict=True
     ):
-        yield flight_sample.transforms(moment, {robot: Placed(row[:3], yaw, roll, pitch)})
+        yield flight.transforms(moment, {robot: Placed(row[:3], yaw, roll, pitch)})

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, replace
 
-from dmrl import images
 from dmrl.formats.label_table import LabelRow
-from dmrl.geometry import Camera
+from dmrl.geometry.frames import Camera
+from dmrl.images import codec
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +41,12 @@ class Crop:
         top = (self.from_height_px - self.height_px / self.scale) / 2
         return max(left, 0.0), max(top, 0.0)
 
-    def pixels(self, rgb: images.Rgb) -> images.Rgb:
+    def pixels(self, rgb: codec.Rgb) -> codec.Rgb:
         """Part of a picture that is kept, (height_px, width_px, 3)."""
         left, top = self.corner_px
         right = min(left + self.width_px / self.scale, self.from_width_px)
         bottom = min(top + self.height_px / self.scale, self.from_height_px)
-        return images.crop_and_scale(rgb, (left, top, right, bottom), self.width_px, self.height_px)
+        return codec.crop_and_scale(rgb, (left, top, right, bottom), self.width_px, self.height_px)
 
     def label(self, row: LabelRow) -> LabelRow:
         """A label in the pixels of the result; its box is clipped, or empty if outside."""

@@ -22,11 +22,13 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats import flight_sample, image_folder
-from dmrl.formats.flight_sample import LOG_COLUMNS, in_order, nanoseconds
-from dmrl.formats.sample import Content, Format, Options, Sample
-from dmrl.geometry import Array
-from dmrl.progress import say
+from dmrl.formats import image_folder
+from dmrl.formats.format import Content, Format, Options
+from dmrl.geometry.frames import Array
+from dmrl.samples import flight
+from dmrl.samples.flight import LOG_COLUMNS, in_order, nanoseconds
+from dmrl.samples.sample import Sample
+from dmrl.terminal.progress import say
 
 TIME = "time_s"
 REQUIRED = (TIME, *LOG_COLUMNS)
@@ -191,18 +193,18 @@ def _streams(log: Log, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
         return names.get(robot, robot)
 
     own, time_ns = name(log.robot), nanoseconds(log.time_s)
-    yield flight_sample.robot_log(own, time_ns, log.columns)
+    yield flight.robot_log(own, time_ns, log.columns)
     for peer in log.ranged:
         range_m = log.columns[f"range_{peer}_m"]
         given = ~np.isnan(range_m)
         usable = given & (range_m > 0) & (range_m < RANGE_MAX_M)
         if refused := int((given & ~usable).sum()):
             say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
-        yield flight_sample.ranges(own, name(peer), time_ns[usable], range_m[usable])
+        yield flight.ranges(own, name(peer), time_ns[usable], range_m[usable])
     for peer in log.seen:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
         known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
-        yield flight_sample.truth(own, name(peer), time_ns[known], xyz[known])
+        yield flight.truth(own, name(peer), time_ns[known], xyz[known])
 
 
 def _pictures(folder: Path, options: Options) -> Iterator[Iterator[Sample]]:

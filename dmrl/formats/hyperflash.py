@@ -11,13 +11,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from dmrl import images
-from dmrl.bayer import rgb_of
 from dmrl.errors import SourceError
 from dmrl.formats import aideck
-from dmrl.formats.sample import Content, Format, Options, Sample, calibration, image
-from dmrl.geometry import AIDECK
-from dmrl.progress import say
+from dmrl.formats.format import Content, Format, Options
+from dmrl.geometry.frames import AIDECK
+from dmrl.images import codec
+from dmrl.images.bayer import rgb_of
+from dmrl.samples.sample import Sample, calibration, image
+from dmrl.terminal.progress import say
 
 HEIGHT_PX, WIDTH_PX = 224, 320
 PIXELS = HEIGHT_PX * WIDTH_PX
@@ -94,7 +95,7 @@ def _samples(source: Path, options: Options) -> Iterator[Sample]:
     with source.open("rb") as stream:
         for k, record in enumerate(records(stream, source)):
             time_ns = round(k * 1e9 / options.rate_hz)
-            png = images.encode_png(rgb_of(record["raw"]))
+            png = codec.encode_png(rgb_of(record["raw"]))
             yield image(time_ns, options.robot, png, "png")
             values = record["values"].tolist()
             odd += not aideck.is_plausible(values)

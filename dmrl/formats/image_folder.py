@@ -23,23 +23,15 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-from dmrl import images
-from dmrl.bayer import rgb_of
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import aideck
-from dmrl.formats.camera_toml import read_camera
 from dmrl.formats.crop import Crop
+from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.label_table import LabelRow, read_labels
-from dmrl.formats.sample import (
-    Content,
-    Format,
-    Options,
-    Sample,
-    calibration,
-    image,
-    intervals,
-    labels,
-)
+from dmrl.geometry.camera_file import read_camera
+from dmrl.images import codec
+from dmrl.images.bayer import rgb_of
+from dmrl.samples.sample import Sample, calibration, image, intervals, labels
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
 LABELS = "labels.csv"
@@ -161,14 +153,14 @@ def _samples(
 ) -> Iterator[Sample]:
     for k, (time_ns, path) in enumerate(pictures):
         data = path.read_bytes()
-        rgb = _colours(data, path) if options.raw else images.decode(data, path)
+        rgb = _colours(data, path) if options.raw else codec.decode(data, path)
         crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
         if options.camera is not None and k == 0:
             yield calibration(time_ns, options.robot, crop.camera(options.camera))
         if crop.changes:
-            data, kind = images.encode_png(crop.pixels(rgb)), "png"
-        elif options.raw or (kind := images.size(data)[2]) not in ("png", "jpeg"):
-            data, kind = images.encode_png(rgb), "png"
+            data, kind = codec.encode_png(crop.pixels(rgb)), "png"
+        elif options.raw or (kind := codec.size(data)[2]) not in ("png", "jpeg"):
+            data, kind = codec.encode_png(rgb), "png"
         yield image(time_ns, options.robot, data, kind)
         if path.name in rows:
             peers = [crop.label(row) for row in rows[path.name] if row.peer]
@@ -181,8 +173,8 @@ def _samples(
             yield from aideck.samples(time_ns, options.robot, peer, states[path.name], camera)
 
 
-def _colours(data: bytes, path: Path) -> images.Rgb:
-    rgb = images.decode(data, path)
+def _colours(data: bytes, path: Path) -> codec.Rgb:
+    rgb = codec.decode(data, path)
     if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
         raise SourceError(f"{path} has colours already, so it is not raw. Leave out --raw")
     return rgb_of(rgb[..., 0].copy())

@@ -19,7 +19,7 @@ from dmrl.formats import (
     ros,
     uwb_tiers,
 )
-from dmrl.formats.sample import Format
+from dmrl.formats.format import Format
 
 # Those with a signature first; any folder with pictures is a folder of pictures.
 FORMATS = {

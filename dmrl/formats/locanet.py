@@ -23,19 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from dmrl import images, topics
+from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.formats.sample import (
-    Content,
-    Format,
-    Options,
-    Sample,
-    calibration,
-    image,
-    intervals,
-    labels,
-)
-from dmrl.geometry import PUBLISHED_RENDER, Array, camera_from_horizontal, project
+from dmrl.formats.format import Content, Format, Options
+from dmrl.geometry.frames import PUBLISHED_RENDER, Array, camera_from_horizontal, project
+from dmrl.images import codec
+from dmrl.samples.sample import Sample, calibration, image, intervals, labels
 
 FOLDERS = ("synImgs", "synImgsMulti")
 STEP_NS = 1_000_000_000
@@ -270,7 +263,7 @@ def _samples(items: list[LocanetImage], robot: str) -> Iterator[Sample]:
 def _jpeg(path: Path) -> bytes:
     """Bytes of a picture that decodes to the size of the published renders."""
     data = path.read_bytes()
-    height_px, width_px, _ = images.decode(data, path).shape
+    height_px, width_px, _ = codec.decode(data, path).shape
     wanted = (PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px)
     if (width_px, height_px) != wanted:
         raise SourceError(

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.formats.flight_sample import Times
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
+from dmrl.samples.flight import Times
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,15 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl import images
-from dmrl.bayer import rgb_of
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
-from dmrl.formats.flight_sample import Times, in_order
+from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.log_block import Block
-from dmrl.formats.sample import Content, Format, Options, Sample, calibration, image
-from dmrl.progress import say
+from dmrl.images import codec
+from dmrl.images.bayer import rgb_of
+from dmrl.samples.flight import Times, in_order
+from dmrl.samples.sample import Sample, calibration, image
+from dmrl.terminal.progress import say
 
 METADATA = "metadata.csv"
 FOLDERS = ("camera_raw", "camera_rgb")
@@ -114,11 +115,11 @@ def _pictures(paths: Sequence[Path], time_ns: Times, options: Options) -> Iterat
         yield calibration(int(time_ns[0]), options.robot, options.camera)
     for path, moment in zip(paths, time_ns.tolist(), strict=True):
         data = path.read_bytes()
-        rgb = images.decode(data, path)
+        rgb = codec.decode(data, path)
         if path.parent.name == FOLDERS[0]:
             if min(rgb.shape[:2]) < 4:
                 raise SourceError(f"{path} is smaller than 4 x 4 pixels. Restore it")
-            yield image(moment, options.robot, images.encode_png(rgb_of(rgb[..., 0].copy())), "png")
+            yield image(moment, options.robot, codec.encode_png(rgb_of(rgb[..., 0].copy())), "png")
         else:
             yield image(moment, options.robot, data, "jpeg")
 

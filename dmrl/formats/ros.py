@@ -21,9 +21,10 @@ from typing import Any
 
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingExtra, SourceError
+from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.ros_messages import HANDLERS, OWN, Placed, own
-from dmrl.formats.sample import Content, Format, Options, Sample
-from dmrl.progress import say
+from dmrl.samples.sample import Sample
+from dmrl.terminal.progress import say
 
 SUFFIXES = (".db3", ".bag", ".mcap")
 NO_PICTURES = (topics.MASKS, topics.DEPTHS)

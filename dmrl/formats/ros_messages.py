@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from dmrl import images, topics
-from dmrl.bayer import rgb_of
+from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.log_block import euler_zyx
-from dmrl.formats.sample import Sample, image
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
+from dmrl.images import codec
+from dmrl.images.bayer import rgb_of
 from dmrl.messages import LogType, descriptor
+from dmrl.samples.sample import Sample, image
 
 HALF_PX = 0.5  # ROS has the first pixel's centre at 0, dmrl its edge
 RANGE_MAX_M = 60.0
@@ -48,10 +49,10 @@ class Placed:
 
 def _picture(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
     rgb = _rgb(message, where.source)
-    yield image(time_ns, where.robot, images.encode_png(rgb), "png")
+    yield image(time_ns, where.robot, codec.encode_png(rgb), "png")
 
 
-def _rgb(message: Any, source: Path) -> images.Rgb:
+def _rgb(message: Any, source: Path) -> codec.Rgb:
     channels = {"mono8": 1, "8UC1": 1, "bayer_rggb8": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3}
     channels |= {"rgba8": 4, "bgra8": 4}
     height, width, step = message.height, message.width, message.step
@@ -72,7 +73,7 @@ def _rgb(message: Any, source: Path) -> images.Rgb:
 
 def _compressed(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
     data = message.data.tobytes()
-    kind = images.size(data, f"a picture in {where.source}")[2]
+    kind = codec.size(data, f"a picture in {where.source}")[2]
     if kind not in ("png", "jpeg"):
         raise SourceError(f"{where.source}: pictures are {kind}. Save them as PNG or JPEG")
     yield image(time_ns, where.robot, data, kind)

@@ -18,10 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats import flight_sample
-from dmrl.formats.flight_sample import from_poses, in_order, nanoseconds
-from dmrl.formats.sample import Content, Format, Options, Sample
-from dmrl.geometry import Array
+from dmrl.formats.format import Content, Format, Options
+from dmrl.geometry.frames import Array
+from dmrl.samples import flight
+from dmrl.samples.flight import from_poses, in_order, nanoseconds
+from dmrl.samples.sample import Sample
 
 RATE_HZ = 10.0
 # What zipfile, zlib and NumPy raise on damaged archives.
@@ -75,9 +76,9 @@ def content(source: Path, _options: Options | None = None) -> Content:
     streams: list[Iterator[Sample]] = []
     for number, (time_s, xy_m, yaw) in sorted(poses.items()):
         log = from_poses(time_s, xy_m, yaw)
-        streams.append(flight_sample.robot_log(f"turtle{number}", nanoseconds(time_s), log))
+        streams.append(flight.robot_log(f"turtle{number}", nanoseconds(time_s), log))
         streams += [
-            flight_sample.truth(
+            flight.truth(
                 f"turtle{number}",
                 f"turtle{peer}",
                 nanoseconds(time_s),
@@ -118,9 +119,7 @@ def _seen_from(here: Array, yaw: Array, peer: Array) -> Array:
 def _ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
     time_ns = nanoseconds(np.arange(len(range_m)) / RATE_HZ)
     kept = np.isfinite(range_m) & (range_m > 0)
-    return flight_sample.ranges(
-        f"turtle{int(one)}", f"turtle{int(other)}", time_ns[kept], range_m[kept]
-    )
+    return flight.ranges(f"turtle{int(one)}", f"turtle{int(other)}", time_ns[kept], range_m[kept])
 
 
 FORMAT = Format("uwb-tiers", "ranges with motion capture", recognises, content)

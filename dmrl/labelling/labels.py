@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.pair import Array
-from dmrl.geometry import Camera, pixels_from_horizontal
+from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED
 
 SOURCE = "estimate"

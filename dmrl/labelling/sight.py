@@ -11,7 +11,7 @@ from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.estimation.camera_pose import Flight, PeerPath
 from dmrl.estimation.view import Motion, View
-from dmrl.geometry import Array, Camera
+from dmrl.geometry.frames import Array, Camera
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Summary, read_table
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dmrl.estimation.bearings import Sharpness, corrected
-from dmrl.geometry import horizontal_from_pixels
+from dmrl.geometry.frames import horizontal_from_pixels
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.sight import Sight
 from dmrl.messages import STATUS_OK

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dmrl.learn.batches import BOX, DEPTH, FIELDS, Batch, Examples, Robots, U, V
-from dmrl.learn.layers import (
+from dmrl.learn.windows import (
     CORNERS,
     Intrinsics,
     Point,

@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dmrl.learn.augment import Augmentation
-from dmrl.learn.layers import Intrinsics
 from dmrl.learn.losses import DepthLoss
 from dmrl.learn.network import CLASS, SPREAD
 from dmrl.learn.optimizer import OptimizerName
 from dmrl.learn.targets import LabelNoise
+from dmrl.learn.windows import Intrinsics
 
 
 @dataclass(frozen=True, slots=True)

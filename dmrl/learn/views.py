@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.images import Rgb
+from dmrl.images.codec import Rgb
 from dmrl.learn.decode import PER_DETECTION, Found
 
 Rows = NDArray[np.float64]

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.counters import SteadySender
 from dmrl.formats.cpx import PORT, Image, ImageReader
-from dmrl.formats.sample import calibration
-from dmrl.formats.sample import image as image_sample
-from dmrl.geometry import AIDECK, Camera
+from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.live.clocks import HostTime, SenderClock
 from dmrl.live.feed import Feed, Health, Received
 from dmrl.live.pictures import SENSOR_PX, Colours, Stored, encoded
+from dmrl.samples.sample import calibration
+from dmrl.samples.sample import image as image_sample
 
 US = 1_000
 CONNECT_S = 3.0

@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
-from dmrl import bayer, images
 from dmrl.errors import SettingError
 from dmrl.formats.cpx import Image
 from dmrl.formats.cpx_pack import pack_image
 from dmrl.formats.cpx_state import State
-from dmrl.geometry import AIDECK
+from dmrl.geometry.frames import AIDECK
+from dmrl.images import bayer, codec
 from dmrl.live.fake_flight import Faults, FlightClock, Pictures
 from dmrl.live.pictures import LEFT_PX, SENSOR_PX, TOP_PX
 
@@ -143,10 +143,10 @@ class FakeCamera(threading.Thread):
         return False
 
     def _image(self, picture: bytes, time_s: float) -> Image:
-        rgb = whole_sensor(images.decode(picture))
+        rgb = whole_sensor(codec.decode(picture))
         height_px, width_px = rgb.shape[:2]
         if self._sends == "jpeg":
-            data = images.encode_jpeg(rgb, JPEG_QUALITY)
+            data = codec.encode_jpeg(rgb, JPEG_QUALITY)
             return Image(width_px, height_px, "jpeg", data)
         robot_us = round(1000 * self._faults.clock_ms(time_s))
         time_us = robot_us + CAMERA_BOOT_US
@@ -161,7 +161,7 @@ class FakeCamera(threading.Thread):
         return State(sent_ms, 1000 * sent_ms + UART_US + CAMERA_BOOT_US)
 
 
-def whole_sensor(rgb: images.Rgb) -> images.Rgb:
+def whole_sensor(rgb: codec.Rgb) -> codec.Rgb:
     """What the whole sensor saw of (H, W, 3), with the cut-off border made up; or as it was."""
     if rgb.shape[:2] != (AIDECK.height_px, AIDECK.width_px):
         return rgb

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.live.log_plan import number_of
 
 Signal = tuple[Array, Array]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 
-from dmrl.formats.sample import Sample
+from dmrl.samples.sample import Sample
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from dmrl.errors import SettingError
-from dmrl.formats.camera_toml import read_camera
+from dmrl.geometry.camera_file import read_camera
 from dmrl.live.camera import CameraClient
 from dmrl.live.cflib_session import check_uri
 from dmrl.live.clocks import HostTime
@@ -12,7 +12,7 @@ from dmrl.live.crazyflie import Link
 from dmrl.live.feed import Feed
 from dmrl.live.pictures import Colours, Stored
 from dmrl.live.robots import Robot, peers_of
-from dmrl.progress import say
+from dmrl.terminal.progress import say
 
 
 def check(robots: Sequence[Robot]) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.formats.sample import Sample
+from dmrl.samples.sample import Sample
 
 BLOCK_BYTES = 26
 BLOCKS_MAX = 16

@@ -4,10 +4,10 @@ from typing import Literal
 
 import numpy as np
 
-from dmrl import bayer, images
 from dmrl.errors import SourceError
 from dmrl.formats.cpx import Image
-from dmrl.geometry import AIDECK
+from dmrl.geometry.frames import AIDECK
+from dmrl.images import bayer, codec
 
 SENSOR_PX = (324, 244)
 """Width and height of all that the AI-deck's camera sees."""
@@ -41,7 +41,7 @@ def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[byt
     """
     whole = (image.width_px, image.height_px) == SENSOR_PX
     if image.encoding == "jpeg":
-        width_px, height_px, kind = images.size(image.data, "the camera's JPEG")
+        width_px, height_px, kind = codec.size(image.data, "the camera's JPEG")
         if (width_px, height_px) != (image.width_px, image.height_px) or kind != "jpeg":
             raise SourceError(
                 f"the camera's {kind} is {width_px} x {height_px} px, not "
@@ -49,18 +49,18 @@ def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[byt
             )
         if not whole:
             return image.data, "jpeg"
-        return _stored(_cut(images.decode(image.data, "the camera's JPEG")), stored), stored
+        return _stored(_cut(codec.decode(image.data, "the camera's JPEG")), stored), stored
     pixels = np.frombuffer(image.data, np.uint8).reshape(image.height_px, image.width_px)
     if whole:
         pixels = _cut(pixels)
     return _stored(bayer.rgb_of(pixels) if colours == "colour" else pixels, stored), stored
 
 
-def _stored(pixels: images.Rgb, stored: Stored) -> bytes:
+def _stored(pixels: codec.Rgb, stored: Stored) -> bytes:
     if stored == "png":
-        return images.encode_png(pixels)
-    return images.encode_jpeg(pixels, JPEG_QUALITY)
+        return codec.encode_png(pixels)
+    return codec.encode_jpeg(pixels, JPEG_QUALITY)
 
 
-def _cut(pixels: images.Rgb) -> images.Rgb:
+def _cut(pixels: codec.Rgb) -> codec.Rgb:
     return pixels[TOP_PX : TOP_PX + AIDECK.height_px, LEFT_PX : LEFT_PX + AIDECK.width_px]

@@ -14,8 +14,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl.errors import DmrlError, RecordingError
-from dmrl.geometry import inside
-from dmrl.images import size
+from dmrl.geometry.frames import inside
+from dmrl.images.codec import size
 from dmrl.recording.blocks import in_file_order
 from dmrl.recording.index import Summary, summary
 from dmrl.recording.reader import columns, read_table

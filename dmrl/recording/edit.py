@@ -6,12 +6,12 @@ from itertools import combinations
 from pathlib import Path
 
 from dmrl.errors import RecordingError
-from dmrl.progress import say
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import summary
 from dmrl.recording.inputs import provenance, refuse_twice
 from dmrl.recording.reader import matching, read_raw, read_table
 from dmrl.recording.writer import RecordingWriter
+from dmrl.terminal.progress import say
 from dmrl.topics import ATTITUDE, CALIBRATION, CAMERA_IMAGE, HEIGHT, RANGE, VELOCITY, names
 
 SENSORS = (CAMERA_IMAGE, ATTITUDE, VELOCITY, HEIGHT, RANGE)

@@ -5,12 +5,12 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dmrl.progress import track
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.reader import read_raw
 from dmrl.recording.writer import RecordingWriter
+from dmrl.terminal.progress import track
 
 
 class Timed(NamedTuple):

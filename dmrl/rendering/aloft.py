@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dmrl.geometry import Array, Camera
+from dmrl.geometry.frames import Array, Camera
 from dmrl.rendering.backdrops import panorama_view, smeared
 from dmrl.rendering.lens import Picture
 from dmrl.rendering.onboard import View

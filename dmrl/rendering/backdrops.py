@@ -9,9 +9,9 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.geometry import Array, Camera
-from dmrl.images import Rgb, crop_and_scale, decode, size
-from dmrl.lens import undistort
+from dmrl.geometry.frames import Array, Camera
+from dmrl.geometry.lens import undistort
+from dmrl.images.codec import Rgb, crop_and_scale, decode, size
 from dmrl.rendering.lens import Picture, between
 
 PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm")

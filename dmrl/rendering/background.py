@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.rendering.canvas import Canvas, Colour, Picture
 
 

@@ -7,7 +7,7 @@ and v down.
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 Picture = NDArray[np.float32]
 Colour = Array

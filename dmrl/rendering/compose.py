@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry import Array, Camera, project
+from dmrl.geometry.frames import Array, Camera, project
 from dmrl.rendering.lens import Canvas, Picture, canvas_of, image_from_pinhole, sample
 from dmrl.rendering.sensor import blur, expose
 from dmrl.rendering.shot import Layer, Look, Part, Robot, Shot

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 MATERIALS = (
     "board",

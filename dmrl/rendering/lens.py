@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import SettingError
-from dmrl.geometry import Array, Camera, inside
-from dmrl.lens import distort, undistort
+from dmrl.geometry.frames import Array, Camera, inside
+from dmrl.geometry.lens import distort, undistort
 
 Picture = NDArray[np.float32]
 LONGEST_SIDE_PX = 4096

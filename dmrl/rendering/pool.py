@@ -11,7 +11,7 @@ from queue import SimpleQueue
 from typing import Any, Self, TypeVar
 
 from dmrl.errors import BlenderError
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.rendering.blender.protocol import Arrays, receive, send
 
 WORKER = Path(__file__).parent / "blender" / "worker.py"

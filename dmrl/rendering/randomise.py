@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from dmrl.geometry import Array, Camera, camera_from_horizontal
+from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.rendering.backdrops import Photos, panorama_view, smeared
 from dmrl.rendering.crazyflie import MATERIALS
 from dmrl.rendering.lens import Picture, pinhole_from_image

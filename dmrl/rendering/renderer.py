@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from dmrl.errors import SettingError
-from dmrl.geometry import Array, Camera
+from dmrl.geometry.frames import Array, Camera
 from dmrl.rendering import crazyflie
 from dmrl.rendering.compose import compose
 from dmrl.rendering.lens import Picture

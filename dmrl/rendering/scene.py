@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.geometry import Array, Camera, camera_from_horizontal
+from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.rendering.background import background
 from dmrl.rendering.quadrotor import RADIUS_M
 from dmrl.rendering.sketch import Look, Pose

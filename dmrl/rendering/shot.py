@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry import Array, Camera, project
+from dmrl.geometry.frames import Array, Camera, project
 from dmrl.rendering.lens import Canvas, Picture, canvas_of
 from dmrl.rendering.sensor import Sensor
 from dmrl.rendering.sketch import Pose

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry import Array, Camera, project
+from dmrl.geometry.frames import Array, Camera, project
 from dmrl.rendering import quadrotor
 from dmrl.rendering.canvas import Canvas, Picture
 

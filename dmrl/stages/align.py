@@ -9,13 +9,12 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl import topics
-from dmrl.alignment import camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.errors import RecordingError, SettingError
 from dmrl.estimation.clocks import Clock, connected
 from dmrl.formats.counters import dejitter
+from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.progress import say, track
 from dmrl.recording import (
     RawMessage,
     RecordingWriter,
@@ -27,7 +26,8 @@ from dmrl.recording import (
     splits,
     summary,
 )
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 METADATA = "dmrl.clocks"
 MOCAP = "mocap"

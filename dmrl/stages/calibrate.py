@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError, SourceError
-from dmrl.formats.camera_toml import write_camera
-from dmrl.geometry import Camera
-from dmrl.images import decode
+from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.frames import Camera
+from dmrl.images.codec import decode
 from dmrl.output import partial_file, refuse_existing
-from dmrl.progress import track
 from dmrl.recording import read, summary
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import track
+from dmrl.terminal.tables import print_json, print_table
 
 try:
     from dmrl.estimation import board
     from dmrl.estimation.camera_pose import LEAST, Calibration, Noise, calibrate
+    from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.sight import camera_flight
-    from dmrl.labelling.write import camera_given, camera_of
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "calibrate", "dmrl calibrate") from e
 

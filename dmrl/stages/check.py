@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from dmrl.recording import check as findings_of
 from dmrl.recording import summary
-from dmrl.tables import print_json
+from dmrl.terminal.tables import print_json
 
 
 def command(

@@ -15,14 +15,14 @@ from cyclopts import Parameter, validators
 from dmrl.errors import SettingError
 from dmrl.export.ros2 import write_bag
 from dmrl.export.tables import write_tables
-from dmrl.formats.camera_toml import camera_named
+from dmrl.formats.format import Content, Options
 from dmrl.formats.known import format_of
-from dmrl.formats.sample import Content, Options
+from dmrl.geometry.camera_file import camera_named
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.progress import track
 from dmrl.recording import SPLIT_METADATA, RecordingWriter, provenance
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import track
+from dmrl.terminal.tables import print_json, print_table
 
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 

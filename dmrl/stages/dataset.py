@@ -17,9 +17,9 @@ from dmrl.dataset.splits import SplitOf, held_out, of_source
 from dmrl.dataset.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
 from dmrl.output import partial_folder
-from dmrl.progress import say, track
 from dmrl.recording import Input, Provenance, provenance, read, splits, summary
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]

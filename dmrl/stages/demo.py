@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl import pipeline
+from dmrl.evaluation.report import report
 
 
 def command(
@@ -26,4 +27,4 @@ def command(
     as_json
         Print one JSON document in place of the table.
     """
-    pipeline.report(pipeline.run("demo", out), as_json=as_json)
+    report(pipeline.run("demo", out), as_json=as_json)

@@ -11,17 +11,18 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl import positions, topics, tracks
+from dmrl import topics
 from dmrl.errors import MissingExtra, SettingError
-from dmrl.evaluation import Pairs, join
+from dmrl.evaluation import positions, tracks
+from dmrl.evaluation.detections import Pairs, join
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import input_of, summary
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_table
 
 figures: ModuleType | None
 try:
-    from dmrl import figures
+    from dmrl.evaluation import figures
 except MissingExtra:
     figures = None
 

@@ -23,9 +23,9 @@ from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, refuse_existing
-from dmrl.progress import say
 from dmrl.recording import provenance
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say
+from dmrl.terminal.tables import print_json, print_table
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,14 +16,14 @@ from cyclopts import Parameter, validators
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.live.fake_camera import FakeCamera, Sends
 from dmrl.live.fake_crazyflie import FakeCrazyflie
 from dmrl.live.fake_flight import FakeFlight, Faults, FlightClock, Pictures
 from dmrl.live.log_plan import number_of
-from dmrl.progress import say
 from dmrl.recording import read, read_table, summary
-from dmrl.tables import print_table
+from dmrl.terminal.progress import say
+from dmrl.terminal.tables import print_table
 
 LOOPBACK = "127.0.0.1"
 LINGER_S = 3.0

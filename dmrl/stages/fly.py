@@ -15,21 +15,21 @@ from dmrl import recipe as recipes
 from dmrl import topics
 from dmrl.errors import SettingError
 from dmrl.flight import NOISE, Clock, Flight, Scenario, Trajectory, Truth, simulate
-from dmrl.formats import flight_sample
-from dmrl.formats.flight_sample import Times, in_order, nanoseconds
-from dmrl.formats.sample import Sample, calibration, image, labels
-from dmrl.geometry import AIDECK, Array
-from dmrl.images import encode_jpeg
+from dmrl.geometry.frames import AIDECK, Array
+from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.progress import say, track
 from dmrl.recording import Provenance, RecordingWriter, provenance
 from dmrl.rendering import aloft, renderer
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.onboard import Body, Renderer, sketched, view
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch import Sketch
-from dmrl.tables import print_json, print_table
+from dmrl.samples import flight as samples
+from dmrl.samples.flight import Times, in_order, nanoseconds
+from dmrl.samples.sample import Sample, calibration, image, labels
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 CameraRenderer = Literal["sketch", "blender"]
 Preset = Literal["ideal", "calibrated", "realistic", "harsh", "published"]
@@ -164,11 +164,11 @@ def _stamps(clock: Clock, true_time_s: Array) -> Times:
 
 def _measured(flight: Flight) -> Iterator[Iterator[Sample]]:
     for robot, log in flight.robots.items():
-        columns = {name: getattr(log, name) for name in flight_sample.LOG_COLUMNS}
-        yield flight_sample.robot_log(robot, START_NS + nanoseconds(log.time_s), columns)
+        columns = {name: getattr(log, name) for name in samples.LOG_COLUMNS}
+        yield samples.robot_log(robot, START_NS + nanoseconds(log.time_s), columns)
     for (robot, peer), ranges in flight.ranges.items():
         time_ns = START_NS + nanoseconds(ranges.time_s)
-        yield flight_sample.ranges(robot, peer, time_ns, ranges.range_m)
+        yield samples.ranges(robot, peer, time_ns, ranges.range_m)
 
 
 def _true(flight: Flight) -> Iterator[Iterator[Sample]]:
@@ -176,7 +176,7 @@ def _true(flight: Flight) -> Iterator[Iterator[Sample]]:
     time_s = np.arange(0.0, end_s, 1.0 / TRUTH_RATE_HZ)
     for robot, peer in permutations(flight.truth, 2):
         xyz = flight.peer_in_horizontal(robot, peer, time_s)
-        yield flight_sample.truth(robot, peer, _stamps(flight.clocks[robot], time_s), xyz)
+        yield samples.truth(robot, peer, _stamps(flight.clocks[robot], time_s), xyz)
     yield (_transforms(flight, float(moment)) for moment in time_s)
 
 
@@ -184,11 +184,11 @@ def _transforms(flight: Flight, true_time_s: float) -> Sample:
     """Every robot's frames, on true time."""
     bodies = {robot: _body(truth, true_time_s) for robot, truth in flight.truth.items()}
     attitudes = {
-        robot: flight_sample.Placed(b.xyz_world, b.yaw_rad, b.roll_rad, b.pitch_rad)
+        robot: samples.Placed(b.xyz_world, b.yaw_rad, b.roll_rad, b.pitch_rad)
         for robot, b in bodies.items()
     }
     time_ns = int(_stamps(Clock(), np.array([true_time_s]))[0])
-    return flight_sample.transforms(time_ns, attitudes)
+    return samples.transforms(time_ns, attitudes)
 
 
 def _body(truth: Truth, true_time_s: float) -> Body:

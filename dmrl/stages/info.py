@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from dmrl.recording import Provenance, Summary, summary
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_table
 
 
 def command(

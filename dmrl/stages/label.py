@@ -12,26 +12,21 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.output import refuse_existing
-from dmrl.progress import say, track
 from dmrl.recording import Summary, provenance, rewrite, summary
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 try:
     from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
     from dmrl.estimation.gate import GATE_M
     from dmrl.estimation.pair import Pair
+    from dmrl.labelling.camera import camera_given, camera_of, image_times
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import read_logs
     from dmrl.labelling.report import PairReport, pair_report
     from dmrl.labelling.sight import read_sight
     from dmrl.labelling.sighted import sighted
-    from dmrl.labelling.write import (
-        camera_given,
-        camera_of,
-        image_times,
-        label_messages,
-        position_messages,
-    )
+    from dmrl.labelling.write import label_messages, position_messages
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl label") from e
 

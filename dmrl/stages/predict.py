@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, open_detector
 from dmrl.errors import MissingTopic
-from dmrl.images import Rgb, decode
+from dmrl.images.codec import Rgb, decode
 from dmrl.learn.decode import PER_DETECTION, Found, Grids
 from dmrl.learn.decode import decode as find
 from dmrl.learn.pretrained import resolved
 from dmrl.learn.views import VIEWS, agreed, returned, shown
 from dmrl.messages import message
-from dmrl.progress import track
 from dmrl.recording import (
     Provenance,
     RawMessage,
@@ -31,7 +30,8 @@ from dmrl.recording import (
     summary,
 )
 from dmrl.recording.inputs import sha256_of_file
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import track
+from dmrl.terminal.tables import print_json, print_table
 
 Map = NDArray[np.floating]
 OWN = (topics.DETECTIONS, topics.GRID)

@@ -23,13 +23,13 @@ from dmrl.deploy.rounding import moments_of
 from dmrl.deploy.samples import SAMPLES, save_samples
 from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.errors import MissingExtra, SettingError
-from dmrl.evaluation import labels_of_split
+from dmrl.evaluation.detections import labels_of_split
 from dmrl.learn.metrics import DEFINITIONS
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, refuse_existing
-from dmrl.progress import say, track
 from dmrl.recording import provenance
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 try:
     from dmrl.learn.model import Model, load_model, save_model

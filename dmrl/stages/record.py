@@ -11,9 +11,8 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from dmrl.bayer import load_opencv
-from dmrl.ending import ended_by_signal
 from dmrl.errors import OutputError, RecordingError
+from dmrl.images.bayer import load_opencv
 from dmrl.live.camera import CameraClient
 from dmrl.live.cflib_session import load_cflib
 from dmrl.live.clocks import HostTime
@@ -26,7 +25,8 @@ from dmrl.live.table import LiveTable
 from dmrl.messages import message
 from dmrl.output import partial_of, refuse_existing
 from dmrl.recording import RecordingWriter, provenance
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.ending import ended_by_signal
+from dmrl.terminal.tables import print_json, print_table
 
 FLUSH_S = 1.0
 """What a killed process loses at most."""

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.recording import recover
-from dmrl.tables import print_json
+from dmrl.terminal.tables import print_json
 
 
 def command(

@@ -13,14 +13,12 @@ from cyclopts import Parameter, validators
 
 from dmrl import recipe as recipes
 from dmrl import topics
-from dmrl.backgrounds import photos_of
+from dmrl.dataset.backgrounds import photos_of
 from dmrl.errors import RecipeError, SettingError
-from dmrl.formats.camera_toml import KNOWN, camera_named
-from dmrl.formats.sample import Sample, calibration, intervals
-from dmrl.geometry import Camera
+from dmrl.geometry.camera_file import KNOWN, camera_named
+from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.progress import say, track
 from dmrl.recording import (
     SPLIT_METADATA,
     Provenance,
@@ -31,11 +29,13 @@ from dmrl.recording import (
 )
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.lens import canvas_of
+from dmrl.rendering.messages import ROBOT, samples
 from dmrl.rendering.randomise import Drawn, World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer, Scene
 from dmrl.rendering.settings import PRESETS, Settings
-from dmrl.shots import ROBOT, samples
-from dmrl.tables import print_json, print_table
+from dmrl.samples.sample import Sample, calibration, intervals
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 PANORAMA_KINDS = (".exr", ".hdr")
 

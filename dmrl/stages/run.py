@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl import pipeline
+from dmrl.evaluation.report import report
 
 
 def command(
@@ -30,4 +31,4 @@ def command(
         Print one JSON document in place of the tables.
     """
     folder = Path(Path(recipe).stem) if out is None else out
-    pipeline.report(pipeline.run(recipe, folder, data), as_json=as_json)
+    report(pipeline.run(recipe, folder, data), as_json=as_json)

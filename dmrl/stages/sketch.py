@@ -13,17 +13,17 @@ from cyclopts import Parameter, validators
 from numpy.random import Generator
 
 from dmrl.errors import SettingError
-from dmrl.formats.camera_toml import write_camera
 from dmrl.formats.image_folder import CALIBRATION, LABELS
 from dmrl.formats.label_table import LabelRow, write_labels
-from dmrl.geometry import AIDECK, Camera
-from dmrl.images import encode_png
+from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.frames import AIDECK, Camera
+from dmrl.images.codec import encode_png
 from dmrl.output import partial_folder
-from dmrl.progress import track
 from dmrl.recording import provenance
 from dmrl.rendering.scene import random_look, random_poses
 from dmrl.rendering.sketch import Sketch, draw
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import track
+from dmrl.terminal.tables import print_json, print_table
 
 CAMERA = replace(AIDECK, distortion=())
 """The AI-deck's camera without its distortion."""

@@ -9,20 +9,20 @@ from cyclopts import Parameter, validators
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, SettingError
-from dmrl.formats.camera_toml import write_camera
-from dmrl.geometry import Camera
+from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.progress import say, track
 from dmrl.recording import Summary, Timed, provenance, rewrite, summary
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 try:
     from dmrl.estimation.identity import Identity
     from dmrl.estimation.tracker import Track, Tracker, Tuning
+    from dmrl.evaluation.tracks import CAMERAS_METADATA
+    from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.sight import Sight, read_sight
-    from dmrl.labelling.write import camera_given, camera_of
-    from dmrl.tracks import CAMERAS_METADATA
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 

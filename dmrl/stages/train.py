@@ -16,12 +16,12 @@ from dmrl.dataset import Split, open_dataset
 from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, partial_of, refuse_existing
-from dmrl.progress import track
 from dmrl.recording import provenance
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import track
+from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.examples import material
+    from dmrl.dataset.for_training import material
     from dmrl.learn.batches import Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.fit import Step, Training, device_of, new_network

@@ -19,8 +19,8 @@ from dmrl.deploy.store import load
 from dmrl.deploy.targets import targets
 from dmrl.deploy.verification import TargetResult, expected, prove
 from dmrl.errors import DatasetError, SettingError
-from dmrl.progress import say, track
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
 
 Image = NDArray[np.uint8]
 Count = Annotated[int, Parameter(validator=validators.Number(gte=0))]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl import card, topics
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.topics import camera_image, labels

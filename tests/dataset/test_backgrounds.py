@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.backgrounds import painted_over, photos_of
+from dmrl.dataset.backgrounds import painted_over, photos_of
 from dmrl.errors import SettingError
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.stages import dataset
 
 from .conftest import Record, peer, pixels_of

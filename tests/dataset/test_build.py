@@ -7,7 +7,7 @@ import pytest
 
 from dmrl.dataset import open_dataset
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message, schema_bytes
 from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter, read
 from dmrl.stages import convert

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.board import corners, intrinsics
-from dmrl.geometry import AIDECK, Array
+from dmrl.geometry.frames import AIDECK, Array
 
 COLUMNS, ROWS, SQUARE_M = 7, 5, 0.03
 K = AIDECK.image_from_optical - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's centre

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.camera_pose import Flight, Noise, PeerPath, calibrate
-from dmrl.geometry import AIDECK, Camera, inside, pixels_from_horizontal
+from dmrl.geometry.frames import AIDECK, Camera, inside, pixels_from_horizontal
 
 TRUE = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
 

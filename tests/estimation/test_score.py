@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.score import DEFINITIONS, Figures, Judged, figures, overall
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 
 def judged(error_m: Array, std_m: float = 0.1, kept: bool | Array = True) -> Judged:

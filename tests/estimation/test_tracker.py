@@ -7,7 +7,13 @@ from scipy.stats import chi2
 from dmrl.estimation.identity import Identity
 from dmrl.estimation.tracker import Tracker, Tuning
 from dmrl.estimation.view import Motion, View
-from dmrl.geometry import AIDECK, Array, horizontal_from_pixels, inside, pixels_from_horizontal
+from dmrl.geometry.frames import (
+    AIDECK,
+    Array,
+    horizontal_from_pixels,
+    inside,
+    pixels_from_horizontal,
+)
 
 TUNING = Tuning()
 DT_S = 0.1

@@ -5,7 +5,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from dmrl.export.ros2 import write_bag
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.messages import LogType, message
 from dmrl.recording import RecordingWriter, provenance, read, summary
 from dmrl.stages import convert

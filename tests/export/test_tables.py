@@ -8,7 +8,7 @@ import pytest
 
 from dmrl.errors import OutputError
 from dmrl.export.tables import write_tables
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance
 

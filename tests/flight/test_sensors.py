@@ -8,7 +8,7 @@ import pytest
 
 from dmrl.flight import NOISE, Flight, Noise, Scenario, simulate
 from dmrl.flight.sensors import coloured, pair_errors
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 
 PRESETS = ["calibrated", "realistic", "harsh"]
 FLIGHTS = 60

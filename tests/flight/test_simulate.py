@@ -6,7 +6,7 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.flight import NOISE, TRAJECTORIES, Clock, Scenario, Trajectory, simulate
 from dmrl.flight.motion import GRAVITY_MPS2
-from dmrl.geometry import camera_from_horizontal
+from dmrl.geometry.frames import camera_from_horizontal
 
 SHORT = Scenario(duration_s=30.0)
 IDEAL = NOISE["ideal"]

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from dmrl.formats.cpx import Image
 from dmrl.formats.cpx_pack import pack_image
 from dmrl.formats.cpx_state import State
-from dmrl.images import encode_jpeg, encode_png
+from dmrl.images.codec import encode_jpeg, encode_png
 
 from . import plain_usd
 

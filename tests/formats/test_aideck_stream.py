@@ -3,15 +3,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.bayer import rgb_of
 from dmrl.errors import SourceError
 from dmrl.formats import aideck_stream
 from dmrl.formats.cpx import Image
 from dmrl.formats.cpx_pack import pack_image
 from dmrl.formats.cpx_state import State
+from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
-from dmrl.formats.sample import Options, Sample
-from dmrl.images import decode, encode_jpeg
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode, encode_jpeg
+from dmrl.samples.sample import Sample
 
 from . import foreign
 

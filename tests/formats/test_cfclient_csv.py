@@ -5,8 +5,9 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats import cfclient_csv
+from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
-from dmrl.formats.sample import Options, Sample
+from dmrl.samples.sample import Sample
 
 
 @pytest.fixture

@@ -7,7 +7,8 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats import cfusdlog, mixed_records
-from dmrl.formats.sample import Options, Sample
+from dmrl.formats.format import Options
+from dmrl.samples.sample import Sample
 
 from . import foreign, plain_usd
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.formats.camera_toml import KNOWN
+from dmrl.formats.format import Options
 from dmrl.formats.image_folder import SUFFIXES
 from dmrl.formats.known import FORMATS
 from dmrl.formats.label_table import COLUMNS
-from dmrl.formats.sample import Options
-from dmrl.geometry import Camera
+from dmrl.geometry.camera_file import KNOWN
+from dmrl.geometry.frames import Camera
 
 TEXT = (Path(__file__).parents[2] / "docs" / "sources.md").read_text(encoding="utf-8")
 

@@ -5,10 +5,10 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats import flight_csv
-from dmrl.formats.flight_sample import LOG_COLUMNS, from_poses
-from dmrl.formats.sample import Options
-from dmrl.geometry import AIDECK
-from dmrl.images import encode_png
+from dmrl.formats.format import Options
+from dmrl.geometry.frames import AIDECK
+from dmrl.images.codec import encode_png
+from dmrl.samples.flight import LOG_COLUMNS, from_poses
 
 HEADER = ["time_s", *LOG_COLUMNS]
 Rows = list[list[object]]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dmrl.errors import DmrlError
+from dmrl.formats.format import Options
 from dmrl.formats.known import FORMATS
-from dmrl.formats.sample import Options
 from dmrl.messages import message
 
 from . import foreign

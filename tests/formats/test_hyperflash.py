@@ -3,12 +3,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.bayer import mosaic, rgb_of
 from dmrl.errors import SourceError
 from dmrl.formats import hyperflash
+from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
-from dmrl.formats.sample import Options, Sample
-from dmrl.images import Rgb, decode
+from dmrl.images.bayer import mosaic, rgb_of
+from dmrl.images.codec import Rgb, decode
+from dmrl.samples.sample import Sample
 
 from . import foreign
 

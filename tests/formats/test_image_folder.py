@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.bayer import rgb_of
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import image_folder
-from dmrl.formats.sample import Options, Sample
-from dmrl.geometry import AIDECK, project
-from dmrl.images import decode, encode_jpeg, encode_png
+from dmrl.formats.format import Options
+from dmrl.geometry.frames import AIDECK, project
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode, encode_jpeg, encode_png
+from dmrl.samples.sample import Sample
 
 HEADER = "file,peer,u_px,v_px,depth_m\n"
 

@@ -7,9 +7,9 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats import locanet
-from dmrl.formats.sample import Options
-from dmrl.geometry import PUBLISHED_RENDER, Array, camera_from_horizontal, project
-from dmrl.images import encode_jpeg
+from dmrl.formats.format import Options
+from dmrl.geometry.frames import PUBLISHED_RENDER, Array, camera_from_horizontal, project
+from dmrl.images.codec import encode_jpeg
 
 POSITION = "./dataset/synImgs/{:04d}.jpg 0.1,-0.2 1.0,0.25,-0.125,0.0,0.1,2.0\n"
 LABEL = "./dataset/synImgs/{:04d}.jpg 0.1,-0.2 132,137,1000,0\n"

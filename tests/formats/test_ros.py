@@ -4,12 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.bayer import rgb_of
 from dmrl.errors import SourceError
 from dmrl.formats import ros
+from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
-from dmrl.formats.sample import Options, Sample
-from dmrl.images import decode
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode
+from dmrl.samples.sample import Sample
 
 from . import foreign
 

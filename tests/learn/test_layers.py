@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.learn.batches import FIELDS
-from dmrl.learn.layers import Window, facing, flat, moved, sample, turned
+from dmrl.learn.windows import Window, facing, flat, moved, sample, turned
 
 CAMERA = (120.0, 118.0, 160.0, 100.0)
 WHOLE = (0, 0, 320, 224)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import ModelError
-from dmrl.images import decode
+from dmrl.images.codec import decode
 from dmrl.learn import pretrained
 from dmrl.learn.decode import decode as find
 from dmrl.learn.model import load_model

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.geometry import grid_label
+from dmrl.geometry.frames import grid_label
 from dmrl.learn.batches import CLASS_ID, FIELDS
 from dmrl.learn.targets import as_targets, targets
 

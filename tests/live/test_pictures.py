@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from dmrl import bayer, images
 from dmrl.errors import SourceError
 from dmrl.formats.cpx import Image
+from dmrl.images import bayer, codec
 from dmrl.live.fake_camera import whole_sensor
 from dmrl.live.pictures import encoded
 
@@ -17,21 +17,21 @@ def test_the_whole_sensor_is_cut_to_what_the_calibration_is_of() -> None:
     raw = bayer.mosaic(whole_sensor(SMOOTH))
     data, kind = encoded(Image(324, 244, "raw", raw.tobytes()), "colour")
     assert kind == "png"
-    difference = np.abs(images.decode(data).astype(int) - SMOOTH)
+    difference = np.abs(codec.decode(data).astype(int) - SMOOTH)
     assert difference[1:-1, 1:-1].max() <= 4
     grey, _ = encoded(Image(324, 244, "raw", raw.tobytes()), "grey")
-    assert (images.decode(grey)[..., 1] == raw[10:234, 2:322]).all()
+    assert (codec.decode(grey)[..., 1] == raw[10:234, 2:322]).all()
 
 
 def test_a_jpeg_of_the_right_size_keeps_its_bytes() -> None:
-    jpeg = images.encode_jpeg(SMOOTH)
+    jpeg = codec.encode_jpeg(SMOOTH)
     assert encoded(Image(320, 224, "jpeg", jpeg), "colour") == (jpeg, "jpeg")
-    whole = images.encode_jpeg(whole_sensor(SMOOTH))
+    whole = codec.encode_jpeg(whole_sensor(SMOOTH))
     data, kind = encoded(Image(324, 244, "jpeg", whole), "colour", "jpeg")
-    assert images.size(data) == (320, 224, kind)
+    assert codec.size(data) == (320, 224, kind)
 
 
 def test_a_jpeg_of_another_size_than_was_said_is_refused() -> None:
-    jpeg = images.encode_jpeg(SMOOTH)
+    jpeg = codec.encode_jpeg(SMOOTH)
     with pytest.raises(SourceError, match="not 160 x 120 px as it said"):
         encoded(Image(160, 120, "jpeg", jpeg), "colour")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.messages import message, schema_bytes
 from dmrl.recording import Provenance, RecordingWriter, check
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SettingError
-from dmrl.geometry import AIDECK
-from dmrl.images import encode_jpeg, encode_png
+from dmrl.geometry.frames import AIDECK
+from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.rendering.backdrops import LIGHT_OF, panorama_view, photos_in, smeared
 
 CAMERA = replace(AIDECK, distortion=())

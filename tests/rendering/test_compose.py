@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.geometry import AIDECK, Camera
+from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.rendering.compose import compose
 from dmrl.rendering.lens import canvas_of, image_from_pinhole
 from dmrl.rendering.sensor import Sensor

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SettingError
-from dmrl.geometry import AIDECK
+from dmrl.geometry.frames import AIDECK
 from dmrl.rendering.lens import between, canvas_of, image_from_pinhole, pinhole_from_image, sample
 
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.geometry import AIDECK, project
+from dmrl.geometry.frames import AIDECK, project
 from dmrl.rendering.onboard import NEAREST_M, Body, View, in_front, pose_of, sketched, view
 
 CAMERA = replace(AIDECK, distortion=())

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl.geometry import PUBLISHED_RENDER, project
-from dmrl.images import encode_png
+from dmrl.geometry.frames import PUBLISHED_RENDER, project
+from dmrl.images.codec import encode_png
 from dmrl.rendering.backdrops import photos_in
 from dmrl.rendering.crazyflie import MATERIALS
 from dmrl.rendering.randomise import PALETTE, World, draw_scene, strong_colours

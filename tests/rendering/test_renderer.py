@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.geometry import AIDECK
+from dmrl.geometry.frames import AIDECK
 from dmrl.rendering import pool
 from dmrl.rendering.blender import protocol
 from dmrl.rendering.renderer import Model, Renderer, Scene

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from dmrl.geometry import AIDECK, Array, camera_from_horizontal, project
+from dmrl.geometry.frames import AIDECK, Array, camera_from_horizontal, project
 from dmrl.rendering.canvas import Canvas
 from dmrl.rendering.quadrotor import DISCS, MESH, RADIUS_M
 from dmrl.rendering.scene import random_look, random_poses

@@ -8,7 +8,7 @@ import torch
 
 from dmrl import card
 from dmrl.dataset import open_dataset
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.learn.model import Model, save_model
 from dmrl.learn.network import build, to_input
 from dmrl.messages import message

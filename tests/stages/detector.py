@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import topics
-from dmrl.geometry import AIDECK, Camera, inside, pixels_from_horizontal
+from dmrl.geometry.frames import AIDECK, Camera, inside, pixels_from_horizontal
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read_raw, read_table, summary
 

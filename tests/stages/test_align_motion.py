@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import RecordingError, SettingError
-from dmrl.images import encode_jpeg
+from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance, read_raw, read_table, summary
 from dmrl.stages import fly

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
-from dmrl.formats.camera_toml import read_camera
-from dmrl.geometry import AIDECK
-from dmrl.images import encode_png
+from dmrl.geometry.camera_file import read_camera
+from dmrl.geometry.frames import AIDECK
+from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read
 from dmrl.stages import calibrate, fly, label

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dmrl.errors import DmrlError, OutputError, SettingError, SourceError
-from dmrl.geometry import AIDECK
-from dmrl.images import decode, encode_png
+from dmrl.geometry.frames import AIDECK
+from dmrl.images.codec import decode, encode_png
 from dmrl.recording import SPLIT_METADATA, check, read, read_table, summary
 from dmrl.stages import fly, label
 from dmrl.stages.convert import Settings, run

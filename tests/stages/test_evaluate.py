@@ -9,7 +9,7 @@ from PIL import Image
 
 from dmrl.cli import app
 from dmrl.errors import MissingExtra, OutputError, RecordingError, SettingError
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, message
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 from dmrl.stages import convert, evaluate, merge, predict

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import pipeline, positions
+from dmrl import pipeline
 from dmrl.errors import OutputError, RecordingError, SettingError
+from dmrl.evaluation import positions
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.evaluate import Settings, command, run

@@ -9,9 +9,9 @@ import pytest
 from dmrl import recipe as recipes
 from dmrl.errors import OutputError, RecipeError, SettingError
 from dmrl.flight import NOISE, Scenario, simulate
-from dmrl.formats.flight_sample import LOG_COLUMNS
-from dmrl.images import decode
+from dmrl.images.codec import decode
 from dmrl.recording import check, read, read_table, summary
+from dmrl.samples.flight import LOG_COLUMNS
 from dmrl.stages import convert, fly
 from dmrl.stages.fly import Flags, Settings
 

@@ -8,8 +8,8 @@ import pytest
 from dmrl import topics
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
 from dmrl.flight import NOISE
-from dmrl.formats.camera_toml import write_camera
-from dmrl.geometry import AIDECK, pixels_from_horizontal
+from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.frames import AIDECK, pixels_from_horizontal
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import (
     Provenance,

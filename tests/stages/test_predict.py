@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
-from dmrl.images import decode, encode_png
+from dmrl.images.codec import decode, encode_png
 from dmrl.learn.model import Model, load_model, save_model
 from dmrl.learn.network import build
 from dmrl.messages import message

@@ -10,7 +10,7 @@ from dmrl.cli import app
 from dmrl.deploy.integer import Conv
 from dmrl.deploy.store import load
 from dmrl.errors import OutputError, SettingError
-from dmrl.images import decode, encode_png
+from dmrl.images.codec import decode, encode_png
 from dmrl.learn.model import load_model
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import MissingExtra, OutputError, RecordingError, SettingError
-from dmrl.images import decode
+from dmrl.images.codec import decode
 from dmrl.live import crazyflie
 from dmrl.live.robots import Robot, robot_of
 from dmrl.recording import read, read_table, recover

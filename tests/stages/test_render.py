@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 from dmrl.errors import BlenderError, OutputError, RecordingError, SettingError
-from dmrl.formats.camera_toml import write_camera
-from dmrl.geometry import Array, Camera, project
-from dmrl.images import decode
+from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.frames import Array, Camera, project
+from dmrl.images.codec import decode
 from dmrl.recording import check, read, read_table, summary
 from dmrl.rendering import crazyflie
 from dmrl.rendering.lens import image_from_pinhole
+from dmrl.rendering.messages import quaternion
 from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot
-from dmrl.shots import quaternion
 from dmrl.stages.render import camera_of, run
 
 SMALL = Settings(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import OutputError, SettingError
-from dmrl.images import decode
+from dmrl.images.codec import decode
 from dmrl.recording import SPLIT_METADATA, read, summary
 from dmrl.stages import convert
 from dmrl.stages.sketch import CAMERA, Settings, run, sketch

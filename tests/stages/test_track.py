@@ -6,8 +6,8 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
-from dmrl.formats.camera_toml import write_camera
-from dmrl.labelling.write import camera_of
+from dmrl.geometry.camera_file import write_camera
+from dmrl.labelling.camera import camera_of
 from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary, trim
 from dmrl.recording.inputs import sha256_of_file
 from dmrl.stages import evaluate, fly, track

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.images import encode_jpeg, encode_png
+from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 

@@ -9,7 +9,7 @@ import pytest
 from dmrl import topics
 from dmrl.dataset import open_dataset
 from dmrl.errors import DatasetError, RecordingError, SettingError
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.recording import provenance as made_by

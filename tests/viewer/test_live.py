@@ -7,10 +7,10 @@ import numpy as np
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from dmrl.formats.flight_sample import ranges
-from dmrl.formats.sample import Sample, image
-from dmrl.images import encode_png
+from dmrl.images.codec import encode_png
 from dmrl.live.feed import Received
+from dmrl.samples.flight import ranges
+from dmrl.samples.sample import Sample, image
 from dmrl.viewer.live import LiveView, layout
 
 MS = 1_000_000

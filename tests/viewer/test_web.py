@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from dmrl.colours import RGB
-from dmrl.images import Rgb, decode
+from dmrl.images.codec import Rgb, decode
 from dmrl.viewer import Page, Settings
 
 Make = Callable[..., Path]

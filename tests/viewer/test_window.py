@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import OutputError, SettingError
-from dmrl.images import decode
+from dmrl.images.codec import decode
 from dmrl.stages import view as stage
 from dmrl.viewer import Page, Settings, Web, process, screenshot, view, window
 from dmrl.viewer.layouts import BACKGROUND, IMAGE_OPACITY

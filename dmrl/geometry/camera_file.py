@@ -5,7 +5,7 @@ from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
 from dmrl.errors import SourceError
-from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
+from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 
 KNOWN = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
 """Cameras that have a name."""

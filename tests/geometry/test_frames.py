@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dmrl import geometry, topics
-from dmrl.geometry import (
+from dmrl import topics
+from dmrl.geometry.frames import (
     AIDECK,
     PUBLISHED_RENDER,
     Array,
     camera_from_horizontal,
+    frames,
     grid_label,
     horizontal_from_pixels,
     inside,
@@ -33,7 +34,7 @@ def pixel(xyz_horizontal: tuple[float, float, float], roll_deg: float, pitch_deg
     return uv[0]
 
 
-@pytest.mark.parametrize("module", [geometry, topics], ids=lambda m: m.__name__)
+@pytest.mark.parametrize("module", [frames, topics], ids=lambda m: m.__name__)
 def test_the_examples_in_the_docstrings_run(module: object) -> None:
     found = doctest.testmod(module)  # type: ignore[arg-type]
     assert found.attempted > 0
@@ -180,7 +181,7 @@ def test_pixels_of_the_horizontal_frame_are_those_of_opencv_with_distortion() ->
         # OpenCV gets the attitude as a product of single turns, written down by hand.
         ry = cv2.Rodrigues(np.array([0.0, pitch[k], 0.0]))[0]
         rx = cv2.Rodrigues(np.array([roll[k], 0.0, 0.0]))[0]
-        turn = geometry.OPTICAL_FROM_CAMERA @ (ry @ rx).T
+        turn = frames.OPTICAL_FROM_CAMERA @ (ry @ rx).T
         expected, _ = cv2.projectPoints(
             xyz[k],
             cv2.Rodrigues(turn)[0],

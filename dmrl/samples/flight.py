@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.formats.sample import Sample
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
+from dmrl.samples.sample import Sample
 
 Times = NDArray[np.int64]
 

@@ -3,53 +3,53 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import images
 from dmrl.errors import SourceError
+from dmrl.images import codec
 
 
 @pytest.fixture
-def rgb() -> images.Rgb:
+def rgb() -> codec.Rgb:
     return np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
 
 
-def test_png_keeps_every_pixel(rgb: images.Rgb) -> None:
-    png = images.encode_png(rgb)
-    assert images.size(png) == (32, 24, "png")
-    np.testing.assert_array_equal(images.decode(png), rgb)
-    assert images.encode_png(rgb) == png
+def test_png_keeps_every_pixel(rgb: codec.Rgb) -> None:
+    png = codec.encode_png(rgb)
+    assert codec.size(png) == (32, 24, "png")
+    np.testing.assert_array_equal(codec.decode(png), rgb)
+    assert codec.encode_png(rgb) == png
 
 
-def test_jpeg_is_near(rgb: images.Rgb) -> None:
+def test_jpeg_is_near(rgb: codec.Rgb) -> None:
     smooth = np.broadcast_to(np.arange(24, dtype=np.uint8)[:, None, None] * 8, (24, 32, 3)).copy()
-    jpeg = images.encode_jpeg(smooth)
-    assert images.size(jpeg) == (32, 24, "jpeg")
-    assert np.abs(images.decode(jpeg).astype(int) - smooth).max() < 6
+    jpeg = codec.encode_jpeg(smooth)
+    assert codec.size(jpeg) == (32, 24, "jpeg")
+    assert np.abs(codec.decode(jpeg).astype(int) - smooth).max() < 6
 
 
 def test_ppm_may_hold_comments_and_junk() -> None:
     ppm = b"P6\n# a camera\n2 1\n# its name\n255\n" + bytes([1, 2, 3, 4, 5, 6]) + b"junk"
-    np.testing.assert_array_equal(images.decode(ppm), [[[1, 2, 3], [4, 5, 6]]])
-    assert images.size(ppm) == (2, 1, "ppm")
+    np.testing.assert_array_equal(codec.decode(ppm), [[[1, 2, 3], [4, 5, 6]]])
+    assert codec.size(ppm) == (2, 1, "ppm")
 
 
 def test_real_frames_with_junk_behind_their_pixels(data: Path) -> None:
     for path in (data / "aideck-frames").glob("*.ppm"):
         bytes_ = path.read_bytes()
         pixels = np.frombuffer(bytes_[15 : 15 + 320 * 224 * 3], np.uint8)
-        np.testing.assert_array_equal(images.decode(bytes_).ravel(), pixels)
+        np.testing.assert_array_equal(codec.decode(bytes_).ravel(), pixels)
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5, 0.1])
-def test_a_cut_picture_is_named(rgb: images.Rgb, share: float) -> None:
-    png = images.encode_png(rgb)
+def test_a_cut_picture_is_named(rgb: codec.Rgb, share: float) -> None:
+    png = codec.encode_png(rgb)
     with pytest.raises(SourceError, match=r"^a\.png cannot be decoded: .*Remove it") as e:
-        images.decode(png[: int(len(png) * share)], "a.png")
+        codec.decode(png[: int(len(png) * share)], "a.png")
     assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize("bad", [b"", b"GIF89a" + b"\0" * 40, b"\x89PNG\r\n\x1a\n" + b"\0" * 40])
 def test_what_is_no_picture_is_named(bad: bytes) -> None:
-    for function in (images.decode, images.size):
+    for function in (codec.decode, codec.size):
         with pytest.raises(SourceError, match=r"^a\.png is not a picture \(PNG, JPEG"):
             function(bad, "a.png")
 
@@ -57,7 +57,7 @@ def test_what_is_no_picture_is_named(bad: bytes) -> None:
 def test_the_part_that_is_scaled_is_the_one_named() -> None:
     rgb = np.zeros((40, 60, 3), np.uint8)
     rgb[10:30, 20:40] = 200
-    part = images.crop_and_scale(rgb, (20, 10, 40, 30), 10, 10)
+    part = codec.crop_and_scale(rgb, (20, 10, 40, 30), 10, 10)
     assert part.min() > 150  # the border mixes with its neighbours
     assert np.abs(part[1:-1, 1:-1].astype(int) - 200).max() < 6
-    assert images.crop_and_scale(rgb, (0, 0, 60, 40), 30, 20).shape == (20, 30, 3)
+    assert codec.crop_and_scale(rgb, (0, 0, 60, 40), 30, 20).shape == (20, 30, 3)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dmrl import plots, topics
 from dmrl.estimation.score import ErrorTrace
-from dmrl.evaluation import Pairs
-from dmrl.images import decode
+from dmrl.evaluation.detections import Pairs
+from dmrl.images.codec import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored
 from dmrl.plots import Example

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl import images, topics
+from dmrl import topics
 from dmrl.estimation.clocks import Clock, estimate_clock
 from dmrl.estimation.exchanges import estimate_from_exchanges
 from dmrl.estimation.image_motion import rates, shift, small
-from dmrl.geometry import Array
-from dmrl.progress import track
+from dmrl.geometry.frames import Array
+from dmrl.images import codec
 from dmrl.recording import Summary, read, read_table
+from dmrl.terminal.progress import track
 
 Signals = dict[str, tuple[Array, Array]]
 """By name: times (N,), seconds since the recording's start, increasing, and values (N,)."""
@@ -85,7 +86,7 @@ def camera_clock(
     count = held.topics[topic].count
     for stamped in track(read(recording, topic), f"Turns of {robot}'s camera", count):
         at = f"{topic} at {stamped.time_ns} ns in {recording}"
-        after = small(images.decode(stamped.message.data, at))
+        after = small(codec.decode(stamped.message.data, at))
         if before is not None:
             moved.append(shift(before, after) or (np.nan, np.nan))
         times.append(even_ns.get(stamped.time_ns, stamped.time_ns))

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.formats.sample import Sample, image, labels
-from dmrl.geometry import Array, camera_from_horizontal
-from dmrl.images import encode_jpeg, encode_png
+from dmrl.geometry.frames import Array, camera_from_horizontal
+from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.rendering.randomise import Drawn
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot, Shot
+from dmrl.samples.sample import Sample, image, labels
 
 ROBOT = "cf1"
 """The robot that carries the camera."""

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.formats.camera_toml import camera_named, read_camera, write_camera
-from dmrl.geometry import AIDECK, PUBLISHED_RENDER, Camera
+from dmrl.geometry.camera_file import camera_named, read_camera, write_camera
+from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 
 
 @pytest.mark.parametrize("camera", [AIDECK, PUBLISHED_RENDER])

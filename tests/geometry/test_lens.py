@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dmrl.geometry import AIDECK
-from dmrl.lens import distort, undistort
+from dmrl.geometry.frames import AIDECK
+from dmrl.geometry.lens import distort, undistort
 
 
 def test_a_lens_that_folds_back_gives_no_pixel_out_there() -> None:

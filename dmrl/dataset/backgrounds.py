@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.bayer import load_opencv
 from dmrl.dataset import Split, is_dataset, open_dataset
 from dmrl.errors import SettingError
-from dmrl.images import Rgb
+from dmrl.images.bayer import load_opencv
+from dmrl.images.codec import Rgb
 from dmrl.rendering.backdrops import Photos, photos_in
 
 MOST_HIDDEN = 0.15

@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.dataset import Split
-from dmrl.dataset.rows import LOOKED, sources_in
 from dmrl.errors import RecordingError, SettingError
-from dmrl.images import size
+from dmrl.geometry.frames import inside
+from dmrl.images.codec import size
 from dmrl.learn.matching import Points
 from dmrl.messages import STATUS_OK
-from dmrl.progress import track
 from dmrl.recording import read, read_table, splits, summary
 from dmrl.recording.inputs import refuse_twice
+from dmrl.recording.sources import LOOKED, sources_in
+from dmrl.terminal.progress import track
 
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
@@ -115,13 +116,12 @@ def labels_of_split(split: Split, rows: Sequence[int]) -> Points:
     height_px, width_px = split.image_shape
     entries = _column(split.table, "peers")
     labels = _points(entries, None, np.array(rows, np.int64), len(split))
-    return labels.select(_inside(labels, width_px, height_px))
+    return labels.select(_in_view(labels, width_px, height_px))
 
 
-def _inside(labels: Points, width_px: int, height_px: int) -> Mask:
-    inside: Mask = (labels.u_px >= 0) & (labels.u_px < width_px)
-    inside &= (labels.v_px >= 0) & (labels.v_px < height_px) & (labels.depth_m > 0)
-    return inside
+def _in_view(labels: Points, width_px: int, height_px: int) -> Mask:
+    uv = np.column_stack([labels.u_px, labels.v_px])
+    return inside(uv, width_px, height_px) & (labels.depth_m > 0)
 
 
 def _spans(
@@ -160,13 +160,13 @@ def _join_robot(
     judged, in_usable, in_detections = np.intersect1d(times[usable], seen_at, return_indices=True)
     labels = _points(peers, mine, np.flatnonzero(usable)[in_usable], len(times))
     width_px, height_px = _image_size(recording, robot)
-    inside = _inside(labels, width_px, height_px)
-    left_out["labels outside their image"] += int((~inside).sum())
+    seen = _in_view(labels, width_px, height_px)
+    left_out["labels outside their image"] += int((~seen).sum())
     every = _column(detected, "detections")
     detections = _points(every, None, in_detections, len(detected))
     threshold = float(np.max(_column(detected, "threshold").to_numpy(), initial=0.0))
     at = [At(recording, robot, int(time_ns)) for time_ns in judged]
-    return Pairs(at, labels.select(inside), detections, threshold, left_out)
+    return Pairs(at, labels.select(seen), detections, threshold, left_out)
 
 
 def _by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
@@ -239,10 +239,10 @@ def _together(parts: list[Pairs]) -> Pairs:
 def _within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
     if spans is None:
         return np.ones(len(times), bool)
-    inside = np.zeros(len(times), bool)
+    within = np.zeros(len(times), bool)
     for start, end in spans:
-        inside |= (start <= times) & (times <= end)
-    return inside
+        within |= (start <= times) & (times <= end)
+    return within
 
 
 def _image_of(entries: pa.Array) -> Times:

@@ -1,16 +1,11 @@
-"""What every format gives: rows for a recording, named but not yet messages.
+"""Samples: messages to be, named but not yet built, as every format and simulation gives them."""
 
-A format is one file with two functions, ``recognises(source) -> bool`` and
-``content(source, options) -> Content``, its ``FORMAT``, and one row in ``dmrl.formats.known``.
-"""
-
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from dmrl import topics
-from dmrl.geometry import Camera
+from dmrl.geometry.frames import Camera
 from dmrl.messages import LogType
 
 Intervals = dict[str, list[tuple[int, int]]]
@@ -36,78 +31,6 @@ class Sample:
     topic: str
     message: str | LogType
     fields: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Content:
-    """Everything a source holds.
-
-    Parameters
-    ----------
-    samples
-        In log-time order.
-    total
-        Number of samples; None where it is not known beforehand.
-    split
-        Inclusive intervals of log time by split name; empty where the source has no split.
-    """
-
-    samples: Iterator[Sample]
-    total: int | None = None
-    split: Intervals = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What the user says of a source. A format takes what it has use for.
-
-    Parameters
-    ----------
-    robot
-        Robot that carries the camera, or whose log it is.
-    names
-        Names of robots by those, or the numbers, that the source has for them.
-    rate_hz
-        Pictures per second where the source has no times.
-    labels
-        CSV file with labels; None: the source's own.
-    camera
-        Camera that took the pictures as they are stored; None: the source's own.
-    size_px
-        Width and height to crop and scale pictures to; None: they stay as they are.
-    raw
-        Grey pictures are as a colour sensor gave them (RGGB).
-    """
-
-    robot: str = "cf1"
-    names: Mapping[str, str] = field(default_factory=dict)
-    rate_hz: float = 10.0
-    labels: Path | None = None
-    camera: Camera | None = None
-    size_px: tuple[int, int] | None = None
-    raw: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Format:
-    """One foreign format: how to know it, how to read it.
-
-    Parameters
-    ----------
-    name
-        As ``--from`` takes it.
-    what
-        What it is, in a few words: an article and a noun.
-    recognises
-        Whether a file or folder looks like it; looks at a few bytes only.
-    content
-        Samples of a source.
-    """
-
-    name: str
-    what: str
-    recognises: Callable[[Path], bool]
-    content: Callable[[Path, Options], Content]
 
 
 def intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:

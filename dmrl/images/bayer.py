@@ -5,7 +5,7 @@ from types import ModuleType
 import numpy as np
 
 from dmrl.errors import MissingExtra
-from dmrl.images import Grey, Rgb
+from dmrl.images.codec import Grey, Rgb
 
 
 def load_opencv(extra: str = "bayer", what: str = "a raw picture") -> ModuleType:

@@ -12,10 +12,16 @@ from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.estimation.score import inside_truth
 from dmrl.estimation.track_score import DEFINITIONS, NEAR_M, Judged, assigned, figures
-from dmrl.formats.camera_toml import parse_camera
-from dmrl.geometry import Array, Camera, horizontal_from_pixels, inside, pixels_from_horizontal
+from dmrl.geometry.camera_file import parse_camera
+from dmrl.geometry.frames import (
+    Array,
+    Camera,
+    horizontal_from_pixels,
+    inside,
+    pixels_from_horizontal,
+)
+from dmrl.labelling.camera import camera_of
 from dmrl.labelling.sight import Sight, read_sight
-from dmrl.labelling.write import camera_of
 from dmrl.recording import Summary, input_of, read, read_table, summary
 
 TITLE, EACH = "tracks against truth", "observer"

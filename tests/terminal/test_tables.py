@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_table
 
 
 def test_a_table_holds_every_cell_unwrapped(capsys: pytest.CaptureFixture[str]) -> None:

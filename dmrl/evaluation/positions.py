@@ -21,7 +21,7 @@ from dmrl.estimation.score import (
     inside_truth,
     overall,
 )
-from dmrl.geometry import Array
+from dmrl.geometry.frames import Array
 from dmrl.messages import STATUS_OK
 from dmrl.recording import input_of, read_table, summary
 

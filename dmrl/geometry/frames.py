@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.lens import distort, undistort
+from dmrl.geometry.lens import distort, undistort
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 import pytest
 
-from dmrl.progress import say, track
+from dmrl.terminal.progress import say, track
 
 
 def test_a_pipe_sees_no_bar(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,1 @@
+"""Detections, positions and tracks, joined with what is true and judged."""

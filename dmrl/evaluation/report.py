@@ -1,0 +1,86 @@
+"""What a pipeline came to: a table of its evaluations, and where its pictures are."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from dmrl.evaluation import positions
+from dmrl.terminal.tables import print_json, print_table
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """One step that is done: its stage, its output, and whether it was there already."""
+
+    stage: str
+    out: Path
+    seconds: float
+    skipped: bool
+
+
+EVALUATION_NAME, POSITIONS_NAME = "evaluation.json", "positions.json"
+COLUMNS = {
+    "median_px": ("median, px", ".1f"),
+    "within_8_px": ("within 8 px", ".1%"),
+    "within_20_px": ("within 20 px", ".1%"),
+    "depth_mae_m": ("depth MAE, m", ".3f"),
+    "f1": ("F1", ".3f"),
+    "ap_16_px": ("AP at 16 px", ".3f"),
+}
+
+
+def report(done: Sequence[Done], *, as_json: bool = False) -> None:
+    """Print what a pipeline came to: a row per evaluation, and where the pictures are.
+
+    Parameters
+    ----------
+    done
+        What ``run`` gave.
+    as_json
+        Print one JSON document instead: seconds per step, evaluations, pictures.
+    """
+    evaluations, judged = _documents(done, EVALUATION_NAME), _documents(done, POSITIONS_NAME)
+    # What a stage drew for training is data, not a picture of the result.
+    pictures = [picture for d in done if d.stage != "sketch" for picture in _pictures(d.out)]
+    if as_json:
+        print_json(
+            {
+                "steps": [asdict(d) for d in done],
+                "evaluations": evaluations,
+                "positions": judged,
+                "pictures": pictures,
+            }
+        )
+        return
+    for name, document in judged.items():
+        headers = [words for _, words, _ in positions.COLUMNS]
+        print_table(name, ["pair", *headers], positions.rows(document))
+    rows = [(name, *_row(document)) for name, document in evaluations.items()]
+    headers = [words for words, _ in COLUMNS.values()]
+    print_table("", ["evaluation", "against", "images", *headers], rows)
+    for picture in pictures:
+        print(picture)
+
+
+def _documents(done: Sequence[Done], name: str) -> dict[str, dict[str, Any]]:
+    """JSON documents of this name, by the output they stand in."""
+    return {
+        d.out.name: json.loads((d.out / name).read_text(encoding="utf-8"))
+        for d in done
+        if (d.out / name).is_file()
+    }
+
+
+def _row(document: dict[str, Any]) -> list[str]:
+    figures = document["overall"]
+    values = [(figures[name]["value"], form) for name, (_, form) in COLUMNS.items()]
+    cells = ["-" if value is None else format(value, form) for value, form in values]
+    return [document["against"], str(document["images"]), *cells]
+
+
+def _pictures(out: Path) -> list[Path]:
+    if out.is_dir():
+        return sorted(out.rglob("*.png"))
+    return [out] if out.suffix == ".png" and out.exists() else []

@@ -1,0 +1,1 @@
+"""Frames, lenses and the camera file."""

@@ -1,0 +1,1 @@
+"""Pictures: encoded, decoded, and raw as a Bayer sensor gives them."""
