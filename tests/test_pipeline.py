@@ -5,6 +5,7 @@ import pytest
 
 from dmrl import pipeline
 from dmrl.errors import DmrlError, RecipeError, SettingError, SourceError
+from dmrl.evaluation.report import report
 
 SMALL = """
 kind = "pipeline"
@@ -63,13 +64,13 @@ def test_a_pipeline_runs_every_step_and_then_none(
         "evaluate",
     ]
     assert not any(d.skipped for d in done)
-    pipeline.report(done)
+    report(done)
     table = capsys.readouterr().out
     assert "evaluation" in table
     assert "error-violins.png" in table
     again = pipeline.run(recipe, tmp_path / "out")
     assert all(d.skipped for d in again)
-    pipeline.report(again, as_json=True)
+    report(again, as_json=True)
     assert json.loads(capsys.readouterr().out)["evaluations"]["evaluation"]["against"] == "truth"
 
 
@@ -173,7 +174,7 @@ optional = true
     done = pipeline.run(write(tmp_path, text), tmp_path / "out")
     assert not done[-1].out.exists()
     assert "evaluate: left out." in capsys.readouterr().err
-    pipeline.report(done)
+    report(done)
     with pytest.raises(DmrlError, match="has no detections"):
         recipe = write(tmp_path, text.replace("optional = true", ""))
         pipeline.run(recipe, tmp_path / "again")

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dmrl import topics
+from dmrl.geometry import frames
 from dmrl.geometry.frames import (
     AIDECK,
     PUBLISHED_RENDER,
     Array,
     camera_from_horizontal,
-    frames,
     grid_label,
     horizontal_from_pixels,
     inside,

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import pipeline
 from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.evaluation import positions
+from dmrl.evaluation.report import Done, report
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.evaluate import Settings, command, run
@@ -108,9 +108,9 @@ def test_a_pipeline_shows_judged_positions(
     labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run([labelled], tmp_path / "positions", Settings())
-    done = [pipeline.Done("evaluate", tmp_path / "positions", 1.0, skipped=False)]
-    pipeline.report(done)
+    done = [Done("evaluate", tmp_path / "positions", 1.0, skipped=False)]
+    report(done)
     assert "cf1 sees cf2" in capsys.readouterr().out
-    pipeline.report(done, as_json=True)
+    report(done, as_json=True)
     shown = json.loads(capsys.readouterr().out)
     assert shown["positions"]["positions"]["overall"]["samples"] == 1599
