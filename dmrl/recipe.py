@@ -276,10 +276,15 @@ def _faults(keys: Any, schema: type[Any]) -> list[str]:
     try:
         schema(**_validated(keys, schema))
     except ValidationError as e:
-        return [f"{'.'.join(map(str, d['loc']))}: {d['msg'].lower()}" for d in e.errors()]
+        return [f"{'.'.join(map(str, d['loc']))}: {_said(d['msg'])}" for d in e.errors()]
     except ValueError as e:
         return [str(e)]
     return []
+
+
+def _said(message: str) -> str:
+    """What pydantic says, or what a nested dataclass said to it."""
+    return message.removeprefix("Value error, ") if "Value error" in message else message.lower()
 
 
 def _instance(keys: Mapping[str, Any], schema: type[Settings]) -> Settings:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dmrl.flight.faults import Happened
 from dmrl.geometry.frames import Array
 
 RATE_HZ = 100.0
@@ -36,7 +37,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class RobotLog:
-    """What one robot measured of itself, (N,) each, on its own clock, 100 Hz.
+    """What one robot measured of itself, (N,) each, on its own clock, 100 Hz; NaN where silent.
 
     Parameters
     ----------
@@ -123,12 +124,15 @@ class Flight:
         By (robot that ranges, robot that answers); both ways of each pair.
     clocks
         Clock of each robot.
+    faults
+        What went wrong, and when.
     """
 
     robots: dict[str, RobotLog]
     truth: dict[str, Truth]
     ranges: dict[tuple[str, str], Ranges]
     clocks: dict[str, Clock]
+    faults: tuple[Happened, ...] = ()
 
     def peer_in_horizontal(self, i: str, j: str, time_s: Array) -> Array:
         """(N, 3) where robot ``j`` is in ``i``'s horizontal frame, metres.

@@ -1,5 +1,6 @@
 """A whole flight from a scenario, a noise preset and a seed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -7,8 +8,9 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.errors import SettingError
-from dmrl.flight import motion, sensors
+from dmrl.flight import failing, motion, sensors
 from dmrl.flight.arrays import RATE_HZ, Clock, Flight
+from dmrl.flight.faults import ENDS, Fault, Happened, check, happened
 from dmrl.flight.motion import TRAJECTORIES, Motion, Start, Trajectory
 from dmrl.flight.noise import Noise
 from dmrl.geometry.frames import Array
@@ -46,7 +48,7 @@ class Scenario:
         return tuple(f"cf{k + 1}" for k in range(self.robots))
 
 
-def simulate(scenario: Scenario, noise: Noise, seed: int) -> Flight:
+def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault] = ()) -> Flight:
     """A flight: logs, ranges and truth. The same arguments give the same flight.
 
     Parameters
@@ -57,26 +59,28 @@ def simulate(scenario: Scenario, noise: Noise, seed: int) -> Flight:
         How wrong the sensors are.
     seed
         Another seed gives another flight.
+    faults
+        What goes wrong besides. What they do not touch is as it is without them.
 
     Raises
     ------
     SettingError
-        If the scenario cannot be flown.
+        If the scenario cannot be flown, or a fault does not fit into it.
     """
     _check(scenario)
-    motions = _motions(scenario, seed)
-    names = scenario.names
-    truth = {
-        name: motion.truth_of(motions[k], _height(_rng(seed, "height", k), scenario))
-        for k, name in enumerate(names)
-    }
-    clocks = {name: _clock(_rng(seed, "clock", k), k, noise) for k, name in enumerate(names)}
-    robots = {
-        name: sensors.robot_log(
-            _rng(seed, "log", k), truth[name], motions[k].yaw_rate, clocks[name], noise
+    flight_s, names = scenario.duration_s, scenario.names
+    check(faults, names, flight_s)
+    events = [happened(_rng(seed, "fault", k), fault, flight_s) for k, fault in enumerate(faults)]
+    moves = _motions(scenario, seed)
+    truth, clocks, robots = {}, {}, {}
+    for k, name in enumerate(names):
+        mine = [event for event in events if event.fault.robot == name]
+        way, height = _flown(moves[k], _height(_rng(seed, "height", k), scenario), mine)
+        truth[name] = motion.truth_of(way, height)
+        clocks[name] = failing.clock_with(_clock(_rng(seed, "clock", k), k, noise), mine)
+        robots[name] = sensors.robot_log(
+            _rng(seed, "log", k), truth[name], way.yaw_rate, clocks[name], noise
         )
-        for k, name in enumerate(names)
-    }
     ranges = {
         (names[i], names[j]): sensors.ranges(
             _rng(seed, "range", i, j),
@@ -88,10 +92,22 @@ def simulate(scenario: Scenario, noise: Noise, seed: int) -> Flight:
         )
         for i, j in permutations(range(len(names)), 2)
     }
-    return Flight(robots, truth, ranges, clocks)
+    for k, event in enumerate(events):
+        robot, rng = event.fault.robot, _rng(seed, "fault", k, 1)
+        robots[robot] = failing.log_with(rng, robots[robot], truth[robot], event)
+        for link in (link for link in ranges if event.befalls(link)):
+            ranges[link] = failing.ranges_with(rng, ranges[link], clocks[link[0]], event)
+    return Flight(robots, truth, ranges, clocks, tuple(events))
 
 
-PURPOSES = ("motion", "height", "clock", "log", "range", "pair", "start")
+def _flown(way: Motion, height_m: Array, events: Sequence[Happened]) -> tuple[Motion, Array]:
+    """A robot's motion and height, to the landing or crash that ends them."""
+    for event in (event for event in events if event.fault.kind in ENDS):
+        way, height_m = failing.brought_down(way, height_m, event)
+    return way, height_m
+
+
+PURPOSES = ("motion", "height", "clock", "log", "range", "pair", "start", "fault")
 
 
 def _rng(seed: int, purpose: str, *numbers: int) -> Generator:

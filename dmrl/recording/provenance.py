@@ -121,8 +121,7 @@ class Provenance:
 
     def to_recipe(self) -> str:
         """The settings as a TOML recipe: what was run can be run again."""
-        settings = {k: v for k, v in self.settings.items() if v is not None}
-        return tomli_w.dumps({"kind": self.stage, **settings})
+        return tomli_w.dumps({"kind": self.stage, **_without_none(self.settings)})
 
     def ancestry(self) -> Iterator[tuple[int, Input]]:
         """Depth of every input, and of theirs, nearest first; each with its provenance once."""
@@ -139,3 +138,10 @@ def _nested(made: Provenance, depth: int) -> Iterator[tuple[int, Input]]:
         yield depth, source
         if source.provenance is not None:
             yield from _nested(source.provenance, depth + 1)
+
+
+def _without_none(value: Any) -> Any:
+    """The same without what TOML has no word for."""
+    if isinstance(value, Mapping):
+        return {k: _without_none(v) for k, v in value.items() if v is not None}
+    return [_without_none(v) for v in value] if isinstance(value, list | tuple) else value

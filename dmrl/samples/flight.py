@@ -33,7 +33,8 @@ EXACT = [0.0] * 9
 def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
     """Attitude, velocity and height of one robot, three samples per time.
 
-    The yaw of the attitude is the integral of the yaw rate, from 0 at the first time.
+    A sensor whose values are not all finite has no sample at that time. The yaw of the attitude
+    is the integral of the yaw rate, from 0 at the first time, gaps bridged.
 
     Parameters
     ----------
@@ -45,16 +46,24 @@ def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Itera
         (N,) for each of ``LOG_COLUMNS``.
     """
     rate = columns["yaw_rate_radps"]
+    turning = np.isfinite(rate)
+    if turning.any():
+        rate = np.interp(time_ns, time_ns[turning], rate[turning])
     turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
     yaw = np.concatenate([[0.0], np.cumsum(turned)])
-    rows = np.stack([*(columns[name] for name in LOG_COLUMNS), yaw], axis=1).tolist()
+    rows = np.stack([*(columns[name] for name in LOG_COLUMNS), yaw], axis=1)
+    silent = ~np.isfinite(rows)
+    turns, moves, climbs = (~silent[:, part].any(axis=1) for part in ([0, 1, 2], [3, 4], [5]))
     names = topics.attitude(robot), topics.velocity(robot), topics.height(robot)
-    for moment, row in zip(time_ns.tolist(), rows, strict=True):
+    for k, (moment, row) in enumerate(zip(time_ns.tolist(), rows.tolist(), strict=True)):
         roll, pitch, yaw_rate, vx, vy, height, yaw_rad = row
         attitude = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw_rad}
-        yield Sample(moment, names[0], "Attitude", {**attitude, "yaw_rate_radps": yaw_rate})
-        yield Sample(moment, names[1], "Velocity", {"vx_mps": vx, "vy_mps": vy})
-        yield Sample(moment, names[2], "Height", {"height_m": height})
+        if turns[k]:
+            yield Sample(moment, names[0], "Attitude", {**attitude, "yaw_rate_radps": yaw_rate})
+        if moves[k]:
+            yield Sample(moment, names[1], "Velocity", {"vx_mps": vx, "vy_mps": vy})
+        if climbs[k]:
+            yield Sample(moment, names[2], "Height", {"height_m": height})
 
 
 def ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sample]:

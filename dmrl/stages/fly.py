@@ -14,7 +14,7 @@ from cyclopts import Parameter, validators
 from dmrl import recipe as recipes
 from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.flight import NOISE, Clock, Flight, Scenario, Trajectory, Truth, simulate
+from dmrl.flight import NOISE, Clock, Fault, Flight, Scenario, Trajectory, Truth, simulate
 from dmrl.geometry.frames import AIDECK, Array
 from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
@@ -69,6 +69,8 @@ class Settings:
         The first robots, so many at most, carry a camera.
     camera_rate_hz
         Pictures per second and robot.
+    faults
+        What goes wrong besides: tables with kind, robot and more; docs/flights.md has them all.
     """
 
     robots: Annotated[int, Parameter(validator=validators.Number(gte=2, lte=20))] = 2
@@ -81,6 +83,7 @@ class Settings:
     camera_renderer: CameraRenderer = "sketch"
     cameras_max: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 20
     camera_rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=100))] = 5.0
+    faults: tuple[Fault, ...] = ()
 
 
 def run(out: Path, settings: Settings) -> dict[str, int]:
@@ -107,7 +110,8 @@ def run(out: Path, settings: Settings) -> dict[str, int]:
     scenario = Scenario(
         settings.robots, settings.duration_s, settings.trajectory, settings.yaw_spread_rad
     )
-    flight = simulate(scenario, NOISE[settings.noise], settings.seed)
+    flight = simulate(scenario, NOISE[settings.noise], settings.seed, settings.faults)
+    _tell(flight)
     made = provenance("fly", settings, seed=settings.seed, libraries=("numpy", "pillow"))
     streams = [*_measured(flight), *_true(flight)]
     counts: Counter[str] = Counter()
@@ -120,6 +124,14 @@ def run(out: Path, settings: Settings) -> dict[str, int]:
             sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
             counts[_pattern(sample.topic)] += 1
     return dict(sorted(counts.items()))
+
+
+def _tell(flight: Flight) -> None:
+    """Say what goes wrong and when, in seconds from the start."""
+    end_s = float(next(iter(flight.truth.values())).time_s[-1])
+    for event in flight.faults:
+        windows = [f"{start:.1f}-{min(end, end_s):.1f}" for start, end in event.windows_s.tolist()]
+        say(f"{event.fault}: {', '.join(windows)} s")
 
 
 def _renderer(

@@ -8,7 +8,7 @@ import pytest
 
 from dmrl import recipe as recipes
 from dmrl.errors import OutputError, RecipeError, SettingError
-from dmrl.flight import NOISE, Scenario, simulate
+from dmrl.flight import NOISE, Fault, Scenario, simulate
 from dmrl.images.codec import decode
 from dmrl.recording import check, read, read_table, summary
 from dmrl.samples.flight import LOG_COLUMNS
@@ -143,6 +143,47 @@ def test_every_wrong_key_of_a_recipe_is_named(tmp_path: Path) -> None:
     assert all(key in str(caught.value) for key in ("robots", "trajectory", "wind"))
 
 
+def test_a_recipe_with_faults_is_flown_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "faulty.toml", tmp_path / "out.mcap"
+    path.write_text(
+        'kind = "fly"\nduration_s = 6.0\nseed = 3\n'
+        '[[faults]]\nkind = "height_gap"\nrobot = "cf2"\nstart_s = 2\nduration_s = 1\n'
+        '[[faults]]\nkind = "range_gap"\nrobot = "cf1"\npeer = "cf2"\nstart_s = 1\n'
+        '[[faults]]\nkind = "attitude_gap"\nrobot = "cf1"\nstart_s = 4\nduration_s = 1\n'
+    )
+    fly.run(out, recipes.load(path, "fly", Settings))
+    told = capsys.readouterr().err.splitlines()
+    assert told[:2] == ["height_gap of cf2: 2.0-3.0 s", "range_gap of cf1-cf2: 1.0-6.0 s"]
+    counts = {topic: info.count for topic, info in summary(out).topics.items()}
+    assert (counts["/cf2/height"], counts["/cf1/height"]) == (501, 601)
+    assert counts["/cf1/attitude"] == 501
+    assert counts["/cf1/range/cf2"] < 60
+    yaw = read_table(out, "/cf1/attitude", fields=("yaw_rad",))["yaw_rad"].to_numpy()
+    assert np.isfinite(yaw).all()
+    assert [f for f in check(out) if f.level == "error"] == []
+    again = tmp_path / "again.toml"
+    again.write_text(summary(out).provenance.to_recipe())
+    fly.run(tmp_path / "again.mcap", recipes.load(again, "fly", Settings))
+    assert (tmp_path / "again.mcap").read_bytes() == out.read_bytes()
+
+
+def test_wrong_faults_are_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(
+        'kind = "fly"\n[[faults]]\nkind = "gremlins"\nrobot = "cf1"\n'
+        '[[faults]]\nkind = "nlos"\nrobot = "cf1"\nduration_s = -2.0\n'
+        '[[faults]]\nkind = "nlos"\nrobot = "cf1"\nwhen = 3\n'
+    )
+    with pytest.raises(RecipeError) as caught:
+        recipes.load(path, "fly", Settings)
+    said = str(caught.value)
+    assert "\n" not in said
+    assert "faults.0.kind" in said and "faults.1: nlos of cf1 must last over 0 s" in said
+    assert "faults.2.when" in said
+
+
 def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     for bad in (
@@ -151,6 +192,7 @@ def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
         Settings(seed=-1),
         Settings(camera_rate_hz=0.0),
         Settings(cameras_max=0),
+        Settings(faults=(Fault("nlos", "cf3"),)),
     ):
         with pytest.raises(SettingError):
             fly.run(out, bad)

@@ -1,0 +1,110 @@
+"""What faults do to a flight: to its motion, its clocks, logs and ranges.
+
+A fault changes what it names and nothing else: every other number of the flight stays as it was
+without the fault.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.random import Generator
+
+from dmrl.flight.arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
+from dmrl.flight.faults import Happened
+from dmrl.flight.motion import Motion
+from dmrl.geometry.frames import Array
+
+COAST_S = 0.3
+"""Time constant with which it comes to rest."""
+SINK_MPS, FALL_MPS2 = 0.4, 5.0
+FLOOR_M = 0.02
+RUNAWAY_S = 2.0
+"""Time constant with which the estimate of a crashed robot runs away."""
+OUTLIER_M = (-1.0, 3.0)
+"""What is added to an outlier, uniform."""
+SHORTEST_RANGE_M = 0.01
+
+
+def brought_down(way: Motion, height_m: Array, end: Happened) -> tuple[Motion, Array]:
+    """A robot's motion and height with a landing or a crash.
+
+    It flies its way ever slower and comes to rest: the way is the same, the pace is not.
+
+    Parameters
+    ----------
+    way
+        Over the floor.
+    height_m
+        (N,) above the floor.
+    end
+        When it lands or crashes.
+    """
+    time_s, start_s = np.arange(len(height_m)) / RATE_HZ, end.windows_s[0, 0]
+    since = np.maximum(time_s - start_s, 0.0)
+    place_s = np.minimum(time_s, start_s) + COAST_S * (1 - np.exp(-since / COAST_S))
+    pace = np.exp(-since / COAST_S)
+    high = float(np.interp(start_s, time_s, height_m))
+    if end.fault.kind == "crash":
+        fallen = np.minimum(FALL_MPS2 * since**2 / 2, high - FLOOR_M)
+    else:
+        part = np.minimum(since * SINK_MPS / (high - FLOOR_M), 1.0)
+        fallen = (high - FLOOR_M) * (1 - np.cos(np.pi * part)) / 2
+    return Motion(
+        np.interp(place_s, time_s, way.position),
+        np.interp(place_s, time_s, way.velocity) * pace,
+        np.interp(place_s, time_s, way.yaw),
+        np.interp(place_s, time_s, way.yaw_rate) * pace,
+    ), np.where(since > 0, high - fallen, height_m)
+
+
+def clock_with(clock: Clock, faults: Sequence[Happened]) -> Clock:
+    """A robot's clock with the faults of it."""
+    for one in faults:
+        if one.fault.kind == "clock_drift":
+            clock = replace(clock, drift=clock.drift + one.fault.amount * 1e-6)
+        if one.fault.kind == "clock_offset":
+            clock = replace(clock, offset_s=clock.offset_s + one.fault.amount)
+    return clock
+
+
+def log_with(rng: Generator, log: RobotLog, truth: Truth, one: Happened) -> RobotLog:
+    """A robot's log with a fault of its sensors; NaN where a sensor is silent."""
+    at, amount = one.during(truth.time_s), one.fault.amount
+    match one.fault.kind:
+        case "yaw_rate_bias":
+            return replace(log, yaw_rate_radps=log.yaw_rate_radps + amount * at)
+        case "height_step":
+            return replace(log, height_m=log.height_m + amount * at)
+        case "height_gap":
+            return replace(log, height_m=np.where(at, np.nan, log.height_m))
+        case "velocity_scale":
+            gain = 1 + amount * at
+            return replace(log, vx_mps=gain * log.vx_mps, vy_mps=gain * log.vy_mps)
+        case "velocity_stuck" | "velocity_gap":
+            reads = 0.0 if one.fault.kind == "velocity_stuck" else np.nan
+            vx, vy = (np.where(at, reads, v) for v in (log.vx_mps, log.vy_mps))
+            return replace(log, vx_mps=vx, vy_mps=vy)
+        case "attitude_gap":
+            silent = {
+                name: np.where(at, np.nan, getattr(log, name))
+                for name in ("roll_rad", "pitch_rad", "yaw_rate_radps")
+            }
+            return replace(log, **silent)
+        case "crash":
+            since = np.maximum(truth.time_s - one.windows_s[0, 0], 0.0)
+            speed, way = amount * (1 - np.exp(-since / RUNAWAY_S)), rng.uniform(-np.pi, np.pi)
+            vx, vy = log.vx_mps + speed * np.cos(way), log.vy_mps + speed * np.sin(way)
+            return replace(log, vx_mps=vx, vy_mps=vy)
+    return log
+
+
+def ranges_with(rng: Generator, ranges: Ranges, clock: Clock, one: Happened) -> Ranges:
+    """The ranges of one robot to another with a fault of their link."""
+    at, amount = one.during(clock.true_time(ranges.time_s)), one.fault.amount
+    if one.fault.kind == "range_gap":
+        return Ranges(ranges.time_s[~at], ranges.range_m[~at])
+    wrong = amount * at
+    if one.fault.kind == "range_outliers":
+        wrong = rng.uniform(*OUTLIER_M, len(at)) * (at & (rng.random(len(at)) < amount))
+    return replace(ranges, range_m=np.maximum(ranges.range_m + wrong, SHORTEST_RANGE_M))
