@@ -30,7 +30,13 @@ except MissingExtra:
     plots = None
 
 
-def write_card(folder: Path, *, title: str | None = None, license_id: str | None = None) -> Path:
+def write_card(
+    folder: Path,
+    *,
+    title: str | None = None,
+    license_id: str | None = None,
+    into: Path | None = None,
+) -> Path:
     """Path of the README.md that was written into a dataset's folder.
 
     Parameters
@@ -39,6 +45,8 @@ def write_card(folder: Path, *, title: str | None = None, license_id: str | None
         A dataset.
     title, license_id
         None: as the card before has them, or as the dataset was made.
+    into
+        Another folder to write it into. None: the dataset's, in place of the card before.
 
     Raises
     ------
@@ -48,18 +56,18 @@ def write_card(folder: Path, *, title: str | None = None, license_id: str | None
     dataset = open_dataset(folder)
     splits = {name: dataset.split(name) for name in dataset.splits}
     made = _provenance(folder)
-    readme = folder / "README.md"
-    before = read_front(readme)
+    old, readme = folder / "README.md", (into or folder) / "README.md"
+    before = read_front(old)
     title = title or before.get("pretty_name") or made.settings.get("title") or _title(made)
     license_id = license_id or before.get("license") or made.settings.get("license", "unknown")
     counts = {name: count(split) for name, split in splits.items()}
-    figures = _draw(folder / "figures", counts, splits)
+    figures = _draw(readme.parent / "figures", counts, splits)
     text = [*front_matter(splits, str(title), str(license_id), parquet=dataset.parquet)]
     text += sections.about(splits, str(title), made)
     text += sections.loading(splits, parquet=dataset.parquet)
     text += [*sections.numbers(counts), *figures, *sections.features(splits)]
     text += ["## Provenance", "", *sections.ancestry(made), "", YOURS]
-    written = "\n".join(text) + (_yours(readme) or "\n")
+    written = "\n".join(text) + (_yours(old) or "\n")
     partial_of(readme).write_text(written, encoding="utf-8")
     partial_of(readme).replace(readme)
     return readme

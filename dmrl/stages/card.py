@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.card import write_card
+from dmrl.output import partial_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,15 +29,30 @@ class Settings:
 DEFAULTS = Settings()
 
 
-def run(dataset: Path, settings: Settings) -> Path:
-    """The card, written into the dataset's folder in place of the one before.
+def run(dataset: Path, settings: Settings, out: Path | None = None) -> Path:
+    """The card, written into the dataset's folder in place of the one before, or into ``out``.
+
+    Parameters
+    ----------
+    dataset
+        Folder of the dataset.
+    settings
+        See `Settings`.
+    out
+        Folder to write, card and figures in it. None: the dataset's own card is written again.
 
     Raises
     ------
     DatasetError
         If the folder is not a dataset, or lacks a shard.
+    OutputError
+        If ``out`` exists.
     """
-    return write_card(dataset, title=settings.title, license_id=settings.license)
+    if out is None:
+        return write_card(dataset, title=settings.title, license_id=settings.license)
+    with partial_folder(out) as folder:
+        card = write_card(dataset, title=settings.title, license_id=settings.license, into=folder)
+    return out / card.name
 
 
 def command(

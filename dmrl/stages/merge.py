@@ -1,7 +1,6 @@
 """merge: several recordings into one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,12 +10,7 @@ from dmrl.errors import SettingError
 from dmrl.recording import merge
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Merging has no settings."""
-
-
-def run(recordings: Sequence[Path], out: Path, _settings: Settings) -> int:
+def run(recordings: Sequence[Path], out: Path) -> int:
     """Messages of the recordings merged into ``out``; see `dmrl.recording.merge`."""
     return merge(recordings, out)
 
@@ -35,5 +29,5 @@ def command(
             "merge wants two recordings or more and OUT: dmrl merge A.mcap B.mcap OUT.mcap"
         )
     *inputs, out = recordings
-    count = run(inputs, out, Settings())
+    count = run(inputs, out)
     print(f"{out}: {count} messages of {len(inputs)} recordings")

@@ -6,8 +6,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dmrl.recording import recover
+from dmrl.recording import Recovery, recover
 from dmrl.terminal.tables import print_json
+
+
+def run(recording: Path, out: Path) -> Recovery:
+    """What was brought back of ``recording`` into ``out``; see `dmrl.recording.recover`."""
+    return recover(recording, out)
 
 
 def command(
@@ -31,7 +36,7 @@ def command(
     as_json
         Print one JSON document instead of a line.
     """
-    result = recover(recording, out)
+    result = run(recording, out)
     if as_json:
         print_json(asdict(result))
         return

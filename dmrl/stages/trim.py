@@ -1,6 +1,7 @@
 """trim: a stretch of a recording, or some of its topics."""
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,14 +11,69 @@ from dmrl.errors import SettingError
 from dmrl.recording import summary, trim
 
 
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is kept. Camera calibration is kept wherever it stands.
+
+    Parameters
+    ----------
+    from_s
+        First time kept, seconds from the recording's start.
+    to_s
+        First time left out, seconds from the recording's start.
+    topic
+        Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
+    """
+
+    from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
+    to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None
+    topic: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
+
+
+def run(recording: Path, out: Path, settings: Settings) -> int:
+    """Messages of ``recording`` kept in ``out``.
+
+    Parameters
+    ----------
+    recording
+        A whole recording.
+    out
+        Recording to write. Must not exist.
+    settings
+        See `Settings`.
+
+    Raises
+    ------
+    SettingError
+        If a time is none.
+    RecordingError
+        If the recording cannot be read, or nothing would be left.
+    OutputError
+        If ``out`` exists or cannot be written.
+    """
+    for flag, value in (("--from", settings.from_s), ("--to", settings.to_s)):
+        if value is not None and not math.isfinite(value):
+            raise SettingError(f"{flag} {value} is no time. Give seconds from the start")
+    start_ns = summary(recording).start_ns
+    first, last = settings.from_s, settings.to_s
+    return trim(
+        recording,
+        out,
+        start_ns=None if first is None else start_ns + round(first * 1e9),
+        end_ns=None if last is None else start_ns + round(last * 1e9),
+        topics=settings.topic,
+    )
+
+
+DEFAULTS = Settings()
+
+
 def command(
     recording: Path,
     out: Path,
     /,
     *,
-    from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None,
-    to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None,
-    topic: Annotated[list[str] | None, Parameter(negative=())] = None,
+    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
 ) -> None:
     """Keep a stretch of a recording, or some of its topics.
 
@@ -29,22 +85,5 @@ def command(
         A recording.
     out
         Recording to write. Must not exist.
-    from_s
-        First time kept, seconds from the recording's start.
-    to_s
-        First time left out, seconds from the recording's start.
-    topic
-        Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
     """
-    for flag, value in (("--from", from_s), ("--to", to_s)):
-        if value is not None and not math.isfinite(value):
-            raise SettingError(f"{flag} {value} is no time. Give seconds from the start")
-    start_ns = summary(recording).start_ns
-    count = trim(
-        recording,
-        out,
-        start_ns=None if from_s is None else start_ns + round(from_s * 1e9),
-        end_ns=None if to_s is None else start_ns + round(to_s * 1e9),
-        topics=topic or (),
-    )
-    print(f"{out}: {count} messages")
+    print(f"{out}: {run(recording, out, settings)} messages")

@@ -1,5 +1,6 @@
 """``dmrl verify``: whether the C of an export computes what the int8 network says."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +19,8 @@ from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import load
 from dmrl.deploy.targets import targets
 from dmrl.deploy.verification import TargetResult, expected, prove
-from dmrl.errors import DatasetError, SettingError
+from dmrl.errors import DatasetError, SettingError, ToolError
+from dmrl.output import partial_file
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -92,7 +94,7 @@ class Result:
         return [t for t in self.targets if t.skipped]
 
 
-def run(folder: Path, settings: Settings) -> Result:
+def run(folder: Path, settings: Settings, out: Path | None = None) -> Result:
     """Compile the C of an export folder in every way, and compare it with the reference.
 
     Parameters
@@ -101,6 +103,8 @@ def run(folder: Path, settings: Settings) -> Result:
         What ``dmrl export`` wrote.
     settings
         See `Settings`.
+    out
+        JSON file to write, as ``dmrl verify --json`` prints. None: nothing is written.
 
     Raises
     ------
@@ -108,7 +112,32 @@ def run(folder: Path, settings: Settings) -> Result:
         If the folder is not an export, or is damaged.
     DatasetError, SettingError
         If there are no images to try it on.
+    ToolError
+        If ``out`` is wanted, but the C is wrong, or a required target cannot be tried.
+    OutputError
+        If ``out`` exists.
     """
+    if out is None:
+        return _tried(folder, settings)
+    with partial_file(out) as partial:
+        result = _tried(folder, settings)
+        _require_proof(folder, result, settings)
+        text = json.dumps(document(result), indent=1, allow_nan=False)
+        partial.write_text(text + "\n", encoding="utf-8")
+    return result
+
+
+def _require_proof(folder: Path, result: Result, settings: Settings) -> None:
+    """A proof is of every target: nobody reads the table of a step."""
+    if bad := [t for t in result.targets if t.error or t.mismatches]:
+        what = bad[0].error or f"{bad[0].mismatches} images differ from the reference"
+        raise ToolError(f"{folder}: {bad[0].target}: {what}. See: dmrl verify {folder}")
+    if settings.require and result.skipped:
+        one = result.skipped[0]
+        raise ToolError(f"{folder}: {one.target} not tried: {one.skipped}. Install it")
+
+
+def _tried(folder: Path, settings: Settings) -> Result:
     require_c(folder)
     network = load(folder)
     pictures = _pictures(network, folder, settings)

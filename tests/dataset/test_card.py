@@ -97,6 +97,17 @@ def test_writing_it_again_gives_the_same_bytes(built: Path) -> None:
     assert {p: p.read_bytes() for p in built.rglob("*") if p.is_file()} == before
 
 
+def test_a_card_can_be_written_elsewhere_and_the_one_before_stays(
+    built: Path, tmp_path: Path
+) -> None:
+    before = (built / "README.md").read_bytes()
+    card = run_card(built, CardSettings(title="Elsewhere"), tmp_path / "card")
+    assert card == tmp_path / "card" / "README.md"
+    assert 'pretty_name: "Elsewhere"' in card.read_text(encoding="utf-8")
+    assert (tmp_path / "card" / "figures" / "depth.png").is_file()
+    assert (built / "README.md").read_bytes() == before
+
+
 def test_what_a_hand_wrote_below_the_line_stays(built: Path) -> None:
     readme = built / "README.md"
     before = readme.read_text(encoding="utf-8")

@@ -151,7 +151,7 @@ def test_messages_without_a_definition_are_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seconds", [float("nan"), float("inf")])
 def test_a_time_that_is_none_trims_nothing(tmp_path: Path, flight: Path, seconds: float) -> None:
     with pytest.raises(SettingError, match="is no time"):
-        stage.command(flight, tmp_path / "b.mcap", to_s=seconds)
+        stage.run(flight, tmp_path / "b.mcap", stage.Settings(to_s=seconds))
 
 
 def test_a_merge_of_two_flights_by_the_same_robots_is_said(

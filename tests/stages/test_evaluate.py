@@ -106,7 +106,7 @@ def test_two_messages_of_one_image_count_together(
             sink.write(k, "/cf1/labels", message("PeerLabels")(peers=marks, sources=["hand"]))
     for first, second in ((true, hand), (hand, true)):
         both = tmp_path / f"{first.stem}-first.mcap"
-        merge.run([first, second], both, merge.Settings())
+        merge.run([first, second], both)
         assert figures(both)["median_px"] == 5
         assert figures(both, Settings(against="hand", draws=5))["median_px"] == 0
 

@@ -12,7 +12,7 @@ from dmrl.deploy.c import write_c
 from dmrl.deploy.integer import Conv, IntegerNetwork
 from dmrl.deploy.samples import save_samples
 from dmrl.deploy.store import INTEGER_NAME, save
-from dmrl.errors import DatasetError, ModelError, SettingError
+from dmrl.errors import DatasetError, ModelError, SettingError, ToolError
 from dmrl.stages.verify import Settings, document, run
 
 from ..deploy.networks import random_network
@@ -87,6 +87,26 @@ def test_c_of_another_network_is_found_out(
     (gcc,) = json.loads(capsys.readouterr().out)["targets"]
     assert gcc["mismatches"] > 0
     assert not gcc["error"]
+
+
+@needs_gcc
+def test_a_proof_is_written_only_where_the_c_is_right(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "proof.json"
+    run(folder, GCC, out)
+    assert json.loads(out.read_text())["targets"][0]["mismatches"] == 0
+    network = random_network(SEED)
+    wrong = export(network, tmp_path / "export", carries=changed(network))
+    with pytest.raises(ToolError, match=r"gcc: \d+ images differ from the reference"):
+        run(wrong, GCC, tmp_path / "lie.json")
+    assert sorted(p.name for p in tmp_path.glob("*.json*")) == ["proof.json"]
+
+
+def test_no_proof_of_a_target_that_is_required_and_not_there(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ToolError, match="gcc not tried"):
+        run(folder, replace(GCC, require=True), tmp_path / "proof.json")
 
 
 @needs_gcc
