@@ -1,6 +1,6 @@
 """Some thousand messages as arrays of offsets into the bytes that hold them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
+
+ROWS = 10_000  # that become Python objects at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,17 @@ class Block:
             self.start[rows],
             self.end[rows],
         )
+
+    def rows(self) -> Iterator[tuple[int, int, int, bytes]]:
+        """Channel number, log time, publish time and payload of one message after the other."""
+        view = self.data.data
+        for first in range(0, len(self), ROWS):
+            part = slice(first, first + ROWS)
+            columns = (self.channel, self.time_ns, self.publish_ns, self.start, self.end)
+            for number, time_ns, publish_ns, start, end in zip(
+                *(column[part].tolist() for column in columns), strict=True
+            ):
+                yield number, time_ns, publish_ns, bytes(view[start:end])
 
     def compact(self) -> "Block":
         """A copy that holds no bytes but its own messages'."""

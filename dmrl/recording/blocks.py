@@ -5,30 +5,33 @@ walked as NumPy arrays instead: one block holds the bytes of a chunk and, for ea
 in it, its times and where its payload starts and ends. Decoders work on whole blocks.
 """
 
-import io
 import struct
 import zlib
-from collections.abc import Iterator, Set
+from collections import Counter
+from collections.abc import Collection, Iterator, Set
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
-import lz4.frame
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel as McapChannel
-from mcap.records import Chunk, ChunkIndex, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Chunk, ChunkIndex
 from mcap.summary import Summary as McapSummary
 
-from dmrl.recording.block import Block, Bytes, Ints, concatenate
-from dmrl.recording.index import channel_of, damaged, mcap_summary, opened
+from dmrl.recording import sums
+from dmrl.recording.block import EMPTY, Block, Ints, concatenate, joined
+from dmrl.recording.chunks import (
+    RECORD_HEADER,
+    SMALLEST_MESSAGE,
+    messages_at,
+    of_channels,
+    scanned,
+    unpacked,
+)
+from dmrl.recording.index import mcap_summary, metadata_of
+from dmrl.recording.opening import RECORD, Bounded, damaged, opened
+from dmrl.recording.walk import channel_of, walked
 from dmrl.recording.writer import Channel
-
-RECORD_HEADER = 1 + 8  # opcode, length
-MESSAGE_HEADER = 2 + 4 + 8 + 8  # channel id, sequence, log time, publish time
-SMALLEST_MESSAGE = RECORD_HEADER + MESSAGE_HEADER
 
 
 def blocks(
@@ -61,16 +64,45 @@ def blocks(
     high = np.iinfo(np.int64).max if end_ns is None else end_ns
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
-        if summary is None or (not summary.chunk_indexes and _message_count(summary)):
-            yield from _unindexed(path, stream, topics, low, high)
+        if summary is None:
+            yield _unindexed(path, stream, topics, low, high)
             return
         channels = {
             number: channel_of(number, summary.channels, summary.schemas)
             for number in summary.channels
             if topics is None or summary.channels[number].topic in topics
         }
+        found: Counter[int] = Counter()
         for block in _in_time_order(path, stream, summary, channels, low, high):
+            tally(found, block)
             yield block, channels
+        if start_ns is None and end_ns is None:
+            compare(path, summary, channels, found)
+
+
+def tally(found: Counter[int], block: Block) -> None:
+    """Count the messages of a block by channel number."""
+    for number, count in enumerate(np.bincount(block.channel).tolist()):
+        if count:
+            found[number] += count
+
+
+def compare(
+    path: Path, summary: McapSummary, channels: dict[int, Channel], found: Counter[int]
+) -> None:
+    """Nothing, if as many messages were found as the statistics say.
+
+    Raises
+    ------
+    RecordingError
+        If there are more or fewer.
+    """
+    said = summary.statistics.channel_message_counts if summary.statistics else {}
+    for number, channel in channels.items() if said else ():
+        if found[number] != said.get(number, 0):
+            raise damaged(
+                path, f"{channel.topic} has {found[number]} of {said.get(number, 0)} messages"
+            )
 
 
 def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
@@ -83,11 +115,18 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
     """
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
-        if summary is None or not summary.chunk_indexes:
+        if summary is None:
+            walk = walked(path, stream)
+            for block in walk.blocks:
+                yield block, walk.channels
             return
         channels = {n: channel_of(n, summary.channels, summary.schemas) for n in summary.channels}
+        found: Counter[int] = Counter()
         for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
-            yield in_chunk(path, stream, chunk, channels), channels
+            block = in_chunk(path, stream, chunk, channels, summary.channels)
+            tally(found, block)
+            yield block, channels
+        compare(path, summary, channels, found)
 
 
 def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
@@ -96,38 +135,39 @@ def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
     Raises
     ------
     RecordingError
-        If the file is not a complete recording.
+        If the file is not a complete recording, or its message indexes are damaged.
     """
     parts: dict[str, list[Ints]] = {topic: [_NO_TIMES] for topic in topics}
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
-        chunks = [] if summary is None else summary.chunk_indexes
-        indexed = bool(chunks) and all(chunk.message_index_offsets for chunk in chunks)
-        for chunk in chunks if indexed else ():
-            first = chunk.chunk_start_offset + chunk.chunk_length
-            stream.seek(first)
-            raw = stream.read(chunk.message_index_length)
-            for number, at in chunk.message_index_offsets.items():
-                topic = summary.channels[number].topic if summary is not None else ""
-                if topic in parts:
-                    parts[topic].append(_index_entries(path, raw, at - first, number)[:, 0])
-    if not indexed:
-        for block, channels in blocks(path, topics):
-            for number, channel in channels.items():
-                parts[channel.topic].append(block.time_ns[block.channel == number])
+        if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
+            channels = {n: channel.topic for n, channel in summary.channels.items()}
+            said = metadata_of(path, stream, summary).get(sums.METADATA_NAME)
+            crc = 0
+            for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
+                first = chunk.chunk_start_offset + chunk.chunk_length
+                stream.seek(first)
+                raw = stream.read(chunk.message_index_length)
+                crc = zlib.crc32(raw, crc)
+                for number, at in chunk.message_index_offsets.items():
+                    if channels[number] in parts:
+                        entries = _index_entries(path, raw, at - first, number)
+                        parts[channels[number]].append(entries[:, 0])
+            if said and said[-1].get("indexes") != sums.text(crc):
+                raise damaged(path, "its message indexes fail their CRC")
+            return {topic: np.concatenate(times) for topic, times in parts.items()}
+    for block, found in blocks(path, topics):
+        for number, channel in found.items():
+            parts[channel.topic].append(block.time_ns[block.channel == number])
     return {topic: np.concatenate(times) for topic, times in parts.items()}
 
 
 _NO_TIMES: Ints = np.empty(0, np.int64)
 
 
-def _message_count(summary: McapSummary) -> int:
-    return summary.statistics.message_count if summary.statistics else 1
-
-
 def _in_time_order(
     path: Path,
-    stream: BinaryIO,
+    stream: Bounded,
     summary: McapSummary,
     channels: dict[int, Channel],
     low: int,
@@ -136,7 +176,7 @@ def _in_time_order(
     chunks = chunks_between(summary, channels.keys(), low, high)
     held: Block | None = None
     for k, chunk in enumerate(chunks):
-        block = in_chunk(path, stream, chunk, channels)
+        block = in_chunk(path, stream, chunk, channels, summary.channels)
         block = block.take((block.time_ns >= low) & (block.time_ns < high))
         held = concatenate(held, block).sorted()
         if k + 1 == len(chunks):
@@ -170,16 +210,36 @@ def chunks_between(
 
 
 def in_chunk(
-    path: Path, stream: BinaryIO, chunk: ChunkIndex, channels: dict[int, Channel]
+    path: Path,
+    stream: Bounded,
+    chunk: ChunkIndex,
+    channels: dict[int, Channel],
+    known: Collection[int],
 ) -> Block:
-    """The messages of a chunk that are of some channels, in the order of the chunk."""
+    """The messages of a chunk that are of some channels, in the order of the chunk.
+
+    Parameters
+    ----------
+    path, stream
+        The recording.
+    chunk
+        What its summary says of the chunk.
+    channels
+        Those that are wanted.
+    known
+        Numbers of all channels of the recording.
+
+    Raises
+    ------
+    RecordingError
+        If the chunk is not what its summary and its message indexes say.
+    """
     stream.seek(chunk.chunk_start_offset)
     raw = stream.read(chunk.chunk_length + chunk.message_index_length)
-    if len(raw) < RECORD_HEADER or raw[0] != Opcode.CHUNK:
-        raise damaged(path, f"no chunk at byte {chunk.chunk_start_offset}")
-    data = unpacked(path, _chunk_record(raw), chunk.chunk_start_offset)
+    record = _chunk_record(path, raw, chunk)
+    data = unpacked(path, record, chunk.chunk_start_offset)
     if not chunk.message_index_offsets:
-        return scanned(data, set(channels))
+        return _within(path, chunk, of_channels(scanned(data), channels, known))
     parts = [np.empty((0, 2), np.int64)]
     for number, at in chunk.message_index_offsets.items():
         if number in channels:
@@ -189,7 +249,7 @@ def in_chunk(
     # Indexes carry no CRC of their own, so they are held against the records they point at.
     if entries.size and not 0 <= entries[0, 1] <= entries[-1, 1] <= len(data) - SMALLEST_MESSAGE:
         raise damaged(path, f"index beyond the chunk at byte {chunk.chunk_start_offset}")
-    block = _at(data, entries[:, 1])
+    block = messages_at(data, entries[:, 1])
     if not (
         (data[entries[:, 1]] == Opcode.MESSAGE).all()
         and np.array_equal(block.time_ns, entries[:, 0])
@@ -197,7 +257,33 @@ def in_chunk(
         and set(np.unique(block.channel).tolist()) <= channels.keys()
     ):
         raise damaged(path, f"index of the chunk at byte {chunk.chunk_start_offset} is wrong")
+    return _within(path, chunk, block)
+
+
+def _within(path: Path, chunk: ChunkIndex, block: Block) -> Block:
+    """The block, if its messages are of the time that the chunk is said to be of."""
+    low, high = chunk.message_start_time, chunk.message_end_time
+    if len(block) and not low <= int(block.time_ns.min()) <= int(block.time_ns.max()) <= high:
+        raise damaged(
+            path,
+            f"messages in the chunk at byte {chunk.chunk_start_offset} are of "
+            "other times than it says",
+        )
     return block
+
+
+def _chunk_record(path: Path, raw: bytes, said: ChunkIndex) -> Chunk:
+    """The chunk at the start of some bytes, if it is the one that the summary says is there."""
+    at = said.chunk_start_offset
+    if len(raw) < RECORD_HEADER or raw[0] != Opcode.CHUNK:
+        raise damaged(path, f"no chunk at byte {at}")
+    chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(raw[RECORD_HEADER : said.chunk_length])))
+    if RECORD.unpack_from(raw)[1] != said.chunk_length - RECORD_HEADER or any(
+        getattr(chunk, name) != getattr(said, name)
+        for name in ("message_start_time", "message_end_time", "uncompressed_size", "compression")
+    ):
+        raise damaged(path, f"the chunk at byte {at} is not the one that its summary lists")
+    return chunk
 
 
 def _index_entries(path: Path, raw: bytes, at: int, number: int) -> Ints:
@@ -209,93 +295,14 @@ def _index_entries(path: Path, raw: bytes, at: int, number: int) -> Ints:
     return entries.reshape(-1, 2).astype(np.int64)
 
 
-def _chunk_record(raw: bytes) -> Chunk:
-    stream = io.BytesIO(raw)
-    stream.seek(RECORD_HEADER)
-    chunk: Chunk = Chunk.read(ReadDataStream(stream))
-    return chunk
-
-
-def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
-    """The records of a chunk, decompressed and checked against its CRC.
-
-    Raises
-    ------
-    RecordingError
-        If they cannot be decompressed, or the CRC does not match.
-    """
-    try:
-        if chunk.compression == "zstd":
-            data = zstandard.ZstdDecompressor().decompress(chunk.data, chunk.uncompressed_size)
-        elif chunk.compression == "lz4":
-            data = lz4.frame.decompress(chunk.data)
-        elif chunk.compression == "":
-            data = chunk.data
-        else:
-            raise damaged(path, f"unknown compression {chunk.compression!r}")
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as e:
-        raise damaged(path, f"chunk at byte {offset}: {e}") from e
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise damaged(path, f"chunk at byte {offset} fails its CRC")
-    return np.frombuffer(data, np.uint8)
-
-
-def _at(data: Bytes, at_record: Ints) -> Block:
-    """The messages whose records start at these offsets."""
-
-    def field(offset: int, dtype: str) -> Ints:
-        # A view with a stride of one byte reads unaligned integers in one gather.
-        size = np.dtype(dtype).itemsize
-        view = np.ndarray((max(len(data) - size + 1, 0),), dtype, data, 0, (1,))
-        return view[at_record + offset].astype(np.int64)
-
-    start = at_record + RECORD_HEADER + MESSAGE_HEADER
-    return Block(
-        data,
-        field(RECORD_HEADER, "<u2"),
-        field(RECORD_HEADER + 6, "<u8"),
-        field(RECORD_HEADER + 14, "<u8"),
-        start,
-        at_record + RECORD_HEADER + field(1, "<u8"),
-    )
-
-
-def scanned(data: Bytes, numbers: set[int]) -> Block:
-    """The messages of a chunk that has no message index, record by record."""
-    view, offsets, at = data.data, [], 0
-    while at + RECORD_HEADER <= len(view):
-        opcode, size = struct.unpack_from("<BQ", view, at)
-        if opcode == Opcode.MESSAGE and int.from_bytes(view[at + 9 : at + 11], "little") in numbers:
-            offsets.append(at)
-        at += RECORD_HEADER + size
-    return _at(data, np.array(offsets, np.int64))
-
-
 def _unindexed(
-    path: Path, stream: BinaryIO, topics: frozenset[str] | None, low: int, high: int
-) -> Iterator[tuple[Block, dict[int, Channel]]]:
+    path: Path, stream: Bounded, topics: frozenset[str] | None, low: int, high: int
+) -> tuple[Block, dict[int, Channel]]:
     """One block with every message, for a file without chunk indexes."""
-    stream.seek(0)
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    rows: list[Message] = []
-    for record in StreamReader(stream, validate_crcs=True).records:
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, McapChannel) and (topics is None or record.topic in topics):
-            channels[record.id] = channel_of(record.id, {record.id: record}, schemas)
-        elif isinstance(record, Message) and low <= record.log_time < high:
-            rows.append(record)
-    rows = [m for m in rows if m.channel_id in channels]
-    end = np.cumsum([len(m.data) for m in rows], dtype=np.int64)
-    yield (
-        Block(
-            np.frombuffer(b"".join(m.data for m in rows), np.uint8),
-            np.array([m.channel_id for m in rows], np.int64),
-            np.array([m.log_time for m in rows], np.int64),
-            np.array([m.publish_time for m in rows], np.int64),
-            end - np.array([len(m.data) for m in rows], np.int64),
-            end,
-        ).sorted(),
-        channels,
-    )
+    walk = walked(path, stream)
+    channels = {n: c for n, c in walk.channels.items() if topics is None or c.topic in topics}
+    kept = []
+    for whole in walk.blocks:
+        block = of_channels(whole, channels, walk.channels)
+        kept.append(block.take((block.time_ns >= low) & (block.time_ns < high)))
+    return joined(kept).sorted() if kept else EMPTY, channels

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from dmrl.errors import RecordingError
+from dmrl.recording import sums
 from dmrl.recording.index import SPLIT_METADATA, Summary
 from dmrl.recording.provenance import METADATA_NAME
 from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
@@ -15,7 +16,7 @@ def copy_extras(found: Summary, out: RecordingWriter) -> None:
     Its provenance and recipe are left out: they are in the ancestry of the new one.
     """
     for name, records in found.metadata.items():
-        if name != METADATA_NAME:
+        if name not in (METADATA_NAME, sums.METADATA_NAME):
             for values in records:
                 out.add_metadata(name, values)
     for name, data in found.attachments.items():

@@ -10,8 +10,10 @@ from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.block import Block, joined
 from dmrl.recording.blocks import blocks, chunks_between, in_chunk
-from dmrl.recording.index import channel_of, mcap_summary, opened, summary
+from dmrl.recording.index import mcap_summary, summary
+from dmrl.recording.opening import opened
 from dmrl.recording.reader import by_topic, require_types
+from dmrl.recording.walk import channel_of
 from dmrl.recording.writer import Channel
 
 CHUNKS = 16
@@ -76,7 +78,7 @@ def _spread(
         }
         held = []
         for chunk in _chosen(index, channels, start_ns, end_ns):
-            block = in_chunk(path, stream, chunk, channels)
+            block = in_chunk(path, stream, chunk, channels, index.channels)
             block = block.take((block.time_ns >= start_ns) & (block.time_ns < end_ns))
             held.append(block.compact())
     return [block for block in held if len(block)], channels

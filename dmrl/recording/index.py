@@ -1,30 +1,28 @@
 """What a recording holds, from its summary, without reading its messages."""
 
 import os
-import struct
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
-from mcap.exceptions import McapError
-from mcap.reader import SeekingReader
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, MetadataIndex
-from mcap.records import Channel as McapChannel
-from mcap.records import Message as McapMessage
 from mcap.records import Metadata as McapMetadata
-from mcap.records import Schema as McapSchema
-from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.errors import RecordingError
+from dmrl.recording import sums
+from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.provenance import METADATA_NAME, Provenance
+from dmrl.recording.section import section
+from dmrl.recording.walk import channel_of, walked
 from dmrl.recording.writer import Channel
 
-MAGIC = b"\x89MCAP0\r\n"
 SPLIT_METADATA = "dmrl.split"
 
 
@@ -70,74 +68,20 @@ class Summary:
 SETTLED_NS, MOST_REMEMBERED = 1_000_000_000, 8
 _MADE: dict[tuple[Path, str], tuple[tuple[int, int, int], Any]] = {}
 Made = TypeVar("Made")
-Record = TypeVar("Record", Attachment, McapMetadata)
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
-    """The file, open for reading, known to begin and end as a recording does.
+def mcap_summary(path: Path, stream: Bounded) -> McapSummary | None:
+    """The verified summary section of a recording; None where messages are not found with it.
 
     Raises
     ------
     RecordingError
-        If it is absent, not MCAP, cut short, or turns out to be damaged inside the block.
+        If it contradicts itself or the file.
     """
-    if path.is_dir():
-        raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
-    try:
-        with path.open("rb") as stream:
-            _check_ends(path, stream)
-            yield stream
-    except FileNotFoundError:
-        raise RecordingError(f"no recording {path}. Check the name") from None
-    except PermissionError:
-        raise RecordingError(f"{path} may not be read. Check its permissions") from None
-    except (
-        McapError,
-        CRCValidationError,
-        struct.error,
-        OSError,
-        MemoryError,
-        ValueError,
-        KeyError,
-    ) as e:
-        # mcap leaks all of these on damaged lengths and strings.
-        raise damaged(path, e) from e
+    return _remembered("raw", path, stream, lambda: section(path, stream))
 
 
-def damaged(path: Path, cause: object) -> RecordingError:
-    """The error for a file that begins as a recording but does not go on as one."""
-    return RecordingError(
-        f"{path} is damaged ({cause or type(cause).__name__}). "
-        f"Try: dmrl recover {path} recovered.mcap"
-    )
-
-
-def _check_ends(path: Path, stream: BinaryIO) -> None:
-    start = stream.read(len(MAGIC))
-    if not start:
-        raise RecordingError(f"{path} is empty. Make it again")
-    if start != MAGIC:
-        raise RecordingError(
-            f"{path} is not an MCAP file: it begins with {start!r}. To import other formats, "
-            "see: dmrl convert --help"
-        )
-    size = stream.seek(0, 2)
-    stream.seek(max(0, size - len(MAGIC)))
-    if size < 2 * len(MAGIC) or stream.read() != MAGIC:
-        raise RecordingError(
-            f"{path} is cut short: its writer may have died. "
-            f"Try: dmrl recover {path} recovered.mcap"
-        )
-    stream.seek(0)
-
-
-def mcap_summary(path: Path, stream: BinaryIO) -> McapSummary | None:
-    """The summary section of an opened recording, or None where it has none."""
-    return _remembered("raw", path, stream, lambda: _summary_of(SeekingReader(stream)))
-
-
-def _remembered(what: str, path: Path, stream: BinaryIO, make: Callable[[], Made]) -> Made:
+def _remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made]) -> Made:
     """What was made of a file, without making it again as long as it is the same file.
 
     A file that was written in the last second is read again: its time stamp might not tell
@@ -157,42 +101,15 @@ def _remembered(what: str, path: Path, stream: BinaryIO, make: Callable[[], Made
     return made
 
 
-def _summary_of(reader: SeekingReader) -> McapSummary | None:
-    found = reader.get_summary()
-    if found is not None and found.statistics is None and not found.channels:
-        return None
-    return found
-
-
-def channel_of(
-    number: int, channels: dict[int, McapChannel], schemas: dict[int, McapSchema]
-) -> Channel:
-    """Topic and schema of a channel number.
-
-    Raises
-    ------
-    McapError
-        If the channel's schema is not among them.
-    """
-    channel = channels[number]
-    schema = schemas.get(channel.schema_id)
-    if schema is None and channel.schema_id != 0:
-        raise McapError(f"no schema for {channel.topic}")
-    metadata = tuple(sorted(channel.metadata.items()))
-    if schema is None:
-        return Channel(channel.topic, "", b"", "", channel.message_encoding, metadata)
-    return Channel(
-        channel.topic, schema.name, schema.data, schema.encoding, channel.message_encoding, metadata
-    )
-
-
 def channel_on(path: Path, topic: str) -> Channel:
-    """The first channel of a topic that an indexed recording has."""
+    """The first channel of a topic that a recording has."""
     with opened(path) as stream:
-        found = SeekingReader(stream).get_summary()
-        assert found is not None
-        number = min(n for n, channel in found.channels.items() if channel.topic == topic)
-        return channel_of(number, found.channels, found.schemas)
+        found = mcap_summary(path, stream)
+        if found is None:
+            channels = walked(path, stream).channels
+        else:
+            channels = {n: channel_of(n, found.channels, found.schemas) for n in found.channels}
+        return channels[min(n for n, channel in channels.items() if channel.topic == topic)]
 
 
 def summary(path: Path) -> Summary:
@@ -207,65 +124,91 @@ def summary(path: Path) -> Summary:
         return _remembered("summary", path, stream, lambda: _summary(path, stream))
 
 
-def _summary(path: Path, stream: BinaryIO) -> Summary:
+def _summary(path: Path, stream: Bounded) -> Summary:
     found = mcap_summary(path, stream)
-    if found is None:
+    if found is None or found.statistics is None:
         return _scanned(path, stream)
-    metadata: dict[str, list[dict[str, str]]] = {}
-    for record in _records(stream, found.metadata_indexes, McapMetadata):
-        metadata.setdefault(record.name, []).append(dict(record.metadata))
-    attachments = {a.name: a.data for a in _records(stream, found.attachment_indexes, Attachment)}
+    metadata = metadata_of(path, stream, found)
+    metadata.pop(sums.METADATA_NAME, None)
     statistics = found.statistics
-    counts = statistics.channel_message_counts if statistics else {}
     topics: dict[str, TopicInfo] = {}
     for number in sorted(found.channels):
         channel = channel_of(number, found.channels, found.schemas)
         before = topics[channel.topic].count if channel.topic in topics else 0
-        topics[channel.topic] = TopicInfo(channel.schema_name, before + counts.get(number, 0))
+        count = statistics.channel_message_counts.get(number, 0)
+        topics[channel.topic] = TopicInfo(channel.schema_name, before + count)
     return Summary(
         topics=dict(sorted(topics.items())),
-        start_ns=statistics.message_start_time if statistics else 0,
-        end_ns=statistics.message_end_time if statistics else 0,
+        start_ns=statistics.message_start_time,
+        end_ns=statistics.message_end_time,
         metadata=metadata,
-        attachments=attachments,
+        attachments=dict(_attachment(path, stream, at) for at in found.attachment_indexes),
         provenance=_provenance(path, metadata),
     )
 
 
-def _records(
-    stream: BinaryIO, places: Sequence[MetadataIndex | AttachmentIndex], kind: type[Record]
-) -> Iterator[Record]:
-    """The records that an index names. mcap's reader would read the whole summary again."""
-    for place in places:
-        stream.seek(place.offset)
-        record = next(StreamReader(stream, skip_magic=True).records)
-        if not isinstance(record, kind):
-            raise McapError(f"no {kind.__name__} at byte {place.offset}")
-        yield record
+def metadata_of(path: Path, stream: Bounded, found: McapSummary) -> dict[str, list[dict[str, str]]]:
+    """Metadata by name, held against its sum where the recording has one.
 
-
-def _scanned(path: Path, stream: BinaryIO) -> Summary:
-    """The summary of a complete file that was written without one."""
-    stream.seek(0)
-    schemas: dict[int, str] = {0: ""}
-    channels: dict[int, tuple[str, str]] = {}
-    counts: Counter[int] = Counter()
-    times: list[int] = []
+    Raises
+    ------
+    RecordingError
+        If it fails its sum, or does not stand where the summary says.
+    """
     metadata: dict[str, list[dict[str, str]]] = {}
-    for record in StreamReader(stream, validate_crcs=True).records:
-        match record:
-            case McapSchema():
-                schemas[record.id] = record.name
-            case McapChannel():
-                channels[record.id] = record.topic, schemas[record.schema_id]
-            case McapMessage():
-                counts[record.channel_id] += 1
-                times = [min([record.log_time, *times]), max([record.log_time, *times])]
-            case McapMetadata():
-                metadata.setdefault(record.name, []).append(dict(record.metadata))
-    topics = {t: TopicInfo(s, counts[n]) for n, (t, s) in channels.items()}
-    start_ns, end_ns = times or (0, 0)
-    return Summary(topics, start_ns, end_ns, metadata, {}, _provenance(path, metadata))
+    crc = before = 0
+    for place in sorted(found.metadata_indexes, key=lambda place: place.offset):
+        body = _record(path, stream, place, Opcode.METADATA)
+        record = McapMetadata.read(ReadDataStream(BytesIO(body[RECORD.size :])))
+        if record.name != place.name:
+            raise damaged(path, f"metadata {place.name} has another name")
+        metadata.setdefault(record.name, []).append(dict(record.metadata))
+        before, crc = crc, zlib.crc32(body, crc)
+    said = metadata.get(sums.METADATA_NAME)
+    if said and said[-1].get("metadata") != sums.text(before):
+        raise damaged(path, "its metadata fail their CRC")
+    return metadata
+
+
+def _attachment(path: Path, stream: Bounded, place: AttachmentIndex) -> tuple[str, bytes]:
+    """Name and content of an attachment, held against its CRC."""
+    body = _record(path, stream, place, Opcode.ATTACHMENT)
+    crc = int.from_bytes(body[-4:], "little")
+    record = Attachment.read(ReadDataStream(BytesIO(body[RECORD.size :])))
+    if record.name != place.name or (crc and zlib.crc32(body[RECORD.size : -4]) != crc):
+        raise damaged(path, f"attachment {place.name} fails its CRC")
+    return record.name, record.data
+
+
+def _record(
+    path: Path, stream: Bounded, place: MetadataIndex | AttachmentIndex, kind: Opcode
+) -> bytes:
+    """A whole record that an index names. mcap's reader would read the whole summary again."""
+    stream.seek(place.offset)
+    body = stream.read(place.length)
+    if len(body) < RECORD.size or RECORD.unpack_from(body) != (kind, len(body) - RECORD.size):
+        raise damaged(path, f"no {kind.name.lower()} at byte {place.offset}")
+    return body
+
+
+def _scanned(path: Path, stream: Bounded) -> Summary:
+    """The summary of a complete file that was written without one."""
+    walk = walked(path, stream)
+    walk.metadata.pop(sums.METADATA_NAME, None)
+    counts = walk.counts()
+    topics: dict[str, TopicInfo] = {}
+    for number, channel in walk.channels.items():
+        before = topics[channel.topic].count if channel.topic in topics else 0
+        topics[channel.topic] = TopicInfo(channel.schema_name, before + counts[number])
+    held = [block.time_ns for block in walk.blocks if len(block)]
+    return Summary(
+        dict(sorted(topics.items())),
+        min((int(times.min()) for times in held), default=0),
+        max((int(times.max()) for times in held), default=0),
+        walk.metadata,
+        walk.attachments,
+        _provenance(path, walk.metadata),
+    )
 
 
 def _provenance(path: Path, metadata: dict[str, list[dict[str, str]]]) -> Provenance | None:

@@ -17,7 +17,8 @@ from dmrl.errors import MissingTopic, RecordingError
 from dmrl.messages import descriptor, pool_of
 from dmrl.recording.block import EMPTY, Block, joined
 from dmrl.recording.blocks import blocks, indexed_times
-from dmrl.recording.index import TopicInfo, channel_on, damaged, summary
+from dmrl.recording.index import TopicInfo, channel_on, summary
+from dmrl.recording.opening import damaged
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
 from dmrl.recording.writer import Channel, RawMessage
@@ -105,15 +106,8 @@ def read_raw(
     """
     names = matching(path, topics) if topics else None
     for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):
-        view = block.data.data
-        rows = (block.channel, block.time_ns, block.publish_ns, block.start, block.end)
-        for number, time_ns, publish_ns, start, end in zip(*map(list_of, rows), strict=True):
-            yield RawMessage(time_ns, publish_ns, channels[number], bytes(view[start:end]))
-
-
-def list_of(values: Any) -> list[int]:
-    """A NumPy column as Python integers."""
-    return list(values.tolist())
+        for number, time_ns, publish_ns, data in block.rows():
+            yield RawMessage(time_ns, publish_ns, channels[number], data)
 
 
 def read(

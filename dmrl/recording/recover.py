@@ -1,23 +1,41 @@
 """Bringing back what a killed or damaged recording still holds."""
 
-import struct
+import zlib
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.records import Attachment, Chunk, Footer, McapRecord, Message, Metadata, Schema
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    Chunk,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+    Schema,
+)
 from mcap.records import Channel as McapChannel
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.summary import Summary as McapSummary
 
+from dmrl import limits
 from dmrl.errors import RecordingError
-from dmrl.recording.blocks import unpacked
+from dmrl.recording import sums
+from dmrl.recording.block import Block
+from dmrl.recording.chunks import definitions, loose, scanned, unpacked
 from dmrl.recording.extras import copy_extras
-from dmrl.recording.index import MAGIC, Summary, channel_of
+from dmrl.recording.index import Summary
 from dmrl.recording.inputs import sha256_of_file
+from dmrl.recording.opening import DAMAGE, MAGIC, RECORD, Bounded, too_large
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
+from dmrl.recording.section import places, stated
+from dmrl.recording.walk import channel_of
 from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
 
 
@@ -34,7 +52,14 @@ class Recovery:
     nameless
         Messages left out because what defines their topic was in a damaged chunk.
     lost_bytes
-        Bytes after the last whole record.
+        Bytes that are no whole record: after the last one, or before one that is known.
+    missing
+        Messages that the file had and that were not brought back, by topic, as far as it says.
+    counted
+        Whether it says so of the whole file: its end, with its statistics, is there.
+    doubtful
+        Whether metadata or attachments are missing or fail their checksum; what is there is kept
+        as it stands.
     whole
         Whether the file has its footer and nothing was lost.
     """
@@ -43,6 +68,9 @@ class Recovery:
     damaged_chunks: int = 0
     nameless: int = 0
     lost_bytes: int = 0
+    missing: dict[str, int] = field(default_factory=dict)
+    counted: bool = False
+    doubtful: bool = False
     whole: bool = False
 
 
@@ -52,14 +80,22 @@ class _Walk:
 
     path: Path
     recovery: Recovery
+    end: McapSummary  # what the end of the file says, as far as it is there
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
+    found: Counter[int] = field(default_factory=Counter)  # messages by channel number
+    skipped: Counter[int] = field(default_factory=Counter)  # in damaged chunks, by their indexes
+    summed: sums.Sums = field(default_factory=sums.Sums)
+    extras: int = 0  # metadata and attachments
+    chunks: int = 0
+    unpacked: int = 0
+    footer: bool = False
 
 
 def recover(path: Path, out: Path) -> Recovery:
-    """Write a complete recording with every message before the damage.
+    """Write a complete recording with every message that can still be read.
 
     Chunks in the middle that fail their CRC are left out; what follows them is kept.
 
@@ -73,21 +109,23 @@ def recover(path: Path, out: Path) -> Recovery:
     Raises
     ------
     RecordingError
-        If ``path`` does not begin as a recording, or no message can be brought back.
+        If ``path`` does not begin as a recording, no message can be brought back, or it unpacks to
+        more than its size explains.
     OutputError
         If ``out`` exists or cannot be written.
     """
     if not path.is_file():
         raise RecordingError(f"no recording {path}. Check the name")
-    recovery = Recovery()
-    with path.open("rb") as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
+    with Bounded(path) as stream:
+        if stream.size < len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
             raise RecordingError(
                 f"{path} does not begin as a recording: nothing to recover. Make it again"
             )
-        walk = _Walk(path, recovery)
-        _take_summary(stream, walk)
-        stream.seek(0)
+        walk = _Walk(path, Recovery(), _end(path, stream))
+        for record in (*walk.end.schemas.values(), *walk.end.channels.values()):
+            # A topic is defined in the chunk that has its first message. If that is damaged, all
+            # later ones would be nameless.
+            _define(walk, record)
         messages = _messages(stream, walk)
         # Our provenance stands before the first message: it is known once that is reached.
         first = next(messages, None)
@@ -95,12 +133,13 @@ def recover(path: Path, out: Path) -> Recovery:
             raise RecordingError(f"{path} holds no whole chunk: nothing to recover. Make it again")
         with RecordingWriter(out, _provenance(walk)) as sink:
             sink.write_raw(first)
-            recovery.messages = 1
+            walk.recovery.messages = 1
             for raw in messages:
                 sink.write_raw(raw)
-                recovery.messages += 1
+                walk.recovery.messages += 1
             copy_extras(Summary({}, 0, 0, walk.metadata, walk.attachments), sink)
-    return recovery
+    _account(walk)
+    return walk.recovery
 
 
 def _provenance(walk: _Walk) -> Provenance:
@@ -108,69 +147,155 @@ def _provenance(walk: _Walk) -> Provenance:
     if METADATA_NAME in walk.metadata:
         try:
             own = Provenance.from_metadata(walk.metadata[METADATA_NAME][-1])
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             own = None  # damaged like the rest; the messages are what is wanted
     source = Input(walk.path.name, sha256_of_file(walk.path), own)
     return Provenance("recover", inputs=(source,))
 
 
-def _take_summary(stream: BinaryIO, walk: _Walk) -> None:
-    """Definitions of topics as the end of a whole file repeats them.
-
-    A topic is defined in the chunk that has its first message. If that is damaged, all later ones
-    would be nameless.
-    """
-    stream.seek(0)
+def _end(path: Path, stream: Bounded, start: int | None = None) -> McapSummary:
+    """The summary section where the footer says it is, or at ``start``; empty if it is damaged."""
     try:
-        found = make_reader(stream).get_summary()
-    except (McapError, CRCValidationError, struct.error, OSError, MemoryError, ValueError):
-        return  # cut short: there is none
-    for record in (*found.schemas.values(), *found.channels.values()) if found else ():
-        for _ in _take(record, walk):
-            pass
+        return stated(path, stream, start)[0] or McapSummary()
+    except (RecordingError, *DAMAGE):
+        return McapSummary()
 
 
-def _messages(stream: BinaryIO, walk: _Walk) -> Iterator[RawMessage]:
-    for record in _records(stream, walk):
-        if not isinstance(record, Chunk):
-            yield from _take(record, walk)
+def _messages(stream: Bounded, walk: _Walk) -> Iterator[RawMessage]:
+    """Every message that can be read, in the order of the file."""
+    damaged = False  # the chunk whose message indexes follow
+    for at, record in _records(stream, walk):
+        if isinstance(record, Chunk):
+            walk.chunks += 1
+            block = _unpacked(stream, walk, record, at)
+            damaged = block is None
+            if block is not None:
+                yield from _named(walk, block)
+        elif isinstance(record, MessageIndex):
+            if damaged:
+                walk.skipped[record.channel_id] += len(record.records)
+        elif isinstance(record, Message):
+            yield from _named(walk, loose([record]))
+        else:
+            _define(walk, record)
+
+
+def _unpacked(stream: Bounded, walk: _Walk, chunk: Chunk, at: int) -> Block | None:
+    """The messages of a chunk, what it defines noted; None if it is damaged."""
+    try:
+        data = unpacked(walk.path, chunk, at)
+        found = list(definitions(data))
+        block = scanned(data)
+    except (RecordingError, *DAMAGE):
+        walk.recovery.damaged_chunks += 1
+        return None
+    walk.unpacked += len(data)
+    if walk.unpacked > limits.unpacked_bytes(stream.size):
+        raise too_large(walk.path, "it unpacks to more than its size explains")
+    for record in found:
+        _define(walk, record)
+    return block
+
+
+def _named(walk: _Walk, block: Block) -> Iterator[RawMessage]:
+    """The messages of a block whose topic is known."""
+    for number, time_ns, publish_ns, data in block.rows():
+        channel = walk.channels.get(number)
+        if channel is None:
+            walk.recovery.nameless += 1
             continue
+        walk.found[number] += 1
+        yield RawMessage(time_ns, publish_ns, channel, data)
+
+
+def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord]]:
+    """Where they start and whole records up to the footer, over what is damaged between."""
+    known = sorted(start for start, _ in places(walk.end))
+    at = len(MAGIC)
+    while at < stream.size:
+        later = bisect_right(known, at)
+        edge = known[later] if later < len(known) else stream.size
         try:
-            unpacked(walk.path, record, stream.tell())
-        except RecordingError:
-            walk.recovery.damaged_chunks += 1
+            stream.seek(at)
+            opcode, length = RECORD.unpack(stream.read(RECORD.size))
+            end = at + RECORD.size + length
+            if end > edge:
+                raise McapError("it runs into the next record that is known")
+            record = _parsed(opcode, stream.read(length), walk)
+            if opcode == Opcode.DATA_END and walk.end.statistics is None:
+                walk.end = _end(walk.path, stream, end)
+        except DAMAGE:
+            walk.recovery.lost_bytes += edge - at
+            at = edge
             continue
-        for inner in breakup_chunk(record):
-            yield from _take(inner, walk)
+        if opcode == Opcode.FOOTER:
+            walk.footer = True
+            return
+        if record is not None:
+            yield at, record
+        at = end
 
 
-def _records(stream: BinaryIO, walk: _Walk) -> Iterator[McapRecord]:
-    """Whole records up to the footer or the damage; notes what is lost behind it."""
-    good = len(MAGIC)
-    try:
-        for record in StreamReader(stream, emit_chunks=True).records:
-            good = stream.tell()
-            if isinstance(record, Footer):
-                walk.recovery.whole = not walk.recovery.damaged_chunks
-                return
-            yield record
-    except (McapError, CRCValidationError, struct.error, OSError, MemoryError, ValueError):
-        walk.recovery.lost_bytes = walk.path.stat().st_size - good
+_KINDS: dict[int, type[Any]] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: McapChannel,
+    Opcode.CHUNK: Chunk,
+    Opcode.MESSAGE_INDEX: MessageIndex,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.METADATA: Metadata,
+}
 
 
-def _take(record: McapRecord, walk: _Walk) -> Iterator[RawMessage]:
+def _parsed(opcode: int, body: bytes, walk: _Walk) -> McapRecord | None:
+    """The record that these bytes are; None for one that is of no use here."""
+    if opcode == Opcode.MESSAGE:
+        message: Message = Message.read(ReadDataStream(BytesIO(body)), len(body))
+        return message
+    if opcode not in _KINDS:
+        return None
+    record: McapRecord = _KINDS[opcode].read(ReadDataStream(BytesIO(body)))
+    if isinstance(record, Attachment) and zlib.crc32(body[:-4]) != (
+        int.from_bytes(body[-4:], "little") or zlib.crc32(body[:-4])
+    ):
+        walk.recovery.doubtful = True
+    if isinstance(record, Metadata) and record.name != sums.METADATA_NAME:
+        walk.summed.add(RECORD.pack(opcode, len(body)) + body)
+    return record
+
+
+def _define(walk: _Walk, record: McapRecord) -> None:
+    """Note what a record defines."""
     match record:
         case Schema():
             walk.schemas[record.id] = record
         case McapChannel() if not record.schema_id or record.schema_id in walk.schemas:
             walk.channels[record.id] = channel_of(record.id, {record.id: record}, walk.schemas)
         case Metadata():
+            walk.extras += 1
             walk.metadata.setdefault(record.name, []).append(dict(record.metadata))
         case Attachment():
+            walk.extras += 1
             walk.attachments[record.name] = record.data
-        case Message():
-            channel = walk.channels.get(record.channel_id)
-            if channel is None:
-                walk.recovery.nameless += 1
-            else:
-                yield RawMessage(record.log_time, record.publish_time, channel, record.data)
+
+
+def _account(walk: _Walk) -> None:
+    """What is missing, by what the file says it had."""
+    recovery, said = walk.recovery, walk.end.statistics
+    had = Counter(said.channel_message_counts) if said is not None else walk.found + walk.skipped
+    for number, count in sorted((had - walk.found).items()):
+        channel = walk.channels.get(number)
+        topic = channel.topic if channel else f"channel {number}"
+        recovery.missing[topic] = recovery.missing.get(topic, 0) + count
+    recovery.counted = said is not None
+    if said is not None and said.metadata_count + said.attachment_count != walk.extras:
+        recovery.doubtful = True
+    crc = walk.metadata.get(sums.METADATA_NAME)
+    if crc and crc[-1].get("metadata") != sums.text(walk.summed.metadata):
+        recovery.doubtful = True
+    recovery.whole = (
+        walk.footer
+        and walk.chunks == (len(walk.end.chunk_indexes) or walk.chunks)
+        and not recovery.doubtful
+        and not (recovery.damaged_chunks or recovery.nameless or recovery.lost_bytes)
+        and not recovery.missing
+    )

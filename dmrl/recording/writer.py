@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 from dmrl.errors import RecordingError
 from dmrl.messages import schema_bytes
 from dmrl.output import as_output_error, partial_file
+from dmrl.recording import sums
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.topics import row_of
 
@@ -68,7 +69,12 @@ class RawMessage:
 class _WriteThrough(io.BufferedWriter):
     """Hands every finished chunk to the system, so that a killed process keeps it."""
 
+    def __init__(self, raw: io.RawIOBase) -> None:
+        super().__init__(raw)
+        self.sums = sums.Sums()
+
     def write(self, data: Any) -> int:
+        self.sums.add(data)
         count = super().write(data)
         self.flush()
         return count
@@ -113,8 +119,12 @@ class RecordingWriter:
         partial = self._resources.enter_context(partial_file(path, keep_on_error=keep_on_error))
         try:
             raw = self._resources.enter_context(io.FileIO(partial, "wb"))
+            self._stream = _WriteThrough(raw)
             self._writer = Writer(
-                _WriteThrough(raw), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
+                self._stream,
+                chunk_size=CHUNK_BYTES,
+                compression=CompressionType.ZSTD,
+                enable_data_crcs=True,
             )
             self._writer.start(profile="dmrl", library=f"dmrl {provenance.dmrl_version}")
             self._writer.add_metadata(METADATA_NAME, provenance.to_metadata())
@@ -213,6 +223,8 @@ class RecordingWriter:
             self._resources.__exit__(kind, error, traceback)
             return
         try:
+            self._writer.flush()  # its sums are to cover the last chunk, too
+            self._writer.add_metadata(sums.METADATA_NAME, self._stream.sums.to_metadata())
             self._writer.finish()
         except OSError as e:
             self._abandon(e)

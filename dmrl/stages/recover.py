@@ -24,8 +24,8 @@ def command(
 ) -> None:
     """Bring back the messages of a recording that was cut short.
 
-    Every message before the damage is kept, bit for bit; a chunk that fails its CRC is left
-    out, and what follows it is kept.
+    Every message that can be read is kept, bit for bit; a chunk that fails its CRC is left
+    out, and what follows it is kept. The line says how many messages are missing, by topic.
 
     Parameters
     ----------
@@ -40,11 +40,22 @@ def command(
     if as_json:
         print_json(asdict(result))
         return
-    lost = "nothing was lost"
-    if not result.whole:
-        nameless = f"{result.nameless} messages left out whose topic they defined, "
-        lost = (
-            f"{result.damaged_chunks} damaged chunks left out, {nameless * bool(result.nameless)}"
-            f"{result.lost_bytes} bytes after the last whole record lost"
-        )
-    print(f"{out}: {result.messages} messages brought back; {lost}")
+    print(f"{out}: {result.messages} messages brought back; {_lost(result)}")
+
+
+def _lost(result: Recovery) -> str:
+    """What was lost, in words."""
+    if result.whole:
+        sure = "" if result.counted else " as far as can be told: it does not say what it had"
+        return f"nothing was lost{sure}"
+    missing = ", ".join(f"{topic} {count}" for topic, count in result.missing.items())
+    unknown = "it does not say how many messages there were"
+    parts = (
+        f"{sum(result.missing.values())} messages missing ({missing})" * bool(missing),
+        f"{result.damaged_chunks} damaged chunks left out" * bool(result.damaged_chunks),
+        f"{result.nameless} messages left out whose topic they defined" * bool(result.nameless),
+        f"{result.lost_bytes} bytes that are no whole record lost" * bool(result.lost_bytes),
+        "metadata or attachments missing, or damaged and kept as they stand" * result.doubtful,
+        unknown * (not result.counted),
+    )
+    return ", ".join(part for part in parts if part)

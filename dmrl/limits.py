@@ -1,0 +1,35 @@
+"""Budgets: how much a file may ask for, in one place.
+
+Files come from strangers, and a few bytes can ask for a lot: 200 kB of zstd unpack to 6 GB, a
+small PNG to 170 million pixels. A command that reads takes at most about 1 GB and 30 s more than
+the size of its files explains; what asks for more is refused before it is made.
+"""
+
+MB = 1_000_000
+
+UNPACKED_BYTES = 128 * MB
+"""What a chunk of a recording may unpack to; dmrl's own hold 256 KiB and a message."""
+
+UNPACKED_TIMES = 100
+"""A recording may unpack to `UNPACKED_BYTES`, and this many times its own size. The most that
+dmrl's own topics reach is about 20; pictures reach 1."""
+
+TOPICS = 2_000
+"""Channels of a recording, and schemas."""
+
+NAME_CHARACTERS = 1_000
+"""Of a topic or a message type."""
+
+PIXELS = 64 * MB
+"""Of a picture: 8,000 x 8,000. With its copies in other orders that is 0.7 GB."""
+
+DECODED_PIXELS = 1_000 * MB
+"""Of a picture, each of its scans counted: a progressive JPEG of a few kB can have thousands."""
+
+ANCESTORS = 64
+"""How deep a provenance is told: older ancestors keep their hash and lose their story."""
+
+
+def unpacked_bytes(size: int) -> int:
+    """What a recording of ``size`` bytes may unpack to."""
+    return UNPACKED_BYTES + UNPACKED_TIMES * size

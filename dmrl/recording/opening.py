@@ -1,0 +1,103 @@
+"""A recording's file, opened: it begins and ends as one, and no read goes beyond its end."""
+
+import io
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.stream_reader import CRCValidationError
+
+from dmrl.errors import RecordingError
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD = struct.Struct("<BQ")  # opcode, length
+# What mcap leaks on damaged lengths and strings.
+DAMAGE = (
+    McapError,
+    CRCValidationError,
+    struct.error,
+    OSError,
+    MemoryError,
+    ValueError,
+    LookupError,
+    OverflowError,
+)
+
+
+class Bounded(io.BufferedReader):
+    """A file that refuses to read beyond its end, so that a damaged length reserves no memory."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path, "r"))
+        self.size = self.seek(0, io.SEEK_END)
+        self.seek(0)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As a file reads, but all that was asked for.
+
+        Raises
+        ------
+        McapError
+            If the file ends before that.
+        """
+        if size is not None and size > self.size - self.tell():
+            raise McapError(f"a record at byte {self.tell()} runs beyond the end")
+        return super().read(size)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Bounded]:
+    """The file, open for reading, known to begin and end as a recording does.
+
+    Raises
+    ------
+    RecordingError
+        If it is absent, not MCAP, cut short, or turns out to be damaged inside the block.
+    """
+    if path.is_dir():
+        raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
+    try:
+        with Bounded(path) as stream:
+            _check_ends(path, stream)
+            yield stream
+    except FileNotFoundError:
+        raise RecordingError(f"no recording {path}. Check the name") from None
+    except PermissionError:
+        raise RecordingError(f"{path} may not be read. Check its permissions") from None
+    except DAMAGE as e:
+        raise damaged(path, e) from e
+
+
+def damaged(path: Path, cause: object) -> RecordingError:
+    """The error for a file that begins as a recording but does not go on as one."""
+    return RecordingError(
+        f"{path} is damaged ({cause or type(cause).__name__}). "
+        f"Try: dmrl recover {path} recovered.mcap"
+    )
+
+
+def too_large(path: Path, what: str) -> RecordingError:
+    """The error for a file that asks for more than its size explains."""
+    return RecordingError(
+        f"{path}: {what}. Recordings do not; if you trust it, write it again with smaller chunks"
+    )
+
+
+def _check_ends(path: Path, stream: Bounded) -> None:
+    start = stream.read(min(len(MAGIC), stream.size))
+    if not start:
+        raise RecordingError(f"{path} is empty. Make it again")
+    if start != MAGIC:
+        raise RecordingError(
+            f"{path} is not an MCAP file: it begins with {start!r}. To import other formats, "
+            "see: dmrl convert --help"
+        )
+    stream.seek(max(0, stream.size - len(MAGIC)))
+    if stream.size < 2 * len(MAGIC) or stream.read() != MAGIC:
+        raise RecordingError(
+            f"{path} is cut short: its writer may have died. "
+            f"Try: dmrl recover {path} recovered.mcap"
+        )
+    stream.seek(0)

@@ -1,0 +1,165 @@
+"""Recordings that ask for much more than they are: refused before they get it."""
+
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Schema
+from mcap.writer import Writer
+
+from dmrl import limits
+from dmrl.messages import schema_bytes
+
+MAGIC = b"\x89MCAP0\r\n"
+HEIGHT = schema_bytes("Height")
+SPARE_BYTES = 600_000_000
+"""Address space that a refusal may take beyond what Python and its libraries hold."""
+
+BOUNDED = """
+import resource, sys
+from pathlib import Path
+from dmrl.errors import DmrlError
+from dmrl.recording import check, recover, summary, trim
+held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (held + int(sys.argv[2]), -1))
+resource.setrlimit(resource.RLIMIT_CPU, (30, 30))
+path = Path(sys.argv[1])
+out = path.with_name("out.mcap")
+for read in (check, summary, lambda p: trim(p, out), lambda p: recover(p, out)):
+    try:
+        read(path)
+        print("read")
+    except DmrlError as e:
+        assert not out.exists()
+        print(e)
+    out.unlink(missing_ok=True)
+"""
+
+
+def read_bounded(path: Path, spare: int = SPARE_BYTES) -> list[str]:
+    """What check, info, trim and recover say in a process with little memory and time."""
+    done = subprocess.run(
+        [sys.executable, "-c", BOUNDED, str(path), str(spare)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    said = done.stdout.splitlines()
+    assert len(said) == 4
+    return said
+
+
+def zeros(size: int, *, telling: bool = True) -> bytes:
+    """A zstd frame of zeros, by hand: blocks of 128 KiB that take four bytes each."""
+    header = struct.pack("<IBB", 0xFD2FB528, 0xC0 * telling, 7 << 3)
+    header += struct.pack("<Q", size) * telling
+    blocks = [b"\x02\x00\x10\x00"] * (size >> 17)
+    blocks[-1] = b"\x03\x00\x10\x00"
+    return header + b"".join(blocks)
+
+
+def recording(path: Path, *chunks: Chunk) -> Path:
+    """A complete recording without a summary that holds these chunks."""
+    builder = RecordBuilder()
+    Header("", "").write(builder)
+    Schema(1, HEIGHT, "protobuf", "dmrl.v1.Height").write(builder)
+    Channel(1, "/cf1/height", "protobuf", {}, 1).write(builder)
+    for chunk in chunks:
+        chunk.write(builder)
+    DataEnd(0).write(builder)
+    Footer(0, 0, 0).write(builder)
+    path.write_bytes(MAGIC + builder.end() + MAGIC)
+    return path
+
+
+def chunk(data: bytes, size: int, compression: str = "zstd") -> Chunk:
+    return Chunk(compression, data, 1, 0, 0, size)
+
+
+def test_the_frame_of_zeros_is_one() -> None:
+    for telling in (True, False):
+        frame = zeros(1 << 20, telling=telling)
+        assert zstandard.ZstdDecompressor().decompress(frame, 1 << 20) == bytes(1 << 20)
+
+
+@pytest.mark.parametrize(
+    "bomb",
+    [
+        chunk(zeros(6 << 30), 6 << 30),
+        chunk(zeros(6 << 30), 1000),
+        chunk(zeros(6 << 30), 0),
+        chunk(zeros(6 << 30, telling=False), 1000),
+        chunk(lz4.frame.compress(bytes(1 << 28)), 1000, "lz4"),
+    ],
+    ids=["true size", "false size", "no size", "a frame without size", "lz4"],
+)
+def test_a_bomb_is_refused(tmp_path: Path, bomb: Chunk) -> None:
+    path = recording(tmp_path / "bomb.mcap", bomb)
+    assert path.stat().st_size < 2_000_000
+    *read, recovered = read_bounded(path)
+    assert all("unpacks to" in said or "is damaged" in said for said in read), read
+    assert "nothing to recover" in recovered
+
+
+def test_many_small_bombs_are_refused(tmp_path: Path) -> None:
+    size = 100_000_000
+    data = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22 + size, 1, 0, 0, 0) + bytes(size)
+    one = Chunk("zstd", zstandard.compress(data), 0, 0, zlib.crc32(data), len(data))
+    path = recording(tmp_path / "bomb.mcap", *[one] * 50)
+    assert all("it unpacks to more than" in said for said in read_bounded(path))
+
+
+@pytest.mark.slow
+def test_as_many_messages_as_a_chunk_may_hold_are_read_within_the_budget(tmp_path: Path) -> None:
+    message = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, 1, 0, 0, 0)
+    data = message * (limits.UNPACKED_BYTES // len(message))
+    one = Chunk("zstd", zstandard.compress(data), 0, 0, zlib.crc32(data), len(data))
+    path = recording(tmp_path / "many.mcap", one)
+    assert read_bounded(path, 1_000_000_000) == ["read"] * 4
+
+
+def test_an_indexed_bomb_is_refused(tmp_path: Path) -> None:
+    """As a writer would have written it: the summary tells the size."""
+    path = tmp_path / "bomb.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1 << 20)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", HEIGHT)
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        for k in range(400):
+            writer.add_message(channel, k, bytes(1 << 20), k)
+        writer.finish()
+    assert path.stat().st_size < 1_000_000
+    assert all("unpack" in said for said in read_bounded(path))
+
+
+def _topics(writer: Writer) -> None:
+    for k in range(limits.TOPICS + 1):
+        writer.register_channel(f"/cf{k}/height", "protobuf", 1)
+
+
+def _name(writer: Writer) -> None:
+    writer.register_channel("/" + "a" * limits.NAME_CHARACTERS, "protobuf", 1)
+
+
+@pytest.mark.parametrize(
+    ("fill", "complaint"), [(_topics, "2000 topics"), (_name, "1001 characters")]
+)
+def test_topics_and_names_have_a_budget(
+    tmp_path: Path, fill: Callable[[Writer], None], complaint: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.register_schema("dmrl.v1.Height", "protobuf", HEIGHT)
+        fill(writer)
+        writer.add_message(1, 0, b"", 0)
+        writer.finish()
+    assert complaint in read_bounded(path)[0]
