@@ -5,6 +5,9 @@ VENV ?= .venv
 PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,$(shell command -v $(p) 2>/dev/null)))
 BIN := $(abspath $(VENV))/bin
 LAYOUT := build/layout
+# One process for each core, each with one thread: more would take the cores from each other.
+# Tests of a file stay together, with what they share.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist loadfile
 INSTALL := $(BIN)/pip install --constraint constraints.txt --editable
 
 .DEFAULT_GOAL := help
@@ -18,10 +21,10 @@ demo: $(VENV)/.demo ## Run the whole pipeline, small; pictures and a table end u
 	$(BIN)/dmrl demo --out demo
 
 test: $(VENV)/.dev ## Run the tests that take seconds. ARGS="-k name" picks some.
-	$(BIN)/pytest $(ARGS)
+	$(PYTEST) $(ARGS)
 
 test-all: $(VENV)/.dev ## Run every test, the slow ones too.
-	$(BIN)/pytest -m "slow or not slow" $(ARGS)
+	$(PYTEST) -m "slow or not slow" --timeout 3600 $(ARGS)
 
 check: format lint types imports spell ## Check format, lint, types, imports and spelling.
 

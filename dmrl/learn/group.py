@@ -10,6 +10,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,6 +27,10 @@ Made = TypeVar("Made")
 Work = Callable[["Group"], Made]
 """What each process of a group does."""
 SPAWN = multiprocessing.get_context("spawn")
+MEETING_S = 60.0
+"""How long the processes of a group may take to find each other. All have loaded by then."""
+WORK_S = 1800.0
+"""How long one may wait for the others afterwards: the first also validates and saves."""
 LAST_WORDS_S = 5.0
 """How long a process that is done, or killed, may take to be gone."""
 
@@ -91,7 +96,7 @@ def in_group(processes: int, work: Work[Made]) -> Made:
     Raises
     ------
     SettingError
-        If one of the others is killed.
+        If one of the others is killed, or the processes do not find each other.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         return _by_torchrun(work)
@@ -115,8 +120,28 @@ def _by_torchrun(work: Work[Made]) -> Made:
 
 
 def _member(meeting: str, rank: int, size: int, work: Work[Made]) -> Made:
-    distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=size)
+    wait = timedelta(seconds=MEETING_S)
+    try:
+        distributed.init_process_group("gloo", meeting, timeout=wait, rank=rank, world_size=size)
+    except RuntimeError as e:
+        _forget_failed_start()
+        raise SettingError(
+            f"the {size} processes did not find each other within {MEETING_S:g} s. "
+            "Begin again, on a less busy machine or with fewer --processes"
+        ) from e
+    distributed.distributed_c10d._set_pg_timeout(timedelta(seconds=WORK_S))
     return _until_all_are_done(work)
+
+
+def _forget_failed_start() -> None:
+    """Make torch count its groups from 0 again.
+
+    It names a group by that count, and a failed start leaves it raised: the next group of this
+    process would look for its peers under a name that they do not have. Only the end of a group
+    sets it back, so one of this process alone is begun and ended.
+    """
+    distributed.init_process_group("gloo", store=distributed.HashStore(), rank=0, world_size=1)
+    distributed.destroy_process_group()
 
 
 def _until_all_are_done(work: Work[Made]) -> Made:
@@ -145,7 +170,7 @@ def _others(size: int, work: Work[Any]) -> Iterator[str]:
             yield meeting
             for _, process in started:
                 process.join(LAST_WORDS_S)
-        except (EOFError, RuntimeError) as e:
+        except (EOFError, RuntimeError, SettingError) as e:
             for _, process in started:
                 process.join(LAST_WORDS_S / size)
             # One that raised has said so itself, or fails because this one did.
