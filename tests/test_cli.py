@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import io
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -91,17 +92,40 @@ def test_help_of_every_command_fits_a_narrow_terminal(name: str) -> None:
     assert max(map(len, page.getvalue().splitlines())) <= 50
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_without_the_extras_a_command_works_or_names_the_extra(name: str) -> None:
+HELP_OF_EACH = """
+import contextlib, io, json
+from dmrl.cli import COMMANDS, main
+said = {}
+for name in COMMANDS:
+    sys.argv, out, err = ["dmrl", name, "--help"], io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try: main()
+        except SystemExit as e: status = e.code
+    said[name] = status, out.getvalue(), err.getvalue()
+print(json.dumps(said))
+"""
+
+
+@pytest.fixture(scope="module")
+def bare() -> dict[str, tuple[int, str, str]]:
+    """Exit status, output and errors of every command's help where no extra is installed."""
     hide = f"import sys\nsys.modules.update(dict.fromkeys({OPTIONAL}))\n"
-    code = f"{hide}sys.argv = ['dmrl', {name!r}, '--help']\nfrom dmrl.cli import main\nmain()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if done.returncode == 0:
-        assert done.stdout.startswith(f"Usage: dmrl {name}")
+    script = [sys.executable, "-c", hide + HELP_OF_EACH]
+    done = subprocess.run(script, capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_without_the_extras_a_command_works_or_names_the_extra(
+    name: str, bare: dict[str, tuple[int, str, str]]
+) -> None:
+    status, out, err = bare[name]
+    if status == 0:
+        assert out.startswith(f"Usage: dmrl {name}")
     else:
-        assert done.returncode == 1, done.stderr
-        assert "Install it with: pip install 'dmrl[" in done.stderr
-        assert done.stderr.count("\n") == 1, done.stderr
+        assert status == 1, err
+        assert "Install it with: pip install 'dmrl[" in err
+        assert err.count("\n") == 1, err
 
 
 def test_a_command_that_does_not_exist_is_a_bad_command_line_with_or_without_extras() -> None:

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, distributed
+from torch._C._distributed_c10d import HashStore
 
 from dmrl.errors import DmrlError, SettingError
 from dmrl.learn.network import Network
@@ -140,7 +141,7 @@ def _forget_failed_start() -> None:
     process would look for its peers under a name that they do not have. Only the end of a group
     sets it back, so one of this process alone is begun and ended.
     """
-    distributed.init_process_group("gloo", store=distributed.HashStore(), rank=0, world_size=1)
+    distributed.init_process_group("gloo", store=HashStore(), rank=0, world_size=1)
     distributed.destroy_process_group()
 
 

@@ -38,8 +38,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(card, "plots", None)
 
 
-@pytest.fixture
-def record(tmp_path: Path) -> Record:
+def recorder(folder: Path) -> Record:
     """Writes a recording: one list of peers per image, None for an image without labels."""
 
     def write(
@@ -51,7 +50,7 @@ def record(tmp_path: Path) -> Record:
         sizes_px: Mapping[int, tuple[int, int]] | None = None,
         masks: Mapping[int, Any] | None = None,
     ) -> Path:
-        path = tmp_path / name
+        path = folder / name
         path.parent.mkdir(exist_ok=True)
         with RecordingWriter(path, Provenance("test", {"seed": seed})) as sink:
             if split is not None:
@@ -69,3 +68,9 @@ def record(tmp_path: Path) -> Record:
         return path
 
     return write
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Record:
+    """``recorder`` of the test's own folder."""
+    return recorder(tmp_path)

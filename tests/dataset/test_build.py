@@ -248,6 +248,7 @@ def test_the_command_prints_images_and_label_sources(
     assert "flight.mcap" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_published_set_keeps_its_split_and_its_labels_by_source(
     data: Path, tmp_path: Path
 ) -> None:

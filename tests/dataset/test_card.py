@@ -1,38 +1,48 @@
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 from PIL import Image
 
-from dmrl import card
+from dmrl import card, plots
 from dmrl.card import write_card
 from dmrl.errors import DatasetError
 from dmrl.stages.card import Settings as CardSettings
 from dmrl.stages.card import run as run_card
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import Record, peer
+from .conftest import Record, peer, recorder
 
 yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
 datasets = pytest.importorskip("datasets", reason="datasets is not installed")
 
 
-@pytest.fixture(autouse=True)
-def figures() -> None:
-    """Figures are drawn here."""
-
-
-@pytest.fixture
-def built(record: Record, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset whose card has figures. To be read only."""
+    folder = tmp_path_factory.mktemp("card")
+    record = recorder(folder)
     flights = [
         record(peers=[[peer()], [], [peer(), peer(peer="cf3", u_px=40.0)]]),
         record("other.mcap", peers=[[peer(u_px=99.0)], [peer()]], seed=1),
     ]
-    settings = Settings(title="Two flights: a test", license="cc-by-4.0")
-    run(flights, tmp_path / "out", settings)
-    return tmp_path / "out"
+    run(flights, folder / "out", Settings(title="Two flights: a test", license="cc-by-4.0"))
+    return folder / "out"
+
+
+@pytest.fixture
+def built(drawn: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return shutil.copytree(drawn, tmp_path / "out")
+
+
+@pytest.fixture
+def with_figures(figures: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cards of the test have figures."""
+    monkeypatch.setattr(card, "plots", plots)
 
 
 def front_of(folder: Path) -> Any:
@@ -91,14 +101,14 @@ def test_figures_have_units_on_their_axes(built: Path) -> None:
     assert "<!-- u, px -->" in (built / "figures/position.svg").read_text()
 
 
-def test_writing_it_again_gives_the_same_bytes(built: Path) -> None:
+def test_writing_it_again_gives_the_same_bytes(built: Path, with_figures: None) -> None:
     before = {p: p.read_bytes() for p in built.rglob("*") if p.is_file()}
     assert run_card(built, CardSettings()) == built / "README.md"
     assert {p: p.read_bytes() for p in built.rglob("*") if p.is_file()} == before
 
 
 def test_a_card_can_be_written_elsewhere_and_the_one_before_stays(
-    built: Path, tmp_path: Path
+    built: Path, with_figures: None, tmp_path: Path
 ) -> None:
     before = (built / "README.md").read_bytes()
     card = run_card(built, CardSettings(title="Elsewhere"), tmp_path / "card")

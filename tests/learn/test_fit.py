@@ -116,6 +116,7 @@ def test_training_finds_the_dot(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.depth_m[right, 0], 1.5, atol=0.3)
 
 
+@pytest.mark.slow
 def test_dmrl_nano_finds_the_dot_within_its_cell(tmp_path: Path) -> None:
     examples = dots(64)
     settings = FitSettings(

@@ -151,6 +151,7 @@ def test_the_median_is_numpys_also_with_repeats(numbers: list[float], random: ob
     assert got[0] == pytest.approx(np.median(repeated))
 
 
+@pytest.mark.slow
 def test_ten_thousand_images_take_seconds() -> None:
     rng = np.random.default_rng(0)
     images = 10_000

@@ -256,6 +256,7 @@ def published(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out.mcap"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("against", "wanted"),
     [

@@ -343,6 +343,7 @@ def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> N
         assert ours.status == STATUS_AMBIGUOUS
 
 
+@pytest.mark.slow
 def test_real_ranges_of_moving_robots_are_labelled_and_a_static_observer_is_not(
     data: Path, tmp_path: Path
 ) -> None:

@@ -87,6 +87,7 @@ def _fields(settings: Settings) -> dict[str, object]:
     return {name: getattr(settings, name) for name in Settings.__dataclass_fields__}
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -> None:
     # Pictures without loss, so that chunks of the file fill and are written early.
     recipe = tmp_path / "r.toml"
@@ -120,6 +121,7 @@ def test_what_is_resumed_must_be_of_the_same_settings(recording: Path, tmp_path:
         run(tmp_path / "none.mcap", SMALL, resume=True)
 
 
+@pytest.mark.slow
 def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
     settings = Settings(images=6, robots_max=2, empty_share=0.0, samples=2)
     camera = camera_of(settings)
@@ -193,6 +195,7 @@ CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1
 )
 
 
+@pytest.mark.slow
 def test_a_model_of_the_user_s_is_rendered_about_its_middle(blender: Path, tmp_path: Path) -> None:
     path = tmp_path / "cube.obj"
     path.write_text(CUBE)

@@ -224,6 +224,7 @@ run(
 """
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_network(dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, validation_share=0.2)
     for name in ("a", "b"):
