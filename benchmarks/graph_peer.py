@@ -1,0 +1,110 @@
+"""A plain factor graph over a pair, by gtsam: what someone would write in an afternoon.
+
+Poses of both robots ten times a second, odometry between them, ranges between the two with
+Cauchy's loss. Starts are tried all around the first range. No constants are solved for.
+"""
+
+from itertools import pairwise, product
+
+import gtsam
+import numpy as np
+from gtsam import noiseModel
+
+from dmrl.estimation.motion import Increments, odometry, rotation
+from dmrl.estimation.pair import Pair
+from dmrl.geometry.frames import Array
+
+KEY_HZ = 10.0
+FIRST_S = 20.0
+DIRECTIONS = 6
+"""Bearings, and headings, that are tried."""
+KEPT = 3
+RANGE_STD_M, STEP_STD_M, TURN_STD_RAD = 0.10, 0.02, 0.002
+"""Of a range; of a tenth of a second of odometry: the noise of bench_label_faults' sensors."""
+MARGINAL_EVERY = 5
+ANCHOR = noiseModel.Isotropic.Sigma(3, 1e-6)
+ODOMETRY = noiseModel.Diagonal.Sigmas(np.array([STEP_STD_M, STEP_STD_M, TURN_STD_RAD]))
+RANGE = noiseModel.Robust.Create(
+    noiseModel.mEstimator.Cauchy.Create(1.0), noiseModel.Isotropic.Sigma(1, RANGE_STD_M)
+)
+
+
+def solve(pair: Pair) -> tuple[Array, Array, Array]:
+    """Times (K,), states (K, 3) and covariances (K, 3, 3) of the peer, seen by the observer."""
+    key_s = np.arange(pair.time_s[0], pair.time_s[-1], 1 / KEY_HZ)
+    moves = [
+        odometry(track, pair.time_s).increments(key_s[:-1], key_s[1:])
+        for track in (pair.own, pair.peer)
+    ]
+    level_m = _level(pair, key_s)
+    few = min(len(key_s), int(FIRST_S * KEY_HZ))
+    short, whole = _graph(moves, level_m, few), _graph(moves, level_m, len(key_s))
+    first = float(level_m[np.isfinite(level_m)][0])
+    angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    tried = [
+        _optimised(short, moves, few, gtsam.Pose2(first * np.cos(a), first * np.sin(a), heading))
+        for a, heading in product(angles, angles)
+    ]
+    likely = sorted(tried, key=short.error)[:KEPT]
+    ends = [_optimised(whole, moves, len(key_s), v.atPose2(_peer(0))) for v in likely]
+    values = min(ends, key=whole.error)
+    at = np.arange(0, len(key_s), MARGINAL_EVERY)
+    marginals = gtsam.Marginals(whole, values)
+    states, covariances = zip(*(_relative(values, marginals, k) for k in at), strict=True)
+    return key_s[at], np.array(states), np.array(covariances)
+
+
+def _own(k: int) -> int:
+    return 2 * k
+
+
+def _peer(k: int) -> int:
+    return 2 * k + 1
+
+
+def _level(pair: Pair, key_s: Array) -> Array:
+    """(K,) horizontal ranges at the keyframes, medians of those around, or NaN."""
+    edges = np.searchsorted(
+        pair.range_time_s, np.append(key_s, key_s[-1] + 1 / KEY_HZ) - 0.5 / KEY_HZ
+    )
+    found = [np.median(pair.range_m[a:b]) if b > a else np.nan for a, b in pairwise(edges.tolist())]
+    high = np.interp(key_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
+    return np.sqrt(np.maximum(np.array(found) ** 2 - high**2, 0.05**2))
+
+
+def _graph(moves: list[Increments], level_m: Array, count: int) -> gtsam.NonlinearFactorGraph:
+    """Odometry and ranges of the first keyframes."""
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose2(_own(0), gtsam.Pose2(), ANCHOR))
+    for key, way in zip((_own, _peer), moves, strict=True):
+        for k in range(count - 1):
+            step = gtsam.Pose2(*way.shift_m[k], way.turn_rad[k])
+            graph.add(gtsam.BetweenFactorPose2(key(k), key(k + 1), step, ODOMETRY))
+    for k in np.flatnonzero(np.isfinite(level_m[:count])).tolist():
+        graph.add(gtsam.RangeFactorPose2(_own(k), _peer(k), float(level_m[k]), RANGE))
+    return graph
+
+
+def _optimised(
+    graph: gtsam.NonlinearFactorGraph, moves: list[Increments], count: int, start: gtsam.Pose2
+) -> gtsam.Values:
+    """Poses of the first keyframes, from dead reckoning with the peer at a start."""
+    values = gtsam.Values()
+    for key, way, pose in ((_own, moves[0], gtsam.Pose2()), (_peer, moves[1], start)):
+        for k in range(count):
+            values.insert(key(k), pose)
+            if k < count - 1:
+                pose = pose.compose(gtsam.Pose2(*way.shift_m[k], way.turn_rad[k]))
+    return gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+
+
+def _relative(values: gtsam.Values, marginals: gtsam.Marginals, k: int) -> tuple[Array, Array]:
+    """State (3,) and covariance (3, 3) of the peer in the observer's frame at a keyframe."""
+    keys = gtsam.KeyVector([_own(k), _peer(k)])
+    joint = marginals.jointMarginalCovariance(keys).fullMatrix()
+    apart = values.atPose2(_own(k)).between(values.atPose2(_peer(k)))
+    by_both = np.zeros((3, 6))
+    by_both[:2, :2], by_both[:2, 2] = -np.eye(2), (apart.y(), -apart.x())
+    by_both[:2, 3:5] = rotation(np.array(apart.theta()))
+    by_both[2, [2, 5]] = -1.0, 1.0
+    return np.array([apart.x(), apart.y(), apart.theta()]), by_both @ joint @ by_both.T
