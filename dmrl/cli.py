@@ -4,15 +4,13 @@ A command's flags and help come from the function that the table names; errors a
 act on become one line and exit status 1.
 """
 
-import sys
 from difflib import get_close_matches
 from typing import NoReturn
 
 from cyclopts import App, CycloptsError, UnknownCommandError
 from rich.text import Text
 
-from dmrl import __version__
-from dmrl.errors import DmrlError
+from dmrl import __version__, boundary
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
@@ -63,6 +61,7 @@ app = App(
     version=__version__,
     help_format="plaintext",
     error_formatter=bad_command_line,
+    suppress_keyboard_interrupt=False,  # main says what stands
 )
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
     _module = _name.replace("-", "_")
@@ -70,20 +69,10 @@ for _order, (_name, _help) in enumerate(COMMANDS.items()):
 
 
 def main() -> NoReturn:
-    """Run the command; turn known errors into one line and exit status 1."""
-    try:
-        app()
-    except DmrlError as e:
-        print(f"dmrl: {e}", file=sys.stderr)
-        raise SystemExit(1) from None
-    except KeyboardInterrupt:
-        print("dmrl: stopped. Nothing stands under its final name", file=sys.stderr)
-        raise SystemExit(130) from None
-    except BrokenPipeError:
-        # The reader of our output, such as `head`, has gone; there is nobody left to tell.
-        sys.stderr.close()
-        raise SystemExit(1) from None
-    raise SystemExit(0)
+    """Run the command; turn errors into one line and an exit status."""
+    boundary.open_standard_streams()
+    boundary.end_by_signals()
+    raise SystemExit(boundary.status_of(app))
 
 
 if __name__ == "__main__":

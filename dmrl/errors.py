@@ -1,7 +1,8 @@
 """Errors a user can act on. Every message is one line and ends with the way out.
 
 * DmrlError
-  - OutputError       the output exists, or cannot be written
+  - OutputError       the output exists, cannot be written, or is another process's
+  - UnsafeName        a name from a file cannot become a path
   - RecordingError    the file cannot be read, or lacks what was asked of it
     + MissingTopic
   - SourceError       a foreign file or folder is not what its format says
@@ -23,7 +24,11 @@ class DmrlError(Exception):
 
 
 class OutputError(DmrlError):
-    """An output exists already, or cannot be written."""
+    """An output exists already, cannot be written, or is being written by another process."""
+
+
+class UnsafeName(DmrlError):
+    """A name that stands in a file cannot be the name of a file."""
 
 
 class RecordingError(DmrlError):

@@ -1,20 +1,37 @@
-"""Outputs that appear under their name only when they are whole.
+"""Outputs that appear under their name only when they are whole, each written by one process.
 
-A killed process leaves ``<name>.partial`` behind and never ``<name>``.
+A killed process leaves ``<name>.partial`` behind and never ``<name>``. While it lives it holds a
+lock on ``<name>.partial``, which the system takes back when it dies: what is locked is being
+written, what is not is left over. The final name is linked, never replaced, after everything has
+reached the disk.
 """
 
 import errno
+import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dmrl.errors import OutputError
+from dmrl.locking import UNSUPPORTED, is_held, refuse_locked, take_file, take_folder
+
+SUFFIX, OLD = ".partial", ".old"
+MOST_NAME_BYTES = 255 - len(SUFFIX)
+"""Of an output's name: file systems take 255, and the unfinished one is called longer."""
+
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
+_begun: list[Path] = []
 
 
 def partial_of(path: Path) -> Path:
     """``<name>.partial`` beside ``path``."""
-    return path.with_name(path.name + ".partial")
+    return path.with_name(path.name + SUFFIX)
+
+
+def standing() -> list[Path]:
+    """Outputs of this process that are whole and stand under their final name."""
+    return [path for path in _begun if path.exists()]
 
 
 def refuse_existing(path: Path) -> None:
@@ -23,22 +40,43 @@ def refuse_existing(path: Path) -> None:
     Raises
     ------
     OutputError
-        If something is there already, or its folder is not.
+        If something is there already, its folder is not, its name is too long, or another
+        process is writing it.
     """
-    if path.exists() or path.is_symlink():
+    _refuse_taken(path)
+    refuse_locked(partial_of(path))
+
+
+def _refuse_taken(path: Path) -> None:
+    if len(os.fsencode(path.name)) > MOST_NAME_BYTES:
+        raise _name_too_long(path)
+    try:
+        taken = path.exists() or path.is_symlink()
+        homeless = not path.parent.is_dir()
+    except OSError as e:
+        raise as_output_error(path, e) from e
+    if taken:
         raise OutputError(
             f"{path} exists. Outputs are never overwritten; remove it or name another"
         )
-    if not path.parent.is_dir():
+    if homeless:
         raise OutputError(
             f"no folder {path.parent} to write {path.name} in. Try: mkdir -p {path.parent}"
         )
+
+
+def _name_too_long(path: Path) -> OutputError:
+    return OutputError(
+        f"the name {path.name[:40]}... is too long. Give one of {MOST_NAME_BYTES} bytes at most"
+    )
 
 
 def as_output_error(path: Path, error: OSError) -> OutputError:
     """The one-line error for a write to ``path`` that the system refused."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return OutputError(f"no space left for {path}. Free some, or write to another disk")
+    if error.errno == errno.ENAMETOOLONG:
+        return _name_too_long(path)
     return OutputError(f"cannot write {path}: {error.strerror or error}. Choose another place")
 
 
@@ -56,24 +94,56 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        If ``path`` exists, or the system refuses a write.
+        If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
     partial = partial_of(path)
-    try:
-        yield partial
-        partial.replace(path)
-    except OSError as e:
-        if e.filename not in (None, str(partial)):
+    with _refusals(path, partial):
+        held, kept = take_file(partial), keep_on_error
+        try:
+            _begin(path)
+            yield partial
+            sync(partial)
+            _link(partial, path)
+        except _CameBetween:
+            kept = True
             raise
-        raise as_output_error(path, e) from e
-    finally:
-        if not keep_on_error:
-            partial.unlink(missing_ok=True)
+        finally:
+            if not kept or is_held(path, held):
+                with suppress(OSError):  # it would hide the error that brought us here
+                    partial.unlink(missing_ok=True)
+            os.close(held)
 
 
 @contextmanager
-def partial_folder(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
+def rewritten_file(path: Path) -> Iterator[Path]:
+    """Path to write to; it takes the place of ``path``, which may be edited by hand meanwhile.
+
+    For the one file that is written again where it stands, a dataset's card.
+
+    Raises
+    ------
+    OutputError
+        If another process is writing it, or the system refuses a write.
+    """
+    partial = partial_of(path)
+    with _refusals(path, partial):
+        held = take_file(partial)
+        try:
+            yield partial
+            sync(partial)
+            partial.replace(path)
+            _sync_one(path.parent)
+        finally:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+            os.close(held)
+
+
+@contextmanager
+def partial_folder(
+    path: Path, *, keep_on_error: bool = False, resume: bool = False
+) -> Iterator[Path]:
     """Folder to write in; it becomes ``path`` when the block ends without an error.
 
     Parameters
@@ -81,26 +151,158 @@ def partial_folder(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]
     path
         The final folder.
     keep_on_error
-        Leave, and on the next call reuse, the partial folder: for work that can be resumed.
+        Leave the partial folder: for work that can be resumed.
+    resume
+        Go on in the partial folder that is there. Else it begins empty.
 
     Raises
     ------
     OutputError
-        If ``path`` exists, or the disk is full.
+        If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
     partial = partial_of(path)
-    if partial.exists() and not keep_on_error:
-        shutil.rmtree(partial)
+    with _refusals(path, partial):
+        held, kept = take_folder(partial), keep_on_error
+        try:
+            _begin(path)
+            if not resume:
+                _empty(partial)
+            yield partial
+            sync(partial)
+            _rename(partial, path)
+        except _CameBetween:
+            kept = True
+            raise
+        finally:
+            if not kept:
+                shutil.rmtree(partial, ignore_errors=True)
+            os.close(held)
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[None]:
+    """The block may write ``path`` anew; what stood there goes when the new one is whole.
+
+    Until then it stands aside as ``<name>.old``, and comes back if the block fails. A kill
+    leaves it there; the next call goes on with it.
+
+    Raises
+    ------
+    OutputError
+        If the system refuses to move or remove it.
+    """
+    old = path.with_name(path.name + OLD)
     try:
-        partial.mkdir(exist_ok=True)
-        yield partial
-        partial.rename(path)
-    except BaseException as e:
-        if not keep_on_error:
-            shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(e, OSError) and (
-            e.errno in (errno.ENOSPC, errno.EDQUOT) or str(e.filename).startswith(str(partial))
-        ):
-            raise as_output_error(path, e) from e
+        if path.exists() or path.is_symlink():
+            _remove(old)
+            path.rename(old)
+        yield
+    except BaseException:
+        with suppress(OSError):
+            if not (path.exists() or path.is_symlink()):
+                old.rename(path)
         raise
+    with _refusals(path, old):
+        _remove(old)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _begin(path: Path) -> None:
+    """Note an output that is now ours, unless another process has just finished it."""
+    _refuse_taken(path)
+    _begun.append(path)
+
+
+@contextmanager
+def _refusals(path: Path, partial: Path) -> Iterator[None]:
+    """What the system says against a write, as one line; errors of other files pass."""
+    try:
+        yield
+    except OSError as e:
+        named = str(e.filename or partial)
+        mine = named == str(path) or Path(named).is_relative_to(partial)
+        if not mine or isinstance(e, ConnectionError | BrokenPipeError | TimeoutError):
+            raise
+        if e.errno in (None, errno.ENOENT) and not partial.exists():
+            raise OutputError(f"{partial} was removed while it was written. Run it again") from e
+        raise as_output_error(path, e) from e
+
+
+def sync(path: Path) -> None:
+    """Bring a file, or a folder with everything in it, to the disk.
+
+    Raises
+    ------
+    OSError
+        If the disk refuses.
+    """
+    if path.is_dir():
+        for inner in sorted(path.iterdir()):
+            if not inner.is_symlink():
+                sync(inner)
+    _sync_one(path)
+
+
+def _sync_one(path: Path) -> None:
+    held = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(held)
+    except OSError as e:
+        if e.errno not in UNSUPPORTED:
+            raise
+    finally:
+        os.close(held)
+
+
+class _CameBetween(OutputError):
+    """Somebody else has made what we were about to name."""
+
+    def __init__(self, partial: Path, path: Path) -> None:
+        super().__init__(
+            f"{path} came into being while it was written. What was written is {partial}: rename it"
+        )
+
+
+def _link(partial: Path, path: Path) -> None:
+    """Give a whole file its name, which must be free."""
+    try:
+        os.link(partial, path)
+    except FileExistsError:
+        raise _CameBetween(partial, path) from None
+    except OSError as e:
+        if e.errno not in _NO_LINKS:
+            raise
+        _refuse_taken(path)  # FAT has no links: looked at, then renamed
+        partial.rename(path)
+    try:
+        _sync_one(path.parent)
+    except BaseException:
+        path.unlink()  # not sure to be there after a power loss, so not there at all
+        raise
+
+
+def _rename(partial: Path, path: Path) -> None:
+    """Give a whole folder its name; the system refuses if a file or a folder with files has it."""
+    try:
+        partial.rename(path)
+    except OSError as e:
+        if e.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+            raise _CameBetween(partial, path) from None
+        raise
+    try:
+        _sync_one(path.parent)
+    except BaseException:
+        path.rename(partial)
+        raise
+
+
+def _empty(folder: Path) -> None:
+    for inner in folder.iterdir():
+        _remove(inner)

@@ -172,11 +172,6 @@ def test_ctrl_c_ends_with_one_line_and_status_130(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_our_own_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ZeroDivisionError):
-        _end_with(ZeroDivisionError(), monkeypatch)
-
-
 def _subclasses(error: type[Exception]) -> Iterator[type[Exception]]:
     for child in error.__subclasses__():
         yield child

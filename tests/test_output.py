@@ -5,12 +5,22 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from dmrl.errors import OutputError
-from dmrl.output import as_output_error, partial_file, partial_folder, partial_of, refuse_existing
+from dmrl.output import (
+    as_output_error,
+    partial_file,
+    partial_folder,
+    partial_of,
+    refuse_existing,
+    replaced,
+    rewritten_file,
+)
 
 
 def test_a_file_takes_its_name_when_the_block_ends(tmp_path: Path) -> None:
@@ -52,7 +62,7 @@ def test_work_that_can_be_resumed_is_kept_and_found_again(tmp_path: Path) -> Non
         (partial / "epoch").write_text("3")
         raise KeyboardInterrupt
     assert not out.exists()
-    with partial_folder(out, keep_on_error=True) as partial:
+    with partial_folder(out, keep_on_error=True, resume=True) as partial:
         assert (partial / "epoch").read_text() == "3"
     assert (out / "epoch").read_text() == "3"
 
@@ -123,3 +133,219 @@ def test_a_killed_process_leaves_only_the_partial_file(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.mcap"], check=False)
     assert done.returncode == -signal.SIGKILL
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.partial"]
+
+
+WRITER = (
+    "import pathlib, sys\n"
+    "from dmrl import output\n"
+    "from dmrl.errors import OutputError\n"
+    "kind, out, word = sys.argv[1:]\n"
+    "try:\n"
+    "    with getattr(output, kind)(pathlib.Path(out)) as partial:\n"
+    "        inner = partial / 'a' if kind == 'partial_folder' else partial\n"
+    "        inner.write_text(word)\n"
+    "        print('begun', flush=True); sys.stdin.read()\n"
+    "        inner.write_text(word * 2)\n"
+    "except OutputError as e: sys.exit(str(e))\n"
+)
+
+
+@contextmanager
+def _writing(kind: str, out: Path, word: str) -> Iterator[subprocess.Popen[str]]:
+    """Another process that writes ``out`` until its standard input is closed."""
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, kind, str(out), word],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+KINDS = pytest.mark.parametrize("kind", ["partial_file", "partial_folder"])
+
+
+@KINDS
+def test_a_second_writer_gets_one_line_and_the_first_its_output(kind: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with _writing(kind, out, "mine") as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == "begun\n"
+        words = f"out is being written by another dmrl, process {first.pid}"
+        for writer in (partial_file, partial_folder):
+            with pytest.raises(OutputError, match=words), writer(out):
+                pytest.fail("the block ran")
+        with pytest.raises(OutputError, match=words):
+            refuse_existing(out)
+        first.communicate("", timeout=60)
+        assert first.returncode == 0
+    inner = out / "a" if kind == "partial_folder" else out
+    assert inner.read_text() == "minemine"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@KINDS
+def test_of_many_writers_one_wins_and_its_output_is_whole(kind: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", WRITER, kind, str(out)]
+    words = [str(k) * 4000 for k in range(6)]
+    started = [
+        subprocess.Popen(
+            [*command, word], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        for word in words
+    ]
+    said = [process.communicate(timeout=100)[1] for process in started]
+    won = [k for k, process in enumerate(started) if process.returncode == 0]
+    assert len(won) == 1
+    inner = out / "a" if kind == "partial_folder" else out
+    assert inner.read_text() == words[won[0]] * 2
+    assert list(tmp_path.iterdir()) == [out]
+    lost = [text for k, text in enumerate(said) if k not in won]
+    assert all("is being written by" in text or "exists" in text for text in lost)
+    assert all(text.count("\n") == 1 for text in lost)
+
+
+@KINDS
+def test_what_a_killed_writer_leaves_is_in_nobody_s_way(kind: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with _writing(kind, out, "half") as first:
+        assert first.stdout is not None
+        first.stdout.readline()
+        first.kill()
+        first.wait()
+    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
+    with _writing(kind, out, "whole") as second:
+        second.communicate("", timeout=60)
+    assert second.returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_what_is_left_over_is_not_emptied_under_another_name(tmp_path: Path) -> None:
+    partial_of(tmp_path / "a").write_text("whole, killed between its two names")
+    (tmp_path / "b").hardlink_to(partial_of(tmp_path / "a"))
+    with partial_file(tmp_path / "a") as partial:
+        partial.write_text("new")
+    assert (tmp_path / "b").read_text().startswith("whole")
+
+
+@pytest.mark.parametrize("writer", [partial_file, rewritten_file])
+def test_a_link_in_place_of_the_partial_file_is_not_followed(
+    writer: object, tmp_path: Path
+) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    partial_of(tmp_path / "a").symlink_to(victim)
+    with pytest.raises(OutputError, match="symbolic link"), writer(tmp_path / "a"):  # type: ignore[operator]
+        pytest.fail("the block ran")
+    assert victim.read_text() == "precious"
+
+
+def test_what_comes_between_is_not_replaced_and_the_work_is_kept(tmp_path: Path) -> None:
+    for writer in (partial_file, partial_folder):
+        out = tmp_path / writer.__name__
+        with pytest.raises(OutputError, match="came into being"), writer(out) as partial:
+            if partial.is_dir():
+                out.mkdir()
+                (out / "theirs").write_text("")
+            else:
+                partial.write_text("mine")
+                out.write_text("theirs")
+        assert partial.exists()
+    assert (tmp_path / "partial_file").read_text() == "theirs"
+
+
+@pytest.mark.parametrize("writer", [partial_file, partial_folder])
+def test_a_read_only_disk_is_one_error(
+    writer: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: object, *_: object, **__: object) -> int:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    for name in ("open", "mkdir", "unlink"):
+        monkeypatch.setattr(os, name, refuse)
+    with pytest.raises(OutputError, match="Read-only file system"), writer(tmp_path / "a"):  # type: ignore[operator]
+        pytest.fail("the block ran")
+
+
+def test_everything_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, seen = tmp_path / "set", []
+    monkeypatch.setattr(
+        os, "fsync", lambda fd: seen.append((Path(f"/proc/self/fd/{fd}").readlink(), out.exists()))
+    )
+    with partial_folder(out) as partial:
+        (partial / "inner").mkdir()
+        (partial / "inner" / "a").write_text("x")
+    names = [(str(name.relative_to(tmp_path)), stood) for name, stood in seen]
+    assert names == [
+        ("set.partial/inner/a", False),
+        ("set.partial/inner", False),
+        ("set.partial", False),
+        (".", True),
+    ]
+
+
+@pytest.mark.parametrize("writer", [partial_file, partial_folder])
+def test_a_disk_that_fails_to_sync_leaves_nothing(
+    writer: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.fsync
+    left: list[int] = []
+
+    def fail(fd: int) -> None:
+        if not left.pop():
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        real(fd)
+
+    monkeypatch.setattr(os, "fsync", fail)
+    for good in (0, 1):
+        left[:] = [0] + [1] * good
+        with pytest.raises(OutputError, match="Input/output error"), writer(tmp_path / "a") as p:  # type: ignore[operator]
+            (p / "x" if p.is_dir() else p).write_text("x")
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_too_long_is_said_before_any_work(tmp_path: Path) -> None:
+    for length in (248, 256, 5000):
+        with pytest.raises(OutputError, match="Give one of 247 bytes"):
+            refuse_existing(tmp_path / ("a" * length))
+    with partial_file(tmp_path / ("a" * 247)) as partial:
+        partial.write_text("x")
+
+
+def test_a_folder_removed_while_it_is_written_is_said(tmp_path: Path) -> None:
+    gone = pytest.raises(OutputError, match="was removed while it was written")
+    with gone, partial_folder(tmp_path / "set") as partial:
+        partial.rmdir()
+        (partial / "a").write_text("x")
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_an_old_output_goes_when_the_new_one_is_whole(kind: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def make(word: str) -> None:
+        if kind == "folder":
+            with partial_folder(out) as partial:
+                (partial / "a").write_text(word)
+        else:
+            with partial_file(out) as partial:
+                partial.write_text(word)
+
+    with replaced(out):
+        make("first")
+    with pytest.raises(ZeroDivisionError), replaced(out):
+        raise ZeroDivisionError
+    inner = out / "a" if kind == "folder" else out
+    assert inner.read_text() == "first"
+    with replaced(out):
+        assert not out.exists()
+        make("second")
+    assert inner.read_text() == "second"
+    assert list(tmp_path.iterdir()) == [out]

@@ -16,7 +16,7 @@ from dmrl.card.front import front_matter, read_front
 from dmrl.dataset import Split, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX
-from dmrl.output import partial_of
+from dmrl.output import rewritten_file
 from dmrl.recording import Provenance
 from dmrl.recording.provenance import FILE_NAME
 from dmrl.terminal.progress import say
@@ -68,8 +68,8 @@ def write_card(
     text += [*sections.numbers(counts), *figures, *sections.features(splits)]
     text += ["## Provenance", "", *sections.ancestry(made), "", YOURS]
     written = "\n".join(text) + (_yours(old) or "\n")
-    partial_of(readme).write_text(written, encoding="utf-8")
-    partial_of(readme).replace(readme)
+    with rewritten_file(readme) as partial:
+        partial.write_text(written, encoding="utf-8")
     return readme
 
 

@@ -1,6 +1,5 @@
 """``dmrl train``: an Arrow dataset to a run folder with a trained network."""
 
-import shutil
 import time
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -111,9 +110,9 @@ class Given(NamedTuple):
 def _run(
     dataset: Path, out: Path, settings: Settings, given: Given, group: Group, *, resume: bool
 ) -> Result:
-    refuse_existing(out)
     if group.leads:
-        _clear_the_way(partial_of(out), resume=resume)
+        refuse_existing(out)
+        _refuse_unfinished(partial_of(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
     examples, held_out, shares = material(data, settings)
@@ -122,8 +121,8 @@ def _run(
     inputs = [dataset, *filter(None, given)]
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
     identity = " ".join(source.sha256 for source in made.inputs)
-    where = partial_folder(out, keep_on_error=True) if group.leads else nullcontext(partial_of(out))
-    with where as folder:
+    mine = partial_folder(out, keep_on_error=True, resume=resume)
+    with mine if group.leads else nullcontext(partial_of(out)) as folder:
         training = Training(
             network,
             examples,
@@ -147,16 +146,13 @@ def _run(
     return result
 
 
-def _clear_the_way(partial: Path, *, resume: bool) -> None:
+def _refuse_unfinished(partial: Path, *, resume: bool) -> None:
     if resume and not partial.is_dir():
         raise ModelError(f"no {partial} to resume. Train without --resume")
-    if resume or not partial.exists():
-        return
-    if partial.is_dir() and has_checkpoint(partial):
+    if not resume and has_checkpoint(partial):
         raise OutputError(
             f"{partial} holds an interrupted training. Go on with --resume, or remove it"
         )
-    shutil.rmtree(partial)
 
 
 def _threshold(network: Network, held_out: Examples | None, settings: Settings) -> float:

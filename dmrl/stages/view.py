@@ -1,6 +1,5 @@
 """``dmrl view``: recordings in rerun, or what it would show as a file or a picture."""
 
-import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -68,8 +67,6 @@ def command(
     rank
         Take the picture of this row of a dataset; 1 is the worst.
     """
-    # A kill ends rerun's viewer too, as Ctrl-C does; it would be left behind.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     for path, suffix in ((save_to, ".rrd"), (screenshot_to, ".png")):
         if path is not None and path.suffix != suffix:
             raise SettingError(f"{path}: --save writes .rrd, --screenshot .png. Name it so")

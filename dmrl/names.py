@@ -1,0 +1,120 @@
+"""Names that come from files and from the network, made safe before they become anything else.
+
+A recording, a model, a recipe or a packet may come from a stranger, and so does every name in
+it: of a robot, topic, split, step, network, layer, class or event. Before such a name becomes a
+path, a comment of C, Markdown, or a line on a terminal, it goes through one of these functions.
+"""
+
+import re
+import unicodedata
+from pathlib import Path
+
+from dmrl.errors import UnsafeName
+
+MOST_BYTES = 200
+"""Of a name: with ``-00000-of-00001.parquet`` it still fits a file system's 255."""
+
+_PLAIN = re.compile(r"[^A-Za-z0-9 ._,:+()=-]")
+_ROBOT = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def inside(folder: Path, name: str, what: str, *, suffix: str = "") -> Path:
+    """The file or folder ``name + suffix`` in ``folder``: in it, whatever the name is.
+
+    Parameters
+    ----------
+    folder
+        Where it shall lie.
+    name
+        From a file: one part of a path, no more.
+    what
+        What is named so, and where, for the error: ``"flight.mcap: the split"``.
+    suffix
+        Our own ending.
+
+    Raises
+    ------
+    UnsafeName
+        If the name is no plain name of a file.
+    """
+    return folder / (file_name(name, what) + suffix)
+
+
+def file_name(name: str, what: str) -> str:
+    """The name, if it can be that of a file in any folder and is nothing else.
+
+    Raises
+    ------
+    UnsafeName
+        If it is empty, too long, begins with a dot, or holds a slash or a control character.
+    """
+    if not name:
+        raise UnsafeName(f"{what} has an empty name. Give it one")
+    shown = shortened(name)
+    if "/" in name or "\\" in name or name.startswith("."):
+        raise UnsafeName(
+            f"{what} is called {shown!r}, which leads out of its folder or hides in it. "
+            "Names have no slashes and no dot in front"
+        )
+    if not name.isprintable() or len(name.encode("utf-8", "replace")) > MOST_BYTES:
+        raise UnsafeName(
+            f"{what} is called {shown!r}, which no file can be called everywhere. "
+            f"Use up to {MOST_BYTES} letters, digits and signs"
+        )
+    return name
+
+
+def robot_name(name: str, what: str) -> str:
+    """The name, if it is one of a robot: letters, digits, ``_`` and ``-``.
+
+    Raises
+    ------
+    UnsafeName
+        If it is not.
+    """
+    if not _ROBOT.fullmatch(name) or len(name) > MOST_BYTES:
+        raise UnsafeName(
+            f"{what} is called {shortened(name)!r}. Robots' names are letters, digits, _ and -"
+        )
+    return name
+
+
+def plain(text: str) -> str:
+    """The text for comments of C and of Makefiles: what could end one becomes ``_``.
+
+    Letters, digits, spaces and a few signs stay: no ``*/``, no line end, no backslash, no
+    trigraph, no quote and no ``$`` can be written with them.
+    """
+    return _PLAIN.sub("_", shortened(text))
+
+
+def markdown(text: str) -> str:
+    """The text for a line of Markdown, a cell of its tables, or between its backticks.
+
+    What HTML or Markdown could take for markup becomes a character that looks alike.
+    """
+    return one_line(text).translate(_LOOK_ALIKE)
+
+
+_LOOK_ALIKE = str.maketrans(
+    {"<": "‹", ">": "›", "`": "'", "|": "¦", "[": "(", "]": ")", "&": "+", "*": "∗", "\\": "/"}
+)
+
+
+def one_line(text: str) -> str:
+    r"""The text in one line: control characters as ``\x1b``, line ends as spaces.
+
+    What orders a terminal about, or turns a text's direction, is shown and not obeyed.
+    """
+    return "".join(map(_shown, " ".join(text.splitlines())))
+
+
+def _shown(character: str) -> str:
+    if unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp"):
+        return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+    return character
+
+
+def shortened(text: str) -> str:
+    """The text, cut where it is longer than any honest name."""
+    return text if len(text) <= MOST_BYTES else f"{text[:MOST_BYTES]}..."

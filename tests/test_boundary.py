@@ -1,0 +1,141 @@
+"""Where a command ends: one line and an exit status, whatever happened."""
+
+import errno
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dmrl import boundary
+from dmrl.errors import OutputError
+
+DMRL = [sys.executable, "-m", "dmrl.cli"]
+
+
+def _end_of(error: BaseException) -> int:
+    def fail() -> None:
+        raise error
+
+    return boundary.status_of(fail)
+
+
+def test_a_bug_is_one_line_that_names_the_file_with_its_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.delenv("DMRL_DEBUG", raising=False)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert _end_of(KeyError("a\nb")) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith("dmrl: internal error, KeyError: ")
+    found = re.search(r"in (\S+)$", said)
+    assert found is not None
+    text = Path(found[1]).read_text()
+    assert "Traceback (most recent call last)" in text
+    assert "in fail" in text
+
+
+def test_a_bug_keeps_its_traceback_where_someone_looks_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("DMRL_DEBUG", "1")
+    with pytest.raises(ZeroDivisionError):
+        _end_of(ZeroDivisionError())
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.EROFS, os.strerror(errno.EROFS), "a.mcap"), "a.mcap: Read-only file system"),
+        (OSError(errno.EIO, os.strerror(errno.EIO)), "Input/output error"),
+        (MemoryError(), "not enough memory"),
+        (OutputError("a\x1b[31m\nb exists"), r"a\x1b[31m b exists"),
+    ],
+)
+def test_what_the_system_refuses_is_one_line(
+    error: Exception,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.delenv("DMRL_DEBUG", raising=False)
+    assert _end_of(error) == 1
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_says_that_nothing_has_its_final_name(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    command = [*DMRL, "sketch", str(tmp_path / "out"), "--images", "99999"]
+    with subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell starts its background jobs deaf to it, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        try:
+            until = time.monotonic() + 60
+            while not (tmp_path / "out.partial" / "000001.png").exists():
+                assert time.monotonic() < until
+                time.sleep(0.05)
+            process.send_signal(number)
+            _, said = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 128 + number
+    assert said == "dmrl: stopped. Nothing stands under its final name\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_whole_when_a_signal_comes_is_said(tmp_path: Path) -> None:
+    code = (
+        "import os, sys, signal; from pathlib import Path\n"
+        "from dmrl import boundary; from dmrl.output import partial_file\n"
+        "def work():\n"
+        "    for name in 'ab':\n"
+        "        with partial_file(Path(name)) as partial:\n"
+        "            partial.write_text('x')\n"
+        "            if name == 'b': os.kill(os.getpid(), signal.SIGTERM)\n"
+        "boundary.end_by_signals(); sys.exit(boundary.status_of(work))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 143
+    assert done.stderr == "dmrl: stopped. Whole: a; nothing else has its final name\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [(">&-", "Bad file descriptor"), (">/dev/full", "No space left on device")],
+)
+def test_an_output_that_takes_nothing_is_one_line(where: str, words: str) -> None:
+    shell = f'"$@" {where}'
+    command = ["sh", "-c", shell, "sh", *DMRL, "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("dmrl: ")
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_no_file_is_opened_as_a_closed_standard_stream(tmp_path: Path) -> None:
+    code = (
+        "from pathlib import Path; import os\n"
+        "from dmrl import boundary\n"
+        "boundary.open_standard_streams()\n"
+        f"held = os.open({str(tmp_path / 'out')!r}, os.O_CREAT | os.O_WRONLY)\n"
+        "raise SystemExit(held)\n"
+    )
+    command = ["sh", "-c", '"$@" <&- >&- 2>&-', "sh", sys.executable, "-c", code]
+    assert subprocess.run(command, check=False).returncode > 2
