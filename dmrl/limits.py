@@ -26,6 +26,15 @@ PIXELS = 64 * MB
 DECODED_PIXELS = 1_000 * MB
 """Of a picture, each of its scans counted: a progressive JPEG of a few kB can have thousands."""
 
+DEPTH = 200
+"""Of JSON and TOML: how many tables and lists stand in each other."""
+
+TOML_CHARACTERS = 100_000
+"""Of a recipe or a camera file; long dotted keys take a time that grows with their square."""
+
+STEPS = 2_000
+"""Of a pipeline, and inputs of one of them, after ``each`` is written out."""
+
 ANCESTORS = 64
 """How deep a provenance is told: older ancestors keep their hash and lose their story."""
 

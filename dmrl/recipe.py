@@ -6,7 +6,6 @@ for several. A recipe with faults is refused whole, every fault named.
 """
 
 import json
-import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from difflib import get_close_matches
@@ -17,6 +16,8 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
+from dmrl import limits
+from dmrl.documents import parse_toml
 from dmrl.errors import RecipeError
 
 Settings = TypeVar("Settings")
@@ -149,6 +150,8 @@ def load_pipeline(
     steps = keys.get("step")
     if not isinstance(steps, list) or not steps:
         raise _faulty(name, [*faults, "step: at least one [[step]] is required"])
+    if sum(map(_size, steps)) > limits.STEPS:
+        raise _faulty(name, [f"step: more than {limits.STEPS} steps and inputs, each written out"])
     numbered = [
         (number, _with_recipe(one))
         for number, step in enumerate(steps, start=1)
@@ -183,8 +186,8 @@ def _shipped() -> Traversable:
 
 def _parse(name: str | Path, content: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(content)
-    except tomllib.TOMLDecodeError as e:
+        return parse_toml(content)
+    except ValueError as e:
         raise RecipeError(f"{name} is not TOML: {e}. Mend that line") from e
 
 
@@ -198,6 +201,15 @@ def _faulty(name: str | Path, faults: Iterable[str]) -> RecipeError:
     lines = list(faults)
     keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
     return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Mend them all")
+
+
+def _size(step: Any) -> int:
+    """How many steps and inputs of theirs a step stands for."""
+    if not isinstance(step, dict):
+        return 1
+    each, inputs = step.get("each", 1), step.get("inputs", ())
+    count = each if isinstance(each, int) else len(each) if isinstance(each, list) else 1
+    return max(count, 1) * (1 + (len(inputs) if isinstance(inputs, list) else 0))
 
 
 def _repeated(step: Any) -> list[Any]:

@@ -241,3 +241,35 @@ def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> N
 
 def test_shipped_recipes_are_those_of_the_folder() -> None:
     assert recipe.names() == sorted(path.stem for path in RECIPES.glob("*.toml"))
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        '[[step]]\nstage = "draw"\neach = 100000000\nout = "a{each}.mcap"\n',
+        '[[step]]\nstage = "draw"\neach = 1999\ninputs = ["a{each}"]\nout = "b"\n',
+        '[[step]]\nstage = "draw"\nout = "a"\n' * 2001,
+    ],
+    ids=["steps", "inputs", "written out"],
+)
+def test_what_a_pipeline_repeats_has_a_budget(write: Write, steps: str) -> None:
+    path = write(f'kind = "pipeline"\n{steps}')
+    with pytest.raises(RecipeError, match="more than 2000 steps and inputs"):
+        recipe.load_pipeline(path, SCHEMAS, SCHEMAS.__getitem__)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("a = " + "[" * 90_000, "nests deeper"),
+        (f"[{'a.' * 10_000}a]", "nests deeper"),
+        ("a" + ".a" * 5_000 + " = 1", "nests deeper"),
+        ("# " + "a" * 100_000, "characters"),
+    ],
+    ids=["lists", "tables", "dotted keys", "long"],
+)
+def test_depth_and_length_of_a_recipe_have_a_budget(
+    write: Write, text: str, complaint: str
+) -> None:
+    with pytest.raises(RecipeError, match=complaint):
+        recipe.read(write(text))

@@ -4,7 +4,6 @@ Everything on it is counted from the data or read from provenance.json, so it ca
 again at any time. Kept from the card before: title, license, and what stands below ``YOURS``.
 """
 
-import json
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +13,7 @@ from dmrl.card import sections
 from dmrl.card.counts import Counts, count
 from dmrl.card.front import front_matter, read_front
 from dmrl.dataset import Split, open_dataset
+from dmrl.documents import parse_json
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.output import rewritten_file
@@ -96,7 +96,7 @@ def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> 
 def _provenance(folder: Path) -> Provenance:
     path = folder / FILE_NAME
     try:
-        return Provenance.from_json(json.loads(path.read_text(encoding="utf-8")))
+        return Provenance.from_json(parse_json(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise DatasetError(f"{path} cannot be read ({e}). Make the dataset again") from None
 

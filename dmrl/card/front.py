@@ -8,6 +8,7 @@ from typing import Any
 import pyarrow as pa
 
 from dmrl.dataset import Split, layout
+from dmrl.documents import parse_json
 
 SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
 
@@ -24,7 +25,7 @@ def read_front(readme: Path) -> dict[str, str]:
 def _scalar(text: str) -> str:
     # We write JSON strings; a hand may have written a bare word.
     try:
-        return str(json.loads(text))
+        return str(parse_json(text))
     except ValueError:
         return text
 

@@ -1,6 +1,5 @@
 """Open datasets: shards are mapped into memory, never read as a whole."""
 
-import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from dmrl.dataset import layout
+from dmrl.documents import parse_json
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.images.codec import decode
@@ -191,7 +191,7 @@ def _parquet_names(folder: Path) -> list[tuple[str, int, int]]:
 
 def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DatasetError(f"{path} is missing. Make the dataset again, or copy it whole") from None
     except ValueError as e:

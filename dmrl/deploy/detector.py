@@ -3,7 +3,6 @@
 Rooms are loaded by name when they are asked for: each needs packages that the others do not.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -19,6 +18,7 @@ from dmrl.deploy.c import NAME
 from dmrl.deploy.compiled import Compiled
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.store import INTEGER_NAME, load
+from dmrl.documents import parse_json
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
@@ -192,7 +192,7 @@ def _grids(runs: Backend) -> Callable[[Images], Grids]:
 def _described(file: Path) -> tuple[int, float]:
     """Stride and threshold that the description of an export folder says."""
     try:
-        said = json.loads(file.read_text(encoding="utf-8"))
+        said = parse_json(file.read_text(encoding="utf-8"))
         return int(said["stride_px"]), float(said["threshold"])
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise ModelError(f"{file} is damaged: {e}. Export the model again") from None

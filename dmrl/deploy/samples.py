@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.documents import load_npz
 from dmrl.errors import ModelError
 
 SAMPLES_NAME = "samples.npz"
@@ -27,8 +28,7 @@ def load_samples(folder: Path) -> NDArray[np.uint8]:
     """
     file = folder / SAMPLES_NAME
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            images = np.asarray(archive["images"])
+        images = load_npz(file)["images"]
     except FileNotFoundError:
         raise ModelError(f"no {file}. Quantise the model again") from None
     except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as e:

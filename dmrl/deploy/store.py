@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.integer import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
+from dmrl.documents import load_npz, parse_json
 from dmrl.errors import ModelError
 
 INTEGER_NAME = "integer.npz"
@@ -65,9 +66,8 @@ def load(path: Path) -> IntegerNetwork:
     if not file.is_file():
         raise ModelError(f"no {file.name} in {file.parent}. Make one with: dmrl quantize")
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        said = json.loads(arrays.pop("description").tobytes())
+        arrays = load_npz(file)
+        said = parse_json(arrays.pop("description").tobytes())
         if said["format"] != FORMAT:
             raise ModelError(
                 f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Update dmrl"

@@ -1,11 +1,11 @@
 """What a pipeline came to: a table of its evaluations, and where its pictures are."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from dmrl.documents import parse_json
 from dmrl.evaluation import positions
 from dmrl.terminal.tables import print_json, print_table
 
@@ -67,7 +67,7 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
 def _documents(done: Sequence[Done], name: str) -> dict[str, dict[str, Any]]:
     """JSON documents of this name, by the output they stand in."""
     return {
-        d.out.name: json.loads((d.out / name).read_text(encoding="utf-8"))
+        d.out.name: parse_json((d.out / name).read_text(encoding="utf-8"))
         for d in done
         if (d.out / name).is_file()
     }

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dmrl.documents import load_npz
 from dmrl.errors import SourceError
 from dmrl.formats.format import Content, Format, Options
 from dmrl.geometry.frames import Array
@@ -94,8 +95,7 @@ def content(source: Path, _options: Options | None = None) -> Content:
 
 def _arrays(source: Path) -> dict[str, Array]:
     try:
-        with np.load(source, allow_pickle=False) as archive:
-            return {name: np.asarray(archive[name], float) for name in archive.files}
+        return {name: np.asarray(values, float) for name, values in load_npz(source).items()}
     except BROKEN as e:
         why = " ".join(str(e).split())
         raise SourceError(f"{source} cannot be read: {why}. Fetch it again") from e

@@ -1,9 +1,9 @@
 """A camera's calibration in a TOML file."""
 
-import tomllib
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
+from dmrl.documents import parse_toml
 from dmrl.errors import SourceError
 from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 
@@ -71,8 +71,8 @@ def parse_camera(text: str, path: Path) -> Camera:
         As `read_camera`.
     """
     try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as e:
+        values = parse_toml(text)
+    except ValueError as e:
         raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
     wrong = [key for key in values if key not in KEYS]
     wrong += [f"{key} (missing)" for key in NEEDED if key not in values]

@@ -5,12 +5,14 @@ calibration belongs to the pixels as they were stored.
 """
 
 import struct
+import warnings
 from io import BytesIO
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from dmrl import limits
 from dmrl.errors import SourceError
 
 Rgb = NDArray[np.uint8]
@@ -23,12 +25,30 @@ BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBom
 
 def _open(data: bytes, what: object) -> Image.Image:
     try:
-        return Image.open(BytesIO(data), formats=FORMATS)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
+            return Image.open(BytesIO(data), formats=FORMATS)
+    except Image.DecompressionBombError:
+        raise _too_many(what) from None
     except BROKEN:
         names = ", ".join(FORMATS)
         raise SourceError(
             f"{what} is not a picture ({names}). Remove it or save it again"
         ) from None
+
+
+def _too_many(what: object) -> SourceError:
+    most = f"{limits.PIXELS / 1e6:.0f} million pixels"
+    return SourceError(f"{what} has more than {most}, or too many scans. Scale it down")
+
+
+def _decodable(image: Image.Image, data: bytes, what: object) -> None:
+    """Nothing, if decoding takes no more time and memory than a picture may."""
+    pixels = image.width * image.height
+    # Every scan of a progressive JPEG goes over all pixels; FF DA starts one.
+    scans = data.count(b"\xff\xda") if image.format == "JPEG" else 1
+    if pixels > limits.PIXELS or pixels * scans > limits.DECODED_PIXELS:
+        raise _too_many(what)
 
 
 def decode(data: bytes, what: object = "the image") -> Rgb:
@@ -49,9 +69,10 @@ def decode(data: bytes, what: object = "the image") -> Rgb:
     Raises
     ------
     SourceError
-        If the bytes are no such picture, or end too soon.
+        If the bytes are no such picture, end too soon, or ask for more pixels than a picture may.
     """
     with _open(data, what) as image:
+        _decodable(image, data, what)
         try:
             return np.asarray(image.convert("RGB"))
         except BROKEN as e:

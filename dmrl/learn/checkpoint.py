@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.optim import Optimizer
 
+from dmrl.documents import parse_json
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn.model import set_weights, weights_of, write_tensors
 from dmrl.learn.network import Network
@@ -86,7 +87,7 @@ def load_checkpoint(
     if not has_checkpoint(folder):
         raise ModelError(f"no checkpoint in {folder} to resume from. Train without --resume")
     try:
-        said = json.loads((folder / STATE_NAME).read_text(encoding="utf-8"))
+        said = parse_json((folder / STATE_NAME).read_text(encoding="utf-8"))
         tensors = load_file(folder / said.pop("tensors"))
         state = State(**said)
     except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:

@@ -69,13 +69,13 @@ def _read(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
     key = f"{layer}/{layer}/{variable}:0"
     if not isinstance(group.get(key), h5py.Dataset):
         raise ModelError(f"{path} has no {layer}/{variable}. Give weights of locanet")
-    values = np.asarray(group[key], dtype=np.float32)
-    wanted = _keras_shape(layer, variable)
-    if values.shape != wanted:
+    wanted, shape = _keras_shape(layer, variable), group[key].shape
+    if shape != wanted:
         raise ModelError(
-            f"{path}: {layer}/{variable} has shape {values.shape}, locanet needs {wanted}. "
+            f"{path}: {layer}/{variable} has shape {shape}, locanet needs {wanted}. "
             "Give weights of locanet"
         )
+    values = np.asarray(group[key], dtype=np.float32)
     if values.ndim == 4:
         values = values.transpose(3, 2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(values))

@@ -15,6 +15,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from dmrl import limits
+from dmrl.documents import parse_json
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
@@ -265,12 +267,15 @@ def _read_description(path: Path) -> dict[str, Any]:
         "training": dict,
     }
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
+        said = parse_json(path.read_text(encoding="utf-8"))
     except ValueError as e:
         raise ModelError(f"{path} is not JSON: {e}. Copy it again") from None
     for key, kind in kinds.items():
         if not isinstance(said, dict) or not isinstance(said.get(key), kind):
             raise ModelError(f"{path} has no valid {key}. Give the model.json of dmrl train")
+    if not 0 < said["width_px"] * said["height_px"] <= limits.PIXELS or said["width_px"] < 0:
+        size = f"{said['width_px']} x {said['height_px']}"
+        raise ModelError(f"{path} is for images of {size}. Give the model.json of dmrl train")
     if said["architecture"] not in ARCHITECTURES:
         known = ", ".join(sorted(ARCHITECTURES))
         raise ModelError(

@@ -18,7 +18,7 @@ from dmrl.geometry.frames import inside
 from dmrl.images.codec import size
 from dmrl.recording.blocks import in_file_order
 from dmrl.recording.index import Summary, summary
-from dmrl.recording.reader import columns, read_table
+from dmrl.recording.reader import by_topic, columns, read_table
 from dmrl.topics import (
     CAMERA_IMAGE,
     LABELS,
@@ -67,8 +67,7 @@ def check(path: Path) -> list[Finding]:
     """
     found = summary(path)
     rules: tuple[Callable[[Path, Summary], Iterator[Finding]], ...] = (
-        _schemas,
-        _times,
+        _messages,
         _images,
         _labels,
     )
@@ -78,41 +77,51 @@ def check(path: Path) -> list[Finding]:
     return sorted(findings, key=lambda f: f.level)
 
 
-def _schemas(path: Path, found: Summary) -> Iterator[Finding]:
-    """Message types against the table of topics, and every message against its type."""
+def _messages(path: Path, found: Summary) -> Iterator[Finding]:
+    """Every message against its type and its time, in one pass over the file."""
+    known = {topic for topic, info in found.topics.items() if _carries(topic, info.schema)}
     for topic, info in found.topics.items():
         row = row_of(topic)
-        if row is None:
-            continue
-        if not row.carries(info.schema):
+        if row is not None and topic not in known:
             yield Finding(
                 "error", topic, f"carries {info.schema or 'no schema'}, not {row.message}"
             )
-            continue
-        try:
-            for _ in columns(path, topic):
-                pass
-        except RecordingError as e:
-            yield Finding("error", topic, str(e))
-
-
-def _times(path: Path, found: Summary) -> Iterator[Finding]:
-    """Times that go back or repeat in the file, and gaps in topics that have a rhythm."""
     times: dict[str, list[NDArray[np.int64]]] = {topic: [] for topic in found.topics}
+    broken: dict[str, str] = {}
     for block, channels in in_file_order(path):
-        for number in np.unique(block.channel):
-            times[channels[int(number)].topic].append(block.time_ns[block.channel == number])
+        for number in np.unique(block.channel).tolist():
+            topic = channels[number].topic
+            mine = block.take(block.channel == number)
+            times[topic].append(mine.time_ns)
+            if topic in known and topic not in broken:
+                try:
+                    by_topic(path, mine, channels, {topic: None})
+                except RecordingError as e:
+                    broken[topic] = str(e)
+    for topic, why in broken.items():
+        yield Finding("error", topic, why)
     for topic, parts in times.items():
-        step_ns = np.diff(np.concatenate([np.empty(0, np.int64), *parts]))
-        if (back := step_ns[step_ns < 0]).size:
-            yield Finding(
-                "warning",
-                topic,
-                f"{back.size} messages go back in time, by up to {-back.min() / 1e9:.3f} s",
-            )
-        if repeated := int((step_ns == 0).sum()):
-            yield Finding("warning", topic, f"{repeated} messages repeat the time before them")
-        yield from _gaps(topic, step_ns[step_ns > 0])
+        yield from _times(topic, np.concatenate([np.empty(0, np.int64), *parts]))
+
+
+def _carries(topic: str, schema: str) -> bool:
+    """Whether a topic is dmrl's, and carries what it should."""
+    row = row_of(topic)
+    return row is not None and row.carries(schema)
+
+
+def _times(topic: str, time_ns: NDArray[np.int64]) -> Iterator[Finding]:
+    """Times that go back or repeat in the file, and gaps in topics that have a rhythm."""
+    step_ns = np.diff(time_ns)
+    if (back := step_ns[step_ns < 0]).size:
+        yield Finding(
+            "warning",
+            topic,
+            f"{back.size} messages go back in time, by up to {-back.min() / 1e9:.3f} s",
+        )
+    if repeated := int((step_ns == 0).sum()):
+        yield Finding("warning", topic, f"{repeated} messages repeat the time before them")
+    yield from _gaps(topic, step_ns[step_ns > 0])
 
 
 def _gaps(topic: str, step_ns: NDArray[np.int64]) -> Iterator[Finding]:

@@ -1,8 +1,8 @@
 """What copying stages carry over besides messages: metadata and attachments."""
 
-import json
 from pathlib import Path
 
+from dmrl.documents import parse_json
 from dmrl.errors import RecordingError
 from dmrl.recording import sums
 from dmrl.recording.index import SPLIT_METADATA, Summary
@@ -43,7 +43,7 @@ def splits(path: Path, found: Summary) -> dict[str, list[tuple[int, int]]]:
     try:
         for record in found.metadata.get(SPLIT_METADATA, []):
             for name, ranges in record.items():
-                out.setdefault(name, []).extend((int(a), int(b)) for a, b in json.loads(ranges))
+                out.setdefault(name, []).extend((int(a), int(b)) for a, b in parse_json(ranges))
     except (ValueError, TypeError) as e:
         raise RecordingError(
             f"{path}: its split is not a list of [start_ns, end_ns] ({e}). "

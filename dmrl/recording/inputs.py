@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from dmrl.documents import parse_json
 from dmrl.errors import RecordingError
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
@@ -119,6 +120,6 @@ def _own_provenance(path: Path) -> Provenance | None:
     if not file.is_file():
         return None
     try:
-        return Provenance.from_json(json.loads(file.read_text(encoding="utf-8")))
+        return Provenance.from_json(parse_json(file.read_text(encoding="utf-8")))
     except (ValueError, KeyError, TypeError) as e:
         raise RecordingError(f"{file} is damaged: {e}. Make {path} again") from e

@@ -13,7 +13,8 @@ from typing import Any, Self
 
 import tomli_w
 
-from dmrl import __version__
+from dmrl import __version__, limits
+from dmrl.documents import parse_json
 
 FILE_NAME = "provenance.json"
 METADATA_NAME = "dmrl.provenance"
@@ -70,20 +71,24 @@ class Provenance:
         return asdict(self._told_once())
 
     def _told_once(self) -> "Provenance":
-        """The same, but with no provenance for an input that was there before, by its hash."""
+        """The same, but with no provenance for an input that was there before, by its hash.
+
+        Nor for one that is older than the budget: its hash stays, its story does not.
+        """
         told: set[str] = set()
 
-        def first_time(made: Provenance) -> Provenance:
+        def first_time(made: Provenance, depth: int) -> Provenance:
             inputs = []
             for source in made.inputs:
-                own = None if source.sha256 in told else source.provenance
+                known = source.sha256 in told or depth >= limits.ANCESTORS
+                own = None if known else source.provenance
                 if own is not None:
                     told.add(source.sha256)
-                    own = first_time(own)
+                    own = first_time(own, depth + 1)
                 inputs.append(replace(source, provenance=own))
             return replace(made, inputs=tuple(inputs))
 
-        return first_time(self)
+        return first_time(self, 1)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
@@ -117,7 +122,7 @@ class Provenance:
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self:
         """The provenance that ``to_metadata`` gave."""
         plain = ("stage", "dmrl_version")
-        return cls.from_json({k: v if k in plain else json.loads(v) for k, v in metadata.items()})
+        return cls.from_json({k: v if k in plain else parse_json(v) for k, v in metadata.items()})
 
     def to_recipe(self) -> str:
         """The settings as a TOML recipe: what was run can be run again."""

@@ -1,7 +1,11 @@
+import struct
+import zlib
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from dmrl.errors import SourceError
 from dmrl.images import codec
@@ -61,3 +65,54 @@ def test_the_part_that_is_scaled_is_the_one_named() -> None:
     assert part.min() > 150  # the border mixes with its neighbours
     assert np.abs(part[1:-1, 1:-1].astype(int) - 200).max() < 6
     assert codec.crop_and_scale(rgb, (0, 0, 60, 40), 30, 20).shape == (20, 30, 3)
+
+
+def _png_of(width_px: int, height_px: int) -> bytes:
+    """A grey PNG of zeros, made without its pixels."""
+    packer = zlib.compressobj(9)
+    row = bytes(1 + width_px)
+    body = b"".join(packer.compress(row) for _ in range(height_px)) + packer.flush()
+    parts = (
+        (b"IHDR", struct.pack(">IIBBBBB", width_px, height_px, 8, 0, 0, 0, 0)),
+        (b"IDAT", body),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts
+    )
+
+
+@pytest.mark.parametrize("side_px", [8_001, 13_000, 30_000])
+def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(
+    side_px: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header = _png_of(side_px, 1)
+    header = header[:16] + struct.pack(">II", side_px, side_px) + header[24:]
+    header = header[:29] + struct.pack(">I", zlib.crc32(header[12:29])) + header[33:]
+    monkeypatch.setattr(Image.Image, "load", None)
+    monkeypatch.setattr(Image.Image, "convert", None)
+    for data in (
+        header,
+        b"P6 %d %d 255 " % (side_px, side_px),
+        b"P5 %d %d 255 " % (side_px, side_px),
+    ):
+        with pytest.raises(SourceError, match=r"a\.png has more than 64 million pixels"):
+            codec.decode(data, "a.png")
+
+
+def test_a_jpeg_of_endless_scans_is_refused() -> None:
+    grey = Image.new("L", (4000, 4000))
+    buffer = BytesIO()
+    grey.save(buffer, "JPEG", progressive=True)
+    data = buffer.getvalue()
+    assert codec.decode(data).shape == (4000, 4000, 3)
+    at = data.index(b"\xff\xda")
+    second = data.index(b"\xff\xda", at + 2)
+    endless = data[:second] + data[at:second] * 1000 + data[second:]
+    with pytest.raises(SourceError, match="too many scans"):
+        codec.decode(endless)
+
+
+def test_a_large_photo_is_no_bomb() -> None:
+    assert codec.decode(_png_of(6000, 4000)).shape == (4000, 6000, 3)

@@ -3,6 +3,9 @@
 import json
 from pathlib import Path
 
+import pytest
+
+from dmrl import limits
 from dmrl.recording import Provenance
 from dmrl.recording.provenance import Input
 from dmrl.stages.info import ancestry_lines
@@ -54,3 +57,19 @@ def test_it_is_written_to_a_folder(tmp_path: Path) -> None:
     made.write(tmp_path)
     text = (tmp_path / "provenance.json").read_text()
     assert Provenance.from_json(json.loads(text)) == made
+
+
+def test_the_oldest_of_a_long_ancestry_keep_their_hash_alone() -> None:
+    made = Provenance("first")
+    for k in range(300):
+        made = Provenance(f"step {k}", inputs=(Input(f"{k}.mcap", f"{k:064x}", made),))
+    back = Provenance.from_metadata(made.to_metadata())
+    assert len(list(back.ancestry())) == limits.ANCESTORS
+    assert list(back.ancestry())[-1][1].provenance is None
+    assert Provenance.from_metadata(back.to_metadata()) == back
+
+
+def test_a_provenance_that_nests_without_end_is_refused() -> None:
+    deep = '{"inputs": [{"name": "a", "sha256": "b", "provenance": ' * 20_000
+    with pytest.raises(ValueError, match="nests deeper"):
+        Provenance.from_metadata({"stage": "a", "inputs": f"[{deep}"})

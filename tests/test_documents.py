@@ -1,0 +1,55 @@
+"""Documents of strangers: what asks for too much is a ValueError, before it gets it."""
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.documents import load_npz, parse_json, parse_toml
+
+
+def test_documents_are_read() -> None:
+    assert parse_json('{"a": [1, {"b": null}]}') == {"a": [1, {"b": None}]}
+    assert parse_toml("a.b = [1]") == {"a": {"b": [1]}}
+
+
+@pytest.mark.parametrize("depth", [201, 5_000, 1_000_000])
+def test_nesting_has_a_budget(depth: int) -> None:
+    for text in ("[" * depth + "]" * depth, '{"a":' * depth + "1" + "}" * depth):
+        with pytest.raises(ValueError, match="nests deeper than 200"):
+            parse_json(text)
+
+
+def test_as_deep_as_may_be_is_read() -> None:
+    assert parse_json("[" * 199 + "]" * 199) is not None
+
+
+def test_arrays_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, one=np.arange(5), two=np.zeros((2, 3)))
+    found = load_npz(path)
+    assert found["one"].tolist() == [0, 1, 2, 3, 4]
+    assert found["two"].shape == (2, 3)
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for k in range(3):
+            archive.writestr(f"{k}.npy", bytes(50 << 20))
+    assert path.stat().st_size < 200_000
+    with pytest.raises(ValueError, match="it unpacks to 157 MB"):
+        load_npz(path)
+
+
+def test_an_array_that_is_said_to_be_huge_is_refused(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    shape = {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**7)}
+    np.lib.format.write_array_header_1_0(header, shape)
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", header.getvalue() + bytes(80))
+    with pytest.raises(ValueError):
+        load_npz(path)
