@@ -248,7 +248,7 @@ class Training:
         return {"loss": sum(means), **dict(zip(LOSSES, means, strict=True))}
 
     def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:
-        """(5,) losses of a batch of ``whole`` images, of which this process has a part."""
+        """``LOSSES`` of a batch of ``whole`` images, of which this process has a part."""
         group = self._group
         share = len(group.part(np.arange(whole))) / whole
         return train_step(

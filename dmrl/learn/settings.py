@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dmrl.learn.augment import Augmentation
-from dmrl.learn.losses import DepthLoss
+from dmrl.learn.losses import TERMS, LossSettings
 from dmrl.learn.network import CLASS, SPREAD
 from dmrl.learn.optimizer import OptimizerName
 from dmrl.learn.targets import LabelNoise
@@ -12,8 +12,8 @@ from dmrl.learn.windows import Intrinsics
 
 
 @dataclass(frozen=True, slots=True)
-class FitSettings:
-    """How a network is trained.
+class FitSettings(LossSettings):
+    """How a network is trained; what is learnt stands in `LossSettings`.
 
     Parameters
     ----------
@@ -39,23 +39,6 @@ class FitSettings:
     target_sigma_cells
         Width (one sigma) of a robot in the confidence targets, cells. 0: one cell, as
         published.
-    focus
-        Exponent of the focal confidence loss. 0: plain cross entropy.
-    confidence_weight
-        Factor of the confidence loss.
-    depth_loss
-        "log": absolute error of the log depth. "squared": squared error in m^2, as published.
-    depth_weight
-        Factor of the depth loss.
-    offset_weight
-        Factor of the sub-cell offset's loss, for networks that have the channels.
-    spread_weight
-        Factor of the loss of a channel that says how sure the depth is. 0: no such channel.
-    classes
-        What tells robots apart, one pattern of peer names each: ["cf2", "cf[3-9]"] is two
-        classes. Empty: the network does not tell.
-    class_weight
-        Factor of the class loss.
     distill_share
         With a teacher: how much of the losses is against what it says, the rest against the
         labels, 0 to 1.
@@ -119,14 +102,6 @@ class FitSettings:
     weight_decay: float = 1e-2
     ema_steps: int = 500
     target_sigma_cells: float = 0.7
-    focus: float = 2.0
-    confidence_weight: float = 1.0
-    depth_loss: DepthLoss = "log"
-    depth_weight: float = 1.0
-    offset_weight: float = 0.5
-    spread_weight: float = 0.0
-    classes: tuple[str, ...] = ()
-    class_weight: float = 1.0
     distill_share: float = 0.5
     label_noise: LabelNoise = "ignore"
     shares: dict[str, float] = field(default_factory=dict)
@@ -198,7 +173,7 @@ SHARES = (
 )
 NOT_NEGATIVE = (
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
-    *("confidence_weight", "depth_weight", "offset_weight", "spread_weight", "class_weight"),
+    *(term.weight for term in TERMS),
     *("rotation_deg", "paste"),
     *("plain_epochs", "frozen_norm_epochs"),
 )

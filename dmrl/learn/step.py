@@ -7,19 +7,22 @@ from torch import Tensor
 
 from dmrl.learn.batches import Batch
 from dmrl.learn.group import Group
-from dmrl.learn.losses import class_loss, confidence_loss, depth_loss, offset_loss, spread_loss
-from dmrl.learn.network import CLASS, SPREAD, Network, by_name, to_input
+from dmrl.learn.losses import TERMS, weighted
+from dmrl.learn.network import Network, by_name, to_input
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.targets import Targets, as_targets, targets
+from dmrl.learn.targets import as_targets, targets
 
 ALONE = Group()
-LOSSES = ("confidence_loss", "depth_loss", "offset_loss", "spread_loss", "class_loss")
+LOSSES = tuple(term.name for term in TERMS)
 
 
 def losses(
     network: Network, batch: Batch, settings: FitSettings, teacher: Network | None = None
 ) -> Tensor:
-    """(5,) weighted ``LOSSES`` of a batch; with a teacher, a share of what it says for labels."""
+    """The weighted losses of a batch, in the order of ``LOSSES``.
+
+    With a teacher, a share of them is against what it says in place of the labels.
+    """
     device = next(network.parameters()).device
     images, robots = (t.to(device, non_blocking=True) for t in batch)
     pixels = to_input(images)
@@ -32,12 +35,12 @@ def losses(
         label_noise=settings.label_noise,
     )
     named = by_name(network.channels, out)
-    parts = _against(named, wanted, settings)
+    parts = weighted(named, wanted, settings)
     if teacher is None:
         return parts
     with torch.no_grad():
         said = _output(teacher, pixels, settings)
-    taught = _against(named, as_targets(teacher.channels, said, wanted), settings)
+    taught = weighted(named, as_targets(teacher.channels, said, wanted), settings)
     return torch.lerp(parts, taught, settings.distill_share)
 
 
@@ -47,30 +50,6 @@ def _output(network: Network, pixels: Tensor, settings: FitSettings) -> Tensor:
     with torch.autocast(pixels.device.type, torch.bfloat16, enabled=half):
         out: Tensor = network(pixels)
     return out.float()
-
-
-def _against(out: dict[str, Tensor], wanted: Targets, settings: FitSettings) -> Tensor:
-    """(5,) weighted losses of an output, by channel, against targets."""
-    none = out["confidence"].new_zeros(())
-    confidence = confidence_loss(
-        out["confidence"], wanted.confidence, wanted.confidence_weight, focus=settings.focus
-    )
-    depth = depth_loss(out["log_depth"], wanted.depth_m, wanted.weight, settings.depth_loss)
-    offset = spread = classes = none
-    if "offset_u" in out:
-        both = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
-        offset = offset_loss(both, wanted.offset, wanted.offset_weight)
-    if SPREAD in out:
-        spread = spread_loss(out[SPREAD], out["log_depth"], wanted.depth_m, wanted.weight)
-    if settings.classes:
-        logits = torch.stack([out[f"{CLASS}{k}"] for k in range(len(settings.classes))], dim=1)
-        classes = class_loss(logits, wanted.class_id, wanted.weight)
-    weights = (
-        *(settings.confidence_weight, settings.depth_weight, settings.offset_weight),
-        *(settings.spread_weight, settings.class_weight),
-    )
-    parts: Tensor = torch.stack((confidence, depth, offset, spread, classes))
-    return parts * none.new_tensor(weights)
 
 
 def train_step(
@@ -83,7 +62,7 @@ def train_step(
     share: float = 1.0,
     teacher: Network | None = None,
 ) -> Tensor:
-    """(5,) losses of a batch, after one step of the optimizer on their sum.
+    """Losses of a batch in the order of ``LOSSES``, after one step of the optimizer on their sum.
 
     Parameters
     ----------

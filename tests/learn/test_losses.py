@@ -1,17 +1,24 @@
 import math
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
 from dmrl.learn.losses import (
+    TERMS,
     DepthLoss,
+    LossSettings,
     class_loss,
     confidence_loss,
     depth_loss,
     offset_loss,
     spread_loss,
+    weighted,
 )
+from dmrl.learn.network import build, by_name
+from dmrl.learn.settings import FitSettings
+from dmrl.learn.targets import targets
 
 
 def test_confidence_loss_is_the_published_sum_over_cells() -> None:
@@ -92,3 +99,40 @@ def test_class_loss_is_the_papers_and_only_where_the_class_is_known() -> None:
     weight = torch.tensor([[[0.5, 1.0, 0.0]]])
     p = 1 / (1 + math.exp(-1))
     assert float(class_loss(logits, class_id, weight)) == pytest.approx(-0.5 * 2 * math.log(p))
+
+
+WEIGHTS = [field.name for field in fields(FitSettings) if field.name.endswith("_weight")]
+
+
+def test_every_weight_weighs_one_term() -> None:
+    assert sorted(WEIGHTS) == sorted(term.weight for term in TERMS)
+    assert len({term.name for term in TERMS}) == len(TERMS)
+
+
+@pytest.mark.parametrize("key", WEIGHTS)
+def test_every_weight_changes_the_loss_by_its_own_term(key: str) -> None:
+    settings = FitSettings(classes=("a", "b"), spread_weight=1.0)
+    network = build("dmrl-nano", extra=settings.extra).eval()
+    robots = torch.tensor([[[20.0, 12.0, 1.5, 1.0, 1.0, 0.1, 15.0, 8.0, 25.0, 16.0, 1.0]]])
+    wanted = targets(robots, (4, 5), sigma_cells=0.7)
+    with torch.no_grad():
+        out = by_name(network.channels, network(torch.ones(1, 3, 32, 40)))
+    before = weighted(out, wanted, settings)
+    after = weighted(out, wanted, replace(settings, **{key: 3 * getattr(settings, key)}))
+    own = next(k for k, term in enumerate(TERMS) if term.weight == key)
+    assert float(before[own]) != 0
+    factors = torch.ones(len(TERMS))
+    factors[own] = 3.0
+    torch.testing.assert_close(after, before * factors)
+
+
+def test_a_term_is_nothing_to_a_network_that_lacks_its_channels() -> None:
+    network = build("locanet").eval()
+    wanted = targets(torch.full((1, 1, 11), math.nan), (4, 5), sigma_cells=0.7)
+    with torch.no_grad():
+        out = by_name(network.channels, network(torch.ones(1, 3, 32, 40)))
+    parts = dict(
+        zip((term.name for term in TERMS), weighted(out, wanted, LossSettings()), strict=True)
+    )
+    assert {name for name, part in parts.items() if not part} >= {"offset_loss", "class_loss"}
+    assert parts["confidence_loss"] > 0
