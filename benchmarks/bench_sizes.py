@@ -144,7 +144,7 @@ def ram_bytes(network: IntegerNetwork) -> int:
     """Bytes of state of the C."""
     with tempfile.TemporaryDirectory(prefix="dmrl-sizes-") as folder:
         write_c(network, Path(folder), [])
-        return state_bytes(Path(folder))
+        return state_bytes(network, Path(folder))
 
 
 def print_line(each: Judged) -> None:

@@ -10,7 +10,7 @@ from typing import NoReturn
 from cyclopts import App, CycloptsError, UnknownCommandError
 from rich.text import Text
 
-from dmrl import __version__, boundary
+from dmrl import __version__, boundary, plugins
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
@@ -50,7 +50,7 @@ def bad_command_line(error: CycloptsError) -> Text:
         return Text(f"dmrl: {error}")
     # The error's own text would load every command, and fail where an extra is missing.
     word = error.unused_tokens[0]
-    near = get_close_matches(word, COMMANDS, n=1)
+    near = get_close_matches(word, [*COMMANDS, *plugins.found(plugins.STAGES)], n=1)
     hint = f"Did you mean {near[0]}?" if near else "Try: dmrl --help"
     return Text(f"dmrl: no command {word}. {hint}")
 
@@ -66,6 +66,10 @@ app = App(
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
     _module = _name.replace("-", "_")
     app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help, sort_key=_order)
+for _name, _plugin in plugins.found(plugins.STAGES).items():
+    if _name not in COMMANDS:
+        _help = f"{_plugin.summary} (of the package {_plugin.package})".strip()
+        app.command(f"dmrl.plugins:{_name}", name=_name, help=_help, sort_key=len(COMMANDS))
 
 
 def main() -> NoReturn:

@@ -13,6 +13,7 @@
   - BlenderError      Blender cannot be set up, does not start, or cannot use a model
   - ToolError         a compiler or an emulator is missing, or fails
   - MissingExtra      a package that an optional room needs is not installed
+  - PluginError       what another package adds to dmrl does not work
 """
 
 from collections.abc import Iterable
@@ -97,3 +98,7 @@ class MissingExtra(DmrlError):
 
     def __init__(self, package: str, extra: str, what: str) -> None:
         super().__init__(f"{what} needs {package}. Install it with: pip install 'dmrl[{extra}]'")
+
+
+class PluginError(DmrlError):
+    """What another package adds to dmrl cannot be loaded, or fails; the package is named."""

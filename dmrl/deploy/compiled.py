@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c import NAME, write_c
+from dmrl.deploy.c import c_name, write_c
 from dmrl.deploy.c.harness import DETECTION, MOST, Answer, detections_of, harness
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.toolchain import host_compiler, run
@@ -50,15 +50,16 @@ class Compiled:
         if folder is None:
             write_c(network, build, [])
             folder = build
-        require_c(folder)
+        require_c(network, folder)
+        name = c_name(network)
         (build / "harness.c").write_text(harness(network), encoding="utf-8")
         library = build / "network.so"
-        sources = (build / "harness.c", folder / f"{NAME}.c")
+        sources = (build / "harness.c", folder / f"{name}.c")
         own = PC_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()
-        flags = (*FLAGS, *own, f"-D{NAME.upper()}_BAYER=0", "-I", folder)
+        flags = (*FLAGS, *own, f"-D{name.upper()}_BAYER=0", "-iquote", folder)
         run(
             (compiler or host_compiler(), *flags, *sources, "-o", library),
-            f"compiling {folder / NAME}.c",
+            f"compiling {folder / name}.c",
         )
         self._run = ctypes.CDLL(str(library)).harness_run
 
@@ -79,15 +80,15 @@ class Compiled:
         return self.answer(image).grids
 
 
-def require_c(folder: Path) -> None:
-    """Nothing, if a folder holds the C of an export.
+def require_c(network: IntegerNetwork, folder: Path) -> None:
+    """Nothing, if a folder holds the C of a network.
 
     Raises
     ------
     ModelError
         If a file is missing or empty.
     """
-    for name in (f"{NAME}.c", f"{NAME}.h"):
+    for name in (f"{c_name(network)}.c", f"{c_name(network)}.h"):
         file = folder / name
         if not file.is_file() or not file.stat().st_size:
             raise ModelError(

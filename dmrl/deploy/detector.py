@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.backends import Backend, OnLevels, grids_of, integer
-from dmrl.deploy.c import NAME
+from dmrl.deploy.c import c_name
 from dmrl.deploy.compiled import Compiled
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.store import INTEGER_NAME, load
@@ -30,7 +30,6 @@ FLOAT_ONNX_NAME = "model.onnx"
 INT8_ONNX_NAME = "model.int8.onnx"
 DESCRIPTION_NAME = "model.json"
 WEIGHTS_NAME = "model.safetensors"
-C_NAME = f"{NAME}.c"
 QUANTISE = "Make one with: dmrl quantize MODEL DATASET OUT"
 LIBRARIES: dict[BackendName, tuple[str, ...]] = {
     "torch": ("torch", "numpy"),
@@ -163,9 +162,10 @@ def _integer(model: Path, backend: BackendName) -> Detector:
 
 def _c(model: Path, backend: BackendName) -> Detector:
     network = _network(model, backend)
-    folder = model if (model / C_NAME).is_file() else None
-    runs = OnLevels(network, Compiled(network, folder).run)
-    return _of_network(model, network, runs, model / C_NAME if folder else _integer_file(model))
+    source = model / f"{c_name(network)}.c"
+    exported = source.is_file()
+    runs = OnLevels(network, Compiled(network, model if exported else None).run)
+    return _of_network(model, network, runs, source if exported else _integer_file(model))
 
 
 def _network(model: Path, backend: BackendName) -> IntegerNetwork:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c import NAME
+from dmrl.deploy.c import c_name
 from dmrl.deploy.c.text import fill
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.targets import RISCV_FLAGS, Build
@@ -58,14 +58,14 @@ def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cos
     if missing(RISCV):
         return None
     with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
-        code, constants = _sizes(folder, Path(place))
+        code, constants = _sizes(network, folder, Path(place))
         counted = None
         if not missing(EMULATOR):
             counted = _instructions(network, folder, Path(place), image)
     return Cost(code, constants, counted)
 
 
-def state_bytes(folder: Path) -> int:
+def state_bytes(network: IntegerNetwork, folder: Path) -> int:
     """Bytes of RAM that the header of an export folder states; compilers hold it to that.
 
     Raises
@@ -73,18 +73,20 @@ def state_bytes(folder: Path) -> int:
     ModelError
         If it states none.
     """
-    text = (folder / f"{NAME}.h").read_text(encoding="utf-8", errors="replace")
+    header = folder / f"{c_name(network)}.h"
+    text = header.read_text(encoding="utf-8", errors="replace")
     found = re.search(r"_STATE_BYTES \((\d+)", text)
     if not found:
-        raise ModelError(f"{folder / NAME}.h is damaged. Export the model again: dmrl export")
+        raise ModelError(f"{header} is damaged. Export the model again: dmrl export")
     return int(found[1])
 
 
-def _sizes(folder: Path, build: Path) -> tuple[int, int]:
+def _sizes(network: IntegerNetwork, folder: Path, build: Path) -> tuple[int, int]:
     """Bytes of code and of constants of the object."""
-    target = build / f"{NAME}.o"
-    flags = ("-std=c99", "-O3", *RISCV_FLAGS, f"-D{NAME.upper()}_BAYER=0")
-    run((RISCV, *flags, "-c", folder / f"{NAME}.c", "-o", target), "measuring the C")
+    name = c_name(network)
+    target = build / f"{name}.o"
+    flags = ("-std=c99", "-O3", *RISCV_FLAGS, f"-D{name.upper()}_BAYER=0")
+    run((RISCV, *flags, "-c", folder / f"{name}.c", "-o", target), "measuring the C")
     said = run((RISCV.replace("gcc", "size"), "-A", target), "measuring the C").decode()
     sections = re.findall(r"^(\.\S+)\s+(\d+)", said, flags=re.MULTILINE)
     code = sum(int(size) for name, size in sections if name.startswith(".text"))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmrl.deploy.c import NAME
+from dmrl.deploy.c import c_name
 from dmrl.deploy.c.harness import harness
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.toolchain import EMULATOR, RISCV, missing, run
@@ -58,9 +58,10 @@ class Build:
         """
         harness_c, program = build / "harness.c", build / "program"
         harness_c.write_text(harness(network), encoding="utf-8")
-        mode = f"-D{NAME.upper()}_BAYER={int(self.bayer)}"
-        flags: tuple[str | Path, ...] = (*self.flags, mode, "-I", folder)
-        sources = (harness_c, folder / f"{NAME}.c")
+        name = c_name(network)
+        mode = f"-D{name.upper()}_BAYER={int(self.bayer)}"
+        flags: tuple[str | Path, ...] = (*self.flags, mode, "-iquote", folder)
+        sources = (harness_c, folder / f"{name}.c")
         last: tuple[str, ...] = ("-lgcc",) if self.emulated else ()
         what = f"{self.compiler} {self.label}"
         run((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)

@@ -1,12 +1,16 @@
 """The one table of formats, in the order in which a source is held against them.
 
-A new format is one file beside this one and one row here; docs/add-a-format.md shows it.
+A new format is one file beside this one and one row here, or a plug-in of another package; see
+docs/add-a-format.md.
 """
 
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 
-from dmrl.errors import SourceError
+from dmrl import plugins
+from dmrl.errors import PluginError, SourceError
 from dmrl.formats import (
     aideck_stream,
     cfclient_csv,
@@ -19,7 +23,10 @@ from dmrl.formats import (
     ros,
     uwb_tiers,
 )
-from dmrl.formats.format import Format
+from dmrl.formats.format import Content, Format, Options
+from dmrl.plugins import Plugin
+from dmrl.samples.sample import Sample
+from dmrl.terminal.progress import say
 
 # Those with a signature first; any folder with pictures is a folder of pictures.
 FORMATS = {
@@ -53,23 +60,64 @@ def format_of(source: Path, name: str | None = None) -> Format:
     ------
     SourceError
         If there is no such source or format, or none fits: lists the formats.
+    PluginError
+        If a plug-in that is asked for by name cannot be loaded.
     """
-    known = ", ".join(FORMATS)
+    added = {n: p for n, p in plugins.found(plugins.FORMATS).items() if n not in FORMATS}
+    known = ", ".join([*FORMATS, *added])
     if not source.exists():
         raise SourceError(f"no file or folder {source}. Name one to convert")
     if not (source.is_file() or source.is_dir()):
         raise SourceError(f"{source} is neither a file nor a folder. Save it to a file first")
+    if name in added:
+        return _plugged(added[name])
     if name is not None and name not in FORMATS:
-        near = get_close_matches(name, FORMATS, n=1)
+        near = get_close_matches(name, [*FORMATS, *added], n=1)
         hint = f"Did you mean {near[0]}? " if near else ""
         raise SourceError(f"--from {name}: no such kind. {hint}Kinds: {known}")
     if name is not None:
         return FORMATS[name]
     if source.is_file() and source.stat().st_size == 0:
         raise SourceError(f"{source} is empty, 0 bytes. Name another file")
-    for candidate in FORMATS.values():
-        if candidate.recognises(source):
-            return candidate
+    if guess := _guess(source, added.values()):
+        return guess
     if source.suffix == ".mcap":
         raise SourceError(f"{source} is a recording already. Say --to: csv, parquet, ros2")
     raise SourceError(f"{source} looks like no kind that is known. Say --from: {known}")
+
+
+def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:
+    """The first format that knows a source: plug-ins after dmrl's own, before plain pictures."""
+    *own, pictures = FORMATS.values()
+    if found := next((f for f in own if f.recognises(source)), None):
+        return found
+    for plugin in added:
+        try:
+            form = _plugged(plugin)
+            if form.recognises(source):
+                return form
+        except PluginError as e:
+            say(f"{e}. Not tried on {source}")
+    return pictures if pictures.recognises(source) else None
+
+
+def _plugged(plugin: Plugin) -> Format:
+    """A format of another package; what fails in it names the package."""
+    loaded = plugin.load()
+    form = getattr(loaded, "FORMAT", loaded)
+    plugin.require(isinstance(form, Format), "a dmrl.formats.format.Format")
+
+    def recognises(source: Path) -> bool:
+        with plugin.blamed(f"fails to look at {source}"):
+            return bool(form.recognises(source))
+
+    def content(source: Path, options: Options) -> Content:
+        with plugin.blamed(f"fails to read {source}"):
+            held: Content = form.content(source, options)
+            return replace(held, samples=samples(source, held.samples))
+
+    def samples(source: Path, given: Iterator[Sample]) -> Iterator[Sample]:
+        with plugin.blamed(f"fails to read {source}"):
+            yield from given
+
+    return Format(plugin.name, form.what, recognises, content)

@@ -12,7 +12,7 @@ A matrix that turns ``b`` coordinates into ``a`` coordinates is named ``a_from_b
 A grid cell is (row, col) = (v, u) // stride; the paper writes (x_p / 8, y_p / 8).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,9 @@ class Camera:
 
 AIDECK = Camera(320, 224, 183.73, 184.12, 166.90, 77.51, (-0.0957, 0.0211, 0.0, 0.0, 0.0))
 """The AI-deck camera of the paper (eq. 1): 324x244 cropped to 320x224."""
+
+AIDECK_PINHOLE = replace(AIDECK, distortion=())
+"""The same without its distortion: what flights and sketches are seen with."""
 
 PUBLISHED_RENDER = Camera(320, 224, 120.0, 120.0, 160.0, 112.0)
 """The camera that the published synthetic images were rendered with."""

@@ -22,10 +22,11 @@ from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 from dmrl.learn.keras import read_h5
 from dmrl.learn.network import (
-    ARCHITECTURES,
     CLASS,
     SPREAD,
     Network,
+    architecture,
+    architecture_names,
     build,
     by_name,
     parameter_count,
@@ -65,7 +66,7 @@ class Model:
     network
         In evaluation mode.
     architecture
-        Its name in ``ARCHITECTURES``.
+        Its name, one of ``network.architecture_names()``.
     name
         Of the file or folder it came from.
     width_px, height_px
@@ -247,7 +248,7 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
 
 def _extra(said: dict[str, Any], path: Path) -> list[str]:
     """Channels on top of the architecture's own, as a description lists them all."""
-    own = list(ARCHITECTURES[said["architecture"]].own)
+    own = list(architecture(said["architecture"]).own)
     outputs = said.get("outputs", own)
     extra = outputs[len(own) :] if isinstance(outputs, list) else None
     wanted = [name for name in extra or [] if name == SPREAD]
@@ -276,10 +277,9 @@ def _read_description(path: Path) -> dict[str, Any]:
     if not 0 < said["width_px"] * said["height_px"] <= limits.PIXELS or said["width_px"] < 0:
         size = f"{said['width_px']} x {said['height_px']}"
         raise ModelError(f"{path} is for images of {size}. Give the model.json of dmrl train")
-    if said["architecture"] not in ARCHITECTURES:
-        known = ", ".join(sorted(ARCHITECTURES))
+    if said["architecture"] not in architecture_names():
         raise ModelError(
-            f"{path} asks for architecture {said['architecture']}, this dmrl knows {known}. "
-            "Update dmrl"
+            f"{path} asks for architecture {said['architecture']}, this dmrl knows "
+            f"{', '.join(architecture_names())}. Update dmrl, or install the package that brings it"
         )
     return dict(said)

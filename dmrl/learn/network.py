@@ -1,4 +1,4 @@
-"""The networks, by name. A new one is a class here, or in a file beside, and a row below.
+"""The networks, by name. A new one is a class here and a row of ``ARCHITECTURES``, or a plug-in.
 
 Every network takes images as ``to_input`` gives them and returns (N, C, rows, cols), one cell
 per ``stride_px`` pixels both ways. Its ``channels`` name what each of the C is; the first two
@@ -7,11 +7,13 @@ are the same for all, see ``CHANNEL_MEANINGS``.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from contextlib import nullcontext
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 
+from dmrl import plugins
 from dmrl.errors import SettingError
 from dmrl.learn.depthwise import Depthwise
 
@@ -200,6 +202,34 @@ ARCHITECTURES: dict[str, type[Network]] = {
 }
 
 
+def architecture_names() -> list[str]:
+    """Names of all architectures, dmrl's and those of plug-ins, sorted."""
+    return sorted({*ARCHITECTURES, *plugins.found(plugins.NETWORKS)})
+
+
+def architecture(name: str) -> type[Network]:
+    """The class of an architecture.
+
+    Raises
+    ------
+    SettingError
+        If there is no architecture of this name.
+    PluginError
+        If it is a plug-in's, and cannot be loaded.
+    """
+    if name in ARCHITECTURES:
+        return ARCHITECTURES[name]
+    plugin = plugins.found(plugins.NETWORKS).get(name)
+    if plugin is None:
+        raise SettingError(
+            f"no architecture {name}. Choose one of: {', '.join(architecture_names())}"
+        )
+    loaded = plugin.load()
+    fits = isinstance(loaded, type) and issubclass(loaded, Network)
+    plugin.require(fits, "a subclass of dmrl.learn.network.Network")
+    return cast(type[Network], loaded)
+
+
 def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     """A new network, its weights drawn with ``seed``, channels last in memory.
 
@@ -209,13 +239,14 @@ def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     ------
     SettingError
         If there is no architecture of this name.
+    PluginError
+        If it is a plug-in's, and cannot be loaded.
     """
-    if name not in ARCHITECTURES:
-        known = ", ".join(sorted(ARCHITECTURES))
-        raise SettingError(f"no architecture {name}. Choose one of: {known}")
+    form, plugin = architecture(name), plugins.found(plugins.NETWORKS).get(name)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = ARCHITECTURES[name](extra)
+        with plugin.blamed("cannot be built") if plugin else nullcontext():
+            network = form(extra)
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 

@@ -15,7 +15,7 @@ from dmrl import recipe as recipes
 from dmrl import topics
 from dmrl.errors import SettingError
 from dmrl.flight import NOISE, Clock, Fault, Flight, Scenario, Trajectory, Truth, simulate
-from dmrl.geometry.frames import AIDECK, Array
+from dmrl.geometry.frames import AIDECK_PINHOLE, Array
 from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
 from dmrl.output import refuse_existing
@@ -28,6 +28,7 @@ from dmrl.rendering.sketch import Sketch
 from dmrl.samples import flight as samples
 from dmrl.samples.flight import Times, in_order, nanoseconds
 from dmrl.samples.sample import Sample, calibration, image, labels
+from dmrl.terminal.arguments import AsJson, Seed
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -37,8 +38,6 @@ Preset = Literal["ideal", "calibrated", "realistic", "harsh", "published"]
 START_NS = 1_000_000_000
 """Log time of the start: clocks that run late must not show a time before zero."""
 TRUTH_RATE_HZ = 20.0
-CAMERA = replace(AIDECK, distortion=())
-"""The AI-deck's camera without its distortion."""
 JPEG_QUALITY = 92
 
 
@@ -77,7 +76,7 @@ class Settings:
     duration_s: Annotated[float, Parameter(validator=validators.Number(gte=1, lte=3600))] = 100.0
     trajectory: Trajectory = "in_view"
     noise: Preset = "realistic"
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0
+    seed: Seed = 0
     yaw_spread_rad: float = 3.141592653589793
     camera: bool = False
     camera_renderer: CameraRenderer = "sketch"
@@ -224,7 +223,7 @@ def _camera(
     """The calibration of one robot's camera, then its pictures, each with its labels."""
     period_s = 1.0 / settings.camera_rate_hz
     time_s = np.arange(period_s / 2, settings.duration_s, period_s)
-    yield calibration(START_NS, robot, CAMERA)
+    yield calibration(START_NS, robot, AIDECK_PINHOLE)
 
     def bodies(moment_s: float) -> dict[str, Body]:
         return {name: _body(truth, moment_s) for name, truth in flight.truth.items()}
@@ -234,7 +233,7 @@ def _camera(
         for k, moment_s in enumerate(time_s.tolist())
     ]
     stamps = _stamps(flight.clocks[robot], time_s).tolist()
-    for time_ns, seen, picture in zip(stamps, views, draw(CAMERA, views), strict=True):
+    for time_ns, seen, picture in zip(stamps, views, draw(AIDECK_PINHOLE, views), strict=True):
         yield image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
         yield labels(time_ns, robot, list(_labels(list(seen.poses), picture)), ["truth"])
 
@@ -302,7 +301,7 @@ def command(
     /,
     *,
     flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate a flight of robots that measure themselves and each other.
 

@@ -4,7 +4,7 @@ So a demonstration takes the same road as anyone's own pictures.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -16,19 +16,15 @@ from dmrl.errors import SettingError
 from dmrl.formats.image_folder import CALIBRATION, LABELS
 from dmrl.formats.label_table import LabelRow, write_labels
 from dmrl.geometry.camera_file import write_camera
-from dmrl.geometry.frames import AIDECK, Camera
+from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 from dmrl.images.codec import encode_png
 from dmrl.output import partial_folder
 from dmrl.recording import provenance
 from dmrl.rendering.scene import random_look, random_poses
 from dmrl.rendering.sketch import Sketch, draw
+from dmrl.terminal.arguments import AsJson, Seed, Share
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
-
-CAMERA = replace(AIDECK, distortion=())
-"""The AI-deck's camera without its distortion."""
-
-Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +46,7 @@ class Settings:
     """
 
     images: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=999_999))] = 600
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0
+    seed: Seed = 0
     robots_max: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=20))] = 3
     empty_share: Share = 0.1
     test_share: Share = 0.2
@@ -83,14 +79,14 @@ def run(out: Path, settings: Settings) -> dict[str, int]:
             rows += _rows(name, picture, _split(settings, index))
         with (partial / LABELS).open("w", newline="", encoding="utf-8") as stream:
             write_labels(stream, rows)
-        (partial / CALIBRATION).write_text(write_camera(CAMERA), encoding="utf-8")
+        (partial / CALIBRATION).write_text(write_camera(AIDECK_PINHOLE), encoding="utf-8")
         made = provenance("sketch", settings, seed=settings.seed, libraries=("numpy", "pillow"))
         made.write(partial)
     empty = sum(not row.peer for row in rows)
     return {"images": settings.images, "robots": len(rows) - empty, "empty images": empty}
 
 
-def sketch(settings: Settings, index: int, camera: Camera = CAMERA) -> Sketch:
+def sketch(settings: Settings, index: int, camera: Camera = AIDECK_PINHOLE) -> Sketch:
     """Picture number ``index``, the same whatever else is drawn.
 
     Parameters
@@ -152,7 +148,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Draw a folder of pictures of small drones, with exact labels.
 

@@ -138,8 +138,8 @@ def _require_proof(folder: Path, result: Result, settings: Settings) -> None:
 
 
 def _tried(folder: Path, settings: Settings) -> Result:
-    require_c(folder)
     network = load(folder)
+    require_c(network, folder)
     pictures = _pictures(network, folder, settings)
     noise = _noise(network, settings)
     images = [*pictures, *noise]
@@ -155,7 +155,7 @@ def _tried(folder: Path, settings: Settings) -> Result:
         tried,
         # C that a target could not compile or run is not worth measuring.
         None if any(t.error for t in tried) else cost(network, folder, images[0]),
-        state_bytes(folder),
+        state_bytes(network, folder),
     )
 
 

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.deploy.bayer import demosaic
-from dmrl.deploy.c import write_c
+from dmrl.deploy.c import c_name, write_c
 from dmrl.deploy.c.harness import answers
 from dmrl.deploy.c.source import source
 from dmrl.deploy.c.text import names_of
@@ -84,9 +84,7 @@ def test_raw_mosaics_of_any_phase_are_seen_as_the_reference_sees_them(
 ) -> None:
     network = next(n for n in map(quantised_network, range(20)) if n.channels == channels)
     write_c(network, tmp_path, [])
-    flags = tuple(
-        f"-DLOCANET_RED_{axis}={k}" for axis, k in zip(("ROW", "COL"), phase, strict=True)
-    )
+    flags = tuple(f"-DRANDOM_RED_{axis}={k}" for axis, k in zip(("ROW", "COL"), phase, strict=True))
     build = Build("Bayer", "gcc", ("-O1", *flags), bayer=True)
     raw = noise(network, 1)[0, ..., 0]
     command = build.program(network, tmp_path, tmp_path)
@@ -107,7 +105,7 @@ def test_the_c_is_strict_c99_without_a_warning(compiler: str, tmp_path: Path) ->
         folder.mkdir()
         write_c(network, folder, [])
         for bayer in ("0", "1"):
-            command = [compiler, *STRICT, f"-DLOCANET_BAYER={bayer}", "-fsyntax-only", "locanet.c"]
+            command = [compiler, *STRICT, f"-DRANDOM_BAYER={bayer}", "-fsyntax-only", "random.c"]
             subprocess.run(command, cwd=folder, check=True, capture_output=True)
 
 
@@ -117,9 +115,9 @@ def test_the_c_calls_no_library(level: str, tmp_path: Path) -> None:
         pytest.skip(f"no {RISCV}")
     write_c(quantised_network(1), tmp_path, [])
     flags = ("-std=c99", level, *RISCV_FLAGS)
-    subprocess.run([RISCV, *flags, "-c", "locanet.c", "-o", "locanet.o"], cwd=tmp_path, check=True)
+    subprocess.run([RISCV, *flags, "-c", "random.c", "-o", "random.o"], cwd=tmp_path, check=True)
     tool = RISCV.replace("gcc", "nm")
-    said = subprocess.run([tool, "-u", "locanet.o"], cwd=tmp_path, check=True, capture_output=True)
+    said = subprocess.run([tool, "-u", "random.o"], cwd=tmp_path, check=True, capture_output=True)
     assert said.stdout == b""
 
 
@@ -130,7 +128,7 @@ def test_the_self_test_passes_and_fails_when_a_weight_is_changed(tmp_path: Path)
     assert done.stdout.count(b"as the reference") == 2
     (tmp_path / "other").mkdir()
     write_c(_changed(network), tmp_path / "other", [])
-    shutil.copy(tmp_path / "other" / "locanet.c", tmp_path)
+    shutil.copy(tmp_path / "other" / "random.c", tmp_path)
     failed = subprocess.run(["make", "test"], cwd=tmp_path, capture_output=True, check=False)
     assert failed.returncode != 0
     assert b"DIFFERS" in failed.stdout
@@ -141,7 +139,7 @@ def test_the_self_test_needs_no_library_when_silent(tmp_path: Path) -> None:
         pytest.skip(f"no {RISCV}")
     write_c(quantised_network(2), tmp_path, [])
     flags = ("-std=c99", "-O2", *RISCV_FLAGS, "-DSILENT", "-Wl,--entry=main")
-    command = [RISCV, *flags, "main.c", "locanet.c", "-o", "self_test"]
+    command = [RISCV, *flags, "main.c", "random.c", "-o", "self_test"]
     subprocess.run(command, cwd=tmp_path, check=True)
 
 
@@ -163,12 +161,50 @@ def _changed(network: IntegerNetwork) -> IntegerNetwork:
 
 def test_layers_may_have_any_names(tmp_path: Path) -> None:
     network = max(map(random_network, range(20)), key=lambda n: len(n.layers))
-    names = ("conv", "conv_weights", "while", "locanet_run", "3", "Conv", "passing_0", "")
+    names = ("conv", "conv_weights", "while", "random_run", "3", "Conv", "passing_0", "")
     layers = tuple(
         replace(layer, name=names[k % len(names)]) for k, layer in enumerate(network.layers)
     )
     result = proved(replace(network, layers=layers), tmp_path, QUICK)
     assert (result.error, result.mismatches) == ("", 0)
+
+
+@pytest.mark.parametrize(
+    ("architecture", "name"),
+    [
+        ("locanet", "locanet"),
+        ("dmrl-nano", "dmrl_nano"),
+        ("3-Tiny Nets!", "net_3_tiny_nets"),
+        ("main", "net_main"),
+        ("string", "string"),
+        ("__x #error", "x_error"),
+        ("網", "net"),
+        ("x" * 300, "x" * 40),
+    ],
+)
+def test_files_and_functions_are_named_after_the_architecture(
+    architecture: str, name: str, tmp_path: Path
+) -> None:
+    network = replace(random_network(0), architecture=architecture, name="some folder")
+    assert c_name(network) == name
+    result = proved(network, tmp_path, QUICK)
+    assert (result.error, result.mismatches) == ("", 0)
+    assert {f"{name}.c", f"{name}.h", f"{name}_vectors.h"} <= {f.name for f in tmp_path.iterdir()}
+    assert f"int {name}_run(" in (tmp_path / f"{name}.h").read_text()
+    subprocess.run(["make", "self_test"], cwd=tmp_path, check=True, capture_output=True)
+
+
+def test_two_networks_go_into_one_program(tmp_path: Path) -> None:
+    one, other = (replace(random_network(k), architecture=f"net-{k}") for k in (0, 1))
+    for network in (one, other):
+        write_c(network, tmp_path, [])
+    (tmp_path / "both.c").write_text(
+        '#include "net_0.h"\n#include "net_1.h"\n'
+        "static net_0_t a;\nstatic net_1_t b;\n"
+        "int main(void) { net_0_init(&a); net_1_init(&b); return 0; }\n"
+    )
+    command = ["gcc", "-std=c99", "both.c", "net_0.c", "net_1.c", "-o", "both"]
+    subprocess.run(command, cwd=tmp_path, check=True)
 
 
 def test_the_same_network_gives_the_same_text() -> None:

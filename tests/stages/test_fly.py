@@ -9,6 +9,7 @@ import pytest
 from dmrl import recipe as recipes
 from dmrl.errors import OutputError, RecipeError, SettingError
 from dmrl.flight import NOISE, Fault, Scenario, simulate
+from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.images.codec import decode
 from dmrl.recording import check, read, read_table, summary
 from dmrl.samples.flight import LOG_COLUMNS
@@ -48,7 +49,7 @@ def test_what_was_measured_stands_on_the_clock_of_the_robot(seen: Path) -> None:
 
 def test_truth_labels_are_projections_of_the_true_positions(seen: Path) -> None:
     flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
-    camera = fly.CAMERA
+    camera = AIDECK_PINHOLE
     for k, stamped in enumerate(read(seen, "/cf1/labels")):
         time_s = np.array([0.1 + 0.2 * k])
         assert stamped.time_ns == 1_000_000_000 + round(time_s[0] * 1e9)

@@ -9,7 +9,7 @@ from dmrl import topics
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
 from dmrl.flight import NOISE
 from dmrl.geometry.camera_file import write_camera
-from dmrl.geometry.frames import AIDECK, pixels_from_horizontal
+from dmrl.geometry.frames import AIDECK, AIDECK_PINHOLE, pixels_from_horizontal
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import (
     Provenance,
@@ -115,7 +115,7 @@ def test_labels_are_projections_of_the_positions(labelled: Path) -> None:
             for n in ("roll_rad", "pitch_rad")
         )
         uv, depth_m, _ = pixels_from_horizontal(
-            np.array([[at.x, at.y, at.z]]), roll, pitch, fly.CAMERA
+            np.array([[at.x, at.y, at.z]]), roll, pitch, AIDECK_PINHOLE
         )
         for peer in stamped.message.peers:
             if peer.source == "estimate" and peer.status == STATUS_OK:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from dmrl.errors import OutputError, SettingError
+from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.images.codec import decode
 from dmrl.recording import SPLIT_METADATA, read, summary
 from dmrl.stages import convert
-from dmrl.stages.sketch import CAMERA, Settings, run, sketch
+from dmrl.stages.sketch import Settings, run, sketch
 
 SMALL = Settings(images=12, seed=5, empty_share=0.3)
 
@@ -50,7 +51,7 @@ def test_converted_labels_are_what_was_drawn(folder: Path, tmp_path: Path) -> No
         assert {p.source for p in peers} <= {"truth"}
     (calibration,) = read(out, "/cf1/camera/calibration")
     np.testing.assert_array_equal(
-        np.reshape(calibration.message.K, (3, 3)), CAMERA.image_from_optical
+        np.reshape(calibration.message.K, (3, 3)), AIDECK_PINHOLE.image_from_optical
     )
     (split,) = summary(out).metadata[SPLIT_METADATA]
     assert json.loads(split["test"]) == [[1_000_000_000, 1_100_000_000]]

@@ -113,8 +113,8 @@ def test_no_proof_of_a_target_that_is_required_and_not_there(
 def test_c_that_does_not_compile_is_an_error_of_its_target(folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "export"
     shutil.copytree(folder, broken)
-    text = (broken / "locanet.c").read_text()
-    (broken / "locanet.c").write_text(text[: len(text) // 2])
+    text = (broken / "random.c").read_text()
+    (broken / "random.c").write_text(text[: len(text) // 2])
     result = run(broken, replace(GCC, targets=("sanitizers",)))
     assert result.wrong
     assert "error" in result.targets[0].error
@@ -141,7 +141,7 @@ def test_an_empty_folder_is_no_export(tmp_path: Path) -> None:
         run(tmp_path, GCC)
 
 
-@pytest.mark.parametrize("name", ["locanet.c", "locanet.h", INTEGER_NAME])
+@pytest.mark.parametrize("name", ["random.c", "random.h", INTEGER_NAME])
 @pytest.mark.parametrize("damage", ["removed", "emptied"])
 def test_a_damaged_export_is_named(folder: Path, tmp_path: Path, name: str, damage: str) -> None:
     broken = tmp_path / "export"

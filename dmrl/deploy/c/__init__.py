@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c.source import source
-from dmrl.deploy.c.text import NAME, fill, names_of
+from dmrl.deploy.c.text import c_name, fill, names_of
 from dmrl.deploy.c.vectors import MOST, vectors
 from dmrl.deploy.integer import IntegerNetwork
 
-__all__ = ["NAME", "write_c"]
+__all__ = ["c_name", "write_c"]
 
 L1_FOR_STATE = 48 * 1024
 """Bytes of the GAP8's 64 kB of L1 that a state may take: the cores' stacks lie there too."""
@@ -48,12 +48,12 @@ def write_c(
     ModelError
         If the C cannot carry the network; the layer is named.
     """
-    names = names_of(network)
+    names, name = names_of(network), c_name(network)
     made = source(network, names, bayer=bayer)
     files = {
-        f"{NAME}.c": made.code,
-        f"{NAME}.h": made.header,
-        f"{NAME}_vectors.h": vectors(network, images, names, bayer=bayer),
+        f"{name}.c": made.code,
+        f"{name}.h": made.header,
+        f"{name}_vectors.h": vectors(network, images, names, bayer=bayer),
         "main.c": fill("main.c", **names, most=MOST),
         "Makefile": fill("Makefile", **names),
         "README.md": fill(
@@ -68,6 +68,6 @@ def write_c(
             memory="L1" if made.state_bytes <= L1_FOR_STATE else "L2",
         ),
     }
-    for name, text in files.items():
-        (folder / name).write_text(text, encoding="utf-8")
+    for file, text in files.items():
+        (folder / file).write_text(text, encoding="utf-8")
     return list(files)

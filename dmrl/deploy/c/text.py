@@ -1,5 +1,6 @@
 """Templates, and arrays of numbers, as C text."""
 
+import re
 from importlib.resources import files
 from string import Template
 
@@ -9,8 +10,9 @@ from numpy.typing import NDArray
 from dmrl import __version__
 from dmrl.deploy.integer import IntegerNetwork
 
-NAME = "locanet"
-"""Of the C files, and prefix of their functions, whichever the network."""
+OTHER_FILES = ("main", "harness", "count")
+"""C files that stand beside the network's at one time or another."""
+LONGEST_NAME = 40
 WIDTH = 100
 
 
@@ -44,11 +46,21 @@ def wrapped(words: list[str], indent: str) -> list[str]:
     return [*lines, line.rstrip()]
 
 
+def c_name(network: IntegerNetwork) -> str:
+    """Name of a network's C files, and prefix of their functions: that of its architecture.
+
+    In letters, digits and underscores, as C wants it: dmrl-nano is dmrl_nano.
+    """
+    name = re.sub(r"[^a-z0-9]+", "_", network.architecture.lower()).strip("_")[:LONGEST_NAME]
+    return name if name[:1].isalpha() and name not in OTHER_FILES else f"net_{name}".rstrip("_")
+
+
 def names_of(network: IntegerNetwork) -> dict[str, str]:
     """What every template is told of a network."""
+    name = c_name(network)
     return {
-        "prefix": NAME,
-        "PREFIX": NAME.upper(),
+        "prefix": name,
+        "PREFIX": name.upper(),
         "version": __version__,
         "description": (
             f"{network.name}: int8 network {network.architecture} for images of "

@@ -1,0 +1,11 @@
+"""Kinds of arguments that several commands take."""
+
+from typing import Annotated
+
+from cyclopts import Parameter, validators
+
+AsJson = Annotated[bool, Parameter(name="--json", negative=())]
+"""Whether one JSON document is printed in place of the table."""
+Seed = Annotated[int, Parameter(validator=validators.Number(gte=0))]
+"""Of everything drawn at random."""
+Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]

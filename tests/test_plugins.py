@@ -1,0 +1,232 @@
+"""What another package adds by entry points: it works, it is lazy, and broken it harms nobody."""
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import plugins
+from dmrl.errors import PluginError, SettingError, SourceError
+from dmrl.formats.known import format_of
+from dmrl.learn.model import Model, load_model, save_model
+from dmrl.learn.network import architecture_names, build
+from dmrl.recording import read_table, summary
+from dmrl.stages import convert
+
+Install = Callable[..., None]
+
+FORMAT = """
+    from dmrl import topics
+    from dmrl.formats.format import Content, Format
+    from dmrl.samples.sample import Sample
+
+    def recognises(source):
+        return source.suffix == ".alt"
+
+    def content(source, options):
+        rows = [line.split() for line in source.read_text().splitlines()]
+        topic = topics.height(options.robot)
+        return Content(
+            Sample(int(time_ns), topic, "Height", {"height_m": float(high)})
+            for time_ns, high in rows
+        )
+
+    FORMAT = Format("whatever", "a text of heights", recognises, content)
+"""
+NETWORK = """
+    import torch
+    from torch import nn
+    from dmrl.learn.network import ConvNorm, Network
+
+    class Tiny(Network):
+        def __init__(self, extra=()):
+            super().__init__(extra)
+            self.body = nn.Sequential(
+                ConvNorm(3, 8, stride=2), ConvNorm(8, 8, stride=2), ConvNorm(8, 8, stride=2)
+            )
+            self.head = nn.Conv2d(8, len(self.channels), 1)
+
+        def forward(self, images):
+            return self.head(self.body(images))
+"""
+STAGE = """
+    from pathlib import Path
+
+    def command(word: str, /, *, times: int = 1) -> None:
+        \"\"\"Say a word.
+
+        Parameters
+        ----------
+        word
+            What to say.
+        times
+            How often.
+        \"\"\"
+        if word == "fall":
+            raise ValueError("over\\nthe edge")
+        print(word * times)
+"""
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Install a package of one module, ``MODULE.py``, with its entry points."""
+    site = tmp_path / "site"
+    site.mkdir()
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.setenv("PYTHONPATH", str(site))
+
+    def installed(package: str, text: str, **entries: str) -> None:
+        module = package.replace("-", "_")
+        (site / f"{module}.py").write_text(textwrap.dedent(text))
+        about = site / f"{module}-1.0.dist-info"
+        about.mkdir()
+        about.joinpath("METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\nSummary: Made by others.\n"
+        )
+        about.joinpath("entry_points.txt").write_text(
+            "".join(f"[dmrl.{group}]\n{line}\n" for group, line in entries.items())
+        )
+        plugins.found.cache_clear()
+
+    yield installed
+    plugins.found.cache_clear()
+    for path in site.glob("*.py"):
+        sys.modules.pop(path.stem, None)
+
+
+def dmrl(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dmrl.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("kind", ["altitudes", None])
+def test_a_format_of_another_package_is_converted_from(
+    kind: str | None, install: Install, tmp_path: Path
+) -> None:
+    install("alt-logs", FORMAT, formats="altitudes = alt_logs:FORMAT")
+    source, out = tmp_path / "flight.alt", tmp_path / "out.mcap"
+    source.write_text("1000 0.5\n2000 0.75\n")
+    convert.run(source, out, convert.Settings(source_kind=kind))
+    assert read_table(out, "/cf1/height")["height_m"].to_pylist() == [0.5, 0.75]
+    assert summary(out).topics["/cf1/height"].schema == "dmrl.v1.Height"
+
+
+def test_names_of_plugins_are_offered_and_none_is_imported_before(
+    install: Install, tmp_path: Path
+) -> None:
+    install("alt-logs", "raise AssertionError('imported')", formats="altitudes = alt_logs:FORMAT")
+    (tmp_path / "flight.bin").write_bytes(b"\0\1")
+    with pytest.raises(SourceError, match=r"Did you mean altitudes.* Kinds: .*images, altitudes"):
+        format_of(tmp_path / "flight.bin", "altitude")
+    assert "alt_logs" not in sys.modules
+
+
+def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
+    install(
+        "alt-logs", FORMAT, formats="csv = alt_logs:FORMAT", networks="locanet = alt_logs:FORMAT"
+    )
+    (tmp_path / "flight.alt").touch()
+    assert format_of(tmp_path, "csv").what == "a folder of flight logs"
+    assert type(build("locanet")).__name__ == "LocaNet"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("import nothing_like_it", "cannot be loaded: ModuleNotFoundError: No module named"),
+        ("FORMAT = 1", "is not a dmrl.formats.format.Format: alt_logs:FORMAT"),
+        (FORMAT.replace(".suffix", ".sufix"), "fails to look at .*flight.alt: AttributeError"),
+        ("raise SystemExit(3)", r"cannot be loaded: SystemExit: 3 \(alt_logs.py:1\)"),
+    ],
+)
+def test_a_broken_format_is_said_and_passed_over(
+    text: str, said: str, install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install("alt-logs", text, formats="altitudes = alt_logs:FORMAT")
+    source = tmp_path / "flight.alt"
+    source.write_text("1 1\n")
+    with pytest.raises(PluginError, match=f"of the package alt-logs, {said}.*uninstall alt-logs"):
+        form = format_of(source, "altitudes")
+        form.recognises(source)
+    with pytest.raises(SourceError, match="looks like no kind"):
+        format_of(source)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "of the package alt-logs" in line
+
+
+def test_a_format_that_fails_while_it_reads_leaves_nothing(
+    install: Install, tmp_path: Path
+) -> None:
+    install("alt-logs", FORMAT, formats="altitudes = alt_logs:FORMAT")
+    source, out = tmp_path / "flight.alt", tmp_path / "out.mcap"
+    source.write_text("1000 0.5\n2000 high\n")
+    done = dmrl("convert", str(source), str(out))
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "of the package alt-logs, fails to read" in done.stderr
+    assert "ValueError: could not convert string to float: 'high'" in done.stderr
+    assert not out.exists()
+
+
+def test_a_network_of_another_package_is_built_saved_and_loaded(
+    install: Install, tmp_path: Path
+) -> None:
+    install("tiny-nets", NETWORK, networks="tiny = tiny_nets:Tiny")
+    assert "tiny" in architecture_names()
+    network = build("tiny", seed=3)
+    (tmp_path / "model").mkdir()
+    save_model(Model(network.eval(), "tiny"), tmp_path / "model")
+    loaded = load_model(tmp_path / "model")
+    images = np.zeros((1, 16, 24, 3), np.uint8)
+    assert loaded.grids(images).confidence.shape == (1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 / 0", "cannot be loaded: ZeroDivisionError"),
+        ("Tiny = dict", "is not a subclass of dmrl.learn.network.Network"),
+        (NETWORK.replace("ConvNorm(3", "ConvNrm(3"), "cannot be built: NameError"),
+    ],
+)
+def test_a_broken_network_is_one_line_and_others_are_built(
+    text: str, said: str, install: Install
+) -> None:
+    install("tiny-nets", text, networks="tiny = tiny_nets:Tiny")
+    with pytest.raises(PluginError, match=f"of the package tiny-nets, {said}"):
+        build("tiny")
+    assert build("locanet")
+    with pytest.raises(SettingError, match=r"no architecture tin. Choose one of: .*tiny"):
+        build("tin")
+
+
+@pytest.mark.parametrize("entry", ["say-it = stages_of_mine", "say-it = stages_of_mine:command"])
+def test_a_stage_of_another_package_is_a_command(entry: str, install: Install) -> None:
+    install("stages-of-mine", STAGE, stages=entry)
+    done = dmrl("say-it", "word", "--times", "2")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "wordword\n", "")
+    assert "How often." in dmrl("say-it", "--help").stdout
+    failed = dmrl("say-it", "fall")
+    assert failed.returncode == 1
+    assert "of the package stages-of-mine, failed: ValueError: over the edge" in failed.stderr
+    assert failed.stderr.count("\n") == 1
+
+
+def test_a_broken_stage_is_listed_and_is_one_line_when_called(install: Install) -> None:
+    install("stages-of-mine", "import nothing_like_it", stages="say-it = stages_of_mine")
+    helped = dmrl("--help")
+    assert helped.returncode == 0
+    assert "say-it" in helped.stdout
+    assert "stages-of-mine" in helped.stdout
+    assert helped.stderr == ""
+    for words in (["say-it", "x"], ["say-it", "--help"]):
+        done = dmrl(*words)
+        assert done.returncode == 1
+        assert "of the package stages-of-mine, cannot be loaded: ModuleNotFoundError" in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert dmrl("info", "--help").returncode == 0
