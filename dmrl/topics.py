@@ -1,4 +1,7 @@
-"""The one table of topics: pattern, message, frame, units, rate, who writes it.
+"""The one table of topics: message, frame, units, rate, who writes it; of sensors, what is plotted.
+
+A sensor is a message and a row here: conversion from CSV, views, plots while recording, merging,
+labelling and the table in README.md follow it.
 
 ``<robot>`` carries the camera or sensor; ``<peer>`` is the robot it sees or ranges to.
 """
@@ -6,6 +9,34 @@
 import re
 from dataclasses import dataclass
 from functools import cache
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """What of a sensor is plotted over time.
+
+    Parameters
+    ----------
+    title
+        Of the panel: what it is, a comma, the unit. Sensors with one title share a panel.
+    fields
+        Of the message, a line each.
+    length
+        One line: the length of the vector whose components the fields are.
+    name
+        What the lines are called; empty: as the robot or, of a pair, the sensor.
+    """
+
+    title: str
+    fields: tuple[str, ...]
+    length: bool = False
+    name: str = ""
+
+    def lines(self, topic: str) -> dict[str, tuple[str, ...]]:
+        """Where each line of a topic stands in a view, and the fields that it is made of."""
+        if self.length or len(self.fields) == 1:
+            return {topic: self.fields}
+        return {f"{topic}/{field}": (field,) for field in self.fields}
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +57,14 @@ class Topic:
         How often, as a rule.
     written_by
         Commands that write it, with commas between.
+    sensor
+        Whether it is what a sensor of the robot says, as it says it: a robot has one stream of it,
+        and whoever has one flies.
+    curve
+        How it is plotted; None: not at all, or in a way of its own.
+    csv
+        Floating-point fields that a flight's CSV file may have, named as here; for a pair with the
+        peer before the unit: ``range_m`` is ``range_<peer>_m``.
     """
 
     pattern: str
@@ -34,6 +73,14 @@ class Topic:
     units: str
     rate: str
     written_by: str
+    sensor: bool = False
+    curve: Curve | None = None
+    csv: tuple[str, ...] = ()
+
+    @property
+    def of_pairs(self) -> bool:
+        """Whether it says something of a peer."""
+        return "{peer}" in self.pattern
 
     def carries(self, message: str) -> bool:
         """Whether a message of this full name may be on the topic."""
@@ -69,6 +116,7 @@ TOPICS = (
         "png or jpeg",
         "camera",
         "convert, record, render, fly",
+        sensor=True,
     ),
     Topic(
         CALIBRATION,
@@ -93,12 +141,42 @@ TOPICS = (
         "rad, rad/s",
         "100 Hz",
         "convert, record, render, fly",
+        sensor=True,
+        csv=("roll_rad", "pitch_rad", "yaw_rate_radps"),
     ),
     Topic(
-        VELOCITY, "dmrl.v1.Velocity", "<robot>/horizontal", "m/s", "100 Hz", "convert, record, fly"
+        VELOCITY,
+        "dmrl.v1.Velocity",
+        "<robot>/horizontal",
+        "m/s",
+        "100 Hz",
+        "convert, record, fly",
+        sensor=True,
+        curve=Curve("speed, m/s", ("vx_mps", "vy_mps"), length=True),
+        csv=("vx_mps", "vy_mps"),
     ),
-    Topic(HEIGHT, "dmrl.v1.Height", "world z", "m", "100 Hz", "convert, record, fly"),
-    Topic(RANGE, "dmrl.v1.UwbRange", "-", "m", "50 Hz", "convert, record, fly"),
+    Topic(
+        HEIGHT,
+        "dmrl.v1.Height",
+        "world z",
+        "m",
+        "100 Hz",
+        "convert, record, fly",
+        sensor=True,
+        curve=Curve("height, m", ("height_m",)),
+        csv=("height_m",),
+    ),
+    Topic(
+        RANGE,
+        "dmrl.v1.UwbRange",
+        "-",
+        "m",
+        "50 Hz",
+        "convert, record, fly",
+        sensor=True,
+        curve=Curve("distance, m", ("range_m",), name="UWB"),
+        csv=("range_m",),
+    ),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
     Topic(
         TRUTH,
@@ -113,6 +191,12 @@ TOPICS = (
     Topic(LOG, "dmrl.log.*", "-", "as logged", "as logged", "convert"),
     Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "convert, fly, render"),
 )
+
+SENSORS = tuple(row for row in TOPICS if row.sensor)
+OWN_SENSORS = tuple(row for row in SENSORS if not row.of_pairs and row.pattern != CAMERA_IMAGE)
+"""What a robot measures of itself."""
+PAIR_SENSORS = tuple(row for row in SENSORS if row.of_pairs)
+"""What a robot measures of a peer."""
 
 
 def camera_image(robot: str) -> str:

@@ -140,7 +140,10 @@ def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
     [
         ("import nothing_like_it", "cannot be loaded: ModuleNotFoundError: No module named"),
         ("FORMAT = 1", "is not a dmrl.formats.format.Format: alt_logs:FORMAT"),
-        (FORMAT.replace("source.suffix", "source.missing"), "fails to look at .*flight.alt: AttributeError"),
+        (
+            FORMAT.replace("source.suffix", "source.missing"),
+            "fails to look at .*flight.alt: AttributeError",
+        ),
         ("raise SystemExit(3)", r"cannot be loaded: SystemExit: 3 \(alt_logs.py:1\)"),
     ],
 )

@@ -4,6 +4,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.messages import LogType, descriptor, message
+from dmrl.samples.flight import LOG_COLUMNS
 from dmrl.topics import TOPICS, names, robots, row_of
 
 
@@ -30,7 +31,24 @@ def test_no_pattern_stands_twice() -> None:
 
 def test_every_pattern_of_the_module_is_in_the_table() -> None:
     patterns = {v for k, v in vars(topics).items() if k.isupper() and isinstance(v, str)}
-    assert patterns == {row.pattern for row in TOPICS}
+    assert patterns <= {row.pattern for row in TOPICS}
+
+
+@pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.pattern)
+def test_what_is_plotted_and_read_are_fields_of_the_message(row: topics.Topic) -> None:
+    if row.curve is None and not row.csv:
+        return
+    fields = descriptor(row.message).fields_by_name
+    wanted = {*row.csv, *(row.curve.fields if row.curve else ())}
+    assert row.sensor and wanted <= set(fields)
+    assert all(
+        fields[f].cpp_type in (fields[f].CPPTYPE_DOUBLE, fields[f].CPPTYPE_FLOAT) for f in row.csv
+    )
+    assert row.curve is None or ", " in row.curve.title
+
+
+def test_a_robots_log_is_what_its_own_sensors_say() -> None:
+    assert tuple(field for row in topics.OWN_SENSORS for field in row.csv)[:6] == LOG_COLUMNS
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.colours import RGB
 from dmrl.terminal.progress import say
+from dmrl.topics import Topic
 from dmrl.viewer import layouts, plots, space
 from dmrl.viewer.entity import WORLD, Entity, camera_frame, horizontal_frame, optical_frame
 from dmrl.viewer.follow import Follower
@@ -17,6 +18,8 @@ from dmrl.viewer.scene import Draw, Scene, eyes_of, firsts, model_draws, picture
 from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
 
 CAMERAS_MAX = 4
+DISTANCE = "distance, m"
+"""Where estimates and truth are plotted beside what is measured."""
 
 
 def flight_scene(selection: Selection, settings: Settings) -> Scene:
@@ -36,8 +39,7 @@ def flight_scene(selection: Selection, settings: Settings) -> Scene:
     for robot in robots:
         draws += _robot_draws(selection, seen, robot, own=robot == robots[0])
     for pair in pairs:
-        measured = topics.uwb_range(*pair)
-        draws.append(Draw(measured, partial(plots.ranges, measured)))
+        draws += [_sensor_draw(row, *pair, own=False) for row in topics.PAIR_SENSORS]
     spaces = _spaces(selection, seen, pairs, robots, eyes)
     panels = {f"{a} sees {b}": _panels(selection, seen, (a, b)) for a, b in pairs}
     if not pairs:
@@ -73,7 +75,7 @@ def _pairs(selection: Selection, robot: str | None) -> list[Names]:
 
 def _robots(selection: Selection, pairs: Sequence[Names], only: str | None) -> list[str]:
     """Robots that are drawn: those of the pairs, and those that measure themselves."""
-    own = {n["robot"] for p in (topics.ATTITUDE, topics.HEIGHT) for n in selection.found(p)}
+    own = {n["robot"] for row in topics.OWN_SENSORS for n in selection.found(row.pattern)}
     own |= {n["robot"] for n in selection.found(topics.TRACKS)} | set(selection.image_ns)
     if only is not None or pairs:
         own &= {name for pair in pairs for name in pair} | {only or pairs[0][0]}
@@ -81,15 +83,20 @@ def _robots(selection: Selection, pairs: Sequence[Names], only: str | None) -> l
 
 
 def _robot_draws(selection: Selection, motion: Motion, robot: str, *, own: bool) -> list[Draw]:
-    attitude, height = topics.attitude(robot), topics.height(robot)
+    attitude = topics.attitude(robot)
     draws = [
         Draw(attitude, partial(plots.attitude, attitude, robot=robot, own=own)),
-        Draw(height, partial(plots.height, height, robot, own=own)),
+        *(_sensor_draw(row, robot, own=own) for row in topics.OWN_SENSORS),
         Draw(topics.tracks(robot), partial(space.tracks, topics.tracks(robot), robot)),
     ]
     if camera_frame(robot) not in motion.poses:
         draws.append(Draw(attitude, partial(space.attitude, robot)))
     return draws
+
+
+def _sensor_draw(row: Topic, robot: str, peer: str = "", *, own: bool) -> Draw:
+    topic = row.pattern.format(robot=robot, peer=peer)
+    return Draw(topic, partial(plots.sensor, topic, row=row, robot=robot, own=own))
 
 
 def _stills(selection: Selection, seen: Motion, robots: Sequence[str]) -> Iterator[Entity]:
@@ -176,15 +183,16 @@ def _nearly_all(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def _panels(selection: Selection, motion: Motion, pair: Names) -> list[Plot]:
     """Plots of what one robot knows of another, those that have something to show."""
     peer = pair[1]
-    estimate, truth, measured = topics.position(*pair), topics.truth(*pair), topics.uwb_range(*pair)
+    estimate, truth = topics.position(*pair), topics.truth(*pair)
     judged = pair in motion.estimates and pair in motion.truths
-    far = [measured] if measured in _topics(selection) else []
-    far += [
-        f"{path}/distance"
-        for path, has in ((truth, motion.truths), (estimate, motion.estimates))
-        if pair in has
+    curves = _curves(selection, topics.PAIR_SENSORS, [pair])
+    for path, has in ((truth, motion.truths), (estimate, motion.estimates)):
+        if pair in has:
+            curves.setdefault(DISTANCE, []).append(f"{path}/distance")
+    panels = [
+        Plot(f" of {peer}, ".join(title.split(", ", 1)), tuple(lines))
+        for title, lines in curves.items()
     ]
-    panels = [Plot(f"distance of {peer}, m", tuple(far))] if far else []
     if judged:
         panels += [
             Plot(
@@ -203,11 +211,24 @@ def _panels(selection: Selection, motion: Motion, pair: Names) -> list[Plot]:
     return [*panels, *_own_panels(selection, pair)]
 
 
+def _curves(
+    selection: Selection, rows: Sequence[Topic], pairs: Sequence[Names]
+) -> dict[str, list[str]]:
+    """Lines of sensors that have something to show, by the title of their panel."""
+    present, found = _topics(selection), dict[str, list[str]]()
+    for row in rows:
+        for robot, peer in pairs:
+            topic = row.pattern.format(robot=robot, peer=peer)
+            if row.curve is not None and topic in present:
+                found.setdefault(row.curve.title, []).extend(row.curve.lines(topic))
+    return found
+
+
 def _own_panels(selection: Selection, robots: Sequence[str]) -> list[Plot]:
     present = _topics(selection)
-    heights = tuple(t for r in robots if (t := topics.height(r)) in present)
     tilted = [t for r in robots if (t := topics.attitude(r)) in present]
-    panels = [Plot("height, m", heights)] if heights else []
+    curves = _curves(selection, topics.OWN_SENSORS, [(robot, "") for robot in robots])
+    panels = [Plot(title, tuple(lines)) for title, lines in curves.items()]
     if tilted:
         own = tilted[0]
         name = f"attitude of {(topics.names(topics.ATTITUDE, own) or {})['robot']}, degrees"

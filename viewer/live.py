@@ -2,10 +2,10 @@
 
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import rerun as rr
@@ -22,20 +22,6 @@ from dmrl.viewer.window import open_window
 PLOT_EVERY_NS = 100_000_000
 """Curves get a point ten times a second: more cannot be seen and costs the recorder."""
 HISTORY_S = 30.0
-
-Fields = Mapping[str, Any]
-
-
-def _speed(fields: Fields) -> float:
-    return float(np.hypot(fields["vx_mps"], fields["vy_mps"]))
-
-
-CURVES: dict[str, tuple[str, Callable[[Fields], float]]] = {
-    topics.HEIGHT: ("height, m", lambda fields: float(fields["height_m"])),
-    topics.VELOCITY: ("speed, m/s", _speed),
-    topics.RANGE: ("distance, m", lambda fields: float(fields["range_m"])),
-}
-"""Title and value of what is drawn as a curve, by pattern of the topic."""
 
 
 def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
@@ -59,16 +45,14 @@ def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-HISTORY_S),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
+    contents: dict[str, list[str]] = {}
+    for row in topics.SENSORS:
+        if row.curve is not None:
+            below = [row.pattern.format(robot=r, peer="*").split("/*")[0] for r in robots]
+            contents.setdefault(row.curve.title, []).extend(f"{escaped(b)}/**" for b in below)
     curves = [
-        rrb.TimeSeriesView(
-            name=title,
-            contents=[
-                f"{escaped(pattern.format(robot=robot, peer='*').split('/*')[0])}/**"
-                for robot in robots
-            ],
-            time_ranges=window,
-        )
-        for pattern, (title, _) in CURVES.items()
+        rrb.TimeSeriesView(name=title, contents=lines, time_ranges=window)
+        for title, lines in contents.items()
     ]
     columns = [rrb.Vertical(*pictures), rrb.Vertical(*curves)] if pictures else curves
     return rrb.Blueprint(
@@ -105,16 +89,18 @@ class LiveView:
                 sample, rr.EncodedImage(contents=sample.fields["data"], media_type=f"image/{kind}")
             )
             return
-        for pattern, (_, value) in CURVES.items():
-            if topics.names(pattern, sample.topic):
-                if sample.time_ns - self._drawn_ns.get(sample.topic, 0) >= PLOT_EVERY_NS:
-                    self._drawn_ns[sample.topic] = sample.time_ns
-                    self._log(sample, rr.Scalars(value(sample.fields)))
-                return
+        row = topics.row_of(sample.topic)
+        late = sample.time_ns - self._drawn_ns.get(sample.topic, 0) >= PLOT_EVERY_NS
+        if row is not None and row.curve is not None and late:
+            self._drawn_ns[sample.topic] = sample.time_ns
+            for path, fields in row.curve.lines(sample.topic).items():
+                values = [float(sample.fields[field]) for field in fields]
+                value = float(np.hypot.reduce(values)) if len(values) > 1 else values[0]
+                self._log(sample, rr.Scalars(value), path)
 
-    def _log(self, sample: Sample, drawn: rr.AsComponents) -> None:
+    def _log(self, sample: Sample, drawn: rr.AsComponents, path: str = "") -> None:
         self._stream.set_time(TIMELINE, timestamp=np.datetime64(sample.time_ns, "ns"))
-        self._stream.log(escaped(sample.topic), drawn)
+        self._stream.log(escaped(path or sample.topic), drawn)
 
 
 class LiveWindow:

@@ -13,6 +13,7 @@ import rerun as rr
 from dmrl.colours import OWN, PEER, RGB, STATUS_RGB
 from dmrl.geometry.frames import Array
 from dmrl.messages import descriptor
+from dmrl.topics import RANGE, Topic
 from dmrl.viewer.entities import Colour
 from dmrl.viewer.entity import Entity
 from dmrl.viewer.motion import Positions
@@ -47,9 +48,23 @@ def _dots(name: str, colour: Colour) -> rr.SeriesPoints:
     return rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[MARKER_UI])
 
 
-def height(path: str, robot: str, batch: pa.RecordBatch, *, own: bool) -> Iterator[Entity]:
-    """A robot's height."""
-    yield line(path, batch["height_m"].to_numpy(), robot, OWN if own else PEER)
+def sensor(
+    topic: str, batch: pa.RecordBatch, row: Topic, robot: str, *, own: bool
+) -> Iterator[Entity]:
+    """What the table of topics says of a sensor: lines of the robot, dots of a pair."""
+    if row.curve is None:
+        return
+    for path, fields in row.curve.lines(topic).items():
+        parts = [batch[field].to_numpy(zero_copy_only=False) for field in fields]
+        values = np.hypot.reduce(parts) if len(parts) > 1 else parts[0]
+        which = [] if path == topic else [fields[0]]
+        if row.of_pairs:
+            kind = row.curve.name or topic.split("/")[2]
+            colour = RGB["range" if row.pattern == RANGE else "other"]
+            yield dots(path, values, " ".join([kind, *which]), colour)
+        else:
+            name = " ".join([robot, *([row.curve.name] if row.curve.name else []), *which])
+            yield line(path, values, name, OWN if own else PEER)
 
 
 def attitude(path: str, batch: pa.RecordBatch, robot: str, *, own: bool) -> Iterator[Entity]:
@@ -63,11 +78,6 @@ def attitude(path: str, batch: pa.RecordBatch, robot: str, *, own: bool) -> Iter
             jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180)
             degrees[jumps + 1] = np.nan
         yield line(f"{path}/{name}", degrees, robot if name == "yaw" else name, colour)
-
-
-def ranges(path: str, batch: pa.RecordBatch) -> Iterator[Entity]:
-    """Measured distances."""
-    yield dots(path, batch["range_m"].to_numpy(), "UWB", RGB["range"])
 
 
 def distance(path: str, positions: Positions, source: str) -> Entity:

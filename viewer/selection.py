@@ -21,8 +21,9 @@ LEAD_NS = 1_000_000_000
 """Measurements so long before the first image are left out."""
 
 MARKS = (topics.LABELS, topics.DETECTIONS, topics.GRID)
-PAIRWISE = (topics.RANGE, topics.POSITION, topics.TRUTH)
-FLIGHT = (*PAIRWISE, topics.TRACKS, topics.ATTITUDE, topics.HEIGHT)
+MEASURED = tuple(row.pattern for row in topics.PAIR_SENSORS)
+PAIRWISE = (*MEASURED, topics.POSITION, topics.TRUTH)
+FLIGHT = (*PAIRWISE, topics.TRACKS, *(row.pattern for row in topics.OWN_SENSORS))
 """Topics that the layout ``flight`` is for."""
 
 WHOLE = ("flight", "compare")
@@ -191,7 +192,7 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def _fitting(every: Sequence[str]) -> Layout:
-    measured = _of(every, (topics.RANGE, topics.POSITION, topics.TRACKS))
+    measured = _of(every, (*MEASURED, topics.POSITION, topics.TRACKS))
     # Labels and detections are nothing without their images, which somebody forgot.
     blind = not topics.robots(list(every)) and not _of(every, MARKS)
     return "flight" if measured or (blind and _of(every, FLIGHT)) else "image"

@@ -7,13 +7,15 @@ Columns, SI units, angles in radians:
   attitude Rz(yaw) Ry(pitch) Rx(roll), z up, so pitch is positive nose down;
 * ``range_<peer>_m`` may be: UWB distance, empty where there was none;
 * ``<peer>_x_m, <peer>_y_m, <peer>_z_m`` may be: true position of the peer in the robot's
-  horizontal frame, empty where it is not known.
+  horizontal frame, empty where it is not known;
+* columns of other sensors may be, as ``csv`` in dmrl/topics.py names them.
 
 Pictures of a robot lie in a folder ``<robot>/``, named by their time in nanoseconds, at least
 12 digits (zeros in front); ``calibration.toml`` there is its camera.
 """
 
 import csv
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
@@ -21,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats import image_folder
 from dmrl.formats.format import Content, Format, Options
@@ -29,6 +32,7 @@ from dmrl.samples import flight
 from dmrl.samples.flight import LOG_COLUMNS, in_order, nanoseconds
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
+from dmrl.topics import Topic
 
 TIME = "time_s"
 REQUIRED = (TIME, *LOG_COLUMNS)
@@ -36,6 +40,13 @@ GAP_S = 1.0
 RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios that found nothing say 65535 mm
 ANGLE_MAX_RAD = np.pi / 2
 YAW_RATE_MAX_RADPS = 12.0
+OWN = {field for row in topics.OWN_SENSORS for field in row.csv}
+OTHERS = tuple(
+    row
+    for row in topics.SENSORS
+    if row.csv and row.pattern != topics.RANGE and not set(row.csv) <= set(LOG_COLUMNS)
+)
+"""Sensors whose columns need no rule of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +70,9 @@ class Log:
     def ranged(self) -> list[str]:
         """Peers that it has ranges to."""
         return [
-            name[6:-2] for name in self.columns if name.startswith("range_") and name[-2:] == "_m"
+            name[6:-2]
+            for name in self.columns
+            if name.startswith("range_") and name[-2:] == "_m" and name not in OWN
         ]
 
     @property
@@ -205,6 +218,26 @@ def _streams(log: Log, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
         known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
         yield flight.truth(own, name(peer), time_ns[known], xyz[known])
+    for row in OTHERS:
+        for peer, columns in _columns_of(row, log):
+            topic = row.pattern.format(robot=own, peer=name(peer))
+            yield flight.sensor(topic, row.message, time_ns, columns)
+
+
+def _columns_of(row: Topic, log: Log) -> Iterator[tuple[str, dict[str, Array]]]:
+    """Columns of a sensor by the fields of its message, for each peer that it has them of."""
+    if not row.of_pairs:
+        peers = [""]
+    else:
+        before, _, unit = row.csv[0].rpartition("_")
+        found = re.compile(f"{before}_(.+)_{unit}")
+        peers = [m[1] for name in log.columns if name not in OWN and (m := found.fullmatch(name))]
+    for peer in peers:
+        named = {
+            field: f"_{peer}_".join(field.rsplit("_", 1)) if peer else field for field in row.csv
+        }
+        if all(name in log.columns for name in named.values()):
+            yield peer, {field: log.columns[name] for field, name in named.items()}
 
 
 def _pictures(folder: Path, options: Options) -> Iterator[Iterator[Sample]]:

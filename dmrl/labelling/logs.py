@@ -126,7 +126,7 @@ def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
         pair = _pair(robots, one, other, usable, warnings)
         if pair is not None:
             pairs[one, other] = pair
-    kinds = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT)
+    kinds = [row.pattern for row in topics.OWN_SENSORS]
     flying = frozenset(name for kind in kinds for name in topics.robots(list(held.topics), kind))
     paired = {name for pair in pairs for name in pair}
     warnings += [

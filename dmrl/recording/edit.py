@@ -12,10 +12,7 @@ from dmrl.recording.inputs import provenance, refuse_twice
 from dmrl.recording.reader import matching, read_raw, read_table
 from dmrl.recording.writer import RecordingWriter
 from dmrl.terminal.progress import say
-from dmrl.topics import ATTITUDE, CALIBRATION, CAMERA_IMAGE, HEIGHT, RANGE, VELOCITY, names
-
-SENSORS = (CAMERA_IMAGE, ATTITUDE, VELOCITY, HEIGHT, RANGE)
-"""Topics of which a robot has one stream."""
+from dmrl.topics import CALIBRATION, names, row_of
 
 
 def merge(paths: Sequence[Path], out: Path) -> int:
@@ -50,7 +47,8 @@ def _warn_of_overlap(one: Path, other: Path) -> None:
     """Say so if two recordings are of other flights by the same robots: their messages mix."""
     first, second = summary(one).topics, summary(other).topics
     for topic in sorted(set(first) & set(second)):
-        if not any(names(pattern, topic) for pattern in SENSORS):
+        row = row_of(topic)
+        if row is None or not row.sensor:
             continue
         (start, end), (from_, to) = (_span(path, topic) for path in (one, other))
         if start < to and from_ < end:

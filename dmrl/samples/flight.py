@@ -73,6 +73,16 @@ def ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sa
         yield Sample(moment, topic, "UwbRange", {"range_m": value})
 
 
+def sensor(
+    topic: str, message: str, time_ns: Times, columns: Mapping[str, Array]
+) -> Iterator[Sample]:
+    """What a sensor said, where all of its (N,) columns are numbers; named as the fields."""
+    values = np.stack(list(columns.values()), axis=1)
+    known = np.isfinite(values).all(axis=1)
+    for moment, row in zip(time_ns[known].tolist(), values[known].tolist(), strict=True):
+        yield Sample(moment, topic, message, dict(zip(columns, row, strict=True)))
+
+
 def truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[Sample]:
     """Exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
     topic, frame = topics.truth(robot, peer), f"{robot}/horizontal"
