@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from cyclopts import Parameter, validators
@@ -13,6 +13,7 @@ from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.recording import Summary, log_times, summary
 from dmrl.terminal.progress import say
+from dmrl.viewer.views import NAMES
 
 # Log times below this do not count from 1970 but from the start of a simulation.
 DURATION_BELOW_NS = 10 * 365 * 86400 * 10**9
@@ -26,12 +27,15 @@ PAIRWISE = (*MEASURED, topics.POSITION, topics.TRUTH)
 FLIGHT = (*PAIRWISE, topics.TRACKS, *(row.pattern for row in topics.OWN_SENSORS))
 """Topics that the layout ``flight`` is for."""
 
-WHOLE = ("flight", "compare")
-"""Layouts with plots: a picture shows all of them."""
+OF_IMAGES = ("image", "compare")
+"""Layouts that are nothing without images."""
 
 MANY_PAIRS = 6
 
-Layout = Literal["auto", "image", "flight", "compare", "dataset"]
+if TYPE_CHECKING:
+    Layout = str
+else:
+    Layout = Literal[("auto", *NAMES, "dataset")]
 Times = NDArray[np.int64]
 Names = tuple[str, str]
 Pixels = Annotated[float | None, Parameter(validator=validators.Number(gte=0))]
@@ -152,7 +156,7 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
     if layout == "dataset":
         raise SettingError(f"{names}: layout dataset is for datasets. Make one: dmrl dataset")
     robots = _robots(every, names, settings.robot)
-    if not robots and (layout != "flight" or not _of(every, FLIGHT)):
+    if not robots and (layout in OF_IMAGES or not _of(every, FLIGHT)):
         raise RecordingError(
             f"no images (/*/camera/image) in {names}. Name the recording with the images as well"
         )
@@ -167,12 +171,12 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
     image_ns = _image_times(found, robots, lower_ns, upper_ns)
     chosen = {r: times[:: settings.every] for r, times in image_ns.items() if times.size}
     empty = upper_ns <= max(lower_ns, start_ns) or lower_ns > last_ns
-    if empty or (robots and not chosen and layout != "flight"):
+    if empty or (robots and not chosen and layout in OF_IMAGES):
         raise SettingError(
             f"no image of {names} in that time; it lasts from 0 to "
             f"{(last_ns - start_ns) / 1e9:.3f} s. Change --from-s or --to-s"
         )
-    if layout != "flight":
+    if layout in OF_IMAGES:
         # What lies before the first image and after the last belongs to none.
         lower_ns = min(int(times[0]) for times in chosen.values())
         upper_ns = max(int(times[-1]) for times in chosen.values()) + 1
@@ -237,7 +241,8 @@ def at_time(selection: Selection, time_s: float | None) -> Selection:
         for robot, times in selection.image_ns.items()
     }
     moment = replace(selection, image_ns=nearest, all_images=False)
-    if selection.layout in WHOLE:
+    # Of layouts with plots a picture shows all of them.
+    if selection.layout != "image":
         return moment
     first = min(int(times[0]) for times in nearest.values())
     return replace(moment, shown_ns=(first, moment.last_image_ns + 1))

@@ -61,7 +61,7 @@ def prepare(
     selection = select(paths, settings)
     if picture:
         selection = at_time(selection, time_s)
-    scene: Scene = _loaded(_SCENES[selection.layout])(selection, settings)
+    scene: Scene = _loaded(f"dmrl.viewer.views.{selection.layout}:scene")(selection, settings)
     shown_ns = moment_ns(selection, time_s)
     return Show(
         " + ".join(recording.stem for recording in selection.recordings),
@@ -105,11 +105,6 @@ def log(show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lam
 
 # Loaded when they are shown: the picture waits for what is imported, and compare and dataset
 # judge models.
-_SCENES = {
-    "image": "dmrl.viewer.pictures:image_scene",
-    "flight": "dmrl.viewer.flight:flight_scene",
-    "compare": "dmrl.viewer.compare:compare_scene",
-}
 _DATASET = "dmrl.viewer.browse:browse"
 
 

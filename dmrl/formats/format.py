@@ -1,7 +1,7 @@
 """What a format is: how to know it, what a user says of it, and the samples it gives.
 
 A format is one file with two functions, ``recognises(source) -> bool`` and
-``content(source, options) -> Content``, its ``FORMAT``, and one row in ``dmrl.formats.known``.
+``content(source, options) -> Content``, and a ``FORMAT``, by which `dmrl.formats.known` finds it.
 """
 
 from collections.abc import Callable, Iterator, Mapping

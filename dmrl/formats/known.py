@@ -1,49 +1,48 @@
 """The one table of formats, in the order in which a source is held against them.
 
-A new format is one file beside this one and one row here, or a plug-in of another package; see
+A new format is one file beside this one with a ``FORMAT``, or a plug-in of another package: see
 docs/add-a-format.md.
 """
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
-from dmrl import plugins
+from dmrl import formats, plugins
 from dmrl.errors import PluginError, SourceError
-from dmrl.formats import (
-    aideck_stream,
-    cfclient_csv,
-    cfusdlog,
-    flight_csv,
-    hyperflash,
-    image_folder,
-    locanet,
-    nanocockpit,
-    ros,
-    uwb_tiers,
-)
 from dmrl.formats.format import Content, Format, Options
 from dmrl.plugins import Plugin
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 
-# Those with a signature first; any folder with pictures is a folder of pictures.
-FORMATS = {
-    f.name: f
-    for f in (
-        locanet.FORMAT,
-        flight_csv.FORMAT,
-        uwb_tiers.FORMAT,
-        ros.FORMAT,
-        nanocockpit.FORMAT,
-        cfclient_csv.FORMAT,
-        cfusdlog.FORMAT,
-        aideck_stream.FORMAT,
-        hyperflash.FORMAT,
-        image_folder.FORMAT,
-    )
-}
+FIRST = (
+    *("locanet", "csv", "uwb-tiers", "rosbag2", "nanocockpit", "cfclient"),
+    *("cfusdlog", "aideck-stream", "hyperflash"),
+)
+"""Their order matters: the sources of some hold files that others know."""
+
+
+def _files() -> dict[str, Format]:
+    """The ``FORMAT`` of every file here: those of ``FIRST``, then the others, by name.
+
+    Plain pictures come last, as any folder with pictures is a folder of pictures.
+    """
+    names = [m.name for m in iter_modules(formats.__path__) if m.name != Path(__file__).stem]
+    modules = [import_module(f"{formats.__name__}.{name}") for name in names]
+    found = [m.FORMAT for m in modules if isinstance(getattr(m, "FORMAT", None), Format)]
+
+    def turn(form: Format) -> tuple[int, str]:
+        if form.name in FIRST:
+            return FIRST.index(form.name), ""
+        return len(FIRST) + (form.name == "images"), form.name
+
+    return {form.name: form for form in sorted(found, key=turn)}
+
+
+FORMATS = _files()
 
 
 def format_of(source: Path, name: str | None = None) -> Format:

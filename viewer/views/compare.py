@@ -43,7 +43,7 @@ class Judged:
     error_m: Array
 
 
-def compare_scene(selection: Selection, settings: Settings) -> Scene:
+def scene(selection: Selection, settings: Settings) -> Scene:
     """Two models in the images of one robot.
 
     Raises

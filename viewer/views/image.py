@@ -7,16 +7,16 @@ from dmrl.viewer.scene import Scene, bars, eyes_of, model_draws, picture_draws
 from dmrl.viewer.selection import Selection, Settings
 
 
-def image_scene(selection: Selection, settings: Settings) -> Scene:
+def scene(selection: Selection, settings: Settings) -> Scene:
     """Images and maps of every robot."""
     scales = entities.scales(settings.depth_max_m)
     eyes = eyes_of(selection, sorted(selection.image_ns), scales)
     blueprint = layouts.image(eyes, scales, overlay=settings.overlay)
-    scene = Scene(blueprint, [], [], eyes)
+    shown = Scene(blueprint, [], [], eyes)
     for eye in eyes:
-        scene.draws += picture_draws(eye, scene.sources.setdefault(eye.robot, set()))
-        scene.draws += model_draws(eye, scales, smooth=settings.overlay)
-        scene.stills += bars(eye, scales)
+        shown.draws += picture_draws(eye, shown.sources.setdefault(eye.robot, set()))
+        shown.draws += model_draws(eye, scales, smooth=settings.overlay)
+        shown.stills += bars(eye, scales)
         if any(n["robot"] == eye.robot for n in selection.found(topics.DETECTIONS)):
-            scene.named["detection"] = RGB["detection"]
-    return scene
+            shown.named["detection"] = RGB["detection"]
+    return shown

@@ -22,7 +22,7 @@ DISTANCE = "distance, m"
 """Where estimates and truth are plotted beside what is measured."""
 
 
-def flight_scene(selection: Selection, settings: Settings) -> Scene:
+def scene(selection: Selection, settings: Settings) -> Scene:
     """What a flight shows, as far as the recordings have it. A few moments of it say what."""
     pairs = _pairs(selection, settings.robot)
     seen = glimpse(selection.recordings, pairs, *selection.shown_ns)

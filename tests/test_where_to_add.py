@@ -1,0 +1,336 @@
+"""docs/architecture.md's "Where to add": each row, done in a copy of the sources and used.
+
+A test edits the copy as the row says, and counts the files that it touched: the table must say so.
+"""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from .viewer.rrd import panels
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+GENERATED = {"schemas/dmrl.binpb"}
+"""What `make schemas` writes."""
+
+
+def promised(row: str) -> int:
+    """Files that a row of the table says are touched."""
+    table = PAGE.split("## Where to add")[1]
+    (found,) = re.findall(rf"^\| {row} \|.*\| (\d+) \|$", table, re.MULTILINE)
+    return int(found)
+
+
+class Clone:
+    """A copy of the sources, laid out as they are installed."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        ignored = shutil.ignore_patterns("__pycache__", "pretrained")
+        shutil.copytree(ROOT / "dmrl", root / "dmrl", ignore=ignored)
+        pretrained = "dmrl/learn/pretrained"
+        (root / pretrained).mkdir()
+        shutil.copy(ROOT / pretrained / "__init__.py", root / pretrained)
+        for name in ("viewer", "schemas", "recipes"):
+            shutil.copytree(ROOT / name, root / name, ignore=ignored)
+            (root / "dmrl" / name).symlink_to(root / name)
+        self._before = self._held()
+
+    def write(self, name: str, text: str) -> None:
+        (self.root / name).write_text(textwrap.dedent(text), encoding="utf-8")
+
+    def after(self, name: str, place: str, text: str) -> None:
+        """Put text behind a place that a file has once."""
+        old = (self.root / name).read_text(encoding="utf-8")
+        assert old.count(place) == 1, (name, place)
+        (self.root / name).write_text(old.replace(place, place + text), encoding="utf-8")
+
+    def touched(self) -> int:
+        """Files written or changed by hand since the copy was made."""
+        now = self._held()
+        changed = {name for name in now if now[name] != self._before.get(name)}
+        return len(changed - GENERATED)
+
+    def _held(self) -> dict[str, bytes]:
+        files = (p for p in self.root.rglob("*") if p.is_file() and p.suffix != ".pyc")
+        return {str(p.relative_to(self.root)): p.read_bytes() for p in files}
+
+    def python(self, *words: str) -> str:
+        """What the copy's Python prints."""
+        environment = {**os.environ, "PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run(
+            [sys.executable, *words],
+            cwd=self.root.parent,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout + done.stderr
+
+    def dmrl(self, *words: str) -> str:
+        """What a command of the copy prints."""
+        return self.python("-m", "dmrl.cli", *words)
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Clone:
+    return Clone(tmp_path / "clone")
+
+
+def flight(folder: Path, columns: dict[str, float]) -> Path:
+    """A flight of one robot as CSV: three rows of all that must be there, and of more."""
+    names = ["time_s", "roll_rad", "pitch_rad", "yaw_rate_radps", "vx_mps", "vy_mps", "height_m"]
+    rows = [[*names, *columns], *([k / 10, *[0.0] * 6, *columns.values()] for k in range(3))]
+    folder.mkdir()
+    text = "\n".join(",".join(map(str, row)) for row in rows)
+    (folder / "cf1.csv").write_text(text + "\n", encoding="utf-8")
+    return folder
+
+
+SENSORS = """    Topic(
+        "/{robot}/pressure",
+        "dmrl.v1.Pressure",
+        "-",
+        "Pa",
+        "50 Hz",
+        "convert",
+        sensor=True,
+        curve=Curve("pressure, Pa", ("pressure_pa",)),
+        csv=("pressure_pa",),
+    ),
+    Topic(
+        "/{robot}/range_up",
+        "dmrl.v1.RangeUp",
+        "world z",
+        "m",
+        "50 Hz",
+        "convert",
+        sensor=True,
+        curve=Curve("height, m", ("range_up_m",), name="up"),
+        csv=("range_up_m",),
+    ),
+    Topic(
+        "/{robot}/sonar/{peer}",
+        "dmrl.v1.Sonar",
+        "-",
+        "m",
+        "10 Hz",
+        "convert",
+        sensor=True,
+        curve=Curve("distance, m", ("sonar_m",)),
+        csv=("sonar_m",),
+    ),
+"""
+
+
+def test_a_sensor(clone: Clone, tmp_path: Path) -> None:
+    pytest.importorskip("grpc_tools")
+    own = 'syntax = "proto3";\npackage dmrl.v1;\nmessage {} {{\n  double {} = 1;\n}}\n'
+    for name, field in (
+        ("Pressure", "pressure_pa"),
+        ("RangeUp", "range_up_m"),
+        ("Sonar", "sonar_m"),
+    ):
+        clone.write(f"schemas/dmrl/v1/{name.lower()}.proto", own.format(name, field))
+    clone.after("dmrl/topics.py", "TOPICS = (\n", SENSORS)
+    # Three sensors here: their messages, and one file.
+    assert clone.touched() == 3 + promised("a sensor")
+    clone.python(str(clone.root / "schemas" / "build.py"))
+
+    values = {"pressure_pa": 101_325.0, "range_up_m": 1.5, "sonar_cf2_m": 2.5}
+    source = flight(tmp_path / "flight", values)
+    out, again, short = (tmp_path / f"{name}.mcap" for name in ("out", "again", "short"))
+    said = clone.dmrl("convert", str(source), str(out))
+    assert "ranges to up" not in said
+    held = json.loads(clone.dmrl("info", str(out), "--json"))["topics"]
+    assert held["/cf1/pressure"] == {"message": "dmrl.v1.Pressure", "count": 3}
+    assert held["/cf1/range_up"]["count"] == held["/cf1/sonar/cf2"]["count"] == 3
+    assert "/cf1/range/up" not in held
+    clone.dmrl("trim", str(out), str(short), "--topic", "/cf1/pressure")
+    assert "both have /cf1/pressure" in clone.dmrl("merge", str(short), str(out), str(again))
+    shown = tmp_path / "shown.rrd"
+    clone.dmrl("view", str(out), "--save", str(shown))
+    assert {"pressure, Pa", "height, m", "distance of cf2, m"} <= panels(shown)
+    # Alone, without anything that dmrl had before.
+    clone.dmrl("view", str(short), "--save", str(tmp_path / "alone.rrd"))
+    assert "pressure, Pa" in panels(tmp_path / "alone.rrd")
+    shutil.copytree(ROOT / "docs", clone.root / "docs")
+    place = str(clone.root / "docs")
+    code = f"import sys; sys.path.insert(0, {place!r}); import build; print(build.topics())"
+    row = "| `/<robot>/sonar/<peer>` | `dmrl.v1.Sonar` | - | m | 10 Hz |"
+    assert row in clone.python("-c", code)
+
+
+FORMAT = '''
+    """Texts of heights: a time in nanoseconds and metres on each line."""
+
+    from pathlib import Path
+
+    from dmrl import topics
+    from dmrl.formats.format import Content, Format, Options
+    from dmrl.samples.sample import Sample
+
+
+    def recognises(source: Path) -> bool:
+        """Whether it is called so."""
+        return source.suffix == ".alt"
+
+
+    def content(source: Path, options: Options) -> Content:
+        """A sample a line."""
+        rows = [line.split() for line in source.read_text().splitlines()]
+        topic = topics.height(options.robot)
+        return Content(Sample(int(t), topic, "Height", {"height_m": float(z)}) for t, z in rows)
+
+
+    FORMAT = Format("altitudes", "a text of heights", recognises, content)
+'''
+
+
+def test_a_foreign_format(clone: Clone, tmp_path: Path) -> None:
+    clone.write("dmrl/formats/altitudes.py", FORMAT)
+    assert clone.touched() == promised("a foreign format")
+    source, out = tmp_path / "flight.alt", tmp_path / "out.mcap"
+    source.write_text("1000 0.5\n2000 0.75\n")
+    assert "/cf1/height" in clone.dmrl("convert", str(source), str(out))
+
+
+NETWORK = """
+class Tiny(Network):
+    \"\"\"Three strided convolutions.\"\"\"
+
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__(extra)
+        self.body = nn.Sequential(*(ConvNorm(k, 8, stride=2) for k in (3, 8, 8)))
+        self.head = nn.Conv2d(8, len(self.channels), 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        \"\"\"(N, C, H/8, W/8).\"\"\"
+        out: Tensor = self.head(self.body(images))
+        return out
+
+"""
+
+
+def test_a_network(clone: Clone, tmp_path: Path) -> None:
+    name = "dmrl/learn/network.py"
+    clone.after(name, "    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)\n", "\n" + NETWORK)
+    clone.after(name, "ARCHITECTURES: dict[str, type[Network]] = {\n", '    "tiny": Tiny,\n')
+    assert clone.touched() == promised("a network")
+    made, out = tmp_path / "tiny", tmp_path / "export"
+    made.mkdir()
+    clone.python(
+        "-c",
+        "from pathlib import Path\n"
+        "from dmrl.learn.model import Model, save_model\n"
+        "from dmrl.learn.network import build\n"
+        f"save_model(Model(build('tiny').eval(), 'tiny'), Path({str(made)!r}))",
+    )
+    assert "model.onnx" in clone.dmrl("export", str(made), str(out))
+
+
+LOSS = """
+
+def _certain(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+    return out["confidence"].sigmoid().mean()
+
+"""
+
+
+def test_a_loss(clone: Clone) -> None:
+    name = "dmrl/learn/losses.py"
+    clone.after(name, "    classes: tuple[str, ...] = ()\n", "    certain_weight: float = 0.0\n")
+    clone.after(name, "return class_loss(logits, wanted.class_id, wanted.weight)\n", LOSS)
+    term = '    Term("certain_loss", "certain_weight", ("confidence",), _certain),\n'
+    clone.after(name, "TERMS = (\n", term)
+    assert clone.touched() == promised("a loss")
+    said = clone.python(
+        "-c",
+        "import torch\n"
+        "from dmrl.learn.batches import Batch\n"
+        "from dmrl.learn.network import build\n"
+        "from dmrl.learn.settings import FitSettings\n"
+        "from dmrl.learn.step import LOSSES, losses\n"
+        "images = torch.zeros(1, 3, 32, 40, dtype=torch.uint8)\n"
+        "batch = Batch(images, torch.full((1, 1, 11), torch.nan))\n"
+        "network = build('locanet').eval()\n"
+        "for weight in (0.0, 3.0):\n"
+        "    parts = losses(network, batch, FitSettings(certain_weight=weight))\n"
+        "    print(float(parts.detach()[LOSSES.index('certain_loss')]) > 0)\n",
+    )
+    assert said.split() == ["False", "True"]
+
+
+COMMAND = '''
+    """hello: greet."""
+
+
+    def command(name: str, /) -> None:
+        """Greet somebody."""
+        print(f"hello {name}")
+'''
+
+
+def test_a_command(clone: Clone) -> None:
+    clone.write("dmrl/stages/hello.py", COMMAND)
+    clone.after("dmrl/cli.py", "COMMANDS = {\n", '    "hello": "Greet somebody.",\n')
+    assert clone.touched() == promised("a command")
+    assert clone.dmrl("hello", "cf1") == "hello cf1\n"
+    assert "Greet somebody." in clone.dmrl("--help")
+
+
+VIEW = '''
+    """Layout ``heights``: how high every robot flies, and nothing else."""
+
+    from functools import partial
+
+    from dmrl import topics
+    from dmrl.viewer import layouts, plots
+    from dmrl.viewer.scene import Draw, Scene
+    from dmrl.viewer.selection import Selection, Settings
+
+
+    def scene(selection: Selection, settings: Settings) -> Scene:
+        """One panel."""
+        row = topics.row_of("/any/height")
+        robots = [found["robot"] for found in selection.found(topics.HEIGHT)]
+        draws = [
+            Draw(path, partial(plots.sensor, path, row=row, robot=robot, own=True))
+            for robot in robots
+            for path in [topics.height(robot)]
+        ]
+        panel = layouts.Plot("heights alone, m", tuple(draw.topic for draw in draws))
+        return Scene(layouts.window(layouts.plot_view(panel)), draws, [], [])
+'''
+
+
+def test_a_view(clone: Clone, tmp_path: Path) -> None:
+    clone.write("viewer/views/heights.py", VIEW)
+    assert clone.touched() == promised("a view")
+    out, shown = tmp_path / "out.mcap", tmp_path / "shown.rrd"
+    clone.dmrl("convert", str(flight(tmp_path / "flight", {})), str(out))
+    clone.dmrl("view", str(out), "--layout", "heights", "--save", str(shown))
+    assert panels(shown) == {"heights alone, m"}
+    assert "heights" in clone.dmrl("view", "--help")
+
+
+def test_every_row_of_the_table_is_tried() -> None:
+    table = PAGE.split("## Where to add")[1].split("\n\n")
+    rows = [
+        line.split(" | ")[0].strip("| ")
+        for part in table
+        for line in part.splitlines()
+        if line.startswith("| a")
+    ]
+    tests = {name.removeprefix("test_").replace("_", " ") for name in globals()}
+    assert rows and [row for row in rows if row not in tests] == []
