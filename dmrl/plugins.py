@@ -61,7 +61,10 @@ class Plugin:
             If it cannot be imported.
         """
         with self.blamed("cannot be loaded"):
-            return self.entry.load()
+            try:
+                return self.entry.load()
+            except SystemExit as e:
+                raise RuntimeError(f"it ends the program, with {e.code}") from e
 
     def require(self, fits: bool, what: str) -> None:
         """Nothing, if what was loaded is what it should be.
@@ -85,9 +88,9 @@ class Plugin:
         """
         try:
             yield
-        except DmrlError:
+        except (DmrlError, BrokenPipeError):  # the latter: who reads our output has gone
             raise
-        except (Exception, SystemExit) as e:
+        except Exception as e:
             last = extract_tb(e.__traceback__)[-1]
             where = f"{Path(last.filename).name}:{last.lineno}"
             text = " ".join(str(e).split()) or "no reason given"
