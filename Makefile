@@ -12,7 +12,7 @@ INSTALL := $(BIN)/pip install --constraint constraints.txt --editable
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all check format lint types imports spell schemas docs layout clean
+.PHONY: help demo test test-all mutants check format lint types imports spell schemas docs layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -25,6 +25,9 @@ test: $(VENV)/.dev ## Run the tests that take seconds. ARGS="-k name" picks some
 
 test-all: $(VENV)/.dev ## Run every test, the slow ones too.
 	$(PYTEST) -m "slow or not slow" --timeout 3600 $(ARGS)
+
+mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. ARGS="geometry --seed 1".
+	$(BIN)/python tests/mutants.py $(ARGS)
 
 check: format lint types imports spell ## Check format, lint, types, imports and spelling.
 

@@ -1,6 +1,8 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dmrl.dataset import open_dataset
 from dmrl.dataset.splits import held_out, of_source
@@ -146,3 +148,31 @@ def test_two_images_at_one_time_are_refused(record: Record, tmp_path: Path) -> N
 def test_a_copy_of_a_recording_is_refused(record: Record, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="hold the same bytes"):
         run([record("x.mcap"), record("y.mcap")], tmp_path / "out", Settings())
+
+
+@given(st.data())
+def test_every_time_has_the_split_of_its_span(data: st.DataObject) -> None:
+    edges = sorted(data.draw(st.sets(st.integers(0, 60), min_size=2, max_size=12)))
+    spans = list(zip(edges[::2], edges[1::2], strict=False))
+    names = [data.draw(st.sampled_from(["train", "test", "val"])) for _ in spans]
+    own: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
+    for k in data.draw(st.permutations(range(len(spans)))):
+        own[names[k]].append(spans[k])
+    split_of = of_source(Path("x.mcap"), own)
+    for time_ns in range(-1, 62):
+        there = [n for n, (start, end) in zip(names, spans, strict=True) if start <= time_ns <= end]
+        assert split_of(time_ns) == (there[0] if there else None)
+
+
+@given(st.sets(st.text("0123456789abcdef", min_size=8, max_size=8), max_size=30), st.floats(0, 1))
+def test_about_the_share_is_held_out_and_more_is_never_other_recordings(
+    hashes: set[str], share: float
+) -> None:
+    content = {Path(f"{k}.mcap"): sha for k, sha in enumerate(sorted(hashes))}
+    held, more = held_out(content, share, 3), held_out(content, min(share + 0.2, 1), 3)
+    assert held <= more <= content.keys()
+    if share > 0 and len(content) > 1:
+        assert 1 <= len(held) < len(content)
+        assert abs(len(held) - share * len(content)) <= 1
+    else:
+        assert not held

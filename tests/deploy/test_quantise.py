@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dmrl.deploy.backends import Float, integer
 from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import FloatConv, Graph, outputs_of, tensors_of, to_input
 from dmrl.deploy.integer import Conv
 from dmrl.deploy.layers import layer_figures
-from dmrl.deploy.quantise import About, quantise
+from dmrl.deploy.quantise import About, _fixed_point, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.errors import ModelError, SettingError
 
@@ -131,3 +133,16 @@ def test_a_network_that_breaks_its_promises_is_refused() -> None:
     late = replace(first, source=2)
     with pytest.raises(ModelError, match="layer first reads tensors"):
         replace(network, layers=(late, *network.layers[1:]))
+
+
+@given(st.floats(2.0**-31, 2.0**29))
+def test_a_factor_is_31_bits_and_a_shift(factor: float) -> None:
+    (multiplier,), (shift,) = _fixed_point(np.array([factor]))
+    assert 2**30 <= multiplier < 2**31
+    assert int(multiplier) / 2 ** int(shift) == pytest.approx(factor, rel=2.0**-31)
+
+
+@pytest.mark.parametrize("power", [-20, 0, 7])
+def test_a_factor_just_below_a_power_of_two_is_carried_to_it(power: int) -> None:
+    (multiplier,), (shift,) = _fixed_point(np.array([np.nextafter(2.0**power, 0)]))
+    assert (multiplier, shift) == (2**30, 30 - power)

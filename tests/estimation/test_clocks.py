@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
 
 from dmrl.estimation.clocks import Clock, connected, estimate_clock
 from dmrl.estimation.exchanges import estimate_from_exchanges
@@ -117,3 +119,27 @@ def test_the_surest_links_are_taken() -> None:
     found = connected(pairs, "a")
     assert found.keys() == {"a", "b", "c"}
     assert found["c"].offset_s == pytest.approx(1.0 - 5.0)
+
+
+CLOCKS = st.builds(Clock, st.floats(-100, 100), st.floats(-1e-3, 1e-3), st.floats(-1000, 1000))
+TIMES_S = np.linspace(-500, 500, 5)
+
+
+@given(CLOCKS, CLOCKS)
+def test_any_clocks_chain_and_undo(one: Clock, two: Clock) -> None:
+    both = two.after(one).corrected(TIMES_S)
+    np.testing.assert_allclose(both, two.corrected(one.corrected(TIMES_S)), atol=1e-8)
+    np.testing.assert_allclose(one.inverse().corrected(one.corrected(TIMES_S)), TIMES_S, atol=1e-8)
+
+
+@settings(max_examples=12, deadline=None, phases=[Phase.generate])
+@given(st.floats(-50, 50), st.floats(-20e-6, 20e-6), st.floats(0.1, 5), st.integers(0, 99))
+def test_any_offset_and_drift_come_back(
+    offset_s: float, drift: float, scale: float, seed: int
+) -> None:
+    seen_s, also_s = np.arange(0, 60, 0.05), np.arange(0.02, 60, 0.07)
+    stamps = also_s + offset_s + drift * (also_s - 30)
+    values = scale * distance(also_s, seed) + 1.0
+    clock = estimate_clock(seen_s, distance(seen_s, seed), stamps, values)
+    assert clock is not None
+    assert np.abs(clock.corrected(stamps) - also_s).max() < 0.01

@@ -44,3 +44,12 @@ def test_a_bearing_that_is_open_is_ambiguous_and_a_blurred_one_unconverged() -> 
     assert (statuses_of(far, spread(*[0.08] * 5), 0.3) == OK).all()
     assert (statuses_of(far, spread(*[0.5] * 5), 0.3) == UNCONVERGED).all()
     assert (statuses_of(far / 4, spread(*[0.5] * 5), 0.3) == AMBIGUOUS).all()
+
+
+def test_where_most_of_a_flight_is_open_all_of_it_is() -> None:
+    near = np.tile([1.0, 0.0, 0.0], (5, 1))
+    vague = spread(0.3, 0.3, 0.3, 0.02, 0.02)  # 0.3 rad at the median: below what is open by itself
+    assert (statuses_of(near, vague, 0.3) == AMBIGUOUS).all()
+    mostly = spread(0.3, 0.3, 0.02, 0.02, 0.02)
+    assert (statuses_of(near, mostly, 0.3) != AMBIGUOUS).all()
+    assert (statuses_of(near, mostly, 0.3)[2:] == OK).all()

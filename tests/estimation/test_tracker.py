@@ -2,6 +2,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from dmrl.estimation.identity import Identity
@@ -227,3 +228,42 @@ def test_an_image_without_detections_and_one_behind_the_lens_s_fold_are_taken() 
     assert tracker.step(STILL, NOTHING) == []
     far_out = View(np.array([[5000.0, 5000.0]]), np.ones(1), 0.0, 0.0)
     assert tracker.step(STILL, far_out) == []
+
+
+def test_what_is_not_seen_grows_as_unsure_as_the_tuning_says() -> None:
+    tracker = Tracker(AIDECK, TUNING)
+    xyz = np.array([[1.5, 0.2, -0.1]])
+    uv, depth_m, _ = pixels_from_horizontal(xyz, LEVEL, LEVEL, AIDECK)
+    tracker.step(Motion(0.0, np.zeros(3), 0.0), View(uv, depth_m, 0.0, 0.0))
+    (track,) = tracker.tracks
+    assert track.position_m == pytest.approx(xyz[0], abs=1e-6)
+    before, dt_s = track.filter.P.copy(), 0.2
+    tracker._predict(track, Motion(dt_s, np.zeros(3), 0.0))
+    after = track.filter.P
+    power = TUNING.acceleration_std_mps2**2
+    moved = before[:3, :3] + dt_s**2 * before[3:6, 3:6]
+    grown = np.diag(after)[:3] - np.diag(moved)
+    own = (TUNING.own_velocity_std_mps * dt_s) ** 2
+    turn = (TUNING.yaw_rate_std_radps * dt_s) ** 2
+    x, y, _ = track.position_m
+    still = power * dt_s**3 / 3
+    assert grown == pytest.approx([still + own + turn * y**2, still + own + turn * x**2, still])
+    assert after[0, 1] - moved[0, 1] == pytest.approx(-turn * x * y)
+    assert np.diag(after)[3:6] - np.diag(before)[3:6] == pytest.approx([power * dt_s] * 3)
+    gained = np.diag(after[:3, 3:6] - before[:3, 3:6]) - dt_s * np.diag(before)[3:6]
+    assert gained == pytest.approx([power * dt_s**2 / 2] * 3)
+    keep = np.exp(-dt_s / TUNING.depth_bias_s)
+    assert after[6, 6] == pytest.approx(TUNING.depth_bias_ratio**2)  # as much lost as gained
+    assert after[0, 6] == pytest.approx(keep * before[0, 6])
+
+
+def test_a_track_moves_against_the_observer() -> None:
+    tracker = Tracker(AIDECK, TUNING)
+    uv, depth_m, _ = pixels_from_horizontal(np.array([[2.0, 0.3, 0.1]]), LEVEL, LEVEL, AIDECK)
+    tracker.step(Motion(0.0, np.zeros(3), 0.0), View(uv, depth_m, 0.0, 0.0))
+    (track,) = tracker.tracks
+    track.filter.x[3:6] = 0.5, 0.0, -0.2  # over ground, along the axes before the turn
+    tracker._predict(track, Motion(0.5, np.array([0.4, 0.1, 0.05]), np.pi / 2))
+    # Ahead by 2 + 0.25 - 0.4 and left by 0.3 - 0.1; after a quarter turn left that is right.
+    assert track.position_m == pytest.approx([0.2, -1.85, -0.05])
+    assert track.velocity_mps == pytest.approx([0.0, -0.5, -0.2])

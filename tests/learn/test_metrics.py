@@ -166,3 +166,20 @@ def test_ten_thousand_images_take_seconds() -> None:
     begun = time.process_time()
     by_band(score(images, labels, off), threshold=0.33)
     assert time.process_time() - begun < 20
+
+
+def test_an_interval_holds_the_middle_95_percent() -> None:
+    images = 400
+    labels, found = scene(images)
+    half = Points(
+        found.image,
+        found.u_px - 30 * (found.image % 2),
+        found.v_px,
+        found.depth_m,
+        found.confidence,
+    )
+    band = by_band(score(images, labels, half), threshold=0.33, draws=2000)[0]
+    share = band.figures["within_8_px"]
+    reach = 1.96 * math.sqrt(0.25 / images)  # of a share of one half
+    assert share.value == 0.5
+    assert (share.low, share.high) == pytest.approx((0.5 - reach, 0.5 + reach), abs=0.006)

@@ -2,6 +2,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -122,3 +123,12 @@ def test_what_is_no_address_is_refused(text: str) -> None:
 
 def test_without_a_port_the_decks_own_is_taken() -> None:
     assert address("192.168.4.1") == ("192.168.4.1", 5000)
+
+
+def test_images_that_did_not_come_are_counted_by_their_numbers() -> None:
+    camera = CameraClient("cf1", "127.0.0.1", 5000, Feed(), HostTime())
+    before = None
+    for number in (None, 254, 255, 259, 260, None, 300):
+        before = camera._count(replace(RAW, frame_id=number), before)
+    assert camera.health.lost == 3  # 256, 257 and 258
+    assert before == 300

@@ -143,3 +143,62 @@ def test_a_topic_without_messages_is_no_trouble(tmp_path: Path) -> None:
         writer.add_message(channel, 0, empty, 0)
         writer.finish()
     assert [f.text for f in check(path)] == ["1 of 1 messages have no image at their time"]
+
+
+@pytest.mark.parametrize(
+    ("period_s", "hole_s", "found"),
+    [(0.1, 0.95, 0), (0.1, 1.05, 1), (0.01, 0.45, 0), (0.01, 0.55, 1)],
+)
+def test_a_gap_is_ten_periods_long_and_half_a_second(
+    tmp_path: Path, period_s: float, hole_s: float, found: int
+) -> None:
+    def fill(write: Write) -> None:
+        for k in range(40):
+            time_s = k * period_s + (hole_s - period_s) * (k >= 20)
+            write(round(time_s * 1e9), "/cf1/height", message("Height")())
+
+    findings = record(tmp_path / "a.mcap", fill)
+    assert len(findings) == found
+    assert all(
+        f"1 gaps, the longest {hole_s:.3f} s; the usual period: {period_s:.3f}" in f
+        for f in findings
+    )
+
+
+def test_ten_steps_make_a_rhythm(tmp_path: Path) -> None:
+    for steps, found in ((9, 0), (10, 1)):
+        moments = [*range(steps), steps + 50]
+
+        def fill(write: Write, moments: list[int] = moments) -> None:
+            for moment in moments:
+                write(moment * 10**9, "/cf1/height", message("Height")())
+
+        assert len(record(tmp_path / f"{steps}.mcap", fill)) == found
+
+
+def off_by(write: Write, off_px: list[tuple[float, float]]) -> None:
+    """Labels beside the middle of their boxes."""
+    write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+    for k, (u_px, v_px) in enumerate(off_px):
+        peer = label(100.0, 100.0)
+        peer.u_px += u_px
+        peer.v_px += v_px
+        write(k * 10**9, "/cf1/camera/image", image())
+        write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[peer]))
+
+
+def test_a_bias_is_told_by_its_standard_error(tmp_path: Path) -> None:
+    def spread(middle_px: float, by_px: float) -> list[float]:
+        return [middle_px + by_px * (-1) ** k for k in range(40)] + [middle_px]
+
+    # The MAD is by_px: 1.2533 * 1.4826 * by_px / sqrt(41) is the error, and five of it count.
+    (finding,) = record(tmp_path / "a.mcap", lambda w: off_by(w, [(0.1, v) for v in spread(3, 2)]))
+    assert "+0.1 px in u and +3.0 px in v" in finding
+    assert "(median of 41, standard error 0.00 and 0.58 px)" in finding
+    far = [(u, 0.0) for u in spread(3, 2.2)]  # five errors are 3.19 px
+    assert record(tmp_path / "b.mcap", lambda w: off_by(w, far)) == []
+    small = [(1.4, -1.4)] * 41
+    assert record(tmp_path / "c.mcap", lambda w: off_by(w, small)) == []
+    few = [(9.0, 9.0)] * 19
+    assert record(tmp_path / "d.mcap", lambda w: off_by(w, few)) == []
+    assert len(record(tmp_path / "e.mcap", lambda w: off_by(w, [(9.0, 9.0)] * 20))) == 1

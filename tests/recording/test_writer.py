@@ -123,3 +123,13 @@ def test_flush_closes_the_open_chunk(tmp_path: Path) -> None:
         sink.flush()
         result = recover(tmp_path / "a.mcap.partial", tmp_path / "b.mcap")
     assert result.messages == 1
+
+
+@pytest.mark.parametrize(("time_ns", "publish_ns"), [(-1, 0), (0, -1)])
+def test_neither_time_may_be_negative(tmp_path: Path, time_ns: int, publish_ns: int) -> None:
+    with (
+        pytest.raises(RecordingError, match=f"time {time_ns} ns on /cf1/height is negative"),
+        RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink,
+    ):
+        sink.write(time_ns, "/cf1/height", HEIGHT(), publish_ns=publish_ns)
+    assert list(tmp_path.iterdir()) == []

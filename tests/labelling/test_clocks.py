@@ -1,0 +1,112 @@
+"""Signals that tell how clocks differ, against motion that is known."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.formats.log_block import quaternion_zyx
+from dmrl.images.codec import encode_png
+from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, summary
+
+TIME_S = np.arange(0, 30, 0.05)
+LATE_S = 0.13
+
+
+def smooth(seed: int, time_s: Any, per_s: float = 1.0) -> Any:
+    """A sum of some waves, and of them the slope."""
+    rng = np.random.default_rng(seed)
+    rates, phases = rng.uniform(0.5, 4.0, 5) * per_s, rng.uniform(0, 6, 5)
+    waves = np.sin(np.outer(time_s, rates) + phases)
+    return waves.sum(axis=1) / 5, (np.cos(np.outer(time_s, rates) + phases) * rates).sum(axis=1) / 5
+
+
+def mocap(path: Path, only: str, tf: bool = False) -> Any:
+    """A robot whose own log is late, and that moves in one way alone."""
+    (roll, _), (pitch, _) = (smooth(k, TIME_S) for k in (1, 2))
+    yaw, yaw_rate = smooth(3, TIME_S)
+    high, _ = smooth(4, TIME_S)
+    moves = {"roll": 0, "pitch": 0, "yaw rate": 0, "height": 0} | {only: 0.3}
+    angles = np.column_stack(
+        [moves["roll"] * roll, moves["pitch"] * pitch, moves["yaw rate"] * yaw]
+    )
+    turns = quaternion_zyx(angles)
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k, time_s in enumerate(TIME_S.tolist()):
+            time_ns, own_ns = round(time_s * 1e9), round((time_s + LATE_S) * 1e9)
+            turn = dict(zip("xyzw", turns[k].tolist(), strict=True))
+            place = {"x": 0.0, "y": 0.0, "z": 1 + moves["height"] * high[k]}
+            if tf:
+                frame = {"child_frame_id": "cf1/horizontal", "translation": place, "rotation": turn}
+                transforms = message("FrameTransforms")(transforms=[frame])
+                sink.write(time_ns, topics.TRANSFORMS, transforms)
+            else:
+                pose = message("PoseInFrame")(pose={"position": place, "orientation": turn})
+                sink.write(time_ns, topics.true_pose("cf1"), pose)
+            rate = moves["yaw rate"] * yaw_rate[k]
+            names = ("roll_rad", "pitch_rad", "yaw_rate_radps")
+            own = dict(zip(names, [*angles[k, :2], rate], strict=True))
+            sink.write(own_ns, topics.attitude("cf1"), message("Attitude")(**own))
+            sink.write(own_ns, topics.height("cf1"), message("Height")(height_m=place["z"]))
+    return mocap_clocks(path, summary(path))
+
+
+@pytest.mark.parametrize("only", ["roll", "pitch", "yaw rate", "height"])
+def test_motion_capture_and_a_robot_agree_in_each_signal(tmp_path: Path, only: str) -> None:
+    found = mocap(tmp_path / "a.mcap", only)
+    assert found.keys() == {"cf1"}
+    assert found["cf1"].by == only
+    assert found["cf1"].offset_s == pytest.approx(-LATE_S, abs=0.01)
+
+
+def test_horizontal_frames_of_motion_capture_count_too(tmp_path: Path) -> None:
+    assert mocap(tmp_path / "a.mcap", "height", tf=True)["cf1"].by == "height"
+
+
+def test_ranges_both_ways_set_the_second_robots_clock(tmp_path: Path) -> None:
+    path, rng = tmp_path / "a.mcap", np.random.default_rng(0)
+    time_s = np.arange(0, 60, 0.05)
+    away, _ = smooth(5, time_s, 0.5)
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k, moment in enumerate(time_s.tolist()):
+            link = ("cf1", "cf2") if k % 2 else ("cf2", "cf1")
+            stamp_s = moment + (0.0 if k % 2 else LATE_S)
+            heard = message("UwbRange")(range_m=3 + away[k] + rng.normal(0, 0.01))
+            sink.write(round(stamp_s * 1e9), topics.uwb_range(*link), heard)
+            sink.write(round(moment * 1e9), topics.uwb_range("cf1", "cf3"), heard)
+    held = summary(path)
+    assert ranging(held) == {("cf1", "cf2"), ("cf2", "cf1"), ("cf1", "cf3")}
+    found = range_clocks(path, held)
+    assert found.keys() == {("cf1", "cf2")}
+    assert found["cf1", "cf2"].offset_s == pytest.approx(-LATE_S, abs=0.03)
+    assert found["cf1", "cf2"].by == "ranges"
+
+
+@pytest.mark.parametrize("axis", ["yaw rate", "pitch rate"])
+def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> None:
+    path, rng = tmp_path / "a.mcap", np.random.default_rng(0)
+    scene = rng.integers(0, 256, (12, 16), np.uint8).repeat(12, 0).repeat(12, 1)
+    image_s = np.arange(0, 23, 0.1)
+    angle, _ = smooth(6, image_s, 0.6)
+    shift = np.rint(20 * angle).astype(int)  # px; what is seen moves right and up
+    own_s = np.arange(0, 23, 0.05)
+    own, rate = smooth(6, own_s, 0.6)
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for moment, px in zip(image_s.tolist(), shift.tolist(), strict=True):
+            turned = (0, px) if axis == "yaw rate" else (-px, 0)
+            seen = np.roll(scene, turned, (0, 1))[16:128, 16:176]
+            rgb = np.repeat(seen[..., None], 3, axis=2)
+            picture = message("CompressedImage")(data=encode_png(rgb), format="png")
+            sink.write(round((moment + LATE_S) * 1e9), topics.camera_image("cf1"), picture)
+        for k, moment in enumerate(own_s.tolist()):
+            turn = {"yaw_rate_radps": rate[k]} if axis == "yaw rate" else {"pitch_rad": own[k]}
+            sink.write(round(moment * 1e9), topics.attitude("cf1"), message("Attitude")(**turn))
+    found = camera_clock(path, summary(path), "cf1", {})
+    assert found is not None
+    assert found.by == axis
+    assert found.offset_s == pytest.approx(-LATE_S, abs=0.02)
+    assert camera_clock(path, summary(path), "cf2", {}) is None

@@ -1,0 +1,182 @@
+"""What is estimated from, and what is left out of it with a word."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.estimation.pair import RATE_HZ
+from dmrl.labelling.logs import LEAST_RANGES, Logs, RobotLog, read_logs
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, summary
+
+START_NS = 7_000_000_000
+Write = Callable[[float, str, Any], None]
+
+
+def flight(write: Write, robots: tuple[str, ...] = ("cf1", "cf2"), until_s: float = 8.0) -> None:
+    """Sensors of robots at 20 Hz; every value tells the time."""
+    for time_s in np.arange(0, until_s, 0.05).tolist():
+        for robot in robots:
+            turn = {"roll_rad": 0.01 * time_s, "pitch_rad": 0.02, "yaw_rate_radps": 0.03 * time_s}
+            write(time_s, topics.attitude(robot), message("Attitude")(**turn))
+            moving = message("Velocity")(vx_mps=0.1 * time_s, vy_mps=-0.2 * time_s)
+            write(time_s, topics.velocity(robot), moving)
+            write(time_s, topics.height(robot), message("Height")(height_m=1 + 0.1 * time_s))
+
+
+def ranges(write: Write, one: str = "cf1", other: str = "cf2", count: int = 40) -> None:
+    for k in range(count):
+        write(
+            0.1 + 0.15 * k, topics.uwb_range(one, other), message("UwbRange")(range_m=2.0 + k / 100)
+        )
+
+
+def logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> Logs:
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for part in parts:
+            part(lambda t, topic, m: sink.write(START_NS + round(t * 1e9), topic, m))
+    return read_logs(path, summary(path), offset_m)
+
+
+def test_a_pair_stands_on_one_grid_with_the_ranges_of_both(tmp_path: Path) -> None:
+    back = lambda write: ranges(write, "cf2", "cf1", 30)  # noqa: E731
+    found = logs(tmp_path / "a.mcap", flight, ranges, back, offset_m=0.5)
+    assert (found.start_ns, found.warnings, found.flying) == (START_NS, [], {"cf1", "cf2"})
+    pair = found.pairs["cf1", "cf2"]
+    assert len(pair.range_m) == 70
+    assert (np.diff(pair.range_time_s) >= 0).all()
+    assert (pair.range_m.min(), pair.range_m.max()) == pytest.approx((1.5, 1.89))
+    assert np.diff(pair.time_s) == pytest.approx(1 / RATE_HZ)
+    middle = slice(20, -20)
+    time_s = pair.time_s[middle]
+    for track in (pair.own, pair.peer):
+        assert track.vx_mps[middle] == pytest.approx(0.1 * time_s, abs=0.01)
+        assert track.vy_mps[middle] == pytest.approx(-0.2 * time_s, abs=0.01)
+        assert track.yaw_rate_radps[middle] == pytest.approx(0.03 * time_s, abs=0.003)
+        assert track.height_m[middle] == pytest.approx(1 + 0.1 * time_s, abs=0.01)
+        assert not track.gap.any()
+
+
+def test_a_log_lasts_as_long_as_all_of_its_sensors() -> None:
+    def sensor(start_s: float, end_s: float) -> tuple[Any, Any]:
+        return np.array([start_s, end_s]), np.zeros((2, 3))
+
+    log = RobotLog(sensor(1, 9), sensor(2, 8), sensor(0, 7))
+    assert (log.start_s, log.end_s) == (2, 7)
+
+
+def test_heights_are_smoothed_over_half_a_second_without_bending_a_climb() -> None:
+    time_s = np.arange(0, 10, 0.05)
+    rng = np.random.default_rng(0)
+    still = (time_s, np.zeros((len(time_s), 3)))
+    climb_m = 0.2 * time_s + 0.05 * time_s**2
+    noise_m = rng.normal(0, 0.02, len(time_s))
+    for extra_m, most_m in ((0 * noise_m, 1e-4), (noise_m, 0.012)):
+        track = RobotLog(still, still, (time_s, (climb_m + extra_m)[:, None])).track(time_s)
+        assert np.std((track.height_m - climb_m)[50:-50]) < most_m
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"roll_rad": 30.0}, "cf1: a tilt of 30 rad and a yaw rate of 0 rad/s (90 % are less)"),
+        ({"yaw_rate_radps": 20.0}, "cf1: a tilt of 0 rad and a yaw rate of 20 rad/s"),
+    ],
+)
+def test_degrees_are_suspected(tmp_path: Path, change: dict[str, float], said: str) -> None:
+    def steep(write: Write) -> None:
+        for time_s in np.arange(0, 8, 0.05).tolist():
+            write(time_s, topics.attitude("cf1"), message("Attitude")(**change))
+            write(time_s, topics.velocity("cf1"), message("Velocity")())
+            write(time_s, topics.height("cf1"), message("Height")())
+
+    only_cf2 = lambda write: flight(write, ("cf2",))  # noqa: E731
+    (warning,) = logs(tmp_path / "a.mcap", steep, only_cf2, ranges).warnings
+    assert warning.startswith(said)
+
+
+def without(kind: str) -> Callable[[Write], None]:
+    return lambda write: flight(lambda t, topic, m: None if kind in topic else write(t, topic, m))
+
+
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        (
+            [without("cf2/velocity"), ranges],
+            ["cf2: no /cf2/velocity; its pairs are left out"],
+        ),
+        (
+            [lambda w: flight(w, until_s=4.9), ranges],
+            ["cf1-cf2: their logs share 4.9 s, under 5 s; left out. Do their clocks agree?"],
+        ),
+        (
+            [flight, lambda w: ranges(w, count=LEAST_RANGES - 1)],
+            [f"cf1-cf2: {LEAST_RANGES - 1} usable ranges, under {LEAST_RANGES}; left out"],
+        ),
+    ],
+    ids=["no velocity", "short", "few ranges"],
+)
+def test_what_is_left_out_is_said(tmp_path: Path, parts: list[Any], said: list[str]) -> None:
+    found = logs(tmp_path / "a.mcap", *parts)
+    assert not found.pairs
+    assert found.warnings == said
+
+
+def test_enough_ranges_are_just_enough(tmp_path: Path) -> None:
+    found = logs(tmp_path / "a.mcap", flight, lambda w: ranges(w, count=LEAST_RANGES))
+    assert len(found.pairs["cf1", "cf2"].range_m) == LEAST_RANGES
+
+
+def test_silence_is_a_gap_of_that_robot(tmp_path: Path) -> None:
+    def silent(write: Write) -> None:
+        def loud(t: float, topic: str, m: Any) -> None:
+            if not (3.0 < t < 5.0 and topic == "/cf2/attitude"):
+                write(t, topic, m)
+
+        flight(loud)
+
+    found = logs(tmp_path / "a.mcap", silent, ranges)
+    pair = found.pairs["cf1", "cf2"]
+    assert not pair.own.gap.any()
+    assert pair.peer.gap[np.abs(pair.time_s - 4.0) < 0.5].all()
+    (warning,) = found.warnings
+    assert warning.startswith("cf1-cf2: cf2 is silent for ")
+    assert warning.endswith(" s; unconverged there")
+
+
+def test_who_has_a_log_and_no_pair_is_flying_and_said_so(tmp_path: Path) -> None:
+    three = lambda write: flight(write, ("cf1", "cf2", "cf3"))  # noqa: E731
+    found = logs(tmp_path / "a.mcap", three, ranges)
+    assert found.flying == {"cf1", "cf2", "cf3"}
+    assert found.warnings == [
+        "cf3: it has a log but no position, so no image counts as one without it"
+    ]
+
+
+def test_samples_that_are_no_numbers_and_clocks_that_go_back_are_said(tmp_path: Path) -> None:
+    def bad(write: Write) -> None:
+        write(8.0, topics.height("cf1"), message("Height")(height_m=float("nan")))
+        write(8.0, topics.uwb_range("cf1", "cf2"), message("UwbRange")(range_m=70.0))
+
+    path = tmp_path / "a.mcap"
+    found = logs(path, flight, ranges, bad)
+    assert found.warnings == [
+        "/cf1/height: 1 of 161 samples are not finite; left out",
+        "cf1-cf2: 1 of 41 ranges are not in (0, 60] m; left out",
+    ]
+    with RecordingWriter(tmp_path / "b.mcap", Provenance("test")) as sink:
+        late = lambda t, topic, m: sink.write(  # noqa: E731
+            START_NS + round(t * 1e9),
+            topic,
+            m,
+            publish_ns=START_NS + round((t - 3 * (t > 4)) * 1e9),
+        )
+        flight(late)
+        ranges(late)
+    back = read_logs(tmp_path / "b.mcap", summary(tmp_path / "b.mcap")).warnings
+    assert "/cf1/attitude: its clock goes back 1 times; samples overlap there" in back

@@ -1,0 +1,114 @@
+"""Positions and labels as they stand in a recording."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
+from dmrl.labelling.labels import NEAREST_M, Look, Positions
+from dmrl.labelling.logs import Logs, RobotLog
+from dmrl.labelling.write import label_messages, position_messages
+from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
+from dmrl.recording import Provenance, RecordingWriter, summary
+
+SECOND_NS = 1_000_000_000
+START_NS = 5 * SECOND_NS
+TIMES_S = np.array([0.0, 10.0])
+ROLL_RATE, PITCH_RATE = 0.02, -0.01
+
+
+def log() -> RobotLog:
+    """Rolls and pitches steadily, so that a time can be told by the attitude."""
+    attitude = np.column_stack([ROLL_RATE * TIMES_S, PITCH_RATE * TIMES_S, 0 * TIMES_S])
+    return RobotLog((TIMES_S, attitude), (TIMES_S, np.zeros((2, 2))), (TIMES_S, np.ones((2, 1))))
+
+
+def logs(flying: Sequence[str] = ("cf1", "cf2")) -> Logs:
+    return Logs(START_NS, {"cf1": log()}, {}, frozenset(flying), [])
+
+
+def flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) -> Path:
+    with RecordingWriter(path, Provenance("test")) as sink:
+        sink.write(START_NS, topics.height("cf1"), message("Height")(height_m=1.0))
+        for moment in images_s:
+            time_ns = START_NS + round(moment * SECOND_NS)
+            sink.write(time_ns, topics.camera_image("cf1"), message("CompressedImage")())
+        for time_ns, entry in labels:
+            sink.write(time_ns, topics.labels("cf1"), entry)
+    return path
+
+
+def at(time_s: Sequence[float], status: int = STATUS_OK) -> Positions:
+    count = len(time_s)
+    xyz_m = np.column_stack(
+        [np.full(count, 2.0), np.linspace(-0.2, 0.2, count), np.full(count, 0.1)]
+    )
+    time_ns = START_NS + np.rint(np.array(time_s) * SECOND_NS).astype(np.int64)
+    covariance = np.tile(np.diag([0.04, 0.03, 0.02]), (count, 1, 1))
+    return Positions(time_ns, xyz_m, covariance, np.full(count, status, np.int8))
+
+
+def written(path: Path, found: dict[str, Positions], camera: Camera, known: Logs) -> list[Any]:
+    look = Look(0.01, cameras={"cf1": camera})
+    return list(label_messages(path, summary(path), known, "cf1", found, look))
+
+
+def test_a_position_message_says_all_of_it() -> None:
+    found = at([1.0, 2.0], STATUS_UNCONVERGED)
+    first, second = position_messages("cf1", "cf2", found)
+    assert (first.time_ns, first.topic) == (START_NS + SECOND_NS, "/cf1/peer/cf2/position")
+    said = second.message
+    assert (said.x, said.y, said.z) == pytest.approx((2.0, 0.2, 0.1))
+    assert list(said.covariance) == pytest.approx([0.04, 0, 0, 0, 0.03, 0, 0, 0, 0.02])
+    assert (said.frame_id, said.status) == ("cf1/horizontal", STATUS_UNCONVERGED)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.5])
+def test_a_label_stands_at_its_image_and_shows_when_that_was_taken(
+    tmp_path: Path, delay_s: float
+) -> None:
+    logged_s = [2.0, 4.0, 6.0]
+    taken_s = [moment - delay_s for moment in logged_s]
+    found = at([0.25, *taken_s, 9.0])  # and positions between the images
+    path = flight(tmp_path / "a.mcap", logged_s)
+    made = written(path, {"cf2": found}, replace(AIDECK, delay_s=delay_s), logs())
+    assert [m.time_ns for m in made] == [START_NS + round(t * SECOND_NS) for t in logged_s]
+    for entry, taken, xyz_m in zip(made, taken_s, found.xyz_m[1:4], strict=True):
+        tilt = np.array([ROLL_RATE * taken]), np.array([PITCH_RATE * taken])
+        (uv,), (depth_m,), _ = pixels_from_horizontal(xyz_m[None], *tilt, AIDECK)
+        (label,) = entry.message.peers
+        assert (label.u_px, label.v_px) == pytest.approx(tuple(uv))
+        assert label.depth_m == pytest.approx(depth_m)
+        assert entry.message.sources == ["estimate"]
+
+
+def test_labels_of_others_stay_and_estimates_of_before_go(tmp_path: Path) -> None:
+    kinds = [{"peer": "cf2", "source": source, "depth_m": 1.0} for source in ("truth", "estimate")]
+    before = message("PeerLabels")(peers=kinds, sources=["truth", "estimate"])
+    image_ns, other_ns = START_NS + 2 * SECOND_NS, START_NS + 3 * SECOND_NS
+    path = flight(tmp_path / "a.mcap", [2.0, 3.0], [(image_ns, before), (other_ns, before)])
+    first, second = written(path, {"cf2": at([2.0])}, AIDECK, logs())
+    assert [p.source for p in first.message.peers] == ["truth", "estimate"]
+    assert list(first.message.sources) == ["estimate", "truth"]
+    assert [p.source for p in second.message.peers] == ["truth"]
+    assert list(second.message.sources) == ["truth"]
+
+
+def test_who_flies_without_a_position_may_be_in_any_image_that_has_one(tmp_path: Path) -> None:
+    path = flight(tmp_path / "a.mcap", [2.0, 3.0])
+    (only,) = written(path, {"cf2": at([2.0])}, AIDECK, logs(["cf1", "cf2", "cf3", "cf4"]))
+    known, *unknown = only.message.peers
+    assert (known.peer, known.status) == ("cf2", STATUS_OK)
+    assert [(p.peer, p.status) for p in unknown] == [(f"cf{k}", STATUS_UNCONVERGED) for k in (3, 4)]
+    assert {(p.u_px, p.v_px, p.depth_m) for p in unknown} == {(160.0, 112.0, NEAREST_M)}
+
+
+def test_without_any_calibration_there_are_no_labels(tmp_path: Path) -> None:
+    path = flight(tmp_path / "a.mcap", [2.0])
+    found = label_messages(path, summary(path), logs(), "cf1", {"cf2": at([2.0])}, Look(0.01))
+    assert list(found) == []

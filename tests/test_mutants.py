@@ -1,0 +1,66 @@
+"""The tool that changes code: what it changes, and what it leaves alone."""
+
+from pathlib import Path
+
+import pytest
+
+from . import mutants
+from .mutants import Mutant, drawn, mutants_of
+
+SOURCE = '''"""Words of 1 + 1."""
+from pathlib import Path
+
+SIZE: tuple[int, 2] = (wide, high)
+
+def far(a: int, b: float = 0.5) -> bool:
+    """More 2 + 2."""
+    if a < 3 and b:
+        raise ValueError(f"{a + 1} is", a - 1)
+    a += 4
+    zip(a, b, strict=True)
+    return -a * b[1:2]
+'''
+
+
+@pytest.fixture
+def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Mutant]:
+    monkeypatch.setattr(mutants, "REPOSITORY", tmp_path)
+    (tmp_path / "dmrl" / "room").mkdir(parents=True)
+    path = tmp_path / "dmrl" / "room" / "a.py"
+    path.write_text(SOURCE)
+    return mutants_of(path)
+
+
+def test_every_kind_of_change_is_made_once_per_place(found: list[Mutant]) -> None:
+    assert sorted((m.line, m.kind, m.before, m.after) for m in found) == [
+        (4, "swap", "(wide, high)", "(high, wide)"),
+        (6, "constant", "0.5", "1.0"),
+        (8, "comparison", "a < 3", "(a <= 3)"),
+        (8, "comparison", "a < 3", "(a > 3)"),
+        (8, "constant", "3", "4"),
+        (8, "term", "a < 3 and b", "(a < 3)"),
+        (8, "term", "a < 3 and b", "(b)"),
+        (10, "constant", "4", "5"),
+        (10, "term", "a += 4", "pass"),
+        (11, "swap", "zip(a, b, strict=True)", "(zip(b, a, strict=True))"),
+        (12, "arithmetic", "-a * b[1:2]", "(-a / b[1:2])"),
+        (12, "constant", "1", "2"),
+        (12, "constant", "2", "3"),
+        (12, "sign", "-a", "(a)"),
+        (12, "sign", "-a * b[1:2]", "(-(-a * b[1:2]))"),
+    ]
+
+
+def test_every_change_can_be_compiled(found: list[Mutant]) -> None:
+    source = SOURCE.encode()
+    for mutant in found:
+        assert source[mutant.start : mutant.end].decode() == mutant.before
+        compile(source[: mutant.start] + mutant.after.encode() + source[mutant.end :], "a", "exec")
+
+
+def test_a_seed_draws_the_same_again_and_every_kind_alike(found: list[Mutant]) -> None:
+    first, again, other = (drawn("room", 6, seed, ()) for seed in (1, 1, 2))
+    assert first == again != other
+    assert {m.kind for m in first} == {m.kind for m in found}
+    assert len(drawn("room", 99, 1, ())) == len(found)
+    assert drawn("room", 99, 1, ("a",)) == []
