@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from . import mutants
-from .mutants import Mutant, drawn, mutants_of
+from . import mutations
+from .mutations import Mutant, drawn, mutants_of
 
 SOURCE = '''"""Words of 1 + 1."""
 from pathlib import Path
@@ -24,7 +24,7 @@ def far(a: int, b: float = 0.5) -> bool:
 
 @pytest.fixture
 def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Mutant]:
-    monkeypatch.setattr(mutants, "REPOSITORY", tmp_path)
+    monkeypatch.setattr(mutations, "REPOSITORY", tmp_path)
     (tmp_path / "dmrl" / "room").mkdir(parents=True)
     path = tmp_path / "dmrl" / "room" / "a.py"
     path.write_text(SOURCE)

@@ -190,6 +190,7 @@ def test_a_teacher_that_says_the_same_leaves_nothing_to_learn(examples: Examples
     torch.testing.assert_close(half, (other + labels) / 2)
 
 
+@pytest.mark.slow
 def test_classes_and_the_spread_are_learnt(examples: Examples, tmp_path: Path) -> None:
     # Squares of class 1 are grey: that is what tells them apart.
     pixels: NDArray[np.uint8] = np.concatenate(list(dots(64).pixels))

@@ -204,6 +204,7 @@ def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [out]
 
 
+@pytest.mark.slow
 def test_blender_renders_what_is_labelled_in_one_place(blender: Path, tmp_path: Path) -> None:
     drawn = Settings(2, 3.0, seed=0, camera=True, camera_rate_hz=1.0)
     rendered = replace(drawn, camera_renderer="blender", cameras_max=1)

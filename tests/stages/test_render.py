@@ -77,6 +77,7 @@ def test_masks_depths_and_labels_agree(recording: Path) -> None:
     assert makes == {"cf", "painted"}
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_changes_no_byte(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "two.mcap"
     run(out, Settings(**{**_fields(SMALL), "workers": 2}))
@@ -140,6 +141,7 @@ def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
     assert np.array_equal(*shots)
 
 
+@pytest.mark.slow
 def test_boxes_are_where_the_mesh_is(blender: Path) -> None:
     settings = Settings(images=30, empty_share=0.0, depth_m=(0.3, 1.0), seed=1)
     camera = camera_of(settings)

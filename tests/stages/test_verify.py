@@ -54,6 +54,7 @@ def everything(folder: Path) -> dict[str, Any]:
     return document(run(folder, Settings(images=2, noise=2)))
 
 
+@pytest.mark.slow
 def test_every_target_computes_what_the_reference_does(everything: dict[str, Any]) -> None:
     assert [t["target"] for t in everything["targets"]] == ["gcc", "clang", "sanitizers", "riscv32"]
     assert all(t["mismatches"] == 0 for t in everything["targets"])
@@ -61,6 +62,7 @@ def test_every_target_computes_what_the_reference_does(everything: dict[str, Any
     assert (everything["images"], everything["noise_images"]) == (2, 2)
 
 
+@pytest.mark.slow
 def test_what_the_c_costs_is_measured(everything: dict[str, Any]) -> None:
     assert 500 < everything["code_bytes"] < 50_000
     assert 0 < everything["stack_bytes"] <= 512
@@ -70,6 +72,7 @@ def test_what_the_c_costs_is_measured(everything: dict[str, Any]) -> None:
     assert all("175 MHz" in e["assuming"] for e in everything["gap8_estimates"])
 
 
+@pytest.mark.slow
 def test_counting_instructions_gives_the_same_number_again(
     everything: dict[str, Any], folder: Path
 ) -> None:

@@ -1,0 +1,158 @@
+"""Small wrong changes to code: which there are, and which of them a seed draws."""
+
+import ast
+import random
+from collections import defaultdict
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[1]
+
+OTHER: dict[type, tuple[type, ...]] = {
+    **{ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.GtE)},
+    **{ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.LtE)},
+    **{ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,)},
+    **{ast.In: (ast.NotIn,), ast.NotIn: (ast.In,), ast.Add: (ast.Sub,), ast.Sub: (ast.Add,)},
+    **{ast.Mult: (ast.Div,), ast.Div: (ast.Mult,), ast.FloorDiv: (ast.Mult,)},
+    **{ast.Mod: (ast.FloorDiv,), ast.Pow: (ast.Mult,), ast.BitAnd: (ast.BitOr,)},
+    **{ast.BitOr: (ast.BitAnd,), ast.LShift: (ast.RShift,), ast.RShift: (ast.LShift,)},
+}
+"""What takes the place of an operator."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mutant:
+    """One change: ``before``, bytes ``start`` to ``end`` of a file, becomes ``after``."""
+
+    path: str
+    line: int
+    kind: str
+    start: int
+    end: int
+    before: str
+    after: str
+
+
+def changes(tree: ast.AST) -> Iterator[tuple[str, ast.expr | ast.stmt, ast.AST]]:
+    """Kind of each change, what is changed, and what takes its place."""
+    for node in _code(tree):
+        if isinstance(node, ast.Compare):
+            for k, operator in enumerate(node.ops):
+                for other in OTHER[type(operator)]:
+                    changed = deepcopy(node)
+                    changed.ops[k] = other()
+                    yield "comparison", node, changed
+        elif isinstance(node, ast.BinOp) and not _is_text(node):
+            yield from _of_arithmetic(node)
+        elif isinstance(node, ast.BoolOp):
+            for k in range(len(node.values)):
+                rest = node.values[:k] + node.values[k + 1 :]
+                yield "term", node, ast.BoolOp(node.op, rest) if rest[1:] else rest[0]
+        elif isinstance(node, ast.AugAssign):
+            yield "term", node, ast.Pass()
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+            yield "sign", node, node.operand
+        elif isinstance(node, ast.Constant):
+            if isinstance(node.value, bool):
+                yield "constant", node, ast.Constant(not node.value)
+            elif isinstance(node.value, int):
+                yield "constant", node, ast.Constant(node.value + 1)
+            elif isinstance(node.value, float):
+                yield "constant", node, ast.Constant(2 * node.value or 1.0)
+        else:
+            yield from _swapped(node)
+
+
+def _of_arithmetic(node: ast.BinOp) -> Iterator[tuple[str, ast.expr, ast.AST]]:
+    for other in OTHER.get(type(node.op), ()):
+        yield "arithmetic", node, ast.BinOp(node.left, other(), node.right)
+    if isinstance(node.op, ast.Add | ast.Sub):
+        yield "term", node, node.left
+        yield "term", node, node.right
+    if isinstance(node.op, ast.Mult | ast.Div | ast.MatMult):
+        yield "sign", node, ast.UnaryOp(ast.USub(), node)
+
+
+def _swapped(node: ast.AST) -> Iterator[tuple[str, ast.expr, ast.AST]]:
+    """Calls, and lists of values, with two neighbours swapped."""
+    if isinstance(node, ast.Call):
+        field = "args"
+    elif isinstance(node, ast.Tuple | ast.List) and isinstance(node.ctx, ast.Load):
+        field = "elts"
+    else:
+        return
+    values = getattr(node, field)
+    if any(isinstance(value, ast.Slice) for value in values):
+        return
+    for k in range(len(values) - 1):
+        pair = values[k : k + 2]
+        same = ast.dump(pair[0]) == ast.dump(pair[1])
+        if same or any(isinstance(v, ast.Starred | ast.Constant | ast.JoinedStr) for v in pair):
+            continue
+        changed = deepcopy(node)
+        getattr(changed, field)[k : k + 2] = reversed(deepcopy(pair))
+        yield "swap", node, changed
+
+
+def _is_text(node: ast.BinOp) -> bool:
+    """Whether an operator joins text or lists, as far as one can see."""
+    kinds = (ast.JoinedStr, ast.List, ast.Tuple)
+    return any(
+        isinstance(n, kinds) or (isinstance(n, ast.Constant) and isinstance(n.value, str))
+        for n in (node.left, node.right)
+    )
+
+
+def _code(node: ast.AST) -> Iterator[ast.AST]:
+    """What is computed: no annotations, no text, no words of an error."""
+    if isinstance(node, ast.JoinedStr | ast.Raise):
+        return
+    if isinstance(node, ast.keyword) and node.arg == "strict":
+        return  # of zip: says only that what is so is so
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list", "pattern"):
+            continue
+        if name == "type" and isinstance(node, ast.ExceptHandler):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                yield from _code(child)
+
+
+def mutants_of(path: Path) -> list[Mutant]:
+    """Every change of a file."""
+    source = path.read_bytes()
+    starts = [0]
+    for line in source.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    found = []
+    for kind, node, changed in changes(ast.parse(source)):
+        assert node.end_lineno is not None and node.end_col_offset is not None
+        start = starts[node.lineno - 1] + node.col_offset
+        end = starts[node.end_lineno - 1] + node.end_col_offset
+        after = ast.unparse(ast.fix_missing_locations(deepcopy(changed)))
+        if isinstance(changed, ast.expr) and not isinstance(changed, ast.Constant | ast.Tuple):
+            after = f"({after})"
+        before = source[start:end].decode()
+        where = str(path.relative_to(REPOSITORY))
+        found.append(Mutant(where, node.lineno, kind, start, end, before, after))
+    return found
+
+
+def drawn(room: str, count: int, seed: int, without: tuple[str, ...]) -> list[Mutant]:
+    """Some changes of a room's code, each kind as often as the others."""
+    rng = random.Random(f"{room} {seed}")
+    by_kind: dict[str, list[Mutant]] = defaultdict(list)
+    for path in sorted((REPOSITORY / "dmrl" / room).rglob("*.py")):
+        if path.stem not in without:
+            for mutant in mutants_of(path):
+                by_kind[mutant.kind].append(mutant)
+    for mutants in by_kind.values():
+        rng.shuffle(mutants)
+    chosen: list[Mutant] = []
+    while len(chosen) < count and any(by_kind.values()):
+        chosen += [by_kind[kind].pop() for kind in sorted(by_kind) if by_kind[kind]]
+    return chosen[:count]
