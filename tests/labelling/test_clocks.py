@@ -9,7 +9,7 @@ import pytest
 from dmrl import topics
 from dmrl.formats.log_block import quaternion_zyx
 from dmrl.images.codec import encode_png
-from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
+from dmrl.labelling.clocks import _increasing, camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, summary
 
@@ -110,3 +110,10 @@ def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> 
     assert found.by == axis
     assert found.offset_s == pytest.approx(-LATE_S, abs=0.02)
     assert camera_clock(path, summary(path), "cf2", {}) is None
+
+
+def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:
+    time_s = np.array([0.0, 1.0, 1.0, 0.5, 2.0, 3.0])
+    kept_s, kept = _increasing(time_s, np.array([5.0, 6.0, 7.0, 8.0, 9.0, np.nan]))
+    assert kept_s.tolist() == [0.0, 1.0, 2.0]
+    assert kept.tolist() == [5.0, 6.0, 9.0]
