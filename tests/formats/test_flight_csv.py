@@ -194,3 +194,8 @@ def test_odometry_from_poses_turns_with_the_robot() -> None:
     assert np.allclose(log["vx_mps"][5:-5], 1.0, atol=1e-4)
     assert np.allclose(log["vy_mps"][5:-5], 0.0, atol=1e-4)
     assert np.allclose(log["yaw_rate_radps"], 0.5)
+
+
+def test_logs_that_share_their_last_samples_are_taken(flight: Path) -> None:
+    write(flight, "cf2", rows(1.18))
+    assert list(flight_csv.content(flight).samples)

@@ -9,7 +9,15 @@ import pytest
 from dmrl import topics
 from dmrl.formats.log_block import quaternion_zyx
 from dmrl.images.codec import encode_png
-from dmrl.labelling.clocks import _increasing, camera_clock, mocap_clocks, range_clocks, ranging
+from dmrl.labelling.clocks import (
+    MOCAP_STEP_S,
+    _increasing,
+    _of_pose,
+    camera_clock,
+    mocap_clocks,
+    range_clocks,
+    ranging,
+)
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, summary
 
@@ -117,3 +125,26 @@ def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:
     kept_s, kept = _increasing(time_s, np.array([5.0, 6.0, 7.0, 8.0, 9.0, np.nan]))
     assert kept_s.tolist() == [0.0, 1.0, 2.0]
     assert kept.tolist() == [5.0, 6.0, 9.0]
+
+
+def test_poses_tell_what_a_robot_measures_of_itself() -> None:
+    time_s = np.arange(0, 4, 0.025)
+    (roll, _), (pitch, _), (yaw, yaw_rate), (x, vx), (y, vy) = (smooth(k, time_s) for k in range(5))
+    angles = np.column_stack([0.8 * roll, 0.9 * pitch, 4 * yaw])  # past half a turn
+    rows = np.column_stack([x, 2 * y, 1 + roll, quaternion_zyx(angles)])
+    found = _of_pose(time_s, rows)
+    assert found["roll"][1] == pytest.approx(0.8 * roll)
+    assert found["pitch"][1] == pytest.approx(0.9 * pitch)
+    assert found["height"][1] == pytest.approx(1 + roll)
+    middle = (time_s[1:] + time_s[:-1]) / 2
+    assert (found["yaw rate"][0] == middle).all()
+    assert found["yaw rate"][1] == pytest.approx(np.interp(middle, time_s, 4 * yaw_rate), abs=0.05)
+    speed = np.interp(middle, time_s, np.hypot(vx, 2 * vy))
+    assert found["speed"][1] == pytest.approx(speed, abs=0.1)
+
+
+def test_poses_that_are_too_near_to_each_other_are_left_out() -> None:
+    rows = np.tile([0.0, 0, 1, 0, 0, 0, 1], (4, 1))
+    time_s = np.array([0.0, 0.5, 1.0, 1.5]) * MOCAP_STEP_S
+    assert _of_pose(time_s, rows)["height"][0].tolist() == [0.0, MOCAP_STEP_S]
+    assert _of_pose(time_s[:2], rows[:2]) == {}

@@ -1,0 +1,46 @@
+"""The six numbers of the published firmware."""
+
+import numpy as np
+import pytest
+
+from dmrl.formats.aideck import FARTHEST_M, is_plausible, samples
+from dmrl.geometry.frames import AIDECK, pixels_from_horizontal
+
+VALUES = (10.0, 20.0, 2.0, 0.3, -0.1, 2.5)
+
+
+@pytest.mark.parametrize("place", range(6))
+def test_numbers_that_no_drone_has_are_not_plausible(place: int) -> None:
+    limit = 180.0 if place < 2 else FARTHEST_M
+    for value, plausible in ((limit, True), (-limit, True), (limit + 0.1, False)):
+        assert is_plausible([*VALUES[:place], value, *VALUES[place + 1 :]]) == plausible
+    for value in (np.nan, np.inf, -limit - 0.1):
+        assert not is_plausible([*VALUES[:place], value, *VALUES[place + 1 :]])
+
+
+def test_degrees_nose_up_become_radians_nose_down() -> None:
+    logged, attitude, position, heard, labels = samples(7, "cf1", "cf2", VALUES, AIDECK)
+    assert logged.fields == dict(zip(("roll", "pitch", "x", "y", "z", "d"), VALUES, strict=True))
+    tilt = {"roll_rad": np.radians(10), "pitch_rad": -np.radians(20)}
+    assert attitude.fields == pytest.approx(tilt)
+    assert [position.fields[axis] for axis in "xyz"] == [2.0, 0.3, -0.1]
+    assert position.fields["frame_id"] == "cf1/horizontal"
+    assert heard.fields == {"range_m": 2.5}
+    (uv,), _, _ = pixels_from_horizontal(
+        np.array([VALUES[2:5]]), *(np.array([value]) for value in tilt.values()), AIDECK
+    )
+    (label,) = labels.fields["peers"]
+    assert (label["u_px"], label["v_px"]) == pytest.approx(tuple(uv))
+    assert {s.time_ns for s in (logged, attitude, position, heard, labels)} == {7}
+
+
+def test_what_is_not_plausible_is_only_logged_and_no_range_is_no_range() -> None:
+    assert len(list(samples(7, "cf1", "cf2", (*VALUES[:5], 1e9), AIDECK))) == 1
+    kinds = [s.message for s in samples(7, "cf1", "cf2", (*VALUES[:5], 0.0), None)]
+    assert kinds[1:] == ["Attitude", "PeerPosition"]
+
+
+def test_who_is_out_of_view_has_no_label() -> None:
+    for xyz in ((-2.0, 0.0, 0.0), (1.0, 5.0, 0.0), (1.0, 0.0, -5.0)):
+        *_, labels = samples(7, "cf1", "cf2", (0.0, 0.0, *xyz, 0.0), AIDECK)
+        assert labels.fields["peers"] == []
