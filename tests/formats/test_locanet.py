@@ -239,3 +239,11 @@ def test_two_sets_in_one_folder_are_not_mixed(folder: Path) -> None:
     (folder / "synImgsMulti").mkdir()
     with pytest.raises(SourceError, match="holds two sets"):
         locanet.read(folder)
+
+
+def test_without_boxes_and_splits_a_set_is_read_all_the_same(folder: Path) -> None:
+    for name in ("boxLabel.txt", "train.txt", "test.txt"):
+        (folder / "synImgs" / name).unlink()
+        assert len(locanet.read(folder)) == 3
+    first = locanet.read(folder)[0]
+    assert (first.split, len(first.published)) == (None, 0)
