@@ -1,6 +1,7 @@
 """Log blocks as the Crazyflie client writes them: CSV, ``Timestamp`` in milliseconds first.
 
-One file per log block, ``<block>-<date>T<time>.csv``. A single file is a robot's log; so is a
+One file per log block, ``<block>-<date>T<time>.csv``. A column whose cells are all without a
+point is of integers, which tells millimetres from metres. A single file is a robot's log; so is a
 folder of such files. In a folder of folders, each of them is a robot, named after it.
 """
 
@@ -8,20 +9,24 @@ import csv
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
 from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.log_block import Block
+from dmrl.geometry.frames import Array
 from dmrl.samples.flight import in_order
 from dmrl.terminal.progress import say
 
 TIME = "Timestamp"
 NS_PER_MS = 1_000_000
 TIME_BITS = 24  # milliseconds in a log packet
+WHOLE = re.compile(r"\s*[+-]?\d+\s*")
 STAMP = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
 
 
@@ -100,8 +105,20 @@ def read_block(path: Path) -> Block:
         raise SourceError(f"{path} has no rows. Name another file")
     values = np.array(rows, float).T
     time_ns = unwrap(values[0], TIME_BITS) * NS_PER_MS
-    columns = dict(zip(names[1:], values[1:], strict=True))
+    cells = zip(*(line.split(",")[1:] for line in lines[1 : len(rows) + 1]), strict=True)
+    columns = {
+        name: _in_its_type(text, column)
+        for name, text, column in zip(names[1:], cells, values[1:], strict=True)
+    }
     return Block(STAMP.sub("", path.stem), time_ns, columns)
+
+
+def _in_its_type(cells: tuple[str, ...], values: Array) -> NDArray[Any]:
+    """A column as the firmware has it: integers are written without a point."""
+    whole = all(WHOLE.fullmatch(cell) for cell in cells)
+    if whole and np.abs(values).max() < 2**31:
+        return values.astype(np.int32)
+    return values
 
 
 def _of_one_clock(blocks: list[Block]) -> list[Block]:

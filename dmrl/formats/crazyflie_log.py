@@ -3,14 +3,17 @@
 Every block is kept as it was logged, on ``/<robot>/log/<block>``. What is known of it comes
 besides, on dmrl's own topics:
 
-* attitude, from ``stateEstimate.q*``, ``stateEstimate`` or ``stabilizer`` ``.roll .pitch
-  .yaw`` (degrees, pitch positive nose up: turned round here), or ``stateEstimateZ.quat``;
+* attitude, from ``stateEstimate.q*``, ``stateEstimateZ.quat``, or ``stateEstimate``, else
+  ``stabilizer`` ``.roll .pitch .yaw`` (degrees, pitch positive nose up: turned round here);
 * its turning rate about the vertical, from ``gyro.*`` (degrees a second, body axes);
-* velocity, from ``stateEstimate.v*``: in the frame of take-off, turned by -yaw;
+* velocity, from ``stateEstimate.v*``: in the frame of take-off, turned by -yaw, for which
+  roll and pitch need not be logged;
 * height, from ``stateEstimate.z``, else ``range.zrange`` (millimetres along the body's z);
-* ranges, from ``ranging.distanceN`` (metres as a float, millimetres as an integer) and the
-  event ``estDistance``;
+* ranges, from ``ranging.distanceN`` (metres as a float, millimetres as an integer, or as
+  whole numbers that metres cannot be) and the event ``estDistance``;
 * pose and true pose, from ``stateEstimate`` and ``locSrv`` (motion capture).
+
+Attitude or velocity that cannot be had of a log is said in one line, with what it lacks.
 """
 
 import re
@@ -18,16 +21,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.formats.log_block import (
-    Block,
-    Series,
-    euler_zyx,
-    quaternion_zyx,
-    series,
-    unpacked_quaternion,
+from dmrl.formats.crazyflie_state import (
+    ANGLES,
+    angle_of,
+    attitude_of,
+    quaternions_of,
+    scaled,
+    turn_of,
+    yaw_rate_of,
 )
+from dmrl.formats.log_block import Block, Series, euler_zyx, series
 from dmrl.geometry.frames import Array
 from dmrl.messages import LogType
 from dmrl.samples import flight
@@ -93,59 +99,6 @@ def as_logged(robot: str, block: Block) -> Stream:
         yield Sample(moment, topic, kind, dict(zip(kind.fields, row, strict=True)))
 
 
-def attitude_of(blocks: Sequence[Block]) -> Series | None:
-    """Roll, pitch, yaw of Rz Ry Rx, radians, (N, 3), yaw unwrapped; None: not logged."""
-    turned = _quaternions(blocks)
-    if turned is not None:
-        angles = euler_zyx(turned.values)
-        return Series(turned.time_ns, _unwrapped(angles))
-    for group in ("stateEstimate", "stabilizer"):
-        logged = series(blocks, [f"{group}.{name}" for name in ("roll", "pitch", "yaw")])
-        if logged is not None:
-            angles = np.radians(logged.values) * (1.0, -1.0, 1.0)
-            return Series(logged.time_ns, _unwrapped(angles))
-    return None
-
-
-def _unwrapped(angles: Array) -> Array:
-    return np.column_stack([angles[:, :2], np.unwrap(angles[:, 2])])
-
-
-def _quaternions(blocks: Sequence[Block], group: str = "stateEstimate") -> Series | None:
-    """(N, 4) unit quaternions x, y, z, w; rows before the estimator has started are left out."""
-    logged = series(blocks, [f"{group}.{name}" for name in ("qx", "qy", "qz", "qw")])
-    packed = series(blocks, ["stateEstimateZ.quat"]) if group == "stateEstimate" else None
-    if logged is None and packed is not None:
-        logged = Series(packed.time_ns, unpacked_quaternion(packed.values[:, 0].astype(np.int64)))
-    if logged is None:
-        return None
-    norm = np.linalg.norm(logged.values, axis=1)
-    good = np.abs(norm - 1) < 0.1
-    if not good.any():
-        return None
-    return Series(logged.time_ns[good], logged.values[good] / norm[good, None])
-
-
-def yaw_rate_of(blocks: Sequence[Block], attitude: Series) -> Array:
-    """(N,) turning rate about the vertical at the times of the attitude, radians a second.
-
-    From the gyroscope: (q sin(roll) + r cos(roll)) / cos(pitch), or r alone where q was not
-    logged; without a gyroscope, the slope of the yaw.
-    """
-    roll, pitch, yaw = attitude.values.T
-    both = series(blocks, ["gyro.y", "gyro.z"])
-    if both is not None:
-        q, r = np.radians(both.at(attitude.time_ns)).T
-        return np.asarray((q * np.sin(roll) + r * np.cos(roll)) / np.cos(pitch))
-    for name, unit in (("gyro.z", np.pi / 180), ("stateEstimateZ.rateYaw", 1e-3)):
-        alone = series(blocks, [name])
-        if alone is not None:
-            return np.asarray(alone.at(attitude.time_ns)[:, 0] * unit)
-    time_s = (attitude.time_ns - attitude.time_ns[0]) * 1e-9
-    usable = len(yaw) > 1 and (np.diff(time_s) > 0).all()
-    return np.asarray(np.gradient(yaw, time_s) if usable else 0 * yaw)
-
-
 def _attitude(robot: str, attitude: Series, yaw_rate: Array) -> Stream:
     names = ("roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_radps")
     rows = np.column_stack([attitude.values, yaw_rate])
@@ -157,32 +110,42 @@ def _samples(topic: str, message: str, time_ns: Times, names: Sequence[str], row
         yield Sample(moment, topic, message, dict(zip(names, row, strict=True)))
 
 
-def _scaled(blocks: Sequence[Block], names: str) -> Series | None:
-    """State in metres: from stateEstimate, else from stateEstimateZ, in millimetres."""
-    plain = series(blocks, [f"stateEstimate.{name}" for name in names.split()])
-    if plain is not None:
-        return plain
-    packed = series(blocks, [f"stateEstimateZ.{name}" for name in names.split()])
-    return None if packed is None else Series(packed.time_ns, packed.values * 1e-3)
-
-
 def _motion(
     robot: str, blocks: Sequence[Block], attitude: Series | None, where: object
 ) -> Iterator[Stream]:
-    velocity = _scaled(blocks, "vx vy vz") or _scaled(blocks, "vx vy")
-    if velocity is not None and attitude is None:
-        say(f"{where}: velocity, but no yaw to turn it by; on {topics.log(robot, '*')} only")
-    elif velocity is not None and attitude is not None:
-        yaw = attitude.at(velocity.time_ns)[:, 2]
+    velocity = scaled(blocks, "vx vy vz") or scaled(blocks, "vx vy")
+    yaw = angle_of(blocks, "yaw") if attitude is None else attitude.part(2)
+    _say_what_lacks(robot, blocks, attitude, velocity, where)
+    if velocity is not None and yaw is not None:
+        turned = yaw.at(velocity.time_ns)[:, 0]
         x, y, *z = velocity.values.T
-        c, s = np.cos(yaw), np.sin(yaw)
+        c, s = np.cos(turned), np.sin(turned)
         rows = np.stack([c * x + s * y, c * y - s * x, *z], axis=1)
         names = ("vx_mps", "vy_mps", "vz_mps")[: rows.shape[1]]
         yield _samples(topics.velocity(robot), "Velocity", velocity.time_ns, names, rows)
-    height = _scaled(blocks, "z") or _flown_over(blocks, attitude)
+    height = scaled(blocks, "z") or _flown_over(blocks, attitude)
     if height is not None:
         names = ("height_m",)
         yield _samples(topics.height(robot), "Height", height.time_ns, names, height.values)
+
+
+def _say_what_lacks(
+    robot: str,
+    blocks: Sequence[Block],
+    attitude: Series | None,
+    velocity: Series | None,
+    where: object,
+) -> None:
+    lacking = [name for name in ANGLES if attitude is None and angle_of(blocks, name) is None]
+    reasons = []
+    if lacking:
+        reasons.append(f"no attitude: no usable stateEstimate {', '.join(lacking)}")
+    if velocity is None:
+        reasons.append("no velocity: no usable stateEstimate vx, vy")
+    elif "yaw" in lacking:
+        reasons.append("no velocity: no yaw to turn vx, vy by")
+    if reasons:
+        say(f"{where}: {'; '.join(reasons)}. What was logged is on {topics.log(robot, '*')}")
 
 
 def _flown_over(blocks: Sequence[Block], attitude: Series | None) -> Series | None:
@@ -201,7 +164,7 @@ def ranges_of(
     robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object
 ) -> Iterator[Stream]:
     """UWB distances. A logged value that did not change is the same measurement still."""
-    for number, time_ns, range_m in _distances(blocks):
+    for number, time_ns, range_m in _distances(blocks, where):
         peer = names.get(str(number), f"cf{number}")
         usable = np.isfinite(range_m) & (range_m > 0) & (range_m < RANGE_MAX_M)
         if refused := int((np.isfinite(range_m) & (range_m != 0) & ~usable).sum()):
@@ -211,15 +174,15 @@ def ranges_of(
         yield flight.ranges(robot, peer, time_ns[usable], range_m[usable])
 
 
-def _distances(blocks: Sequence[Block]) -> Iterator[tuple[int, Times, Array]]:
+def _distances(blocks: Sequence[Block], where: object) -> Iterator[tuple[int, Times, Array]]:
     """(number of the peer, times, metres) of each peer."""
     for block in blocks:
         for name, values in block.columns.items():
             match = DISTANCE.fullmatch(name)
             if match:
                 fresh = np.concatenate([[True], values[1:] != values[:-1]])
-                unit = 1.0 if values.dtype.kind == "f" else 1e-3
-                yield int(match[1]), block.time_ns[fresh], values[fresh].astype(float) * unit
+                metres = values[fresh] * _metres_per_unit(values, f"{where}: {name}")
+                yield int(match[1]), block.time_ns[fresh], metres
         if block.name == "estDistance" and {"id", "distance"} <= block.columns.keys():
             numbers, metres = block.columns["id"], block.columns["distance"].astype(float)
             for number in np.unique(numbers).tolist():
@@ -227,9 +190,22 @@ def _distances(blocks: Sequence[Block]) -> Iterator[tuple[int, Times, Array]]:
                 yield int(number), block.time_ns[mine], metres[mine]
 
 
+def _metres_per_unit(values: NDArray[Any], what: str) -> float:
+    """By the type of a logged distance; a tool in between may have made floats of integers."""
+    told = values[np.isfinite(values) & (values > 0)].astype(float)
+    if values.dtype.kind != "f":
+        if told.size and told.max() < RANGE_MAX_M:
+            say(f"{what} is taken for mm, but is {told.max():.0f} at most. Are they metres?")
+        return 1e-3
+    if told.size and told.min() > RANGE_MAX_M and (told % 1 == 0).all():
+        say(f"{what} holds whole numbers from {told.min():.0f} on: taken for millimetres")
+        return 1e-3
+    return 1.0
+
+
 def _poses(robot: str, blocks: Sequence[Block]) -> Iterator[Stream]:
-    estimated = _pose(_scaled(blocks, "x y z"), _quaternions(blocks) or _from_angles(blocks))
-    true = _pose(series(blocks, [f"locSrv.{n}" for n in "xyz"]), _quaternions(blocks, "locSrv"))
+    estimated = _pose(scaled(blocks, "x y z"), turn_of(blocks))
+    true = _pose(series(blocks, [f"locSrv.{n}" for n in "xyz"]), quaternions_of(blocks, "locSrv"))
     if estimated is not None:
         yield _pose_samples(topics.pose(robot), *estimated)
     if true is not None:
@@ -241,13 +217,6 @@ def _poses(robot: str, blocks: Sequence[Block]) -> Iterator[Stream]:
         yield _pose_samples(topics.true_pose(robot), *true)
     if (placed := true or estimated) is not None:
         yield _transforms(robot, *placed)
-
-
-def _from_angles(blocks: Sequence[Block]) -> Series | None:
-    attitude = attitude_of(blocks)
-    if attitude is None:
-        return None
-    return Series(attitude.time_ns, quaternion_zyx(attitude.values))
 
 
 def _pose(place: Series | None, turn: Series | None) -> tuple[Times, Array] | None:

@@ -37,6 +37,10 @@ class Series:
     time_ns: Times
     values: Array
 
+    def part(self, column: int) -> "Series":
+        """One of the values, (N, 1)."""
+        return Series(self.time_ns, self.values[:, [column]])
+
     def at(self, time_ns: Times) -> Array:
         """(M, C) values at other times, linear between, held before and after."""
         return np.stack([np.interp(time_ns, self.time_ns, v) for v in self.values.T], axis=1)

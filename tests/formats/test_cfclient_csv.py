@@ -105,3 +105,43 @@ def test_what_is_no_log_is_one_line(tmp_path: Path, text: str, message: str) -> 
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(SourceError, match=message):
         samples(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        (("1500", "0", "2500"), ""),
+        (("1500.0", "0.0", "2500.0"), "whole numbers from 1500 on: taken for millimetres"),
+        (("1.5", "0.0", "2.5"), ""),
+    ],
+)
+def test_integers_are_millimetres(
+    cells: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [f"{1000 + 20 * k},{cell}" for k, cell in enumerate(cells)]
+    path = tmp_path / "range-20221011T10-33-32.csv"
+    path.write_text("\n".join(["Timestamp,ranging.distance2", *rows]) + "\n")
+    got = samples(path)["/cf1/range/cf2"]
+    assert [s.fields["range_m"] for s in got] == [1.5, 2.5]
+    err = capsys.readouterr().err
+    assert said in err and "left out" not in err
+
+
+def test_integers_that_are_no_millimetres_are_doubted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "range-20221011T10-33-32.csv"
+    path.write_text("Timestamp,ranging.distance2\n1000,2\n1020,3\n")
+    samples(path)
+    assert "3 at most. Are they metres?" in capsys.readouterr().err
+
+
+def test_attitude_is_put_together_from_several_blocks(tmp_path: Path) -> None:
+    """Roll, pitch and yaw need not be of one block; yaw goes over 180 degrees between rows."""
+    (tmp_path / "tilt.csv").write_text(
+        "Timestamp,stateEstimate.roll,stateEstimate.pitch\n1000,10.5,20.5\n1020,10.5,20.5\n"
+    )
+    (tmp_path / "yaw.csv").write_text("Timestamp,stateEstimate.yaw\n990,179.5\n1010,-179.5\n")
+    first = samples(tmp_path)["/cf1/attitude"][0].fields
+    assert (first["roll_rad"], first["pitch_rad"]) == pytest.approx(np.radians((10.5, -20.5)))
+    assert first["yaw_rad"] == pytest.approx(np.pi)

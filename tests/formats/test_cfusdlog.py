@@ -299,3 +299,54 @@ def test_impossible_ranges_are_left_out_and_said(
     got = [(s.time_ns, s.fields["range_m"]) for s in samples(path)["/cf1/range/cf2"]]
     assert got == [(1_000_000, 1.5), (4_000_000, 2.0)]  # what did not change is not new
     assert "1 ranges to cf2 left out" in capsys.readouterr().err
+
+
+def _log_of(path: Path, variables: tuple[str, ...], *rows: tuple[float, ...]) -> Path:
+    events = {1: ("state", [(name, "f") for name in variables])}
+    path.write_bytes(plain_usd.encode(events, [(1, 1000 * k, row) for k, row in enumerate(rows)]))
+    return path
+
+
+def test_velocity_needs_yaw_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("stateEstimate.vx", "stateEstimate.vy", "stateEstimate.roll", "stateEstimate.yaw")
+    log = _log_of(tmp_path / "log", names, (1.0, 0.0, 5.0, 90.0), (1.0, 0.0, 5.0, 90.0))
+    found = samples(log)
+    fields = found["/cf1/velocity"][0].fields
+    assert (fields["vx_mps"], fields["vy_mps"]) == pytest.approx((0, -1), abs=1e-9)
+    assert "/cf1/attitude" not in found
+    assert "no attitude: no usable stateEstimate pitch." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("variables", "reasons"),
+    [
+        (("gyro.x",), ("roll, pitch, yaw", "no velocity: no usable stateEstimate vx, vy")),
+        (("stateEstimate.vx", "stateEstimate.vy"), ("roll, pitch, yaw", "no yaw to turn")),
+        (("stateEstimate.yaw",), ("stateEstimate roll, pitch;", "no usable stateEstimate vx")),
+    ],
+)
+def test_why_a_log_has_no_attitude_or_velocity_is_said(
+    variables: tuple[str, ...],
+    reasons: tuple[str, ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = samples(_log_of(tmp_path / "log", variables, (0.5,) * len(variables)))
+    assert not {"/cf1/attitude", "/cf1/velocity"} & found.keys()
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and all(reason in err for reason in reasons)
+
+
+def test_real_logs_without_pitch_keep_their_velocity(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = samples(data / "crazypad" / "motor-E8_log00")
+    velocity = found["/cf1/velocity"]
+    assert len(velocity) == 2601
+    # Of a robot that looks along x all the time, it is the slope of where it was.
+    seconds = np.array([s.time_ns for s in velocity]) * 1e-9
+    vx = np.array([s.fields["vx_mps"] for s in velocity])
+    x = np.array([s.fields["pose"]["position"]["x"] for s in found["/cf1/pose"]])
+    flown = np.concatenate([[0], np.cumsum(np.diff(seconds) * (vx[1:] + vx[:-1]) / 2)])
+    assert np.ptp(x) > 2 and np.abs(flown - (x - x[0])).max() < 0.25
+    assert "no attitude: no usable stateEstimate pitch." in capsys.readouterr().err
