@@ -63,8 +63,8 @@ def content(source: Path, options: Options) -> Content:
         raise SourceError(f"{source} holds no whole picture of a CPX stream. Name another file")
     if reader.broken or reader.skipped_bytes:
         say(
-            f"{source}: {reader.broken} pictures are broken and {reader.skipped_bytes} bytes "
-            "belong to nothing; left out"
+            f"{source}: {reader.broken} pictures are broken or cut short and "
+            f"{reader.skipped_bytes} bytes belong to nothing; left out"
         )
     time_ns = _times_ns(times, options.rate_hz)
     pictures = _pictures(source, time_ns, options)
@@ -76,6 +76,7 @@ def _images(source: Path, reader: ImageReader) -> Iterator[Image]:
     with source.open("rb") as stream:
         while data := stream.read(PIECE_BYTES):
             yield from reader.feed(data)
+    reader.finish()
 
 
 def _times_ns(times_us: Sequence[int | None], rate_hz: float) -> list[int]:

@@ -106,6 +106,12 @@ class ImageReader:
             if image is not None:
                 yield image
 
+    def finish(self) -> None:
+        """Nothing more comes: an image that was begun counts as broken."""
+        amid = self._packets.finish()
+        self.broken += amid or self._begun is not None
+        self._begun = None
+
     def take(self, packet: Packet) -> Image | None:
         """The image that a packet completes, if it does."""
         if packet.function == APP:

@@ -56,6 +56,13 @@ class PacketReader:
                 yield packet
         del self._buffer[:at]
 
+    def finish(self) -> bool:
+        """Nothing more comes: whether it ends amid a packet. What is left counts as skipped."""
+        left = len(self._buffer)
+        self._buffer.clear()
+        self.skipped_bytes += left
+        return left > 0
+
     def _step(self, at: int) -> tuple[int, Packet | None] | None:
         """Where to go on, with a packet if there is one at ``at``; None: more bytes wanted."""
         size = self._size(at)

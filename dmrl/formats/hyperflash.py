@@ -42,7 +42,7 @@ def recognises(source: Path) -> bool:
     return aideck.is_plausible(values) and any(values) and not rest
 
 
-def records(stream: BinaryIO, what: object) -> Iterator[np.void]:
+def records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
     """Whole records up to the end marker or the end; says what is left out.
 
     Parameters
@@ -50,13 +50,13 @@ def records(stream: BinaryIO, what: object) -> Iterator[np.void]:
     stream
         The dump.
     what
-        Its name, for the line on stderr.
+        Its name, for the line on stderr; None: there is no such line.
     """
     while len(data := stream.read(RECORD.itemsize)) == RECORD.itemsize:
         if data == ERASED:
             return
         yield np.frombuffer(data, RECORD)[0]
-    if data.strip(b"\xff"):
+    if what is not None and data.strip(b"\xff"):
         say(f"{what}: its last {len(data)} bytes are no whole record; left out")
 
 
@@ -74,17 +74,22 @@ def content(source: Path, options: Options) -> Content:
     Raises
     ------
     SourceError
-        If there is no whole record before the end marker.
+        If there is no whole record before the end marker, or most of them are no records.
     MissingExtra
         If OpenCV is not installed.
     """
     if not source.is_file():
         raise SourceError(f"{source} is no file. Name the dump of a flash")
     with source.open("rb") as stream:
-        first = next(records(stream, source), None)
-    if first is None:
+        plausible = [aideck.is_plausible(r["values"].tolist()) for r in records(stream)]
+    if not plausible:
         raise SourceError(f"{source} holds no record of {RECORD.itemsize} bytes. Name another dump")
-    rgb_of(first["raw"])  # a missing extra is said before anything is written
+    if 2 * sum(plausible) <= len(plausible):
+        raise SourceError(
+            f"{source}: {len(plausible) - sum(plausible)} of {len(plausible)} records have numbers "
+            "that no drone has, so it is no such dump, or its bytes are shifted. Name another"
+        )
+    rgb_of(np.zeros((4, 4), np.uint8))  # a missing extra is said before anything is written
     return Content(_samples(source, options), source.stat().st_size // RECORD.itemsize)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats import aideck_stream
-from dmrl.formats.cpx import Image
+from dmrl.formats.cpx import Image, Layout
 from dmrl.formats.cpx_pack import pack_image
 from dmrl.formats.cpx_state import State
 from dmrl.formats.format import Options
@@ -72,3 +72,23 @@ def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="holds no whole picture of a CPX stream"):
         samples(tmp_path / "a.cpx", b"\0" * 1000)
     assert not aideck_stream.recognises(tmp_path / "a.cpx")
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
+@pytest.mark.parametrize("layout", ["plain", "streamer"])
+def test_a_stream_that_was_cut_says_so(
+    layout: Layout, share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = [
+        Image(32, 24, "raw", raw.tobytes(), 1_000_000 + 50_000 * k, k)
+        for k, raw in enumerate(foreign.pictures(3))
+    ]
+    whole = b"".join(pack_image(image, layout) for image in images)
+    path = tmp_path / "flight.cpx"
+    path.write_bytes(whole[: int(len(whole) * share)])
+    found = aideck_stream.content(path, Options()).samples
+    assert len([s for s in found if s.message == "CompressedImage"]) == int(3 * share)
+    assert "1 pictures are broken or cut short" in capsys.readouterr().err
+    path.write_bytes(whole)
+    list(aideck_stream.content(path, Options()).samples)
+    assert not capsys.readouterr().err

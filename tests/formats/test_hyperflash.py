@@ -125,6 +125,14 @@ def test_it_is_known_by_its_numbers(dump: Path) -> None:
     assert not hyperflash.recognises(dump)
 
 
+def test_bytes_of_something_else_are_refused(dump: Path) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, 2 * 71_704, np.uint8).tobytes()
+    for other in (noise, b"?" + dump.read_bytes()):
+        (path := dump.with_name("other.bin")).write_bytes(other)
+        with pytest.raises(SourceError, match=r"other\.bin: \d of \d records have numbers that no"):
+            hyperflash.content(path, Options())
+
+
 def test_real_frames_are_behind_the_filters_that_are_assumed(data: Path) -> None:
     for number in ("00216", "00375", "00495"):
         rgb = decode((data / "aideck-frames" / f"img{number}.ppm").read_bytes())
