@@ -26,7 +26,7 @@ from types import FrameType
 
 from dmrl import output
 from dmrl.errors import DmrlError
-from dmrl.names import one_line
+from dmrl.names import one_line, without_middle
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
@@ -102,7 +102,7 @@ def _guarded(work: Callable[[], object]) -> int:
 
 def _end(text: str, status: int = 1) -> int:
     with suppress(OSError):
-        sys.stderr.write(f"dmrl: {one_line(text)}\n")
+        sys.stderr.write(f"dmrl: {without_middle(one_line(text))}\n")
     return status
 
 

@@ -5,12 +5,13 @@ act on become one line and exit status 1.
 """
 
 from difflib import get_close_matches
-from typing import NoReturn
+from typing import NoReturn, get_origin
 
-from cyclopts import App, CycloptsError, UnknownCommandError
+from cyclopts import App, CoercionError, CycloptsError, UnknownCommandError
 from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
+from dmrl.names import without_middle
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
@@ -46,8 +47,11 @@ COMMANDS = {
 
 def bad_command_line(error: CycloptsError) -> Text:
     """What is printed for a command line that cannot be understood."""
+    if isinstance(error, CoercionError) and get_origin(error.target_type) is dict and error.token:
+        flag, value = error.token.keyword, error.token.value
+        return Text(f"dmrl: {flag} {value} does not say of what. Try: {flag}.cf1 {value}")
     if not isinstance(error, UnknownCommandError) or not error.unused_tokens:
-        return Text(f"dmrl: {error}")
+        return Text(f"dmrl: {without_middle(str(error))}")
     # The error's own text would load every command, and fail where an extra is missing.
     word = error.unused_tokens[0]
     near = get_close_matches(word, [*COMMANDS, *plugins.found(plugins.STAGES)], n=1)

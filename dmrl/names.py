@@ -14,6 +14,9 @@ from dmrl.errors import UnsafeName
 MOST_BYTES = 200
 """Of a name: with ``-00000-of-00001.parquet`` it still fits a file system's 255."""
 
+LINE_MAX = 480
+"""Of an error: a few lines of a terminal."""
+
 _PLAIN = re.compile(r"[^A-Za-z0-9 ._,:+()=-]")
 _ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -118,3 +121,13 @@ def _shown(character: str) -> str:
 def shortened(text: str) -> str:
     """The text, cut where it is longer than any honest name."""
     return text if len(text) <= MOST_BYTES else f"{text[:MOST_BYTES]}..."
+
+
+def without_middle(line: str) -> str:
+    """A line that a person reads: of a very long one the middle is left out.
+
+    The file at fault stands at its beginning, the way out at its end.
+    """
+    if len(line) <= LINE_MAX:
+        return line
+    return f"{line[: LINE_MAX // 2]} ... {line[-LINE_MAX // 2 :]}"

@@ -16,6 +16,7 @@ from rich.console import Console
 from dmrl import __version__, cli
 from dmrl.cli import COMMANDS, app
 from dmrl.errors import DmrlError
+from dmrl.names import without_middle
 
 HEAVY = {
     *("bpy", "datasets", "h5py", "matplotlib", "mcap", "numpy", "pandas", "PIL", "pyarrow"),
@@ -153,6 +154,22 @@ def test_a_known_error_is_one_line_on_stderr_with_status_1(tmp_path: Path) -> No
     assert done.stderr.startswith("dmrl: ")
     assert "absent.mcap" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_flag_that_wants_a_robot_says_so(tmp_path: Path) -> None:
+    done = dmrl("label", str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"), "--camera", "my.toml")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "dmrl: --camera my.toml does not say of what. Try: --camera.cf1 my.toml\n"
+    )
+
+
+def test_a_line_that_is_far_too_long_keeps_its_file_and_its_way_out() -> None:
+    line = f"flight.mcap has {'far ' * 500}too much. Try: dmrl trim"
+    short = without_middle(line)
+    assert len(short) < 500
+    assert short.startswith("flight.mcap has") and short.endswith("Try: dmrl trim")
+    assert without_middle("short") == "short"
 
 
 def _end_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dmrl.card import sections
 from dmrl.card.counts import Counts, count
-from dmrl.card.front import front_matter, read_front
+from dmrl.card.front import check_license, front_matter, read_front
 from dmrl.dataset import Split, open_dataset
 from dmrl.documents import parse_json
 from dmrl.errors import DatasetError, MissingExtra
@@ -52,7 +52,11 @@ def write_card(
     ------
     DatasetError
         If the folder is not a dataset, lacks a shard, or its provenance.
+    SettingError
+        If the licence is not known.
     """
+    if license_id is not None:
+        check_license(license_id)
     dataset = open_dataset(folder)
     splits = {name: dataset.split(name) for name in dataset.splits}
     made = _provenance(folder)

@@ -6,9 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
 from dmrl.dataset import Split, layout
 from dmrl.documents import parse_json
+from dmrl.errors import SettingError
+
+HUB_LICENSES = ("unknown", "other", "odc-by", "odbl", "pddl", "c-uda")
+"""Words of the Hub's for licences of data that are no SPDX identifiers."""
 
 SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
 
@@ -28,6 +33,30 @@ def _scalar(text: str) -> str:
         return str(parse_json(text))
     except ValueError:
         return text
+
+
+def check_license(text: str) -> None:
+    """Nothing, if a licence is one that others know.
+
+    Parameters
+    ----------
+    text
+        An SPDX expression in any case, or a word of `HUB_LICENSES`.
+
+    Raises
+    ------
+    SettingError
+        If it is neither.
+    """
+    if text.lower() in HUB_LICENSES:
+        return
+    try:
+        canonicalize_license_expression(text)
+    except InvalidLicenseExpression:
+        raise SettingError(
+            f"--license {text}: no licence that SPDX or the Hugging Face Hub know. Try: "
+            "cc-by-4.0, cc0-1.0, mit, other"
+        ) from None
 
 
 def front_matter(

@@ -51,10 +51,11 @@ OTHERS = tuple(
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """One CSV file: its path and its columns, (N,) each, NaN where a cell is empty."""
+    """One CSV file: its path, columns, (N,) each, NaN where a cell is empty, and line of a row."""
 
     path: Path
     columns: dict[str, Array]
+    lines: list[int]
 
     @property
     def robot(self) -> str:
@@ -140,10 +141,12 @@ def read_log(path: Path) -> Log:
     with path.open(newline="", encoding="utf-8-sig") as stream:
         reader = csv.reader(stream)
         next(reader)
-        rows = [_numbers(path, reader.line_num, row, len(names)) for row in reader if row]
+        rows = [(reader.line_num, row) for row in reader if row]
+    lines = [line for line, _ in rows]
+    values = [_numbers(path, line, row, len(names)) for line, row in rows]
     if len(rows) < 2:
         raise SourceError(f"{path} has fewer than two rows. Give it a flight, or remove it")
-    log = Log(path, dict(zip(names, np.array(rows).T, strict=True)))
+    log = Log(path, dict(zip(names, np.array(values).T, strict=True)), lines)
     _check(log)
     return log
 
@@ -161,14 +164,13 @@ def _check(log: Log) -> None:
     for name in REQUIRED:
         if (bad := np.flatnonzero(~np.isfinite(log.columns[name]))).size:
             raise SourceError(
-                f"{log.path}: {name} is no number in row {bad[0] + 1} of the data. Fill it, or "
-                "drop the row"
+                f"{log.path}:{log.lines[bad[0]]}: {name} is no number. Fill it, or drop the line"
             )
     steps = np.diff(log.time_s)
     if (back := np.flatnonzero(steps <= 0)).size:
         raise SourceError(
-            f"{log.path}: time goes back or stands still at row {back[0] + 2} of the data "
-            f"({log.time_s[back[0] + 1]:.6f} s after {log.time_s[back[0]]:.6f} s). Sort the rows"
+            f"{log.path}:{log.lines[back[0] + 1]}: time goes back or stands still "
+            f"({log.time_s[back[0] + 1]:.6f} s after {log.time_s[back[0]]:.6f} s). Sort the lines"
         )
     if log.time_s[0] < 0:
         raise SourceError(f"{log.path} begins before time 0. Add a constant to time_s everywhere")

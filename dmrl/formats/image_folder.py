@@ -32,6 +32,7 @@ from dmrl.geometry.camera_file import read_camera
 from dmrl.images import codec
 from dmrl.images.bayer import rgb_of
 from dmrl.samples.sample import Sample, calibration, image, intervals, labels
+from dmrl.terminal.progress import say
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
 LABELS = "labels.csv"
@@ -78,6 +79,8 @@ def content(source: Path, options: Options) -> Content:
     rows = read_labels(path, known) if options.labels or path.is_file() else {}
     splits = {name: found[0].split for name, found in rows.items()}
     states = _aideck_labels(source / AIDECK_LABELS, known)
+    if states.keys() - rows.keys() and options.camera is None:
+        say(f"{source / AIDECK_LABELS} gives no labels without a camera. Try: --camera aideck")
     return Content(
         samples=_samples(pictures, rows, states, options),
         total=len(pictures) + len(rows) + (options.camera is not None),

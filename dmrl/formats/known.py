@@ -78,6 +78,8 @@ def format_of(source: Path, name: str | None = None) -> Format:
         return FORMATS[name]
     if source.is_file() and source.stat().st_size == 0:
         raise SourceError(f"{source} is empty, 0 bytes. Name another file")
+    if source.is_dir() and not any(source.iterdir()):
+        raise SourceError(f"{source} is an empty folder. Name one with files in it")
     if guess := _guess(source, added.values()):
         return guess
     if source.suffix == ".mcap":

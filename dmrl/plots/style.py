@@ -1,14 +1,38 @@
 """How every figure looks, and how it is written. The only home of matplotlib."""
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from dmrl.errors import MissingExtra
 
+
+@contextmanager
+def _any_backend() -> Iterator[None]:
+    """Import matplotlib whatever the environment's MPLBACKEND is.
+
+    Figures go to files here and need no backend, while matplotlib refuses to be imported where
+    the one that is named is not installed: every notebook's shell names its own.
+    """
+    wanted = None if "matplotlib" in sys.modules else os.environ.pop("MPLBACKEND", None)
+    try:
+        yield
+    finally:
+        if wanted is not None:
+            os.environ["MPLBACKEND"] = wanted
+    if wanted is not None:
+        with suppress(ValueError):
+            mpl.rcParams["backend"] = wanted  # what a notebook plots after this, is shown
+
+
 try:
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
+    with _any_backend():
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import MaxNLocator
 except ImportError as e:
     raise MissingExtra("matplotlib", "plot", "a figure") from e
 

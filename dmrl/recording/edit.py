@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dmrl.errors import RecordingError
 from dmrl.recording.extras import copy_extras
-from dmrl.recording.index import summary
+from dmrl.recording.index import Summary, summary
 from dmrl.recording.inputs import provenance, refuse_twice
 from dmrl.recording.reader import matching, read_raw, read_table
 from dmrl.recording.writer import RecordingWriter
@@ -19,8 +19,8 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     """Write one recording with the messages of several, by log time; how many.
 
     Messages are copied bit for bit; of equal times, those of the first recording come
-    first. Metadata and attachments of all are kept. Two that have a robot's sensor at the same
-    time are mixed with a word.
+    first. Metadata and attachments of all are kept. Two that have the same robot's sensor are
+    mixed with a word.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     """
     refuse_twice(paths)
     for one, other in combinations(paths, 2):
-        _warn_of_overlap(one, other)
+        _warn_of_namesakes(one, other)
     count = 0
     with RecordingWriter(out, provenance("merge", inputs=paths)) as sink:
         for path in paths:
@@ -43,10 +43,13 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     return count
 
 
-def _warn_of_overlap(one: Path, other: Path) -> None:
-    """Say so if two recordings are of other flights by the same robots: their messages mix."""
-    first, second = summary(one).topics, summary(other).topics
-    for topic in sorted(set(first) & set(second)):
+def _warn_of_namesakes(one: Path, other: Path) -> None:
+    """Say so if two recordings have a sensor of one robot: they may be of other flights or robots.
+
+    Parts of one recording, one after the other, go together again without a word.
+    """
+    first, second = summary(one), summary(other)
+    for topic in sorted(set(first.topics) & set(second.topics)):
         row = row_of(topic)
         if row is None or not row.sensor:
             continue
@@ -58,6 +61,18 @@ def _warn_of_overlap(one: Path, other: Path) -> None:
                 "recordings"
             )
             return
+        if not _sources(first) & _sources(second):
+            say(
+                f"{one} and {other} both have {topic}, one after the other, and are one robot now. "
+                "If they are two robots, or two flights, give the robots names of their own: "
+                "dmrl convert --robot"
+            )
+            return
+
+
+def _sources(held: Summary) -> set[str]:
+    """SHA-256 of all that a recording was made from."""
+    return {source.sha256 for _, source in held.provenance.ancestry()} if held.provenance else set()
 
 
 def _span(path: Path, topic: str) -> tuple[int, int]:

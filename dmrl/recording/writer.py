@@ -10,7 +10,7 @@ from typing import Any, Self
 from google.protobuf.descriptor import Descriptor
 from mcap.writer import CompressionType, Writer
 
-from dmrl.errors import RecordingError
+from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
 from dmrl.output import as_output_error, partial_file
 from dmrl.recording import sums
@@ -19,6 +19,7 @@ from dmrl.topics import row_of
 
 # 256 KiB costs no size against 1 MiB and bounds what a crash can lose.
 CHUNK_BYTES = 256 * 1024
+SUFFIX = ".mcap"
 RECIPE_NAME = "recipe.toml"
 
 
@@ -100,7 +101,8 @@ class RecordingWriter:
     Raises
     ------
     OutputError
-        If the file exists, its folder does not, or the disk is full.
+        If the file exists, is not called ``.mcap``, its folder does not exist, or the disk is
+        full.
     """
 
     def __init__(
@@ -111,6 +113,8 @@ class RecordingWriter:
         recipe: str | None = None,
         keep_on_error: bool = False,
     ) -> None:
+        if SUFFIX not in path.suffixes:  # a resumed one is out.mcap.kept for a while
+            raise OutputError(f"{path} is no name of a recording. Call it {path.name}{SUFFIX}")
         self._path = path
         self._channels: dict[Channel, int] = {}
         self._known: dict[str, Channel] = {}

@@ -19,7 +19,8 @@ class Settings:
     title
         Name of the dataset. None: as the card has it.
     license
-        License, as the Hugging Face Hub spells it, such as cc-by-4.0. None: as the card has it.
+        License: an SPDX identifier such as cc-by-4.0, or unknown, other. None: as the card has
+        it.
     """
 
     title: str | None = None

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter, validators
 
 from dmrl import topics
-from dmrl.card import write_card
+from dmrl.card import check_license, write_card
 from dmrl.dataset.rows import Tally, count_images, label_source, one_size, rows_of
 from dmrl.dataset.splits import SplitOf, held_out, of_source
 from dmrl.dataset.write import Row, write_dataset
@@ -59,7 +59,8 @@ class Settings:
     title
         Name of the dataset on its card. Empty: made from the recordings' names.
     license
-        License on the card, as the Hugging Face Hub spells it.
+        License on the card: an SPDX identifier such as cc-by-4.0, or a word of the Hugging Face
+        Hub's: unknown, other.
     """
 
     labels: Literal["best", "truth", "estimate", "hand", "published"] = "best"
@@ -101,10 +102,12 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
     RecordingError
         If a recording cannot be read, lacks images or labels, or its images cannot be used.
     SettingError
-        If a recording has no labels from the source asked for, or two share name or content.
+        If a recording has no labels from the source asked for, two share name or content, or
+        nobody knows the license.
     OutputError
         If ``out`` exists.
     """
+    check_license(settings.license)
     with partial_folder(out) as partial:
         total = sum(count_images(path) for path in recordings)
         made = provenance(

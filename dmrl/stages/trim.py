@@ -45,7 +45,7 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
     Raises
     ------
     SettingError
-        If a time is none.
+        If a time is none, or the last is not after the first.
     RecordingError
         If the recording cannot be read, or nothing would be left.
     OutputError
@@ -54,8 +54,10 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
     for flag, value in (("--from", settings.from_s), ("--to", settings.to_s)):
         if value is not None and not math.isfinite(value):
             raise SettingError(f"{flag} {value} is no time. Give seconds from the start")
-    start_ns = summary(recording).start_ns
     first, last = settings.from_s, settings.to_s
+    if first is not None and last is not None and first >= last:
+        raise SettingError(f"--from {first:g} is not before --to {last:g}. Exchange them")
+    start_ns = summary(recording).start_ns
     return trim(
         recording,
         out,

@@ -1,6 +1,9 @@
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +12,7 @@ from PIL import Image
 
 from dmrl import card, plots
 from dmrl.card import write_card
-from dmrl.errors import DatasetError
+from dmrl.errors import DatasetError, SettingError
 from dmrl.stages.card import Settings as CardSettings
 from dmrl.stages.card import run as run_card
 from dmrl.stages.dataset import Settings, run
@@ -136,6 +139,39 @@ def test_title_and_license_can_be_given_and_stay(built: Path) -> None:
     run_card(built, CardSettings())
     front = front_of(built)
     assert (front["pretty_name"], front["license"]) == ('A "new" name', "mit")
+
+
+@pytest.mark.parametrize("license_id", ["cc0-1.0", "Apache-2.0 OR MIT", "odc-by", "other"])
+def test_licences_that_are_known_are_taken(built: Path, license_id: str) -> None:
+    run_card(built, CardSettings(license=license_id))
+    assert front_of(built)["license"] == license_id
+
+
+def test_a_licence_that_nobody_knows_is_refused(
+    built: Path, record: Record, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingError, match=r"--license foo-1: no licence that .* Try: cc-by-4"):
+        run_card(built, CardSettings(license="foo-1"))
+    with pytest.raises(SettingError, match="--license foo-1"):
+        run([record("new.mcap", seed=2)], tmp_path / "new", Settings(license="foo-1"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_backend_of_a_notebook_stops_no_figure(tmp_path: Path) -> None:
+    code = (
+        "import os, sys\nfrom pathlib import Path\nimport numpy as np\nfrom dmrl import plots\n"
+        "plots.depth_histogram({'train': np.ones(3)}, Path(sys.argv[1]))\n"
+        "print(os.environ['MPLBACKEND'])"
+    )
+    inline = "module://matplotlib_inline.backend_inline"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "depth")],
+        env={**os.environ, "MPLBACKEND": inline},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, inline), done.stderr
+    assert (tmp_path / "depth.png").is_file()
 
 
 @pytest.mark.parametrize("options", [{}, {"png": True}, {"parquet": True}])

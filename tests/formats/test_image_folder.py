@@ -223,6 +223,14 @@ def test_a_wrong_line_of_the_firmware_s_text_is_named(folder: Path, line: str, t
         samples(folder, "PeerPosition")
 
 
+def test_the_firmware_s_text_without_a_camera_is_said(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "label.txt").write_text("a.png 1 2 1.0 0.1 0.0 1.0\n")
+    assert not samples(folder, "PeerLabels")
+    assert "label.txt gives no labels without a camera. Try: --camera" in capsys.readouterr().err
+
+
 def test_raw_pictures_get_their_colours(tmp_path: Path) -> None:
     raw = np.random.default_rng(3).integers(0, 256, (24, 32), np.uint8)
     (tmp_path / "a.pgm").write_bytes(b"P5\n32 24\n255\n" + raw.tobytes())

@@ -162,8 +162,29 @@ def test_a_merge_of_two_flights_by_the_same_robots_is_said(
     later = heights(tmp_path / "c.mcap", [20, 30], "train")
     merge([one, other], tmp_path / "mixed.mcap")
     assert "both have /cf1/height at the same time" in capsys.readouterr().err
-    merge([one, later], tmp_path / "good.mcap")
+    merge([one, later], tmp_path / "after.mcap")
+    assert "both have /cf1/height, one after the other" in capsys.readouterr().err
+
+
+def test_parts_of_one_recording_are_merged_again_without_a_word(
+    tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    middle = summary(flight).start_ns + 5
+    trim(flight, tmp_path / "a.mcap", end_ns=middle)
+    trim(flight, tmp_path / "b.mcap", start_ns=middle)
+    merge([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "out.mcap")
     assert capsys.readouterr().err == ""
+
+
+def test_a_stretch_that_ends_before_it_begins_is_refused(tmp_path: Path, flight: Path) -> None:
+    with pytest.raises(SettingError, match="--from 20 is not before --to 10"):
+        stage.run(flight, tmp_path / "b.mcap", stage.Settings(from_s=20, to_s=10))
+
+
+def test_a_recording_is_called_mcap(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"out is no name of a recording\. Call it out\.mcap"):
+        RecordingWriter(tmp_path / "out", Provenance("test"))
+    assert not [*tmp_path.iterdir()]
 
 
 def test_recovering_a_whole_recording_loses_nothing(tmp_path: Path, flight: Path) -> None:

@@ -97,6 +97,12 @@ def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None
     assert calibration.message.distortion_model == "plumb_bob"
 
 
+def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
+    (tmp_path / "new").mkdir()
+    with pytest.raises(SourceError, match=r"new is an empty folder\. Name one with files"):
+        run(tmp_path / "new", tmp_path / "out.mcap", Settings())
+
+
 @pytest.mark.parametrize(
     ("settings", "kind", "message"),
     [
@@ -139,10 +145,12 @@ def test_a_picture_that_breaks_half_way_leaves_nothing(pictures: Path, tmp_path:
 
 
 def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").write_text("hello")
     with pytest.raises(
         SourceError, match=r"looks like no kind .* Say --from: locanet, csv, .*, images"
     ):
-        run(tmp_path, tmp_path / "out.mcap", Settings())
+        run(tmp_path / "notes", tmp_path / "out.mcap", Settings())
     with pytest.raises(SourceError, match="no file or folder"):
         run(tmp_path / "none", tmp_path / "out.mcap", Settings())
     with pytest.raises(SourceError, match="neither a file nor a folder"):
