@@ -11,7 +11,8 @@ from typing import Annotated, Literal
 from cyclopts import Parameter, validators
 
 from dmrl import topics
-from dmrl.card import check_license, write_card
+from dmrl.card import write_card
+from dmrl.card.front import check_license
 from dmrl.dataset.rows import Tally, count_images, label_source, one_size, rows_of
 from dmrl.dataset.splits import SplitOf, held_out, of_source
 from dmrl.dataset.write import Row, write_dataset
