@@ -32,6 +32,8 @@ from dmrl.terminal.tables import print_json, print_table
 METADATA = "dmrl.clocks"
 MOCAP = "mocap"
 """Stands where a robot's name does."""
+ALL = "*"
+"""Stands for all of a recording, where all of it had to be moved."""
 STAMPED = ("CompressedImage", "CameraCalibration", "PoseInFrame")
 
 
@@ -72,7 +74,8 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
     Returns
     -------
     dict
-        By robot, camera (``cf1/camera``) and ``mocap``, how its times were corrected.
+        By robot, camera (``cf1/camera``) and ``mocap``, how its times were corrected; ``*``: by
+        how much all times were moved besides, where one would be before 0.
 
     Raises
     ------
@@ -93,8 +96,33 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
         clocks = _robots(recording, held, settings)
     if settings.cameras:
         clocks |= _cameras(recording, held, clocks, steady)
-    _write(recording, held, out, clocks, steady, settings)
+    later_ns = max(0, -_earliest_ns(recording, held, clocks, steady))
+    if later_ns:
+        say(f"{recording}: all times are moved by {later_ns / 1e9:.9g} s, as one would be before 0")
+        clocks[ALL] = Clock(later_ns * 1e-9, by="no time before 0")
+    _write(recording, held, out, clocks, steady, later_ns, settings)
     return clocks
+
+
+def _earliest_ns(
+    recording: Path,
+    held: Summary,
+    clocks: Mapping[str, Clock],
+    steady: Mapping[str, Mapping[int, int]],
+) -> int:
+    """The first time of all messages, corrected: every robot's own first one counts."""
+    found = []
+    for topic in held.topics:
+        if topic == topics.TRANSFORMS:  # whose they are stands inside
+            raws = list(read_raw(recording, topic))
+            found += [raw.time_ns + _correction_ns(raw, raw.time_ns, clocks, held) for raw in raws]
+            continue
+        times = read_table(recording, topic, fields=())["log_time"].to_numpy()
+        if len(times):
+            first = int(min(steady.get(topic, {}).values(), default=times.min()))
+            clock = _clock_of(topic, topic.split("/")[1] if topic.count("/") > 1 else "", clocks)
+            found.append(first + (_shift_ns(first, clock, held.start_ns) if clock else 0))
+    return min(found, default=0)
 
 
 def _robots(recording: Path, held: Summary, settings: Settings) -> dict[str, Clock]:
@@ -183,14 +211,10 @@ def _write(
     out: Path,
     clocks: dict[str, Clock],
     steady: dict[str, dict[int, int]],
+    later_ns: int,
     settings: Settings,
 ) -> None:
     made = provenance("align", settings, [recording], libraries=("numpy",))
-    # Robots that were switched on earlier would begin before 0: all times move together.
-    starts = [held.start_ns] + [
-        held.start_ns + _shift_ns(held.start_ns, c, held.start_ns) for c in clocks.values()
-    ]
-    later_ns = max(0, -min(starts))
     copied = track(read_raw(recording), "Writing", held.count)
     with RecordingWriter(out, made) as sink:
         copy_extras(held, sink)
@@ -198,8 +222,7 @@ def _write(
         sink.add_metadata(METADATA, told)
         for raw in copied:
             even_ns = steady.get(raw.topic, {}).get(raw.time_ns, raw.time_ns)
-            clock = _clock_of(raw, clocks)
-            shift_ns = later_ns + (_shift_ns(even_ns, clock, held.start_ns) if clock else 0)
+            shift_ns = later_ns + _correction_ns(raw, even_ns, clocks, held)
             sink.write_raw(_at(raw, even_ns + shift_ns, max(raw.publish_ns + shift_ns, 0)))
 
 
@@ -226,12 +249,18 @@ def _shift_ns(time_ns: int, clock: Clock, start_ns: int) -> int:
     return round((clock.offset_s + clock.drift * (elapsed_s - clock.at_s)) * 1e9)
 
 
-def _clock_of(raw: RawMessage, clocks: Mapping[str, Clock]) -> Clock | None:
+def _correction_ns(
+    raw: RawMessage, time_ns: int, clocks: Mapping[str, Clock], held: Summary
+) -> int:
+    clock = _clock_of(raw.topic, _robot(raw), clocks)
+    return _shift_ns(time_ns, clock, held.start_ns) if clock else 0
+
+
+def _clock_of(topic: str, robot: str, clocks: Mapping[str, Clock]) -> Clock | None:
     """What corrects a message's times: its robot's clock, its camera's, or motion capture's."""
-    robot = _robot(raw)
-    if raw.topic.startswith(f"/{robot}/camera/") and f"{robot}/camera" in clocks:
+    if topic.startswith(f"/{robot}/camera/") and f"{robot}/camera" in clocks:
         return clocks[f"{robot}/camera"]
-    if MOCAP in clocks and (raw.topic == topics.TRANSFORMS or raw.topic.endswith("/truth")):
+    if MOCAP in clocks and (topic == topics.TRANSFORMS or topic.endswith("/truth")):
         return clocks[MOCAP]
     return clocks.get(robot)
 

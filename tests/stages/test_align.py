@@ -1,3 +1,5 @@
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +7,15 @@ import pytest
 
 from dmrl.errors import RecordingError, SettingError
 from dmrl.messages import message
-from dmrl.recording import RecordingWriter, check, provenance, read, read_table, summary
+from dmrl.recording import (
+    RecordingWriter,
+    check,
+    provenance,
+    read,
+    read_raw,
+    read_table,
+    summary,
+)
 from dmrl.stages.align import METADATA, Settings, run
 
 
@@ -59,6 +69,39 @@ def test_a_robot_that_would_begin_before_zero_takes_all_with_it(
         read_table(out, t)["log_time"].to_numpy() for t in ("/cf1/range/cf2", "/cf2/range/cf1")
     ]
     assert np.abs(ranges[0] - ranges[1]).max() < 1_000_000
+
+
+def test_times_stay_where_no_robot_would_begin_before_zero(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """cf1's clock is behind by 30 s: its times move back, and begin at 10 s still."""
+    late = tmp_path / "late.mcap"
+    with RecordingWriter(late, provenance("test")) as sink:
+        sink.write(10**9, "/cf2/height", message("Height")())
+        for raw in read_raw(recording, "/cf1/range/cf2", "/cf2/range/cf1"):
+            sink.write_raw(replace(raw, time_ns=raw.time_ns + 10**10))
+    out = tmp_path / "out.mcap"
+    clocks = run(late, out, Settings(reference="cf2"))
+    assert clocks.keys() == summary(out).metadata[METADATA][0].keys() == {"cf1", "cf2"}
+    assert capsys.readouterr().err == ""
+    before, after = (read_table(p, "/cf2/range/cf1", fields=())["log_time"] for p in (late, out))
+    assert after.equals(before)
+
+
+def test_a_move_of_all_times_is_said_and_kept(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with RecordingWriter(tmp_path / "early.mcap", provenance("test")) as sink:
+        for raw in read_raw(recording):
+            sink.write_raw(raw)
+        sink.write(0, "/cf1/height", message("Height")())
+    out = tmp_path / "out.mcap"
+    clocks = run(tmp_path / "early.mcap", out, Settings(reference="cf2"))
+    assert clocks["*"].offset_s == pytest.approx(29.92, abs=0.01)
+    assert "all times are moved by 29.9" in capsys.readouterr().err
+    told = json.loads(summary(out).metadata[METADATA][0]["*"])
+    assert told["offset_s"] == clocks["*"].offset_s
+    assert summary(out).start_ns == 0
 
 
 def test_what_cannot_be_aligned_is_one_line(recording: Path, tmp_path: Path) -> None:
