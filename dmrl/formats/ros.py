@@ -9,13 +9,14 @@ What is taken, by the message's type; all else is left out, with a line that nam
 * ``sensor_msgs/Range`` on ``.../<robot>/<peer>/...`` or ``/<robot>/range/<peer>``: UWB;
 * ``dmrl_msgs/*``, as ``dmrl convert --to ros2`` writes them, on the topics of dmrl.
 
-Times are those of the headers, and the bag's where they are empty.
+Times are those of the headers. Where they are empty, the time at which the bag received a message
+stands for it, with a line that says so; that time is the publish time of every message.
 """
 
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,7 @@ def _guarded(source: Path, of: Any) -> Iterator[Any]:
 
 def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sample]:
     calibrated: set[str] = set()
+    unstamped: Counter[str] = Counter()
     moving = {line.robot for line in lines.values() if line.kind == "nav_msgs/msg/Odometry"}
 
     def messages(reader: Any) -> Iterator[Any]:
@@ -190,18 +192,24 @@ def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sa
         where = Placed(
             source, line.robot, line.peer, bool(CAPTURE.search(line.topic)), line.robot in moving
         )
-        for sample in _of(line, decoded, _time_ns(decoded, bag_ns), where):
+        time_ns = _stamp_ns(decoded)
+        unstamped[line.topic] += time_ns == 0 < bag_ns
+        for sample in _of(line, decoded, time_ns or max(bag_ns, 0), where):
             if sample.message == "CameraCalibration":
                 if sample.topic in calibrated:
                     continue
                 calibrated.add(sample.topic)
-            yield sample
+            yield replace(sample, publish_ns=max(bag_ns, 0))
+    if told := [f"{count} on {topic}" for topic, count in unstamped.items() if count]:
+        say(f"{source}: a stamp of 0 have {', '.join(told)}; they are at the times of the bag")
 
 
-def _time_ns(message: Any, bag_ns: int) -> int:
+def _stamp_ns(message: Any) -> int | None:
+    """Time in the header; 0: it is empty, None: there is no header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    time_ns = stamp.sec * 1_000_000_000 + stamp.nanosec if stamp is not None else 0
-    return int(time_ns if time_ns > 0 else max(bag_ns, 0))
+    if stamp is None:
+        return None
+    return max(int(stamp.sec * 1_000_000_000 + stamp.nanosec), 0)
 
 
 def _of(line: Line, message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:

@@ -3,7 +3,7 @@
 The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
 """
 
-from dmrl.recording.check import Finding, check
+from dmrl.recording.check import Finding, check, say_findings
 from dmrl.recording.edit import merge, trim
 from dmrl.recording.extras import copy_extras, splits
 from dmrl.recording.glance import glance
@@ -54,6 +54,7 @@ __all__ = [
     "read_table",
     "recover",
     "rewrite",
+    "say_findings",
     "splits",
     "stretches",
     "summary",

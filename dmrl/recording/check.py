@@ -17,8 +17,10 @@ from dmrl.errors import DmrlError, RecordingError
 from dmrl.geometry.frames import inside
 from dmrl.images.codec import size
 from dmrl.recording.blocks import in_file_order
+from dmrl.recording.check_clocks import clocks
 from dmrl.recording.index import Summary, summary
-from dmrl.recording.reader import by_topic, columns, read_table
+from dmrl.recording.reader import by_topic, columns, log_times, read_table
+from dmrl.terminal.progress import say
 from dmrl.topics import (
     CAMERA_IMAGE,
     LABELS,
@@ -35,6 +37,8 @@ BIAS_MIN_LABELS = 20
 # their true projection, sit 0.6 px beside it. 1.5 px is twice that and more.
 BIAS_MIN_PX = 1.5
 BIAS_MIN_SIGMAS = 5.0
+SAID = 2
+"""Findings that a stage says of what it wrote; dmrl check says them all."""
 BORDER_PX = 1.0  # a box this near the border is cut by it, so its middle says nothing
 
 
@@ -57,8 +61,15 @@ class Finding:
     text: str
 
 
-def check(path: Path) -> list[Finding]:
+def check(path: Path, *, quick: bool = False) -> list[Finding]:
     """Everything wrong with a recording, errors first; empty if nothing is.
+
+    Parameters
+    ----------
+    path
+        A recording.
+    quick
+        Its times and labels only, for which images need not be looked at.
 
     Raises
     ------
@@ -68,13 +79,31 @@ def check(path: Path) -> list[Finding]:
     found = summary(path)
     rules: tuple[Callable[[Path, Summary], Iterator[Finding]], ...] = (
         _messages,
+        _clocks,
         _images,
         _labels,
     )
+    if quick:
+        rules = _indexed, _clocks, _labels
     findings = [finding for rule in rules for finding in rule(path, found)]
     if not found.count:
         findings.append(Finding("error", "", "has no messages"))
     return sorted(findings, key=lambda f: f.level)
+
+
+def say_findings(path: Path) -> None:
+    """Say on stderr, in a line or two, what is odd in a recording that was just written."""
+    findings = check(path, quick=True)
+    for finding in findings[:SAID]:
+        say(f"{finding.level}: {finding.topic}: {finding.text}")
+    if len(findings) > SAID:
+        say(f"{len(findings) - SAID} more: dmrl check {path}")
+
+
+def _indexed(path: Path, found: Summary) -> Iterator[Finding]:
+    """Times as the index has them: no message is read."""
+    for topic, time_ns in log_times(path, found.topics).items():
+        yield from _times(topic, time_ns)
 
 
 def _messages(path: Path, found: Summary) -> Iterator[Finding]:
@@ -122,6 +151,11 @@ def _times(topic: str, time_ns: NDArray[np.int64]) -> Iterator[Finding]:
     if repeated := int((step_ns == 0).sum()):
         yield Finding("warning", topic, f"{repeated} messages repeat the time before them")
     yield from _gaps(topic, step_ns[step_ns > 0])
+
+
+def _clocks(path: Path, found: Summary) -> Iterator[Finding]:
+    """Times that do not belong together."""
+    return (Finding("warning", topic, text) for topic, text in clocks(path, found))
 
 
 def _gaps(topic: str, step_ns: NDArray[np.int64]) -> Iterator[Finding]:

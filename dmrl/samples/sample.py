@@ -25,12 +25,15 @@ class Sample:
         The message, as ``dmrl.messages.message`` takes it: its name, or variables of a log.
     fields
         Its fields; a nested message is a mapping, a repeated one a list of mappings.
+    publish_ns
+        When it was received, nanoseconds; None: not known, the log time stands for it.
     """
 
     time_ns: int
     topic: str
     message: str | LogType
     fields: Mapping[str, Any]
+    publish_ns: int | None = None
 
 
 def intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:

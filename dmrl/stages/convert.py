@@ -20,7 +20,7 @@ from dmrl.formats.known import format_of
 from dmrl.geometry.camera_file import camera_named
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.recording import SPLIT_METADATA, RecordingWriter, provenance
+from dmrl.recording import SPLIT_METADATA, RecordingWriter, provenance, say_findings
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -103,7 +103,9 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     read = [path for path in (settings.labels, settings.camera) if path and path.is_file()]
     made = provenance("convert", settings, (source, *read), libraries=("pillow", "numpy"))
     with RecordingWriter(out, made) as sink:
-        return _write(content, sink)
+        counts = _write(content, sink)
+    say_findings(out)
+    return counts
 
 
 def _write(content: Content, sink: RecordingWriter) -> dict[str, int]:
@@ -112,7 +114,8 @@ def _write(content: Content, sink: RecordingWriter) -> dict[str, int]:
         split = {name: json.dumps(times) for name, times in content.split.items()}
         sink.add_metadata(SPLIT_METADATA, split)
     for sample in track(content.samples, "Converting", content.total):
-        sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
+        made = message(sample.message)(**sample.fields)
+        sink.write(sample.time_ns, sample.topic, made, publish_ns=sample.publish_ns)
         counts[sample.topic] += 1
     return dict(sorted(counts.items()))
 

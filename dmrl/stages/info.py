@@ -3,9 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from cyclopts import Parameter
+from numpy.typing import NDArray
 
-from dmrl.recording import Provenance, Summary, summary
+from dmrl.recording import Provenance, Summary, log_times, summary
 from dmrl.terminal.tables import print_json, print_table
 
 
@@ -26,7 +28,7 @@ def command(
         print_json(document(recording, found))
         return
     print(headline(recording, found))
-    print_table("", ("topic", "message", "messages", "rate, Hz"), topic_rows(found))
+    print_table("", ("topic", "message", "messages", "rate, Hz"), topic_rows(recording, found))
     for line in ancestry_lines(found.provenance):
         print(line)
 
@@ -53,13 +55,19 @@ def headline(path: Path, found: Summary) -> str:
     return f"{path}: {megabytes:.1f} MB, {found.count} messages over {duration_s:.3f} s"
 
 
-def topic_rows(found: Summary) -> list[tuple[str, str, int, float | None]]:
-    """Topic, message, count and mean rate of each topic."""
-    duration_s = (found.end_ns - found.start_ns) / 1e9
+def topic_rows(path: Path, found: Summary) -> list[tuple[str, str, int, float | None]]:
+    """Topic, message, count and mean rate of each topic, from its own first message to its last."""
+    times = log_times(path, found.topics)
     return [
-        (topic, info.schema, info.count, (info.count - 1) / duration_s if info.count > 1 else None)
+        (topic, info.schema, info.count, _rate_hz(times.get(topic)))
         for topic, info in found.topics.items()
     ]
+
+
+def _rate_hz(time_ns: NDArray[np.int64] | None) -> float | None:
+    if time_ns is None or len(time_ns) < 2 or time_ns[0] == time_ns[-1]:
+        return None
+    return (len(time_ns) - 1) / float((time_ns[-1] - time_ns[0]) * 1e-9)
 
 
 def ancestry_lines(made: Provenance | None) -> list[str]:

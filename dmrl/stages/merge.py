@@ -7,12 +7,14 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import SettingError
-from dmrl.recording import merge
+from dmrl.recording import merge, say_findings
 
 
 def run(recordings: Sequence[Path], out: Path) -> int:
     """Messages of the recordings merged into ``out``; see `dmrl.recording.merge`."""
-    return merge(recordings, out)
+    count = merge(recordings, out)
+    say_findings(out)
+    return count
 
 
 def command(

@@ -75,7 +75,7 @@ def stream() -> bytes:
     return made + pack_image(Image(32, 24, "raw", pictures(1)[0].tobytes()))
 
 
-def _messages(store: Any) -> list[tuple[str, str, int, Any]]:
+def _messages(store: Any, ranges_stamped: bool) -> list[tuple[str, str, int, Any]]:
     types = store.types
 
     def header(time_ns: int, fields: dict[str, Any]) -> Any:
@@ -106,7 +106,8 @@ def _messages(store: Any) -> list[tuple[str, str, int, Any]]:
         stamped = types["geometry_msgs/msg/PoseStamped"](head, pose)
         found.append(("/vrpn/cf1/pose", "geometry_msgs/msg/PoseStamped", time_ns, stamped))
         ranged = types["sensor_msgs/msg/Range"](
-            header=head, radiation_type=0, field_of_view=0.0, min_range=0.0, max_range=0.0,
+            header=head if ranges_stamped else header(0, more),
+            radiation_type=0, field_of_view=0.0, min_range=0.0, max_range=0.0,
             range=1.5 + k,
         )  # fmt: skip
         found.append(("/uwb/cf1/cf2/distance", "sensor_msgs/msg/Range", time_ns, ranged))
@@ -121,11 +122,16 @@ def _messages(store: Any) -> list[tuple[str, str, int, Any]]:
     return found
 
 
-def ros2_bag(folder: Path, storage: str = "sqlite3") -> Path:
-    """A rosbag2 folder: odometry, motion capture, ranges, raw pictures, and a text."""
+def ros2_bag(
+    folder: Path, storage: str = "sqlite3", *, late_ns: int = 0, ranges_stamped: bool = True
+) -> Path:
+    """A rosbag2 folder: odometry, motion capture, ranges, raw pictures, and a text.
+
+    All came ``late_ns`` after their stamps; ranges may have stamps of 0.
+    """
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer2(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        _write(writer, store, store.serialize_cdr)
+        _write(writer, store, store.serialize_cdr, late_ns, ranges_stamped)
     return folder
 
 
@@ -137,12 +143,18 @@ def ros1_bag(path: Path) -> Path:
     return path
 
 
-def _write(writer: Any, store: Any, serialize: Callable[[Any, str], Any]) -> None:
+def _write(
+    writer: Any,
+    store: Any,
+    serialize: Callable[[Any, str], Any],
+    late_ns: int = 0,
+    ranges_stamped: bool = True,
+) -> None:
     connections: dict[str, Any] = {}
-    for topic, kind, time_ns, message in _messages(store):
+    for topic, kind, time_ns, message in _messages(store, ranges_stamped):
         if topic not in connections:
             connections[topic] = writer.add_connection(topic, kind, typestore=store)
-        writer.write(connections[topic], time_ns, serialize(message, kind))
+        writer.write(connections[topic], time_ns + late_ns, serialize(message, kind))
 
 
 def nanocockpit(folder: Path, count: int = 6) -> Path:

@@ -58,6 +58,22 @@ def test_bags_of_every_kind_give_the_same(
     assert "left out: /chatter" in capsys.readouterr().err
 
 
+def test_when_a_bag_received_its_messages_is_kept(tmp_path: Path) -> None:
+    found = samples(foreign.ros2_bag(tmp_path / "flight", late_ns=7_000_000))
+    for topic in ("/cf1/height", "/cf1/range/cf2", "/cf1/camera/image"):
+        assert [s.time_ns for s in found[topic]] == [10**12 + k * 10**8 for k in range(5)]
+        received = [s.publish_ns or 0 for s in found[topic]]
+        assert received == [10**12 + k * 10**8 + 7_000_000 for k in range(5)]
+
+
+def test_stamps_of_zero_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    late_ns = 48 * 86_400 * 10**9
+    source = foreign.ros2_bag(tmp_path / "flight", late_ns=late_ns, ranges_stamped=False)
+    found = samples(source)
+    assert found["/cf1/range/cf2"][0].time_ns == 10**12 + late_ns
+    assert "5 on /uwb/cf1/cf2/distance; they are at the times of the bag" in capsys.readouterr().err
+
+
 def test_robots_are_named_as_the_user_wants(tmp_path: Path) -> None:
     found = samples(bag("sqlite3", tmp_path), Options(names={"cf1": "a", "cf2": "b"}))
     assert "/a/range/b" in found and "/a/attitude" in found

@@ -73,6 +73,45 @@ def test_times_that_go_back_repeat_or_leave_gaps_are_found(tmp_path: Path) -> No
     assert any("1 gaps, the longest 45.000 s" in f for f in findings)
 
 
+def test_clocks_that_share_no_time_are_found(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        for k in range(20):
+            write(k * 10**9, "/cf1/height", message("Height")())
+            write(k * 10**9, "/cf1/velocity", message("Velocity")())
+            write((k + 56) * 10**9, "/cf2/height", message("Height")())
+            write((k + 119) * 10**9, "/cf1/range/cf2", message("UwbRange")())
+
+    assert record(tmp_path / "a.mcap", fill) == [
+        "warning /cf1/range/cf2 shares no time with the robot's other topics: 100 s between",
+    ]
+
+    def two(write: Write) -> None:
+        for k in range(20):
+            write(k * 10**9, "/cf1/height", message("Height")())
+            write((k + 56) * 10**9, "/cf2/height", message("Height")())
+
+    assert record(tmp_path / "b.mcap", two) == [
+        "warning /cf1 shares no time with /cf2: 37 s between. Clocks of their own? Try: dmrl align"
+    ]
+
+
+def test_times_and_stamps_of_zero_are_found(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        pose = message("PoseInFrame")
+        now_s = 1_800_000_000
+        for k in range(3):
+            moment = {"seconds": now_s + k}
+            write((now_s + k) * 10**9, "/cf1/pose", pose(timestamp=moment))
+            write((now_s + k) * 10**9, "/cf1/pose/truth", pose(timestamp={}))
+        write(0, "/cf1/height", message("Height")())
+
+    findings = record(tmp_path / "a.mcap", fill)
+    assert findings == [
+        "warning /cf1/height 1 messages are at time 0, others of the recording after 2001",
+        "warning /cf1/pose/truth 3 messages have a time stamp of 0",
+    ]
+
+
 def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path) -> None:
     assert record(tmp_path / "a.mcap", lambda write: write(0, "/cf1/camera/image", image())) == [
         "warning /cf1/camera/image no calibration on /cf1/camera/calibration"

@@ -10,7 +10,7 @@ from dmrl.errors import DmrlError, OutputError, SettingError, SourceError
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import decode, encode_png
 from dmrl.recording import SPLIT_METADATA, check, read, read_table, summary
-from dmrl.stages import fly, label
+from dmrl.stages import fly, label, merge
 from dmrl.stages.convert import Settings, run
 
 from ..formats import plain_usd
@@ -95,6 +95,24 @@ def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None
     (calibration,) = read(out, "/cf1/camera/calibration")
     assert list(calibration.message.D) == list(AIDECK.distortion)
     assert calibration.message.distortion_model == "plumb_bob"
+
+
+def test_what_is_odd_in_a_new_recording_is_said_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "logs").mkdir()
+    events = {1: ("state", [("stateEstimate.z", "f")])}
+    for robot, boot_s in (("cf1", 10), ("cf2", 60)):
+        rows = [(1, (boot_s + k) * 1_000_000, (1.0,)) for k in range(5)]
+        (tmp_path / "logs" / robot).write_bytes(plain_usd.encode(events, rows))
+    run(tmp_path / "logs", tmp_path / "out.mcap", Settings())
+    err = capsys.readouterr().err
+    assert "warning: /cf1: shares no time with /cf2: 46 s between" in err
+    for robot in ("cf1", "cf2"):
+        run(tmp_path / "logs" / robot, tmp_path / f"{robot}.mcap", Settings(robot=robot))
+    capsys.readouterr()
+    merge.run([tmp_path / "cf1.mcap", tmp_path / "cf2.mcap"], tmp_path / "merged.mcap")
+    assert "shares no time with /cf2: 46 s" in capsys.readouterr().err
 
 
 def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:

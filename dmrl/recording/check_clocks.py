@@ -1,0 +1,109 @@
+"""Do the times of a recording belong together? Topic and text of what does not."""
+
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from dmrl.errors import RecordingError
+from dmrl.recording.index import Summary
+from dmrl.recording.reader import columns, log_times
+from dmrl.topics import CALIBRATION, TRANSFORMS, names
+
+Times = Mapping[str, NDArray[np.int64]]
+Found = Iterator[tuple[str, str]]
+
+EPOCH_NS = 10**18
+"""Times from here on count from 1970: it is 2001."""
+SPARSE = 2
+"""Topics with fewer messages tell nothing of a clock."""
+
+
+def clocks(path: Path, found: Summary) -> Found:
+    """Robots, or topics of a robot, that share no time; times and stamps of 0.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    found
+        Its summary.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording.
+    """
+    times = {topic: t for topic, t in log_times(path, found.topics).items() if len(t)}
+    yield from _zeros(times)
+    yield from _apart(times)
+    yield from _stamps(path, found)
+
+
+def _zeros(times: Times) -> Found:
+    if not times or max(int(t[-1]) for t in times.values()) < EPOCH_NS:
+        return
+    for topic, moments in times.items():
+        if zeros := int((moments == 0).sum()):
+            yield topic, f"{zeros} messages are at time 0, others of the recording after 2001"
+
+
+def _apart(times: Times) -> Found:
+    robots: dict[str, dict[str, tuple[int, int]]] = {}
+    for topic, moments in times.items():
+        robot = topic.split("/")[1]
+        moments = moments[moments > 0]  # those at 0 are said already
+        if topic == TRANSFORMS or len(moments) < SPARSE or names(CALIBRATION, topic):
+            continue
+        robots.setdefault(robot, {})[topic] = (int(moments[0]), int(moments[-1]))
+    for spans in robots.values():
+        for topic, span in spans.items():
+            others = [other for name, other in spans.items() if name != topic]
+            gap_s = _gap_s(span, _around(others)) if others else 0.0
+            if gap_s > 0:
+                yield topic, f"shares no time with the robot's other topics: {gap_s:.0f} s between"
+    whole = {robot: _around(list(spans.values())) for robot, spans in robots.items()}
+    for one, other in combinations(sorted(whole), 2):
+        gap_s = _gap_s(whole[one], whole[other])
+        if gap_s > 0:
+            yield (
+                f"/{one}",
+                f"shares no time with /{other}: {gap_s:.0f} s between. Clocks of their own? "
+                "Try: dmrl align",
+            )
+
+
+def _around(spans: list[tuple[int, int]]) -> tuple[int, int]:
+    return min(first for first, _ in spans), max(last for _, last in spans)
+
+
+def _gap_s(one: tuple[int, int], other: tuple[int, int]) -> float:
+    """Seconds between two stretches of time; 0 or less where they overlap."""
+    return (max(one[0], other[0]) - min(one[1], other[1])) * 1e-9
+
+
+def _stamps(path: Path, found: Summary) -> Found:
+    """Messages that say of themselves that they are of time 0, and stand at another."""
+    for topic, info in found.topics.items():
+        if info.schema.rpartition(".")[2] not in ("CompressedImage", "PoseInFrame"):
+            continue
+        wrong = 0
+        try:
+            for batch in columns(path, topic, fields=["timestamp"]):
+                stamp = batch["timestamp"]
+                zero = pc.equal(_filled(stamp, "seconds"), 0)
+                zero = pc.and_(zero, pc.equal(_filled(stamp, "nanos"), 0))
+                zero = pc.and_(zero, stamp.is_valid())  # without any stamp, nothing is said
+                wrong += pc.sum(pc.and_(zero, pc.not_equal(batch["log_time"], 0))).as_py() or 0
+        except RecordingError:
+            continue  # said already: its messages are not of their type
+        if wrong:
+            yield topic, f"{wrong} messages have a time stamp of 0"
+
+
+def _filled(stamp: pa.Array, name: str) -> pa.Array:
+    return pc.fill_null(pc.struct_field(stamp, name), 0)
