@@ -10,7 +10,8 @@ from types import ModuleType
 import numpy as np
 
 from dmrl.card import sections
-from dmrl.card.counts import Counts, count
+from dmrl.card.counts import Counts, count, sigmas_of
+from dmrl.card.facts import cautions, read_facts
 from dmrl.card.front import check_license, front_matter, read_front
 from dmrl.dataset import Split, open_dataset
 from dmrl.documents import parse_json
@@ -69,7 +70,8 @@ def write_card(
     text = [*front_matter(splits, str(title), str(license_id), parquet=dataset.parquet)]
     text += sections.about(splits, str(title), made)
     text += sections.loading(splits, parquet=dataset.parquet)
-    text += [*sections.numbers(counts), *figures, *sections.features(splits)]
+    text += [*sections.numbers(counts), *cautions(read_facts(folder), sigmas_of(splits))]
+    text += [*figures, *sections.features(splits)]
     text += ["## Provenance", "", *sections.ancestry(made), "", YOURS]
     written = "\n".join(text) + (_yours(old) or "\n")
     with rewritten_file(readme) as partial:

@@ -1,6 +1,7 @@
 """Numbers for a card, counted from the columns of a dataset; pixels are not touched."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,23 @@ class Counts:
     depth_m: NDArray[np.float64]
     label_sources: Counter[str]
     recordings: Counter[str]
+
+
+def sigmas_of(splits: Mapping[str, Split]) -> dict[str, tuple[int, int, float, float, float]]:
+    """By source: labels with a sigma, all labels, and the median u, v (px) and depth (m) of it."""
+    flat = pa.concat_arrays(
+        [pa.chunked_array(s.table["peers"]).combine_chunks().flatten() for s in splits.values()]
+    )
+    names = ("sigma_u_px", "sigma_v_px", "sigma_depth_m")
+    values = np.column_stack([pc.struct_field(flat, name) for name in names])
+    source = np.array(pc.struct_field(flat, "source").to_pylist(), object)
+    found = {}
+    for name in sorted(set(source.tolist())):
+        mine = values[source == name]
+        known = mine[(mine > 0).any(axis=1)]
+        medians = np.median(known, axis=0).tolist() if len(known) else [0.0, 0.0, 0.0]
+        found[name] = (len(known), len(mine), medians[0], medians[1], medians[2])
+    return found
 
 
 def count(split: Split) -> Counts:

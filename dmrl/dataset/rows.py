@@ -31,6 +31,10 @@ from dmrl.recording.sources import LOOKED, looked_at, sources_in
 SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
 
+TAUGHT = ("estimate", "truth", "hand", "published")
+"""The same, as a network is to learn from them: who estimated labels of a flight that has true ones
+wants to know what estimates teach."""
+
 PATTERNS = (topics.camera_image("*"), topics.labels("*"))
 
 Mask = NDArray[np.uint8]
@@ -45,6 +49,7 @@ class Tally:
     without_labels: int = 0
     of_other_sources: int = 0
     not_ok: int = 0
+    without_mask: int = 0
     in_no_split: int = 0
 
     def left_out(self) -> dict[str, int]:
@@ -53,6 +58,7 @@ class Tally:
             "had no labels": self.without_labels,
             "were not looked at by the chosen source (--labels)": self.of_other_sources,
             "had a label that is not OK (--keep-all keeps them)": self.not_ok,
+            "show a peer, but have no mask (--masks)": self.without_mask,
             "belong to no split of their source (--split)": self.in_no_split,
         }
 
@@ -72,6 +78,16 @@ def count_images(path: Path) -> int:
     return sum(present[t].count for t in found if topics.names(topics.CAMERA_IMAGE, t))
 
 
+def sources_of(path: Path) -> set[str]:
+    """Every source of labels that a recording has."""
+    present: set[str] = set()
+    for topic in summary(path).topics:
+        if topics.names(topics.LABELS, topic):
+            for batch in columns(path, topic, fields=LOOKED):
+                present.update(sources_in(*(batch.column(name) for name in LOOKED)))
+    return present
+
+
 def label_source(path: Path, wanted: str) -> str:
     """The source whose labels are used for a recording.
 
@@ -80,21 +96,19 @@ def label_source(path: Path, wanted: str) -> str:
     path
         A recording that `count_images` accepts.
     wanted
-        One of `SOURCES`, or "best" for the first of them that the recording has.
+        One of `SOURCES`; "best" for the first of them that the recording has; "auto" for the first
+        of `TAUGHT`.
 
     Raises
     ------
     SettingError
         If the recording has labels, but none from that source.
     """
-    present: set[str] = set()
-    for topic in summary(path).topics:
-        if topics.names(topics.LABELS, topic):
-            for batch in columns(path, topic, fields=LOOKED):
-                present.update(sources_in(*(batch.column(name) for name in LOOKED)))
+    present = sources_of(path)
+    order = {"best": SOURCES, "auto": TAUGHT}.get(wanted, (wanted,))
     if not present:
-        return SOURCES[0] if wanted == "best" else wanted
-    usable = [source for source in SOURCES if source in present and wanted in (source, "best")]
+        return order[0]
+    usable = [source for source in order if source in present]
     if not usable:
         has = ", ".join(sorted(present))
         raise SettingError(f"{path} has no labels from {wanted}. Try one of --labels {has}")
@@ -119,7 +133,8 @@ def rows_of(
     keep_all
         Labels that are not OK count as well.
     masks
-        Rows have masks, empty ones where the recording has none.
+        Rows have masks. Images that show a peer and have none are left out: an empty mask would
+        say that nobody is there.
     """
     for image, labels, covered in labelled_images(path, masks=masks):
         if labels is None:
@@ -132,6 +147,8 @@ def rows_of(
             tally.in_no_split += 1
         elif source not in (looked_at(labels) or {source}):
             tally.of_other_sources += 1
+        elif masks and covered is None and mine:
+            tally.without_mask += 1
         elif not keep_all and any(label.status != STATUS_OK for label in mine):
             tally.not_ok += 1
         else:

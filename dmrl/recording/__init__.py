@@ -3,12 +3,13 @@
 The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
 """
 
-from dmrl.recording.check import Finding, check, say_findings
+from dmrl.recording.check import Finding, check, label_findings, say_findings
 from dmrl.recording.edit import merge, trim
 from dmrl.recording.extras import copy_extras, splits
 from dmrl.recording.glance import glance
 from dmrl.recording.index import SPLIT_METADATA, Summary, TopicInfo, summary
 from dmrl.recording.inputs import input_of, provenance
+from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
 from dmrl.recording.provenance import Input, Provenance
 from dmrl.recording.reader import (
     Stamped,
@@ -26,6 +27,7 @@ from dmrl.recording.rewrite import Timed, rewrite
 from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
 
 __all__ = [
+    "LICENCES_METADATA",
     "SPLIT_METADATA",
     "Channel",
     "Finding",
@@ -45,6 +47,10 @@ __all__ = [
     "glance",
     "input_of",
     "interrupted",
+    "label_findings",
+    "licence_beside",
+    "licence_words",
+    "licences",
     "log_times",
     "matching",
     "merge",

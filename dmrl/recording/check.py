@@ -91,6 +91,17 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
     return sorted(findings, key=lambda f: f.level)
 
 
+def label_findings(path: Path) -> list[str]:
+    """What is wrong with the labels of a recording, a line each, such as a bias.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording.
+    """
+    return [f"{finding.topic}: {finding.text}" for finding in _labels(path, summary(path))]
+
+
 def say_findings(path: Path) -> None:
     """Say on stderr, in a line or two, what is odd in a recording that was just written."""
     findings = check(path, quick=True)

@@ -20,7 +20,15 @@ from dmrl.formats.known import format_of
 from dmrl.geometry.camera_file import camera_named
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.recording import SPLIT_METADATA, RecordingWriter, provenance, say_findings
+from dmrl.recording import (
+    LICENCES_METADATA,
+    SPLIT_METADATA,
+    RecordingWriter,
+    licence_beside,
+    licence_words,
+    provenance,
+    say_findings,
+)
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -101,8 +109,13 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     options = _options(settings)
     content = format_of(source, settings.source_kind).content(source, options)
     read = [path for path in (settings.labels, settings.camera) if path and path.is_file()]
+    licence = licence_beside(source)
+    if licence is not None and source.is_file():
+        read.append(licence)
     made = provenance("convert", settings, (source, *read), libraries=("pillow", "numpy"))
     with RecordingWriter(out, made) as sink:
+        if licence is not None:
+            sink.add_metadata(LICENCES_METADATA, {source.name: licence_words(licence)})
         counts = _write(content, sink)
     say_findings(out)
     return counts

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,13 +12,31 @@ from cyclopts import Parameter, validators
 
 from dmrl import topics
 from dmrl.card import write_card
+from dmrl.card.facts import Facts
 from dmrl.card.front import check_license
-from dmrl.dataset.rows import Tally, count_images, label_source, one_size, rows_of
+from dmrl.dataset.rows import (
+    Tally,
+    count_images,
+    label_source,
+    one_size,
+    rows_of,
+    sources_of,
+)
 from dmrl.dataset.splits import SplitOf, held_out, of_source
+from dmrl.dataset.twins import Twins
 from dmrl.dataset.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
 from dmrl.output import partial_folder
-from dmrl.recording import Input, Provenance, provenance, read, splits, summary
+from dmrl.recording import (
+    Input,
+    Provenance,
+    label_findings,
+    licences,
+    provenance,
+    read,
+    splits,
+    summary,
+)
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -37,8 +55,9 @@ class Settings:
     Parameters
     ----------
     labels
-        Whose labels. "best" takes, for each recording, the first of truth, estimate, hand and
-        published that it has.
+        Whose labels. "auto" takes, for each recording, the first of estimate, truth, hand and
+        published that it has: what dmrl label made goes before the truth. "best" takes the truth
+        before estimates.
     keep_all
         Use labels that are not OK as well. Without it, images with such a label are left out.
     split
@@ -50,7 +69,7 @@ class Settings:
         Another seed holds out other recordings.
     masks
         Keep the masks of rendered robots: a training can then paste robots without what was
-        around them.
+        around them. Images that show a peer and have no mask are left out.
     png
         Store PNG images in place of raw pixels: less disk, but decoded at each opening.
     parquet
@@ -64,7 +83,7 @@ class Settings:
         Hub's: unknown, other.
     """
 
-    labels: Literal["best", "truth", "estimate", "hand", "published"] = "best"
+    labels: Literal["auto", "best", "truth", "estimate", "hand", "published"] = "auto"
     keep_all: bool = False
     split: Literal["auto", "recordings", "none"] = "auto"
     test_share: Share = 0.2
@@ -115,12 +134,14 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
             "dataset", settings, recordings, seed=settings.seed, libraries=("pyarrow", "pillow")
         )
         sources = {path: label_source(path, settings.labels) for path in recordings}
+        beside = _beside(sources)
         split_of = _splits(recordings, made, settings)
         _warn_of_lenses(recordings)
         tally = Tally()
+        twins = Twins()
         images = write_dataset(
             partial,
-            _rows(sources, split_of, tally, total, settings),
+            twins.seen(_rows(sources, split_of, tally, total, settings)),
             png=settings.png,
             parquet=settings.parquet,
             shard_images=settings.shard_images,
@@ -129,8 +150,27 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
         )
         _explain(recordings, images, tally, settings)
         made.write(partial)
+        facts = Facts(
+            {why: count for why, count in tally.left_out().items() if count},
+            {path.name: source for path, source in sources.items()},
+            beside,
+            {path.name: found for path in recordings if (found := label_findings(path))},
+            licences(recordings),
+            twins.count,
+        )
+        facts.write(partial)
         write_card(partial)
     return Result(images, {path.name: source for path, source in sources.items()}, tally)
+
+
+def _beside(sources: Mapping[Path, str]) -> dict[str, list[str]]:
+    """Sources that are not used, by recording, which is said where one might be meant."""
+    found = {path.name: sorted(sources_of(path) - {used}) for path, used in sources.items()}
+    for path, used in sources.items():
+        if {"truth", "estimate"} <= {*found[path.name], used}:
+            other = "estimate" if used == "truth" else "truth"
+            say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
+    return {name: others for name, others in found.items() if others}
 
 
 def _splits(

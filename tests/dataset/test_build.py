@@ -52,21 +52,46 @@ def test_masks_are_kept_by_the_place_of_the_peer(record: Record, tmp_path: Path)
     numbers = np.zeros((48, 64), np.uint8)
     numbers[3, 4], numbers[5, 6], numbers[7, 8] = 2, 3, 9
     peers = [peer(peer="cf3"), peer(peer="painted2", u_px=40.0)]
-    path = record(peers=[peers, peers], masks={0: numbers})
-    other = record("other.mcap", seed=1)
+    path = record(peers=[peers, [], peers], masks={0: numbers})
     for png, parquet in ((False, False), (True, True)):
         out = tmp_path / f"out-{parquet}"
         run(
-            [path, other],
+            [path],
             out,
             Settings(masks=True, png=png, parquet=parquet, split="none"),
         )
         got = np.concatenate(open_dataset(out).split("train").masks)
-        assert got.shape == (8, 48, 64)
+        # Of an image in which nobody is, nothing is known to be covered; of one with peers, all of
+        # it would be "nobody".
+        assert got.shape == (2, 48, 64)
         assert {tuple(place): got[tuple(place)] for place in np.argwhere(got).tolist()} == {
             (0, 3, 4): 2,
             (0, 5, 6): 1,
         }
+
+
+def test_images_with_peers_and_no_mask_are_left_out_and_said(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(RecordingError, match=r"6 images show a peer, but have no mask \(--masks"):
+        run([record()], tmp_path / "out", Settings(masks=True))
+    zeros = np.zeros((48, 64), np.uint8)
+    part = record("part.mcap", masks={0: zeros, 1: zeros}, seed=1)
+    assert run([part], tmp_path / "out", Settings(masks=True)).images == {"train": 2}
+    assert "left out: 4 images show a peer, but have no mask" in capsys.readouterr().err
+
+
+def test_labels_that_were_estimated_go_before_the_truth_and_it_is_said(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = record(peers=[[peer(u_px=20.0), peer(source="estimate", u_px=30.0)]])
+    for wanted, used, other in (("auto", "estimate", "truth"), ("best", "truth", "estimate")):
+        out = tmp_path / wanted
+        settings = Settings(split="none") if wanted == "auto" else Settings(wanted, split="none")
+        assert run([flight], out, settings).sources == {"flight.mcap": used}
+        assert f"labels from {used}, not from {other}, which it" in capsys.readouterr().err
+        told = f"- `flight.mcap`: labels of `{used}` are used; there were labels of `{other}` too."
+        assert told in (out / "README.md").read_text()
 
 
 def test_without_being_asked_for_masks_are_left_out(record: Record, tmp_path: Path) -> None:

@@ -7,12 +7,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from dmrl import card, plots
 from dmrl.card import write_card
 from dmrl.errors import DatasetError, SettingError
+from dmrl.images.codec import encode_png
+from dmrl.stages import convert
 from dmrl.stages.card import Settings as CardSettings
 from dmrl.stages.card import run as run_card
 from dmrl.stages.dataset import Settings, run
@@ -119,6 +122,43 @@ def test_a_card_can_be_written_elsewhere_and_the_one_before_stays(
     assert 'pretty_name: "Elsewhere"' in card.read_text(encoding="utf-8")
     assert (tmp_path / "card" / "figures" / "depth.png").is_file()
     assert (built / "README.md").read_bytes() == before
+
+
+def test_it_says_what_to_know_before_learning(record: Record, tmp_path: Path) -> None:
+    def boxed(k: int) -> Any:
+        u_px = 20.0 + k % 20
+        box = [u_px - 8, 10, u_px + 8, 30]
+        return peer(source="published", u_px=u_px, v_px=30.0, box_px=box, sigma_v_px=2.0 + k % 3)
+
+    path = record(peers=[*([boxed(k)] for k in range(30)), None], split={"train": "[[0, 10]]"})
+    run([path], tmp_path / "out", Settings(split="none"))
+    text = (tmp_path / "out" / "README.md").read_text()
+    assert "labels of `published` are: 30 of 30 have a sigma, median 0.0 px in u, 3.0 px in" in text
+    assert "labels of source 'published' are biased: +0.0 px in u and +10.0 px in v" in text
+    assert "- Left out: 1 images had no labels." in text
+    assert "- Leaks: no images of a test split" in text
+    assert "- No licence was found" in text
+    write_card(tmp_path / "out")
+    assert (tmp_path / "out" / "README.md").read_text() == text
+
+
+def test_a_picture_in_train_and_test_is_a_leak(record: Record, tmp_path: Path) -> None:
+    path = record(split={"train": "[[0, 250000000]]", "test": "[[300000000, 600000000]]"}, seed=3)
+    twin = record("twin.mcap", split={"test": "[[0, 600000000]]"}, seed=3)
+    run([path, twin], tmp_path / "out", Settings())
+    assert "- Leaks: 3 images of a test split have" in (tmp_path / "out" / "README.md").read_text()
+
+
+def test_licences_beside_a_source_reach_the_card(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    (folder / "LICENSE.txt").write_text("\n# MIT License\n\nPermission is hereby granted\n")
+    (folder / "0.png").write_bytes(encode_png(np.zeros((48, 64, 3), np.uint8)))
+    (folder / "labels.csv").write_text("file,peer,u_px,v_px,depth_m\n0.png,cf2,10,20,0.5\n")
+    convert.run(folder, tmp_path / "a.mcap", convert.Settings())
+    run([tmp_path / "a.mcap"], tmp_path / "out", Settings())
+    text = (tmp_path / "out" / "README.md").read_text()
+    assert "- Licence beside `pictures`: MIT License." in text
 
 
 def test_what_a_hand_wrote_below_the_line_stays(built: Path) -> None:

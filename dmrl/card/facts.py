@@ -1,0 +1,100 @@
+"""What a card says that its dataset's columns do not tell: kept beside them, as JSON."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dmrl.errors import DatasetError
+
+FILE = "facts.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What was known when a dataset was made.
+
+    Parameters
+    ----------
+    left_out
+        Images that were left out, by the reason.
+    used
+        Source of labels that was used, by recording.
+    beside
+        Sources that stood in a recording besides, by recording.
+    findings
+        What ``dmrl check`` says of labels, by recording.
+    licences
+        Licences that were found beside what recordings were made from, by name.
+    twins
+        Images of test splits whose pixels stand in train too.
+    """
+
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    used: Mapping[str, str] = field(default_factory=dict)
+    beside: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    findings: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    licences: Mapping[str, str] = field(default_factory=dict)
+    twins: int = 0
+
+    def write(self, folder: Path) -> None:
+        """Write them into the folder of a dataset."""
+        text = json.dumps(asdict(self), indent=1, sort_keys=True)
+        (folder / FILE).write_text(text + "\n", encoding="utf-8")
+
+
+def read_facts(folder: Path) -> Facts | None:
+    """Facts of a dataset; None for one that was made before they were kept.
+
+    Raises
+    ------
+    DatasetError
+        If the file is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    try:
+        return Facts(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as e:
+        raise DatasetError(f"{path} cannot be read ({e}). Make the dataset again") from None
+
+
+def cautions(facts: Facts | None, sigmas: Mapping[str, Any]) -> Iterator[str]:
+    """Lines of Markdown: what to know before learning from a dataset.
+
+    Parameters
+    ----------
+    facts
+        Of the dataset.
+    sigmas
+        By source of labels: (labels with a sigma, all labels, their median u, v, px, depth, m).
+    """
+    yield from ("## What to know", "")
+    for source, (known, total, u_px, v_px, depth_m) in sorted(sigmas.items()):
+        spread = f"median {u_px:.1f} px in u, {v_px:.1f} px in v, {depth_m:.2f} m in depth"
+        told = f"{known} of {total} have a sigma, {spread}" if known else "none has a sigma"
+        yield f"- How sure labels of `{source}` are: {told}."
+    if facts is not None:
+        yield from _told(facts)
+    yield ""
+
+
+def _told(facts: Facts) -> Iterator[str]:
+    for name, others in sorted(facts.beside.items()):
+        yield (
+            f"- `{name}`: labels of `{facts.used[name]}` are used; there were labels of "
+            f"{', '.join(f'`{other}`' for other in others)} too."
+        )
+    for name, findings in sorted(facts.findings.items()):
+        yield from (f"- `{name}`: {finding}." for finding in findings)
+    if not facts.findings:
+        yield "- `dmrl check` finds no bias in the labels, as far as they have boxes to tell."
+    reasons = [f"{count} images {why}" for why, count in facts.left_out.items() if count]
+    yield f"- Left out: {'; '.join(reasons) or 'no image'}."
+    yield f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train."
+    for name, licence in sorted(facts.licences.items()):
+        yield f"- Licence beside `{name}`: {licence}."
+    if not facts.licences:
+        yield "- No licence was found beside what the recordings were made from."
