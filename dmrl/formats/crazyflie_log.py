@@ -66,7 +66,15 @@ def streams(
         The source, for warnings.
     """
     blocks = [_ordered(block) for block in blocks]
-    found = [as_logged(robot, block) for block in blocks]
+    logged = [as_logged(robot, block) for block in blocks]
+    return logged + derived(robot, blocks, names, where)
+
+
+def derived(
+    robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object
+) -> list[Stream]:
+    """What is known of blocks in order of time, on dmrl's own topics; see ``streams``."""
+    found: list[Stream] = []
     attitude = attitude_of(blocks)
     if attitude is not None:
         found.append(_attitude(robot, attitude, yaw_rate_of(blocks, attitude)))

@@ -51,6 +51,8 @@ class Options:
         Width and height to crop and scale pictures to; None: they stay as they are.
     raw
         Grey pictures are as a colour sensor gave them (RGGB).
+    columns
+        TOML file that says what the columns of a CSV file are; None: none is given.
     """
 
     robot: str = "cf1"
@@ -60,6 +62,7 @@ class Options:
     camera: Camera | None = None
     size_px: tuple[int, int] | None = None
     raw: bool = False
+    columns: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,6 +61,9 @@ class Settings:
         images: crop to the middle and scale to this width. Needs the height too.
     height_px
         images: crop to the middle and scale to this height. Needs the width too.
+    columns
+        TOML file that says what the columns of a CSV file are, with their units, frames and signs,
+        or nanobench.
     raw
         images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
     to
@@ -76,6 +79,7 @@ class Settings:
     camera: Path | None = None
     width_px: Positive | None = None
     height_px: Positive | None = None
+    columns: Path | None = None
     raw: Annotated[bool, Parameter(negative=())] = False
     to: Literal["csv", "parquet", "ros2"] | None = None
 
@@ -107,8 +111,10 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     if settings.to is not None:
         return write_tables(source, out, settings.to)
     options = _options(settings)
-    content = format_of(source, settings.source_kind).content(source, options)
-    read = [path for path in (settings.labels, settings.camera) if path and path.is_file()]
+    kind = settings.source_kind or ("columns" if settings.columns else None)
+    content = format_of(source, kind).content(source, options)
+    given = (settings.labels, settings.camera, settings.columns)
+    read = [path for path in given if path and path.is_file()]
     licence = licence_beside(source)
     if licence is not None and source.is_file():
         read.append(licence)
@@ -153,6 +159,7 @@ def _options(settings: Settings) -> Options:
         camera=None if settings.camera is None else camera_named(settings.camera),
         size_px=None if width_px is None or height_px is None else (width_px, height_px),
         raw=settings.raw,
+        columns=settings.columns,
     )
 
 

@@ -1,0 +1,159 @@
+"""What the columns of somebody else's CSV file are: a TOML file, one table per quantity.
+
+::
+
+    [time]
+    name = "t"                      # the column
+    unit = "s"
+    [pitch]
+    name = "att_stateEstimate_pitch"
+    unit = "deg"
+    sign = -1                       # logged positive nose up; dmrl has it positive nose down
+    [vx]
+    name = "est_stateEstimate_vx"
+    unit = "m/s"
+    frame = "world"                 # or horizontal, which turns with the robot, or body
+    [range.cf2]
+    name = "uwb_2"
+    unit = "mm"
+
+``QUANTITIES`` lists what there is.
+"""
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from dmrl.errors import SourceError
+
+ANGLE = {"rad": 1.0, "deg": 0.017453292519943295}
+RATE = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
+LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+SPEED = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
+TIME = {"s": 1_000_000_000.0, "ms": 1_000_000.0, "us": 1000.0, "ns": 1.0}
+PLAIN = {"1": 1.0}
+FRAMES = ("world", "horizontal", "body")
+
+QUANTITIES: dict[str, Mapping[str, float]] = {
+    "time": TIME,
+    **dict.fromkeys(("roll", "pitch", "yaw"), ANGLE),
+    **dict.fromkeys(("yaw_rate", "gyro_y", "gyro_z"), RATE),
+    **dict.fromkeys(("vx", "vy", "vz"), SPEED),
+    **dict.fromkeys(("x", "y", "z", "height"), LENGTH),
+    **dict.fromkeys(("qx", "qy", "qz", "qw"), PLAIN),
+    **dict.fromkeys(("true_x", "true_y", "true_z"), LENGTH),
+    **dict.fromkeys(("true_qx", "true_qy", "true_qz", "true_qw"), PLAIN),
+}
+"""Quantities and their units, each with its size in dmrl's (of time: in nanoseconds)."""
+
+TOGETHER = (
+    ("roll", "pitch"),
+    ("vx", "vy"),
+    ("x", "y", "z"),
+    ("qx", "qy", "qz", "qw"),
+    ("true_x", "true_y", "true_z"),
+    ("true_qx", "true_qy", "true_qz", "true_qw"),
+)
+"""Quantities that mean something together only."""
+KEYS = ("name", "unit", "sign", "frame")
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """What one column holds.
+
+    Parameters
+    ----------
+    name
+        In the file's first line.
+    scale
+        From its unit and sign to dmrl's.
+    frame
+        Of a velocity.
+    """
+
+    name: str
+    scale: float
+    frame: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnMap:
+    """Columns by quantity, and of ranges by peer."""
+
+    columns: Mapping[str, Column]
+    ranges: Mapping[str, Column]
+
+    @property
+    def names(self) -> set[str]:
+        """All columns of the file that it takes."""
+        return {column.name for column in (*self.columns.values(), *self.ranges.values())}
+
+
+def read_map(path: Path) -> ColumnMap:
+    """The map that a TOML file describes.
+
+    Raises
+    ------
+    SourceError
+        If the file is not TOML, or describes no map: names every fault, in one line.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
+        raise SourceError(f"{path} is no table of columns in TOML: {e}. Mend it") from None
+    ranges = values.pop("range", {})
+    ranges = ranges if isinstance(ranges, dict) else {"": ranges}
+    faults = [fault for key, table in values.items() for fault in _faults(key, table)]
+    faults += [f for peer, table in ranges.items() for f in _faults(f"range.{peer}", table)]
+    faults += _missing(values)
+    if faults:
+        raise SourceError(f"{path}: {'; '.join(faults)}. See docs/sources.md")
+    columns = {key: _column(QUANTITIES[key], table) for key, table in values.items()}
+    return ColumnMap(columns, {peer: _column(LENGTH, table) for peer, table in ranges.items()})
+
+
+def _missing(values: Mapping[str, Any]) -> Iterator[str]:
+    if "time" not in values:
+        yield "no [time]"
+    for group in TOGETHER:
+        given = [name for name in group if name in values]
+        if given and len(given) < len(group):
+            lacking = ", ".join(f"[{name}]" for name in group if name not in values)
+            yield f"[{given[0]}] wants {lacking} too"
+    frames = {v.get("frame", "") for k, v in values.items() if k[0] == "v" and isinstance(v, dict)}
+    if len(frames) > 1:
+        yield "velocities of several frames"
+    if "height" in values and "z" in values:
+        yield "[height] and [z] are one thing; leave one out"
+
+
+def _faults(key: str, table: Any) -> Iterator[str]:
+    """What is wrong with the table of a quantity."""
+    units = LENGTH if key.startswith("range.") else QUANTITIES.get(key)
+    if units is None:
+        near = get_close_matches(key, QUANTITIES, n=1)
+        yield f"[{key}]: no such quantity" + (f", did you mean {near[0]}?" if near else "")
+        return
+    if not isinstance(table, dict):
+        yield f"{key}: no table with name and unit"
+        return
+    yield from (f"[{key}] {name}: no such key" for name in table if name not in KEYS)
+    if not (isinstance(table.get("name"), str) and table["name"]):
+        yield f"[{key}] name: not the name of a column"
+    if table.get("unit", "1" if units is PLAIN else None) not in units:
+        yield f"[{key}] unit: not one of {', '.join(units)}"
+    if table.get("sign", 1) not in (1, -1) or isinstance(table.get("sign"), bool):
+        yield f"[{key}] sign: not 1 or -1"
+    if units is SPEED and table.get("frame") not in FRAMES:
+        yield f"[{key}] frame: not one of {', '.join(FRAMES)}"
+    if units is not SPEED and "frame" in table:
+        yield f"[{key}] frame: of velocities only"
+
+
+def _column(units: Mapping[str, float], table: Mapping[str, Any]) -> Column:
+    scale = units[table.get("unit", "1")] * table.get("sign", 1)
+    return Column(table["name"], scale, table.get("frame", ""))

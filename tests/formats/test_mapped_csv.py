@@ -1,0 +1,219 @@
+"""CSV files of others, by tables that say what their columns are."""
+
+from pathlib import Path
+from textwrap import dedent
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats import mapped_csv
+from dmrl.formats.column_map import read_map
+from dmrl.formats.format import Options
+from dmrl.formats.known import format_of
+from dmrl.formats.log_block import euler_zyx
+from dmrl.samples.sample import Sample
+
+TABLE = """
+[time]
+name = "t (ms)"
+unit = "ms"
+[roll]
+name = "phi"
+unit = "deg"
+[pitch]
+name = "theta"
+unit = "deg"
+sign = -1
+[yaw]
+name = "psi"
+unit = "rad"
+[yaw_rate]
+name = "r"
+unit = "deg/s"
+[vx]
+name = "vx"
+unit = "cm/s"
+frame = "world"
+[vy]
+name = "vy"
+unit = "cm/s"
+frame = "world"
+[height]
+name = "h"
+unit = "mm"
+[range.cf2]
+name = "d2"
+unit = "mm"
+"""
+HEADER = "t (ms);phi;theta;psi;r;vx;vy;h;d2;note"
+ROWS = ("1000;10;20;1.5707963;5;100;0;500;1500;ok", "1010.5;10;20;1.5707963;5;100;0;510;;ok")
+
+
+def samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Samples by topic."""
+    found: dict[str, list[Sample]] = {}
+    for sample in mapped_csv.content(source, options or Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """A table of columns, and beside it a log that it fits."""
+    (tmp_path / "log.csv").write_text("\n".join([HEADER, *ROWS]) + "\n")
+    (tmp_path / "map.toml").write_text(TABLE)
+    return tmp_path / "map.toml"
+
+
+def test_units_frames_and_signs_are_as_the_table_says(table: Path) -> None:
+    found = samples(table.with_name("log.csv"), Options(columns=table))
+    attitude = found["/cf1/attitude"][0].fields
+    assert (attitude["roll_rad"], attitude["pitch_rad"]) == pytest.approx(np.radians((10, -20)))
+    assert (attitude["yaw_rad"], attitude["yaw_rate_radps"]) == pytest.approx(
+        (np.pi / 2, np.radians(5)), abs=1e-6
+    )
+    # One metre a second along the world's x is to the right of a robot that looks along y.
+    velocity = found["/cf1/velocity"][0].fields
+    assert (velocity["vx_mps"], velocity["vy_mps"]) == pytest.approx((0, -1), abs=1e-6)
+    assert found["/cf1/height"][1].fields == {"height_m": pytest.approx(0.51)}
+    assert [(s.time_ns, s.fields["range_m"]) for s in found["/cf1/range/cf2"]] == [(10**9, 1.5)]
+    assert found["/cf1/height"][1].time_ns == 1_010_500_000
+    logged = found["/cf1/log/columns"][1].fields
+    assert logged["t__ms_"] == 1010.5 and np.isnan(logged["d2"]) and "note" not in logged
+
+
+@pytest.mark.parametrize("frame", ["horizontal", "body"])
+def test_velocities_of_other_frames_are_turned(frame: str, table: Path) -> None:
+    third = '[vz]\nname = "h"\nunit = "mm/s"\nframe = "body"\n' if frame == "body" else ""
+    table.write_text(TABLE.replace('frame = "world"', f'frame = "{frame}"') + third)
+    fields = samples(table.with_name("log.csv"), Options(columns=table))["/cf1/velocity"][0].fields
+    if frame == "horizontal":
+        assert (fields["vx_mps"], fields["vy_mps"]) == pytest.approx((1, 0), abs=1e-9)
+        return
+    (cr, cp), (sr, sp) = np.cos(np.radians((10, -20))), np.sin(np.radians((10, -20)))
+    level = [cp + sp * cr * 0.5, -sr * 0.5, -sp + cp * cr * 0.5]
+    assert [fields[f"v{axis}_mps"] for axis in "xyz"] == pytest.approx(level)
+
+
+def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "map.toml"
+    path.write_text(
+        dedent("""
+        rate = 5
+        [rol]
+        name = "phi"
+        [pitch]
+        name = 5
+        unit = "degrees"
+        sign = 2
+        colour = "red"
+        [vx]
+        name = "vx"
+        unit = "m/s"
+        frame = "earth"
+        [height]
+        name = "h"
+        unit = "m"
+        frame = "world"
+        [range.cf2]
+        name = "d"
+        unit = "s"
+        """)
+    )
+    with pytest.raises(SourceError) as e:
+        read_map(path)
+    text = str(e.value)
+    assert "\n" not in text and "map.toml" in text
+    for fault in (
+        "[rate]: no such quantity",
+        "[rol]: no such quantity, did you mean roll?",
+        "[pitch] name: not the name of a column",
+        "[pitch] unit: not one of rad, deg",
+        "[pitch] sign: not 1 or -1",
+        "[pitch] colour: no such key",
+        "[vx] frame: not one of world, horizontal, body",
+        "[height] frame: of velocities only",
+        "[range.cf2] unit: not one of m, cm, mm",
+        "no [time]",
+        "[vx] wants [vy] too",
+        "[pitch] wants [roll] too",
+    ):
+        assert fault in text
+
+
+@pytest.mark.parametrize("text", ["time = ", "range = 5\n", "time = 5\n"])
+def test_what_is_no_table_is_one_line(text: str, tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(SourceError, match=r"map\.toml"):
+        read_map(tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("soon;1;2;3;4;5;6;7;8;x", r"log\.csv:4: 'soon' is no time"),
+        ("1020;much;2;3;4;5;6;7;8;x", r"log\.csv:4: phi is 'much', no number"),
+        ("1020;1;2;3\n1030;1;2;3;4;5;6;7;8;x", r"log\.csv:4: 4 cells, not 10"),
+        ("-5;1;2;3;4;5;6;7;8;x", r"log\.csv:4: time -5 is before 1970"),
+    ],
+)
+def test_a_wrong_line_is_named(line: str, text: str, table: Path) -> None:
+    log = table.with_name("log.csv")
+    log.write_text(log.read_text() + line + "\n")
+    with pytest.raises(SourceError, match=text):
+        samples(log, Options(columns=table))
+
+
+def test_a_column_that_is_not_there_is_named(table: Path) -> None:
+    table.write_text(TABLE.replace('"phi"', '"roll"'))
+    with pytest.raises(SourceError, match=r"log\.csv:1: no column roll\. Mend the table"):
+        samples(table.with_name("log.csv"), Options(columns=table))
+
+
+def test_units_that_cannot_be_are_doubted(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table.write_text(TABLE.replace('unit = "deg"', 'unit = "rad"'))
+    samples(table.with_name("log.csv"), Options(columns=table))
+    err = capsys.readouterr().err
+    assert "roll reaches 10 rad. Is its unit deg?" in err
+    log = table.with_name("log.csv")
+    rows = [f"{1000 + 10 * k};0;0;{0.02 * k};114.6;0;0;0;0;x" for k in range(50)]  # 2 rad/s
+    log.write_text("\n".join([HEADER, *rows]) + "\n")
+    table.write_text(TABLE.replace('unit = "deg/s"', 'unit = "rad/s"'))
+    samples(log, Options(columns=table))
+    assert "turning rates are 57 times the slope of yaw. Are they deg/s?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name", ["B7_oval_medium_rep3", "B8_star_fast_rep2", "B9_trefoil_fast_rep4"]
+)
+def test_flights_of_nanobench_are_known_and_agree_with_vicon(
+    name: str, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = data / "nanobench" / f"{name}.csv"
+    assert format_of(source).name == "columns"
+    found = samples(source)
+    assert capsys.readouterr().err == ""
+    with source.open() as stream:
+        first = stream.readlines()[1].split(",")[0]
+    assert found["/cf1/attitude"][0].time_ns == int(first.replace(".", ""))
+
+    def rows(topic: str, *names: str) -> np.ndarray:
+        return np.array([[s.fields[n] for n in names] for s in found[topic]])
+
+    truth = [s.fields["pose"] for s in found["/cf1/pose/truth"]]
+    turned = np.array([[p["orientation"][axis] for axis in "xyzw"] for p in truth])
+    place = np.array([[p["position"][axis] for axis in "xyz"] for p in truth])
+    angles = rows("/cf1/attitude", "roll_rad", "pitch_rad", "yaw_rad")
+    off = angles - euler_zyx(turned)
+    off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    assert (np.median(np.abs(off), axis=0) < 0.06).all()
+    time_s = np.array([s.time_ns for s in found["/cf1/velocity"]]) * 1e-9
+    vx, vy = rows("/cf1/velocity", "vx_mps", "vy_mps").T
+    c, s = np.cos(angles[:, 2]), np.sin(angles[:, 2])
+    world = np.stack([c * vx - s * vy, s * vx + c * vy], axis=1)
+    true = np.gradient(place[:, :2], time_s - time_s[0], axis=0)
+    # The estimate lags: off by a tenth of the speed of the fast flights.
+    assert np.median(np.linalg.norm(world - true, axis=1)) < 0.12
+    assert min(np.corrcoef(world[:, k], true[:, k])[0, 1] for k in (0, 1)) > 0.97
+    assert np.ptp(place[:, 0]) > 1
