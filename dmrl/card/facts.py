@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import DatasetError
+from dmrl.names import markdown
 
 FILE = "facts.json"
 
@@ -75,7 +76,7 @@ def cautions(facts: Facts | None, sigmas: Mapping[str, Any]) -> Iterator[str]:
     for source, (known, total, u_px, v_px, depth_m) in sorted(sigmas.items()):
         spread = f"median {u_px:.1f} px in u, {v_px:.1f} px in v, {depth_m:.2f} m in depth"
         told = f"{known} of {total} have a sigma, {spread}" if known else "none has a sigma"
-        yield f"- How sure labels of `{source}` are: {told}."
+        yield f"- How sure labels of `{markdown(source)}` are: {told}."
     if facts is not None:
         yield from _told(facts)
     yield ""
@@ -83,18 +84,16 @@ def cautions(facts: Facts | None, sigmas: Mapping[str, Any]) -> Iterator[str]:
 
 def _told(facts: Facts) -> Iterator[str]:
     for name, others in sorted(facts.beside.items()):
-        yield (
-            f"- `{name}`: labels of `{facts.used[name]}` are used; there were labels of "
-            f"{', '.join(f'`{other}`' for other in others)} too."
-        )
+        used, more = markdown(facts.used[name]), ", ".join(f"`{markdown(o)}`" for o in others)
+        yield f"- `{markdown(name)}`: labels of `{used}` are used; there were labels of {more} too."
     for name, findings in sorted(facts.findings.items()):
-        yield from (f"- `{name}`: {finding}." for finding in findings)
+        yield from (f"- `{markdown(name)}`: {markdown(finding)}." for finding in findings)
     if not facts.findings:
         yield "- `dmrl check` finds no bias in the labels, as far as they have boxes to tell."
     reasons = [f"{count} images {why}" for why, count in facts.left_out.items() if count]
     yield f"- Left out: {'; '.join(reasons) or 'no image'}."
     yield f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train."
     for name, licence in sorted(facts.licences.items()):
-        yield f"- Licence beside `{name}`: {licence}."
+        yield f"- Licence beside `{markdown(name)}`: {markdown(licence)}."
     if not facts.licences:
         yield "- No licence was found beside what the recordings were made from."
