@@ -1,0 +1,113 @@
+"""A source of every kind that docs/sources.md names, small and whole, and ways to damage one."""
+
+from collections.abc import Callable
+from pathlib import Path
+from shutil import copytree
+
+import numpy as np
+
+from ..formats import foreign
+from ..formats.test_fuzz import SOURCES as BINARY
+
+Made = tuple[Path, Path]
+"""A source, and the one file of it that is damaged."""
+
+
+def client_log(folder: Path) -> Made:
+    """Two log blocks of the Crazyflie client."""
+    names = ("vx", "vy", "z", "roll", "pitch", "yaw")
+    head = ",".join(f"stateEstimate.{name}" for name in names)
+    rows = [f"{1000 + 10 * k},0.5,0.1,1.0,1.5,2.5,{0.1 * k:.1f}" for k in range(50)]
+    (folder / "cf1").mkdir()
+    path = folder / "cf1" / "state-20221011T10-33-31.csv"
+    path.write_text("\n".join([f"Timestamp,{head}", *rows]) + "\n")
+    ranges = [f"{1000 + 20 * k},{1500 + k}" for k in range(25)]
+    other = folder / "cf1" / "range-20221011T10-33-32.csv"
+    other.write_text("\n".join(["Timestamp,ranging.distance2", *ranges]) + "\n")
+    return folder / "cf1", path
+
+
+def flight_logs(folder: Path) -> Made:
+    """Two robots in our own tables."""
+    columns = "time_s,roll_rad,pitch_rad,yaw_rate_radps,vx_mps,vy_mps,height_m"
+    flight = folder / "flight"
+    flight.mkdir()
+    for robot, peer in (("cf1", "cf2"), ("cf2", "cf1")):
+        rows = [f"{0.01 * k:.2f},0.01,0.02,0.1,0.5,0.1,1.0,{1.5 + 0.01 * k:.2f}" for k in range(50)]
+        text = "\n".join([f"{columns},range_{peer}_m", *rows]) + "\n"
+        (flight / f"{robot}.csv").write_text(text)
+    return flight, flight / "cf2.csv"
+
+
+def somebodys_csv(folder: Path) -> Made:
+    """Fifty rows that have the columns of NanoBench."""
+    from dmrl.formats.column_map import read_map  # noqa: PLC0415
+    from dmrl.formats.mapped_csv import NANOBENCH  # noqa: PLC0415
+
+    names = sorted(read_map(NANOBENCH).names - {"t", "qw"})
+    rows = [f"{1772662978 + 0.01 * k:.9f},1," + ",".join(["0.01"] * len(names)) for k in range(50)]
+    path = folder / "B7_oval.csv"
+    path.write_text("\n".join([",".join(["t", "qw", *names]), *rows]) + "\n")
+    return path, path
+
+
+def pictures(folder: Path) -> Made:
+    """Pictures with labels; the labels are damaged."""
+    source = folder / "pictures"
+    source.mkdir()
+    for name, data in foreign.coloured().items():
+        (source / name).write_bytes(data)
+    rows = [f"{name},cf2,10.5,8.5,1.2,hand" for name in sorted(foreign.coloured())]
+    path = source / "labels.csv"
+    path.write_text("\n".join(["file,peer,u_px,v_px,depth_m,source", *rows]) + "\n")
+    return source, path
+
+
+def published(data: Path) -> Callable[[Path], Made]:
+    """A part of the published set."""
+
+    def make(folder: Path) -> Made:
+        source = folder / "published"
+        copytree(data / "locanet-multi", source)
+        return source, source / "posLabel.txt"
+
+    return make
+
+
+KINDS: dict[str, Callable[[Path], Made]] = {
+    **{which: make for which, (_, make) in BINARY.items()},
+    "cfclient": client_log,
+    "csv": flight_logs,
+    "columns": somebodys_csv,
+    "labels of pictures": pictures,
+}
+
+
+def cut(data: bytes) -> bytes:
+    """The last two fifths are missing, as after a flat battery."""
+    return data[: len(data) * 3 // 5]
+
+
+def emptied(_: bytes) -> bytes:
+    """Nothing was written."""
+    return b""
+
+
+def scrambled(data: bytes) -> bytes:
+    """Sixty-four bytes in the middle are those of another file."""
+    at = len(data) // 2
+    noise = np.random.default_rng(at).integers(0, 256, 64, np.uint8).tobytes()
+    return data[:at] + noise + data[at + 64 :]
+
+
+def exchanged(_: bytes) -> bytes:
+    """A text of another kind has its name."""
+    return b"Dear diary,\ntoday the drones flew.\n" * 40
+
+
+def doubled(data: bytes) -> bytes:
+    """It was copied onto its own end."""
+    return data + data
+
+
+DAMAGES = (cut, emptied, scrambled, exchanged, doubled)

@@ -1,0 +1,75 @@
+"""A walk: files of every kind arrive damaged, in five ways each.
+
+What a person must see is one of two things. A line that names the file and the way out, and then
+there is no recording. Or a recording of all that is whole, and then a line that says what is not:
+nothing is lost in silence.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import DmrlError
+from dmrl.formats.known import format_of
+from dmrl.names import LINE_MAX
+from dmrl.stages import convert
+
+from . import sources
+
+pytestmark = pytest.mark.slow
+
+
+def converted(source: Path, out: Path, kind: str | None = None) -> dict[str, int]:
+    """Messages of a source by topic, as the command counts them."""
+    return convert.run(source, out, convert.Settings(kind, robot="cf1"))
+
+
+@pytest.mark.parametrize("damage", sources.DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("kind", sources.KINDS)
+@pytest.mark.parametrize("said_kind", [False, True], ids=["guessed", "said"])
+def test_damage_is_refused_or_said(
+    said_kind: bool,
+    kind: str,
+    damage: sources.Callable[[bytes], bytes],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    source, path = sources.KINDS[kind](tmp_path)
+    name = format_of(source).name if said_kind else None
+    whole = converted(source, tmp_path / "whole.mcap")
+    capsys.readouterr()
+    before = path.read_bytes()
+    path.write_bytes(damage(before))
+    out = tmp_path / "out.mcap"
+    try:
+        counts = converted(source, out, name)
+    except DmrlError as e:
+        assert not out.exists() and not [*tmp_path.glob("*.partial")]
+        assert "\n" not in str(e) and len(str(e)) <= LINE_MAX
+        assert path.name in str(e) or source.name in str(e)
+        return
+    said = capsys.readouterr().err
+    lost = {topic: count for topic, count in whole.items() if counts.get(topic, 0) < count}
+    assert not lost or said, f"lost without a word: {lost}"
+
+
+@pytest.mark.parametrize("damage", sources.DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("name", ["posLabel.txt", "train.txt", "boxLabel.txt"])
+def test_damage_of_the_published_set_is_refused_or_said(
+    name: str,
+    damage: sources.Callable[[bytes], bytes],
+    data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    source, _ = sources.published(data)(tmp_path)
+    path = source / name
+    if not path.is_file():
+        path = next(p for p in sorted(source.rglob("*.txt")))
+    path.write_bytes(damage(path.read_bytes()))
+    try:
+        converted(source, tmp_path / "out.mcap")
+    except DmrlError as e:
+        assert "\n" not in str(e) and (path.name in str(e) or source.name in str(e))
+        return
+    assert damage is not sources.cut or capsys.readouterr().err
