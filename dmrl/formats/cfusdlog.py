@@ -30,6 +30,8 @@ VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}
 CODES = "bBhHiIef"
 TYPES_MAX = 250
 CRC_BYTES = 4
+SAID = 3
+"""Files of a folder that are named one by one when they are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,15 +173,17 @@ def _files(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
         yield options.robot, source
         return
     paths = sorted(p for p in source.iterdir() if p.is_file() and p.name[0] != ".")
+    logs = [path for path in paths if path.stat().st_size and recognises(path)]
+    if not logs:
+        raise SourceError(f"no micro-SD log in {source}. Name a folder with one file per robot")
     for path in paths:
         if path.stat().st_size == 0:
             say(f"{path} is empty; left out")
-        elif recognises(path):
+        elif path in logs:
             yield options.names.get(path.stem, path.stem), path
-        else:
-            say(f"{path} is no micro-SD log; left out")
-    if not any(path.stat().st_size and recognises(path) for path in paths):
-        raise SourceError(f"no micro-SD log in {source}. Name a folder with one file per robot")
+    if others := [path.name for path in paths if path.stat().st_size and path not in logs]:
+        more = f" and {len(others) - SAID} more" if len(others) > SAID else ""
+        say(f"{source}: left out: {', '.join(others[:SAID])}{more} is no micro-SD log")
 
 
 def _streams(robot: str, path: Path, options: Options) -> list[crazyflie_log.Stream]:

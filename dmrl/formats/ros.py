@@ -166,9 +166,8 @@ def _guarded(source: Path, of: Any) -> Iterator[Any]:
     rosbags lets through what sqlite, YAML, struct and its decompressors raise on damaged
     bags, so there is no list of errors to name here.
     """
-    reader = _reader(source)
     try:
-        with reader:
+        with _reader(source) as reader:
             yield from of(reader)
     except DmrlError:
         raise

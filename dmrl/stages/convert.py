@@ -34,6 +34,8 @@ from dmrl.terminal.tables import print_json, print_table
 
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 
+RATE_MAX_HZ = 1e6
+SIDE_MAX_PX = 8192
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 
@@ -143,12 +145,10 @@ def _options(settings: Settings) -> Options:
     if not ROBOT.fullmatch(settings.robot):
         raise SettingError(f"--robot {settings.robot!r} cannot stand in a topic. Try: cf1")
     width_px, height_px = settings.width_px, settings.height_px
-    if (
-        settings.rate_hz <= 0
-        or min(width_px or 1, height_px or 1) < 1
-        or 0 in (width_px, height_px)
-    ):
-        raise SettingError("--rate-hz, --width-px and --height-px must be over 0. Raise them")
+    if not 1 / RATE_MAX_HZ <= settings.rate_hz <= RATE_MAX_HZ:
+        raise SettingError(f"--rate-hz {settings.rate_hz:g} must be over 0, from 1e-6 to 1e6")
+    if any(side is not None and not 1 <= side <= SIDE_MAX_PX for side in (width_px, height_px)):
+        raise SettingError(f"--width-px and --height-px must be over 0, {SIDE_MAX_PX} at most")
     if (width_px is None) != (height_px is None):
         raise SettingError("--width-px and --height-px go together. Give both, or neither")
     return Options(

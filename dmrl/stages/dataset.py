@@ -128,6 +128,8 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
         If ``out`` exists.
     """
     check_license(settings.license)
+    if settings.masks and not any(_has_masks(path) for path in recordings):
+        raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     with partial_folder(out) as partial:
         total = sum(count_images(path) for path in recordings)
         made = provenance(
@@ -161,6 +163,10 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
         facts.write(partial)
         write_card(partial)
     return Result(images, {path.name: source for path, source in sources.items()}, tally)
+
+
+def _has_masks(recording: Path) -> bool:
+    return any(topics.names(topics.MASKS, topic) for topic in summary(recording).topics)
 
 
 def _beside(sources: Mapping[Path, str]) -> dict[str, list[str]]:

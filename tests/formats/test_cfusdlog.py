@@ -276,7 +276,7 @@ def test_a_folder_is_a_robot_per_file(tmp_path: Path, capsys: pytest.CaptureFixt
     found = samples(tmp_path)
     assert {"/cf1/attitude", "/cf2/attitude"} <= found.keys()
     err = capsys.readouterr().err
-    assert "cf3 is empty; left out" in err and "notes.txt is no micro-SD log" in err
+    assert "cf3 is empty; left out" in err and "left out: notes.txt is no micro-SD log" in err
 
 
 def test_attitude_before_the_estimator_starts_is_left_out(tmp_path: Path) -> None:
