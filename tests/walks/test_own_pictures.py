@@ -1,0 +1,57 @@
+"""A walk: pictures of one's own camera, labelled by hand, to a dataset that tells what it is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SettingError
+from dmrl.images.codec import encode_png
+from dmrl.stages import convert, dataset
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Thirty pictures; the labels of a tool that counts rows from another edge are 10 px low."""
+    folder = tmp_path / "hall"
+    folder.mkdir()
+    (folder / "LICENSE").write_text("CC BY 4.0\n")
+    rng = np.random.default_rng(0)
+    lines = [
+        "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px,source,sigma_u_px,sigma_v_px"
+    ]
+    for k in range(30):
+        rgb = rng.integers(0, 256, (112, 160, 3), np.uint8)
+        (folder / f"{k:03d}.png").write_bytes(encode_png(rgb))
+        u, v = rng.uniform(30, 120), rng.uniform(30, 70)
+        box = f"{u - 12:.1f},{v - 8:.1f},{u + 12:.1f},{v + 8:.1f}"
+        lines.append(f"{k:03d}.png,cf2,{u:.2f},{v + 10:.2f},1.5,{box},hand,2.0,3.0")
+    (folder / "labels.csv").write_text("\n".join(lines) + "\n")
+    (folder / "900.png").write_bytes(encode_png(rgb))
+    return folder
+
+
+def test_the_week_ends_with_a_card_that_hides_nothing(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = tmp_path / "hall.mcap"
+    convert.run(pictures, recording, convert.Settings())
+    # The bias is told the moment the recording is made.
+    assert "labels of source 'hand' are biased: " in capsys.readouterr().err
+    with pytest.raises(SettingError, match="has no masks"):
+        dataset.run([recording], tmp_path / "d", dataset.Settings(masks=True))
+    with pytest.raises(SettingError, match="no licence that SPDX"):
+        dataset.run([recording], tmp_path / "d", dataset.Settings(license="ccby"))
+    dataset.run([recording], tmp_path / "d", dataset.Settings(license="cc-by-4.0"))
+    assert "left out: 1 images had no labels" in capsys.readouterr().err
+    card = (tmp_path / "d" / "README.md").read_text()
+    for line in (
+        "30 of 30 have a sigma, median 2.0 px in u, 3.0 px in v",
+        "labels of source 'hand' are biased: ",
+        "- Left out: 1 images had no labels.",
+        "- Leaks: no images",
+        "- Licence beside `hall`: CC BY 4.0.",
+    ):
+        assert line in card
