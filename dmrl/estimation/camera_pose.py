@@ -1,84 +1,50 @@
-"""How a camera is mounted, and how late its images are stamped, from a flight. Arrays only.
+"""How a camera is mounted, and how late its images are stamped, from flights. Arrays only.
 
 The network says where a peer is in the image; ranges and odometry say where it is in the
 horizontal frame. What is left between the two, over a whole flight, is the mount's rotation and
-the clock's offset: the bias that Li et al. saw in their labels and left there. Both come by
-maximum likelihood, every label with its own covariance, outliers tamed by Cauchy's loss.
+the clock's offset: the bias that Li et al. saw in their labels and left there. Which detection is
+of which peer depends on both, so several delays are tried, the best is refined, and where two
+explain the images alike neither is believed.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dmrl.geometry.frames import Array, Camera, inside, pixels_from_horizontal
+from dmrl.errors import SettingError
+from dmrl.estimation.camera_views import (
+    Flight,
+    Matched,
+    Noise,
+    View,
+    match,
+    median_px,
+    mounted,
+    residual,
+)
+from dmrl.estimation.mount import LARGEST, Mount, slopes_of, solve
+from dmrl.geometry.frames import Array, Camera
 
-RADII_PX = (60.0, 40.0, 25.0)
-"""How far a detection may be from where its peer is expected, round by round."""
-LARGEST_RAD, LARGEST_S = 0.35, 0.5
-STEP = 1e-3
-"""Of the numeric derivatives: radians and seconds."""
-LONGEST_GAP_S = 0.25
-"""Positions are not interpolated over longer gaps."""
-LEAST_FLIGHTS, PARTS = 3, 10
-"""Flights that are left out in turn, for the standard errors; stretches, where they are fewer."""
+TRIED_S = np.arange(-5, 6) * 0.08
+"""Delays that are tried: their images of a peer that crosses the view still overlap."""
+TRIED_IMAGES = 600
+"""Images, of all peers and flights, that tell a good start from a bad one."""
+WIDE_PX, RADII_PX = 60.0, (60.0, 40.0, 25.0)
+"""How far a detection may be from where its peer is expected: at first, and round by round."""
+WORST = 9.0
+"""Squared residual, whitened, of a detection that is nobody's."""
+ALIKE = 0.1
+"""Tries that fit worse by more than this share are not refined."""
+REFINED = 4
+"""Tries that are refined at most."""
+SAME_S = 0.015
+"""Delays so near to each other are one."""
+LIKELY = 4.0
+"""Two delays are not told apart if their log-likelihoods differ by less: one in fifty."""
 LEAST = 50
 """Fewest matched detections that are worth a calibration."""
-
-
-@dataclass(frozen=True, slots=True)
-class PeerPath:
-    """Where one peer was.
-
-    Parameters
-    ----------
-    time_s
-        (N,) ascending.
-    xyz_m
-        (N, 3) in the observer's horizontal frame.
-    covariance
-        (N, 3, 3) m^2; zero where it is exact.
-    """
-
-    time_s: Array
-    xyz_m: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Flight:
-    """What one observer saw, and where everything was.
-
-    Parameters
-    ----------
-    image_s
-        (K,) log times of the images.
-    image
-        (M,) image of each detection, ascending.
-    uv
-        (M, 2) pixels.
-    attitude_s, attitude_rad
-        (A,) and (A, 2) roll and pitch of the observer.
-    peers
-        By name.
-    """
-
-    image_s: Array
-    image: NDArray[np.int64]
-    uv: Array
-    attitude_s: Array
-    attitude_rad: Array
-    peers: Mapping[str, PeerPath]
-
-
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Standard deviations: of a detection in pixels, of roll and pitch in radians."""
-
-    pixel_std_px: float = 4.0
-    attitude_std_rad: float = 0.015
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +56,8 @@ class Calibration:
     camera
         With its mount and delay.
     mount_std_rad
-        (3,) standard errors of roll, pitch and yaw, by the jackknife over flights or, where they
-        are fewer than three, stretches of them: errors of positions last for seconds, and partly
-        for a flight, so a count of images would promise too much.
+        (3,) standard errors of roll, pitch and yaw. Errors of positions last for seconds, and
+        partly for a flight (`dmrl.estimation.mount`): a count of images would promise too much.
     delay_std_s
         Of the delay.
     matched
@@ -110,20 +75,11 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True)
-class _Matched:
-    """Detections with their peers: when, where in the image, in which view, their weight."""
+class _Try:
+    """Where one start ended: mount and delay, and how badly the images fit, from 0 to `WORST`."""
 
-    time_s: Array
-    uv: Array
-    view: NDArray[np.int64]
-    whiten: Array
-
-    def select(self, keep: NDArray[np.bool_]) -> "_Matched":
-        return _Matched(self.time_s[keep], self.uv[keep], self.view[keep], self.whiten[keep])
-
-
-View = tuple[Flight, PeerPath]
-"""One peer in one flight."""
+    values: Array
+    misfit: float
 
 
 def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibration | None:
@@ -137,130 +93,113 @@ def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibr
         Intrinsics, and the mount and delay to start from.
     noise
         Of detections and attitude.
+
+    Raises
+    ------
+    SettingError
+        If two delays explain the images alike.
     """
-    views = [(flight, peer) for flight in flights for peer in flight.peers.values()]
+    smooth = [flight.smoothed() for flight in flights]
+    views = [(flight, peer) for flight in smooth for peer in flight.peers.values()]
     if not views:
         return None
     start = np.array([*camera.mount_rad, camera.delay_s])
-    found, matched = start, None
-    for radius_px in RADII_PX:
-        matched = _match(views, _camera(camera, found), radius_px, noise)
-        if len(matched.time_s) < LEAST:
-            return None
-        found = _solve(views, camera, matched, found)
-    assert matched is not None
-    parts = _parts(views, matched)
-    rest = [matched.select(parts != k) for k in np.unique(parts)]
-    without = [_solve(views, camera, part, found) for part in rest]
-    spread = np.sqrt((len(without) - 1) * np.var(without, axis=0))
+    tries = _tries(views, camera, start, noise)
+    if not tries:
+        return None
+    ends = [_refined(views, camera, one, noise) for one in _apart(tries)]
+    ends = sorted((end for end in ends if end is not None), key=lambda end: end[0].cost)
+    if not ends:
+        return None
+    found, matched = ends[0]
+    _refuse_alike([end for end, _ in ends])
+    spread = np.sqrt(np.diag(found.covariance))
     return Calibration(
-        _camera(camera, found),
+        mounted(camera, found.values),
         (float(spread[0]), float(spread[1]), float(spread[2])),
         float(spread[3]),
         len(matched.time_s),
-        _median_px(views, camera, matched, start),
-        _median_px(views, camera, matched, found),
+        median_px(views, camera, matched, start),
+        median_px(views, camera, matched, found.values),
     )
 
 
-def _parts(views: Sequence[View], matched: _Matched) -> NDArray[np.int64]:
-    """(N,) number of the stretch that is left out together with a detection.
+def _tries(views: Sequence[View], camera: Camera, start: Array, noise: Noise) -> list[_Try]:
+    """Where each start ends, the best first."""
+    found = []
+    views = [(flight.thinned(TRIED_IMAGES // len(views)), peer) for flight, peer in views]
+    for delay_s in (start[3], *TRIED_S):
+        values = np.array([*start[:3], delay_s])
+        matched = match(views, mounted(camera, values), WIDE_PX, noise)
+        if len(matched.time_s) >= LEAST:
+            values = _rough(views, camera, matched, values)
+            found.append(_Try(values, _misfit(views, camera, values, noise)))
+    return sorted(found, key=lambda one: one.misfit)
 
-    Whole flights where there are several: what biases the positions of one, such as the flow's
-    scale, does not change within it.
+
+def _misfit(views: Sequence[View], camera: Camera, values: Array, noise: Noise) -> float:
+    """Mean squared residual of the images in which a peer is expected, each at most `WORST`.
+
+    A start that explains few images well must not beat one that explains most: an image without
+    a detection near counts as the worst there is.
     """
-    flights = list({id(flight): flight for flight, _ in views})
-    if len(flights) >= LEAST_FLIGHTS:
-        return np.array([flights.index(id(flight)) for flight, _ in views])[matched.view]
-    order = np.argsort(np.argsort(matched.time_s, kind="stable"), kind="stable")
-    return np.asarray(order * PARTS // max(len(order), 1))
+    matched = match(views, mounted(camera, values), WIDE_PX, noise)
+    apart = (matched.whiten @ residual(views, camera, matched, values)[..., None])[..., 0]
+    missed = matched.expected - len(apart)
+    fits = np.minimum((apart**2).sum(axis=1), WORST).sum()
+    return float((fits + WORST * missed) / max(matched.expected, 1))
 
 
-def _camera(camera: Camera, values: Array) -> Camera:
-    roll, pitch, yaw, delay_s = values.tolist()
-    return replace(camera, mount_rad=(roll, pitch, yaw), delay_s=delay_s)
-
-
-def _expected(flight: Flight, camera: Camera, peer: PeerPath, time_s: Array) -> tuple[Array, Array]:
-    """(N, 2) pixels of a peer in images stamped so; (N, 3, 5) with the derivatives."""
-    at_s = time_s - camera.delay_s
-    xyz = np.column_stack([np.interp(at_s, peer.time_s, axis) for axis in peer.xyz_m.T])
-    roll, pitch = (np.interp(at_s, flight.attitude_s, a) for a in flight.attitude_rad.T)
-    uv, _, jacobian = pixels_from_horizontal(xyz, roll, pitch, camera)
-    return uv, jacobian
-
-
-def _match(views: Sequence[View], camera: Camera, radius_px: float, noise: Noise) -> _Matched:
-    """The nearest detection of every peer in every image, if it is near."""
-    parts = []
-    for number, (flight, peer) in enumerate(views):
-        uv, jacobian = _expected(flight, camera, peer, flight.image_s)
-        good = _covered(peer, flight.image_s - camera.delay_s) & inside(
-            uv, camera.width_px, camera.height_px
-        )
-        apart_px = np.linalg.norm(flight.uv - uv[flight.image], axis=1)
-        apart_px[~good[flight.image]] = np.inf
-        order = np.lexsort((apart_px, flight.image))
-        _, first = np.unique(flight.image[order], return_index=True)
-        nearest = order[first]
-        nearest = nearest[apart_px[nearest] <= radius_px]
-        image = flight.image[nearest]
-        time_s = flight.image_s[image]
-        whiten = _whitening(jacobian[image, :2], _spread(peer, time_s - camera.delay_s), noise)
-        parts.append((time_s, flight.uv[nearest], np.full(len(image), number), whiten))
-    return _Matched(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _covered(peer: PeerPath, at_s: Array) -> NDArray[np.bool_]:
-    """(N,) whether the peer's position is known shortly before and after a time."""
-    after = np.searchsorted(peer.time_s, at_s)
-    known = (after > 0) & (after < len(peer.time_s))
-    after = np.clip(after, 1, len(peer.time_s) - 1)
-    return np.asarray(known & (peer.time_s[after] - peer.time_s[after - 1] < LONGEST_GAP_S))
-
-
-def _spread(peer: PeerPath, at_s: Array) -> Array:
-    """(N, 3, 3) covariance of the peer's position at the nearest times."""
-    return peer.covariance[np.clip(np.searchsorted(peer.time_s, at_s), 0, len(peer.time_s) - 1)]
-
-
-def _whitening(jacobian: Array, covariance: Array, noise: Noise) -> Array:
-    """(N, 2, 2) matrices that turn pixel errors into ones of unit variance."""
-    joint = np.zeros((len(jacobian), 5, 5))
-    joint[:, :3, :3] = covariance
-    joint[:, [3, 4], [3, 4]] = noise.attitude_std_rad**2
-    spread = jacobian @ joint @ jacobian.swapaxes(1, 2) + noise.pixel_std_px**2 * np.eye(2)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(spread)))
-
-
-def _residual(views: Sequence[View], camera: Camera, matched: _Matched, values: Array) -> Array:
-    """(N, 2) detection minus expectation, pixels."""
-    out = np.empty_like(matched.uv)
-    for number, (flight, peer) in enumerate(views):
-        mine = matched.view == number
-        uv, _ = _expected(flight, _camera(camera, values), peer, matched.time_s[mine])
-        out[mine] = matched.uv[mine] - uv
-    return np.nan_to_num(out)
-
-
-def _solve(views: Sequence[View], camera: Camera, matched: _Matched, start: Array) -> Array:
-    """(4,) roll, pitch, yaw (rad) and delay (s) of the greatest likelihood."""
+def _rough(views: Sequence[View], camera: Camera, matched: Matched, start: Array) -> Array:
+    """(4,) mount and delay of the greatest likelihood, were all errors of single images."""
 
     def white(values: Array) -> Array:
-        apart = _residual(views, camera, matched, values)
+        apart = residual(views, camera, matched, values)
         return np.asarray((matched.whiten @ apart[..., None]).ravel())
 
     def slopes(values: Array) -> Array:
-        steps = STEP * np.eye(4)
-        sides = [(white(values + step), white(values - step)) for step in steps]
-        return np.column_stack([(ahead - behind) / (2 * STEP) for ahead, behind in sides])
+        found = slopes_of(views, camera, matched, values)
+        return np.asarray(-(matched.whiten @ found).reshape(-1, 4))
 
-    limit = np.array([LARGEST_RAD] * 3 + [LARGEST_S])
-    start = np.clip(start, -0.99 * limit, 0.99 * limit)
-    found = least_squares(white, start, slopes, bounds=(-limit, limit), loss="cauchy")
+    start = np.clip(start, -0.99 * LARGEST, 0.99 * LARGEST)
+    found = least_squares(
+        white, start, slopes, bounds=(-LARGEST, LARGEST), loss="cauchy", xtol=1e-4, max_nfev=10
+    )
     return np.asarray(found.x)
 
 
-def _median_px(views: Sequence[View], camera: Camera, matched: _Matched, values: Array) -> float:
-    apart = _residual(views, camera, matched, values)
-    return float(np.median(np.linalg.norm(apart, axis=1)))
+def _apart(tries: Sequence[_Try]) -> list[_Try]:
+    """The best tries, of each delay one."""
+    kept: list[_Try] = []
+    for one in tries:
+        alone = all(abs(one.values[3] - other.values[3]) > SAME_S for other in kept)
+        if alone and one.misfit < tries[0].misfit * (1 + ALIKE):
+            kept.append(one)
+    return kept[:REFINED]
+
+
+def _refined(
+    views: Sequence[View], camera: Camera, one: _Try, noise: Noise
+) -> tuple[Mount, Matched] | None:
+    """One start, matched again as it gets better; None where too few detections are near."""
+    values, end = one.values, None
+    for radius_px in RADII_PX:
+        matched = match(views, mounted(camera, values), radius_px, noise)
+        if len(matched.time_s) < LEAST:
+            return None
+        found = solve(views, camera, matched, values, noise)
+        values, end = found.values, (found, matched)
+    return end
+
+
+def _refuse_alike(ends: Sequence[Mount]) -> None:
+    """Refuse where a start ended at another delay that is about as likely."""
+    best = ends[0]
+    for other in ends[1:]:
+        apart_s = abs(float(other.values[3] - best.values[3]))
+        if other.cost < best.cost + LIKELY and apart_s > SAME_S:
+            raise SettingError(
+                f"delays of {1e3 * best.values[3]:.0f} and {1e3 * other.values[3]:.0f} ms explain "
+                "the images alike. Calibrate with more flights, or such in which peers cross "
+                "the view faster"
+            )

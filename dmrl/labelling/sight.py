@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
-from dmrl.estimation.camera_pose import Flight, PeerPath
+from dmrl.estimation.camera_views import Flight, PeerPath
 from dmrl.estimation.view import Motion, View
 from dmrl.geometry.frames import Array, Camera
 from dmrl.messages import STATUS_OK

@@ -21,7 +21,8 @@ from dmrl.terminal.tables import print_json, print_table
 
 try:
     from dmrl.estimation import board
-    from dmrl.estimation.camera_pose import LEAST, Calibration, Noise, calibrate
+    from dmrl.estimation.camera_pose import LEAST, Calibration, calibrate
+    from dmrl.estimation.camera_views import Noise
     from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.sight import camera_flight
 except ModuleNotFoundError as e:

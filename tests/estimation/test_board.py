@@ -1,51 +1,71 @@
-import cv2
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from dmrl.estimation.board import corners, intrinsics
-from dmrl.geometry.frames import AIDECK, Array
+from dmrl.estimation.board import Intrinsics, corners, intrinsics
+from dmrl.geometry.frames import AIDECK, Array, Camera
 
-COLUMNS, ROWS, SQUARE_M = 7, 5, 0.03
-K = AIDECK.image_from_optical - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's centre
-
-
-def pose(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Rotation vector and place of a board in view, optical frame."""
-    turn = rng.uniform(-0.6, 0.6, 3) * [1.0, 1.0, 0.3]
-    middle = np.array([(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0]) * SQUARE_M
-    place = np.array([rng.uniform(-0.05, 0.04), rng.uniform(0.0, 0.06), rng.uniform(0.25, 0.35)])
-    return turn, place - cv2.Rodrigues(turn)[0] @ middle
+from .boards import COLUMNS, ROWS, Look, corners_of, lens, picture, pose
 
 
-def picture(turn: Array, place: Array) -> np.ndarray:
-    """The board as the camera shows it: every pixel's ray meets the board's plane."""
-    v, u = np.mgrid[:224, :320].astype(float)
-    rays = cv2.undistortPoints(
-        np.stack([u, v], -1).reshape(-1, 1, 2), K, np.array(AIDECK.distortion)
+def shown(camera: Camera, rng: np.random.Generator, views: int) -> list[tuple[Array, Array]]:
+    """Found and true corners of some views."""
+    pairs = []
+    for _ in range(views):
+        at = pose(rng, camera)
+        look = Look(rng.uniform(0.3, 1.2), rng.uniform(0.5, 4.0), rng.uniform(15, 50))
+        found = corners(picture(*at, camera, look, rng), COLUMNS, ROWS)
+        true = corners_of(*at, camera)
+        if found is not None:
+            turned = np.abs(found[0] - true[0]).max() > np.abs(found[-1] - true[0]).max()
+            pairs.append((found[::-1] if turned else found, true))
+    return pairs
+
+
+def calibrated(camera: Camera, pairs: list[tuple[Array, Array]]) -> Intrinsics:
+    boards = [np.ascontiguousarray(found, np.float32) for found, _ in pairs]
+    return intrinsics(boards, (COLUMNS, ROWS), (camera.width_px, camera.height_px))
+
+
+def normalised(camera: Camera, made: Intrinsics) -> Array:
+    """(4,) errors of focal lengths and centre over the sigmas they are given with."""
+    found = made.camera
+    errors = np.subtract(
+        (found.fx_px, found.fy_px, found.cx_px, found.cy_px),
+        (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
     )
-    rays = np.column_stack([rays.reshape(-1, 2), np.ones(320 * 224)])
-    rotation = cv2.Rodrigues(turn)[0]
-    scale = (rotation[:, 2] @ place) / (rays @ rotation[:, 2])
-    x, y, _ = ((rays * scale[:, None] - place) @ rotation / SQUARE_M).T
-    on = (x > -1) & (x < COLUMNS) & (y > -1) & (y < ROWS)
-    black = (np.floor(x) + np.floor(y)) % 2 == 0
-    grey = np.where(on & black, 30.0, 220.0).reshape(224, 320)
-    return cv2.GaussianBlur(grey, (0, 0), 0.7).astype(np.uint8)
+    return np.asarray(errors / (*made.focal_std_px, *made.centre_std_px))
 
 
 def test_a_drawn_board_gives_the_camera_that_drew_it() -> None:
-    rng = np.random.default_rng(0)
-    poses = [pose(rng) for _ in range(20)]
-    found = [corners(picture(*p), COLUMNS, ROWS) for p in poses]
-    boards = [board for board in found if board is not None]
-    assert len(boards) >= 8
-    made = intrinsics(boards, (COLUMNS, ROWS), (320, 224))
-    assert made.camera.fx_px == pytest.approx(AIDECK.fx_px, rel=0.02)
-    assert made.camera.fy_px == pytest.approx(AIDECK.fy_px, rel=0.02)
-    assert made.camera.cx_px == pytest.approx(AIDECK.cx_px, abs=2.0)
-    assert made.camera.cy_px == pytest.approx(AIDECK.cy_px, abs=2.0)
-    assert made.rms_px < 0.3
+    pairs = shown(AIDECK, np.random.default_rng(0), 10)
+    assert len(pairs) >= 8
+    made = calibrated(AIDECK, pairs)
+    assert made.camera.fx_px == pytest.approx(AIDECK.fx_px, rel=0.005)
+    assert made.camera.fy_px == pytest.approx(AIDECK.fy_px, rel=0.005)
+    assert made.camera.cx_px == pytest.approx(AIDECK.cx_px, abs=0.7)
+    assert made.camera.cy_px == pytest.approx(AIDECK.cy_px, abs=0.7)
+    assert np.abs(normalised(AIDECK, made)).max() < 4
     assert (made.camera.width_px, made.camera.height_px) == (320, 224)
+
+
+def test_corners_are_found_to_a_twentieth_of_a_pixel() -> None:
+    pairs = shown(AIDECK, np.random.default_rng(1), 8)
+    errors = np.concatenate([found - true for found, true in pairs])
+    assert np.sqrt((errors**2).mean()) < 0.06
+    assert np.abs(errors).max() < 0.4
+
+
+@pytest.mark.slow
+def test_sigmas_of_thirty_lenses_hold() -> None:
+    squares = []
+    for seed in range(30):
+        rng = np.random.default_rng(100 + seed)
+        camera = lens(rng)
+        squares.append(normalised(camera, calibrated(camera, shown(camera, rng, 12))) ** 2)
+    low, high = chi2.ppf((0.025, 0.975), 30) / 30
+    for mean in np.mean(squares, axis=0):
+        assert low < mean < high
 
 
 def test_a_picture_without_a_board_has_no_corners() -> None:

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.camera_pose import Flight, Noise, PeerPath, calibrate
+from dmrl.estimation.camera_pose import calibrate
+from dmrl.estimation.camera_views import Flight, Noise, PeerPath
 from dmrl.geometry.frames import AIDECK, Camera, inside, pixels_from_horizontal
 
 TRUE = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)

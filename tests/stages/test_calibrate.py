@@ -13,7 +13,7 @@ from dmrl.recording import Provenance, RecordingWriter, read
 from dmrl.stages import calibrate, fly, label
 from dmrl.stages.calibrate import Settings
 
-from ..estimation.test_board import picture, pose
+from ..estimation.boards import picture, pose
 from .detector import with_detections
 
 CROOKED = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
