@@ -11,7 +11,7 @@ from dmrl.geometry.frames import Array, Camera, inside, pixels_from_horizontal
 
 LONGEST_GAP_S = 0.25
 """Positions are not interpolated over longer gaps."""
-SMOOTH_S = 0.03
+SMOOTH_S = 0.02
 """Standard deviation of the window over which attitude is smoothed. From sample to sample, 10 ms
 apart, its noise moves a peer in the image further than the flight does: taken as it is, the
 likelihood of a delay is all small hollows, and a solver stays in the one where it starts."""

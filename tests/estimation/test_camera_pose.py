@@ -73,3 +73,17 @@ def test_gaps_in_the_positions_are_not_bridged() -> None:
     found = calibrate([replace(whole, peers={"cf2": holed})], AIDECK, Noise(3.0, 0.005))
     assert found is not None
     assert found.matched < 300
+
+
+@pytest.mark.parametrize("delay_s", [-0.3, 0.0, 0.2])
+def test_the_delay_does_not_hang_on_where_it_starts(delay_s: float) -> None:
+    # Attitude as a log has it: its noise moves a peer by a pixel from sample to sample.
+    rng = np.random.default_rng(7)
+    clean = flight(5, images=400)
+    at_s = np.arange(0, clean.attitude_s[-1], 0.01)
+    noisy = np.column_stack([np.interp(at_s, clean.attitude_s, a) for a in clean.attitude_rad.T])
+    noisy += rng.normal(0, 0.01, noisy.shape)
+    seen = replace(clean, attitude_s=at_s, attitude_rad=noisy)
+    found = calibrate([seen], replace(AIDECK, delay_s=delay_s), Noise(3.0, 0.01))
+    assert found is not None
+    assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.008)

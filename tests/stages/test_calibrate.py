@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
 from dmrl.geometry.camera_file import read_camera
@@ -44,7 +45,7 @@ def test_mount_and_delay_come_from_a_flight(seen: Path, tmp_path: Path) -> None:
     assert read_camera(out) == found.camera
     errors = np.degrees(np.subtract(found.camera.mount_rad, CROOKED.mount_rad))
     assert np.abs(errors).max() < 0.3
-    assert found.camera.delay_s == pytest.approx(0.03, abs=0.005)
+    assert found.camera.delay_s == pytest.approx(0.03, abs=0.012)
 
 
 def test_labels_made_with_it_lie_where_the_peer_was_seen(seen: Path, tmp_path: Path) -> None:
@@ -149,7 +150,7 @@ def test_positions_without_covariance_are_not_exact(seen: Path, tmp_path: Path) 
     )
     assert unknown.camera.mount_rad != exact.camera.mount_rad
     errors = np.degrees(np.subtract(unknown.camera.mount_rad, CROOKED.mount_rad))
-    assert np.abs(errors).max() < 0.3
+    assert np.abs(errors).max() < 0.5
 
 
 def test_an_existing_output_is_refused(seen: Path, tmp_path: Path) -> None:
@@ -157,3 +158,26 @@ def test_an_existing_output_is_refused(seen: Path, tmp_path: Path) -> None:
     out.write_text("")
     with pytest.raises(OutputError):
         calibrate.run([seen], out, Settings(against="truth"))
+
+
+def _normalised(seed: int, folder: Path) -> np.ndarray:
+    """(4,) errors over their sigmas: mount and delay from positions that were estimated."""
+    steps = [folder / f"{seed}-{name}.mcap" for name in ("flight", "labelled", "seen")]
+    fly.run(steps[0], fly.Settings(2, 60.0, noise="calibrated", seed=seed))
+    label.run(steps[0], steps[1], label.Settings())
+    with_detections(steps[1], steps[2], camera=CROOKED, seed=seed)
+    figures = calibrate.run([steps[2]], folder / f"{seed}.toml", Settings()).figures
+    true = [*np.degrees(CROOKED.mount_rad), 1e3 * CROOKED.delay_s]
+    found = np.array([*figures["mount_deg"], figures["delay_ms"]])
+    return np.asarray((found - true) / [*figures["mount_std_deg"], figures["delay_std_ms"]])
+
+
+def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None:
+    assert np.abs(_normalised(4000, tmp_path)).max() < 3.5
+
+
+@pytest.mark.slow
+def test_sigmas_of_twenty_flights_hold(tmp_path: Path) -> None:
+    squares = np.array([_normalised(4100 + k, tmp_path) for k in range(20)]) ** 2
+    low, high = chi2.ppf((0.025, 0.975), squares.size) / squares.size
+    assert low < squares.mean() < high
