@@ -17,8 +17,9 @@ from matplotlib.figure import Figure
 
 from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
 from dmrl.estimation.gate import AMBIGUOUS, OK, probability_beyond
-from dmrl.estimation.pair import Mask, Pair, Track, resample, usable_ranges
+from dmrl.estimation.pair import Mask, Pair, Track, usable_ranges
 from dmrl.estimation.score import GOOD_M, Figures, Judged, figures, overall
+from dmrl.estimation.sensors import track as sensed
 from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
 from dmrl.geometry.frames import Array
 
@@ -66,9 +67,9 @@ def pair_of(flight: Flight, robot: str, peer: str) -> Pair:
 
 def track_of(log: RobotLog, grid_s: Array) -> Track:
     """A robot's log on a common time grid."""
-    columns = np.stack([log.vx_mps, log.vy_mps, log.yaw_rate_radps, log.height_m], axis=1)
-    signals, gap = resample(log.time_s, columns, grid_s)
-    return Track(*signals.T, gap)
+    velocity = np.stack([log.vx_mps, log.vy_mps], axis=1)
+    yaw_rate, height = log.yaw_rate_radps[:, None], log.height_m[:, None]
+    return sensed(*((log.time_s, values) for values in (yaw_rate, velocity, height)), grid_s)
 
 
 def judged(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Flown:

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from dmrl.estimation.linear import Linear
+from dmrl.estimation.linear import RANGED, Linear
 from dmrl.estimation.pair import Array
+from dmrl.estimation.robust import Weights
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +37,7 @@ class Normal:
     corner_gradient: Array
 
 
-def normal(
-    linear: Linear, range_key: NDArray[np.intp], range_weight: Array, prior: Array
-) -> Normal:
+def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior: Array) -> Normal:
     """Normal equations without the globals' prior.
 
     Parameters
@@ -47,8 +46,8 @@ def normal(
         Residuals and Jacobians.
     range_key
         (R,) keyframe of each range.
-    range_weight
-        (R,) weight of each squared range residual.
+    weights
+        Of the squared residuals.
     prior
         (n,) information on every keyframe; tiny, so that there is always a solution.
     """
@@ -56,21 +55,22 @@ def normal(
     size = steps.shape[2] - 2 * width - 1
     diagonal = np.zeros((len(steps) + 1, width, width)) + np.diag(prior)
     border, gradient = np.zeros((*diagonal.shape[:2], size)), np.zeros(diagonal.shape[:2])
-    products = steps[..., : 2 * width].swapaxes(1, 2) @ steps
+    rooted = steps * np.sqrt(weights.step)[..., None]
+    products = rooted[..., : 2 * width].swapaxes(1, 2) @ rooted
     for keyframes, rows in ((slice(-1), slice(width)), (slice(1, None), slice(width, 2 * width))):
         diagonal[keyframes] += products[:, rows, rows]
         border[keyframes] += products[:, rows, 2 * width : -1]
         gradient[keyframes] += products[:, rows, -1]
 
-    weighted = ranges * range_weight[:, None]
-    keys, sums = _summed(range_key, weighted[:, :3, None] * ranges[:, None, :])
-    diagonal[keys, :3, :3] += sums[..., :3]
-    border[keys, :3, :2] += sums[..., 3:5]
-    gradient[keys, :3] += sums[..., 5]
-    flat = steps.reshape(-1, steps.shape[2])[:, 2 * width :]
+    weighted = ranges * weights.range[:, None]
+    keys, sums = _summed(range_key, weighted[:, :4, None] * ranges[:, None, :])
+    diagonal[np.ix_(keys, RANGED, RANGED)] += sums[..., :4]
+    border[np.ix_(keys, RANGED, [0, 1])] += sums[..., 4:6]
+    gradient[np.ix_(keys, RANGED)] += sums[..., 6]
+    flat = rooted.reshape(-1, steps.shape[2])[:, 2 * width :]
     rest = flat.T @ flat
     shared = [0, 1, -1]  # bias and scale of the ranges, and the residual
-    rest[np.ix_(shared, shared)] += weighted[:, 3:].T @ ranges[:, 3:]
+    rest[np.ix_(shared, shared)] += weighted[:, 4:].T @ ranges[:, 4:]
     above = products[:, :width, width : 2 * width]
     return Normal(diagonal, above, border, rest[:-1, :-1], gradient, rest[:-1, -1])
 

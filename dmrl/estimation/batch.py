@@ -10,19 +10,22 @@ from dmrl.estimation.linear import (
     METRIC,
     OWN_SCALE,
     PEER_SCALE,
+    RANGE_ERROR,
+    SIZE,
     Linear,
     linearise,
     step_variance,
 )
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
+from dmrl.estimation.robust import cost_of, weights_of
 
 ITERATIONS = 25
 TOLERANCE, ROUGH = 1e-5, 1e-4
 """Relative change of the cost at which the iteration ends; and where solutions are but compared."""
 SAME_M = 0.05
 """Solutions that are nowhere further apart are one."""
-WEAK: Array = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
+WEAK: Array = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1.0])
 """Information on every keyframe, in inverse squares of its units: next to none."""
 
 
@@ -33,11 +36,11 @@ class Solution:
     Parameters
     ----------
     state
-        (K, 5) x, y (m), psi (rad), wx, wy (m/s) at the keyframes.
+        (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m) at the keyframes.
     constants
         (G,) as in ``GLOBALS``.
     cost
-        Half the sum of squares, with the ranges' robust loss.
+        Half the sum of the losses.
     """
 
     state: Array
@@ -60,7 +63,7 @@ def solve_batch(
     problem, noise
         The flight, and what is believed about its sensors.
     state
-        (K, 3) or (K, 5) first guess.
+        (K, 3) or (K, 6) first guess.
     constants
         (G,) first guess, zeros if None.
     known
@@ -70,7 +73,7 @@ def solve_batch(
     """
     constants = np.zeros(len(GLOBALS)) if constants is None else constants
     if state.shape[1] == 3:
-        state = np.column_stack([state, np.zeros((len(state), 2))])
+        state = np.column_stack([state, np.zeros((len(state), SIZE - 3))])
     linear = linearise(problem, noise, state, constants)
     best = cost_of(linear, noise, constants)
     equations = equations_of(problem, noise, linear, constants)
@@ -112,20 +115,14 @@ def evidence(problem: Problem, noise: Noise, solution: Solution) -> float:
     return -solution.cost - float(spread) - log_determinant(equations) / 2
 
 
-def cost_of(linear: Linear, noise: Noise, constants: Array) -> float:
-    """Half the sum of squares, with Cauchy's loss on the ranges."""
-    limit = (noise.cauchy_m / noise.range_std_m) ** 2
-    ranges = limit * np.log1p(linear.range**2 / limit).sum()
-    prior = ((constants / noise.prior_std()) ** 2).sum()
-    return float((linear.step**2).sum() + ranges + prior) / 2
-
-
 def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Array) -> Normal:
-    """Normal equations with Cauchy's weights and the globals' prior."""
-    limit = (noise.cauchy_m / noise.range_std_m) ** 2
-    weight = 1 / (1 + linear.range**2 / limit)
-    equations = normal(linear, problem.range_key, weight, WEAK)
-    information = noise.prior_std() ** -2
+    """Normal equations with the losses' weights and the globals' prior."""
+    weights = weights_of(linear, noise, constants)
+    equations = normal(linear, problem.range_key, weights, WEAK)
+    std_m = noise.range_error_std_m
+    equations.diagonal[0, RANGE_ERROR, RANGE_ERROR] += weights.first / std_m**2
+    equations.gradient[0, RANGE_ERROR] += weights.first * linear.first / std_m
+    information = weights.prior * noise.prior_std() ** -2
     equations.corner[...] += np.diag(information)
     equations.corner_gradient[...] += information * constants
     return equations

@@ -36,7 +36,7 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
     Returns
     -------
     keyframes : Array
-        (K, 5, 5) of x, y (m), psi (rad), wx, wy (m/s).
+        (K, 6, 6) of x, y (m), psi (rad), wx, wy (m/s), b (m).
     constants : Array
         (G, G), in the order of ``GLOBALS``.
     """
@@ -63,7 +63,7 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
     problem, noise
         The flight, and what is believed about its sensors.
     state
-        (K, 5) its solution.
+        (K, 6) its solution.
     """
     step_s = float(np.median(problem.steps_s))
     own_heading, own = path_of(problem.own)
@@ -122,7 +122,7 @@ def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
     problem
         The flight.
     state
-        (K, 3) or (K, 5) its solution.
+        (K, 3) or (K, 6) its solution.
 
     Returns
     -------

@@ -17,7 +17,7 @@ from dmrl.estimation.gate import (
 )
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, mirrored, spread_of
 from dmrl.estimation.keyframe_filter import QUARTER
-from dmrl.estimation.linear import CLOCK
+from dmrl.estimation.linear import CLOCK, OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
@@ -152,10 +152,9 @@ def estimate_pairs(
 
 def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:
     """Estimates seen from either robot, with their statuses."""
-    silent = np.append(flight.gap_s, 0.0) + np.append(0.0, flight.gap_s) > 0
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
-    floor = silent * np.int8(UNCONVERGED)
+    floor = flight.silent * np.int8(UNCONVERGED)
     here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m), floor)
     there = np.maximum(statuses(back.state, back.covariance, gate_m), floor)
     if own < STILL or relative < ALIKE:
@@ -205,11 +204,11 @@ def _from_smoother(
 ) -> Estimate:
     order = np.argsort(-score)
     best = int(order[0])
-    apart = spread_of(-score[order], tracks.swapaxes(0, 1)[order])
+    apart = spread_of(-score[order], tracks[..., :3].swapaxes(0, 1)[order])
     return Estimate(
         flight.key_s,
-        tracks[:, best],
-        covariances[:, best] * SMOOTHER_INFLATION**2 + apart,
+        tracks[:, best, :3],
+        covariances[:, best, :3, :3] * SMOOTHER_INFLATION**2 + apart,
         np.zeros(len(tracks), np.int8),
         np.zeros(len(GLOBALS)),
         noise,
@@ -224,14 +223,14 @@ def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Arra
     apart = spread_of(np.array(costs), np.stack(states))
     found, best = (noise, best) if noise else noise_of(flight, first, best)
     best = solve_batch(flight, found, best.state, best.constants)
-    worse = max(1.0, found.bias_std_m / Noise().bias_std_m) ** 0.75
+    worse = max(1.0, found.scale_std / Noise().scale_std) ** 0.75
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
     none = np.zeros(len(tracks), np.int8)
     return Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
 
 
 def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> list[Solution]:
-    """What the likely starts (S, K, 3) lead to, best first.
+    """What the likely starts (S, K, 5) lead to, best first.
 
     Even starts that look alike half-way may pass the peer on different sides: all are solved that
     are not hopeless, each until it comes to a solution that another one led to.
@@ -242,7 +241,7 @@ def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> li
         start = tracks[number]
         if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
             begun.append(start)
-            found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
+            found.append(solve_batch(flight, noise, *_start(flight, start), found, ROUGH))
     best = min(found, key=lambda s: s.cost)
     # What stuck on its way may come free once all that is constant starts from zero again.
     found.append(solve_batch(flight, noise, best.state, known=found, tolerance=ROUGH))
@@ -250,6 +249,15 @@ def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> li
     for start in mirrored(best.state, KEY_HZ):
         found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
     return sorted(found, key=lambda s: s.cost)
+
+
+def _start(flight: Problem, track: Array) -> tuple[Array, Array]:
+    """States (K, 6) and globals (G,) that a smoothed track (K, 5) says, with jumped ranges."""
+    state, constants = np.zeros((len(track), SIZE)), np.zeros(len(GLOBALS))
+    state[:, :3] = track[:, :3]
+    state[flight.range_key, RANGE_ERROR] = flight.range_level_m
+    constants[[OWN_GYRO, PEER_GYRO]] = track[-1, 3:]
+    return state, constants
 
 
 def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:

@@ -17,8 +17,8 @@ FIRST_S = 20.0
 """How long all starts are followed."""
 KEPT = 6
 """Starts that are followed to the end."""
-START_STD: Array = np.array([0.35, 0.35, 0.45])
-"""Half the distance to the next start, roughly: m, m, rad."""
+START_STD: Array = np.array([0.35, 0.35, 0.45, 0.01, 0.01])
+"""Half the distance to the next start, roughly: m, m, rad; and of the yaw rates' biases, rad/s."""
 APART_M, APART_RAD = 0.4, 0.5
 """Starts nearer than both are one."""
 PASS_M = 0.35
@@ -62,7 +62,7 @@ def candidates(inputs: Inputs, rate_hz: float) -> Array:
     first = [_first(inputs, pair, keyframes) for pair in range(inputs.range_m.shape[1])]
     count = BEARINGS * HEADINGS
     run = keyframe_filter.run(inputs.repeated(count, keyframes), np.concatenate(first), START_STD)
-    end = run.state[-1].reshape(-1, count, 3)
+    end = run.state[-1, :, :3].reshape(-1, count, 3)
     score = run.log_likelihood.reshape(-1, count)
     begun = np.stack(first)
     return np.stack(
@@ -132,7 +132,7 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
     Parameters
     ----------
     state
-        (K, 5) x, y (m), psi (rad), wx, wy (m/s).
+        (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m).
     rate_hz
         Keyframes per second.
     """

@@ -12,6 +12,9 @@ from dmrl.estimation.problem import Noise, Problem
 
 # d rotation / d angle = QUARTER @ rotation
 QUARTER: Array = np.array([[0.0, -1.0], [1.0, 0.0]])
+SIZE = 5
+SHADOWED_M = 0.3
+"""Standard deviation of a range once its level is taken off."""
 INNOVATION_LIMIT = 2.0
 """Standard deviations beyond which an innovation is weighted down."""
 
@@ -24,12 +27,14 @@ class Inputs:
 
     Parameters
     ----------
+    step_s
+        (K, B) seconds to the next keyframe; the last is zero.
     own_turn_rad, peer_turn_rad
         (K, B) turn from this keyframe to the next; the last is zero.
     own_shift_m, peer_shift_m
         (K, B, 2) the same of the position.
     step_var
-        (K, B, 3) variance that the step adds to x, y (m^2) and psi (rad^2).
+        (K, B, 5) variance that the step adds to the state.
     range_m, range_var
         (K, B) range, metres, NaN where there was none, and its variance, m^2.
     own_to_range_m, peer_to_range_m
@@ -38,6 +43,7 @@ class Inputs:
         (K, B) peer's height less the observer's.
     """
 
+    step_s: Array
     own_turn_rad: Array
     peer_turn_rad: Array
     own_shift_m: Array
@@ -73,13 +79,17 @@ def _inputs(problem: Problem, noise: Noise) -> tuple[Array, ...]:
         return np.column_stack([mean(column) for column in values.T])
 
     # pi/2 / n is the variance of a median; half the bias is what the first guess cannot know.
-    variance = 1.5 * noise.range_std_m**2 / many + (0.5 * noise.bias_std_m) ** 2
+    variance = 1.5 * noise.range_std_m**2 / many + 0.05**2
+    steps_s = np.append(problem.steps_s, 0.0)
     shifts = (problem.own.shift_m, problem.peer.shift_m, step_variance(problem, noise))
+    shadowed = problem.range_level_m
+    level = mean(shadowed)
     return (
+        steps_s,
         *(np.append(turn, 0.0) for turn in (problem.own.turn_rad, problem.peer.turn_rad)),
         *(np.vstack([shift, 0.0 * shift[:1]]) for shift in shifts),
-        _medians(problem.range_key, problem.range_m, per_key),
-        variance,
+        _medians(problem.range_key, problem.range_m - shadowed, per_key),
+        np.where(level != 0, SHADOWED_M**2, variance),
         means(problem.own_to_range.shift_m),
         means(problem.peer_to_range.shift_m),
         mean(problem.height_m),
@@ -95,11 +105,11 @@ def _medians(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) ->
 
 
 def step_variance(problem: Problem, noise: Noise) -> Array:
-    """(K - 1, 3) variance that each step adds to x, y (m^2) and psi (rad^2)."""
+    """(K - 1, 5) variance that each step adds to x, y (m^2), psi (rad^2) and the biases."""
     steps_s, gap_s = problem.steps_s, problem.gap_s
     shift = 2 * noise.velocity_psd * steps_s + noise.gap_speed_mps**2 * gap_s
     turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * gap_s
-    return np.column_stack([shift, shift, turn])
+    return np.column_stack([shift, shift, turn, np.zeros((len(turn), 2))])
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +119,12 @@ class Filtered:
     Parameters
     ----------
     state, covariance
-        (K, B, 3), (K, B, 3, 3) after the keyframe's range.
+        (K, B, 5), (K, B, 5, 5) of x, y, psi and the biases of the observer's and the peer's yaw
+        rate, after the keyframe's range.
     prior, prior_covariance
         The same before it.
     step
-        (K, B, 3, 3) Jacobian of the step to the next keyframe.
+        (K, B, 5, 5) Jacobian of the step to the next keyframe.
     log_likelihood
         (B,) of the innovations, robust.
     """
@@ -136,15 +147,15 @@ def run(inputs: Inputs, start: Array, start_std: Array) -> Filtered:
     start
         (B, 3) x, y (m), psi (rad) at the first keyframe.
     start_std
-        (3,) their standard deviations.
+        (5,) standard deviations of these and of the biases, rad/s.
     """
     count, filters = inputs.range_m.shape
-    states = (np.empty((count, filters, 3)) for _ in range(2))
-    matrices = (np.empty((count, filters, 3, 3)) for _ in range(3))
+    states = (np.empty((count, filters, SIZE)) for _ in range(2))
+    matrices = (np.empty((count, filters, SIZE, SIZE)) for _ in range(3))
     (state, prior), (covariance, prior_covariance, step) = states, matrices
     out = Filtered(state, covariance, prior, prior_covariance, step, np.zeros(filters))
-    state = start.copy()
-    covariance = np.broadcast_to(np.diag(start_std**2), (filters, 3, 3)).copy()
+    state = np.concatenate([start, np.zeros((filters, SIZE - 3))], axis=1)
+    covariance = np.broadcast_to(np.diag(start_std**2), (filters, SIZE, SIZE)).copy()
     for k in range(count):
         out.prior[k], out.prior_covariance[k] = state, covariance
         _update(state, covariance, inputs, k, out.log_likelihood)
@@ -152,21 +163,26 @@ def run(inputs: Inputs, start: Array, start_std: Array) -> Filtered:
         state, step = _moved(state, inputs, k)
         out.step[k] = step
         covariance = step @ covariance @ step.swapaxes(1, 2)
-        covariance += inputs.step_var[k][:, :, None] * np.eye(3)
+        covariance += inputs.step_var[k][:, :, None] * np.eye(SIZE)
     return out
 
 
 def _moved(state: Array, inputs: Inputs, k: int) -> tuple[Array, Array]:
-    """(B, 3) states at the next keyframe, and the (B, 3, 3) Jacobian."""
+    """(B, 5) states at the next keyframe, and the (B, 5, 5) Jacobian."""
+    seconds = inputs.step_s[k]
+    own_turn = inputs.own_turn_rad[k] - seconds * state[:, 3]
+    peer_turn = inputs.peer_turn_rad[k] - seconds * state[:, 4]
     turned = _apply(rotation(state[:, 2]), inputs.peer_shift_m[k])
-    back = rotation(-inputs.own_turn_rad[k])
-    after = np.empty_like(state)
+    back = rotation(-own_turn)
+    after = state.copy()
     after[:, :2] = _apply(back, state[:, :2] + turned - inputs.own_shift_m[k])
-    after[:, 2] = state[:, 2] + inputs.peer_turn_rad[k] - inputs.own_turn_rad[k]
-    step = np.zeros((len(state), 3, 3))
+    after[:, 2] += peer_turn - own_turn
+    step = np.zeros((len(state), SIZE, SIZE))
     step[:, :2, :2] = back
     step[:, :2, 2] = _apply(back, turned @ QUARTER.T)
-    step[:, 2, 2] = 1.0
+    step[:, :2, 3] = seconds[:, None] * (after[:, :2] @ QUARTER.T)
+    step[:, [2, 3, 4], [2, 3, 4]] = 1.0
+    step[:, 2, 3], step[:, 2, 4] = seconds, -seconds
     return after, step
 
 
@@ -182,8 +198,8 @@ def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelih
     expected = np.sqrt((offset**2).sum(axis=1) + inputs.height_m[k] ** 2) + 1e-6
     towards = offset / expected[:, None]
     row = np.column_stack([towards, np.einsum("bi,bi->b", towards, peer @ QUARTER.T)])
-    cross = _apply(covariance, row)
-    spread = np.einsum("bi,bi->b", row, cross) + inputs.range_var[k]
+    cross = _apply(covariance[..., :3], row)
+    spread = np.einsum("bi,bi->b", row, cross[:, :3]) + inputs.range_var[k]
     innovation = np.where(seen, inputs.range_m[k] - expected, 0.0)
     size = np.abs(innovation) / np.sqrt(spread)
     softer = inputs.range_var[k] * np.maximum(1.0, size / INNOVATION_LIMIT) ** 2
@@ -195,7 +211,7 @@ def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelih
 
 
 def smoothed(filtered: Filtered) -> tuple[Array, Array]:
-    """States (K, B, 3) and covariances (K, B, 3, 3) given the whole flight (RTS)."""
+    """States (K, B, 5) and covariances (K, B, 5, 5) given the whole flight (RTS)."""
     state, covariance = filtered.state.copy(), filtered.covariance.copy()
     for k in range(len(state) - 2, -1, -1):
         ahead = np.linalg.inv(filtered.prior_covariance[k + 1])

@@ -1,8 +1,9 @@
 """Residuals of a flight and their analytic Jacobians, by keyframe state and by global.
 
-A keyframe is (x, y, psi, wx, wy): w is the error of the measured relative velocity, in the
+A keyframe is (x, y, psi, wx, wy, b): w is the error of the measured relative velocity, in the
 observer's frame, which fades with its correlation time. White noise in its place would cost
-half of what the ranges tell.
+half of what the ranges tell. b is by how much ranges are too long at the time: what shadows a
+range shadows it for seconds.
 
 With s the velocity scales, the process residual is divided by 1 / (1 + s): without that, a
 scale that shrinks the path shrinks the noise with it and is always welcome.
@@ -18,7 +19,11 @@ from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
 
 BIAS, SCALE, OWN_GYRO, PEER_GYRO, OWN_SCALE, PEER_SCALE = range(6)
-SIZE = 5
+SIZE = 6
+RANGED = [0, 1, 2, 5]
+"""States that a range depends on."""
+RANGE_ERROR = 5
+"""Of states and of the residuals of a step."""
 METRIC = [0, 1, 3, 4]
 """Residuals of a step that the velocity scales divide."""
 OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
@@ -34,18 +39,22 @@ class Linear:
     Parameters
     ----------
     steps
-        (K - 1, 5, 5 + 5 + G + 1) of x, y, psi, wx, wy between neighbouring keyframes: by the
+        (K - 1, 6, 6 + 6 + G + 1) of x, y, psi, wx, wy, b between neighbouring keyframes: by the
         keyframe before, by the one after, by the globals; the residual.
     ranges
-        (R, 3 + 2 + 1) by x, y, psi; by bias and scale of the ranges; the residual.
+        (R, 4 + 2 + 1) by x, y, psi, b; by bias and scale of the ranges; the residual.
+
+    first
+        The first keyframe's b over its standard deviation.
     """
 
     steps: Array
     ranges: Array
+    first: float
 
     @property
     def step(self) -> Array:
-        """(K - 1, 5) residuals of the steps."""
+        """(K - 1, 6) residuals of the steps."""
         return self.steps[..., -1]
 
     @property
@@ -62,12 +71,13 @@ def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) ->
     problem, noise
         The flight, and what is believed about its sensors.
     state
-        (K, 5) x, y (m), psi (rad), wx, wy (m/s).
+        (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m).
     constants
         (G,) as in ``GLOBALS``.
     """
     steps = _steps(problem, noise, state, constants)
-    return Linear(steps, _ranges(problem, noise, state, constants))
+    first = float(state[0, RANGE_ERROR]) / noise.range_error_std_m
+    return Linear(steps, _ranges(problem, noise, state, constants), first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +88,8 @@ class _Steps:
     (S, 2) the corrected shifts and ``own_turn``, ``peer_turn`` (S,) turns; ``heading`` and
     ``turned`` (S, 2, 2) rotate by the peer's heading and by the observer's turn; ``ahead`` and
     ``error_ahead`` (S, 2) are the next keyframe's position and velocity error seen from this one;
-    ``half_s`` and ``kept`` (S, 1) half the step's time and what it leaves of a velocity error.
+    ``half_s``, ``kept`` and ``range_kept`` (S, 1) half the step's time and what it leaves of a
+    velocity error and of a range's.
     """
 
     own_gain: float
@@ -93,6 +104,7 @@ class _Steps:
     error_ahead: Array
     half_s: Array
     kept: Array
+    range_kept: Array
 
 
 def _moves(problem: Problem, noise: Noise, state: Array, constants: Array) -> _Steps:
@@ -113,9 +125,10 @@ def _moves(problem: Problem, noise: Noise, state: Array, constants: Array) -> _S
         heading=heading,
         turned=turned,
         ahead=_apply(turned, state[1:, :2]),
-        error_ahead=_apply(turned, state[1:, 3:]),
+        error_ahead=_apply(turned, state[1:, 3:5]),
         half_s=steps_s[:, None] / 2,
         kept=np.exp(-steps_s / noise.velocity_tau_s)[:, None],
+        range_kept=np.exp(-steps_s / noise.range_tau_s)[:, None],
     )
 
 
@@ -137,29 +150,31 @@ def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> Ar
 
 
 def _residual(moves: _Steps, state: Array) -> Array:
-    error = state[:-1, 3:]
+    error = state[:-1, 3:5]
     shift = moves.ahead - state[:-1, :2] - moves.peer + moves.own
     shift = shift - moves.half_s * (error + moves.error_ahead)
     turn = state[1:, 2] - state[:-1, 2] - moves.peer_turn + moves.own_turn
-    return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error])
+    longer = state[1:, RANGE_ERROR:] - moves.range_kept * state[:-1, RANGE_ERROR:]
+    return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error, longer])
 
 
 def _by_states(moves: _Steps, by_start: Array, by_end: Array) -> None:
-    """Fill in (S, 5, 5) zeros each."""
-    by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0])
+    """Fill in (S, 6, 6) zeros each."""
+    by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
     by_start[:, :2, 2] = -moves.peer @ QUARTER.T
     by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -moves.half_s, -moves.kept
-    by_end[:, :2, :2] = by_end[:, 3:, 3:] = moves.turned
-    by_end[:, :2, 3:] = -moves.half_s[:, None] * moves.turned
-    by_end[:, 2, 2] = 1.0
+    by_start[:, RANGE_ERROR, RANGE_ERROR] = -moves.range_kept[:, 0]
+    by_end[:, :2, :2] = by_end[:, 3:5, 3:5] = moves.turned
+    by_end[:, :2, 3:5] = -moves.half_s[:, None] * moves.turned
+    by_end[:, 2, 2] = by_end[:, RANGE_ERROR, RANGE_ERROR] = 1.0
 
 
 def _by_globals(moves: _Steps, problem: Problem, out: Array) -> None:
-    """Fill in (S, 5, G) zeros."""
+    """Fill in (S, 6, G) zeros."""
     steps_s, heading = problem.steps_s, moves.heading
     moved = moves.ahead - moves.half_s * moves.error_ahead
     out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER.T)
-    out[:, 3:, OWN_GYRO] = -steps_s[:, None] * (moves.error_ahead @ QUARTER.T)
+    out[:, 3:5, OWN_GYRO] = -steps_s[:, None] * (moves.error_ahead @ QUARTER.T)
     out[:, 2, OWN_GYRO], out[:, 2, PEER_GYRO] = -steps_s, steps_s
     out[:, :2, OWN_SCALE] = -moves.own_gain * moves.own
     out[:, :2, PEER_SCALE] = moves.peer_gain * moves.peer
@@ -169,27 +184,29 @@ def _by_globals(moves: _Steps, problem: Problem, out: Array) -> None:
 
 
 def step_variance(problem: Problem, noise: Noise) -> Array:
-    """(K - 1, 5) variance of each step's residuals, before whitening."""
+    """(K - 1, 6) variance of each step's residuals, before whitening."""
     steps_s = problem.steps_s
     shift = 2 * noise.velocity_white_psd * steps_s + noise.gap_speed_mps**2 * problem.gap_s
     turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * problem.gap_s
     faded = 1 - np.exp(-2 * steps_s / noise.velocity_tau_s)
     error = 2 * noise.velocity_std_mps**2 * faded
-    return np.column_stack([shift, shift, turn, error, error])
+    longer = noise.range_error_std_m**2 * (1 - np.exp(-2 * steps_s / noise.range_tau_s))
+    return np.column_stack([shift, shift, turn, error, error, longer])
 
 
 def _ranges(problem: Problem, noise: Noise, state: Array, constants: Array) -> Array:
-    at = state[problem.range_key, :3]
+    at = state[problem.range_key]
     peer = _apply(rotation(state[:, 2])[problem.range_key], problem.peer_to_range.shift_m)
     offset = at[:, :2] + peer - problem.own_to_range.shift_m
     distance = np.sqrt((offset**2).sum(axis=1) + problem.height_m**2) + 1e-6
     towards = offset / distance[:, None]
     gain = 1 + constants[SCALE]
-    out = np.empty((len(at), 6))
+    out = np.empty((len(at), 7))
     out[:, :2] = -gain * towards
     out[:, 2] = gain * (towards[:, 0] * peer[:, 1] - towards[:, 1] * peer[:, 0])
-    out[:, 3 + BIAS], out[:, 3 + SCALE] = -1.0, -distance
-    out[:, -1] = problem.range_m - gain * distance - constants[BIAS]
+    out[:, 3] = -1.0
+    out[:, 4 + BIAS], out[:, 4 + SCALE] = -1.0, -distance
+    out[:, -1] = problem.range_m - gain * distance - constants[BIAS] - at[:, RANGE_ERROR]
     return out / noise.range_std_m
 
 

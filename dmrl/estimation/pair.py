@@ -29,7 +29,9 @@ class Track:
     height_m
         (K,) height above the floor, metres.
     gap
-        (K,) whether the sensors were silent; the values there are only filled in.
+        (K,) whether velocity or yaw rate was silent; the values there are only filled in.
+    height_gap
+        (K,) whether the height was; None: nowhere.
     """
 
     vx_mps: Array
@@ -37,6 +39,7 @@ class Track:
     yaw_rate_radps: Array
     height_m: Array
     gap: Mask
+    height_gap: Mask | None = None
 
     def values(self) -> tuple[Array, Array, Array, Array]:
         """The four signals."""

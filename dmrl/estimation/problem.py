@@ -5,9 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.estimation.jumps import levels
 from dmrl.estimation.motion import Increments, odometry
-from dmrl.estimation.pair import Array, Pair
+from dmrl.estimation.pair import LONGEST_GAP_S, Array, Mask, Pair
 
+BLOCK_S, REACH = 0.1, 3
+"""Ranges jump between medians of so many blocks of this length."""
+JUMP_M = 0.45
+"""Smaller ones are left to the solve."""
 SHIFT_S = 0.02
 """Half the time difference behind the derivative by the peer's clock."""
 
@@ -28,6 +33,10 @@ class Noise:
         White noise of a range.
     cauchy_m
         Residual at which a range counts half.
+    range_error_std_m, range_tau_s
+        Coloured noise of the ranges, and its correlation time.
+    jump
+        A change of that noise this many standard deviations large counts half: it may jump.
     bias_std_m, scale_std
         Offset and scale of a pair's ranges.
     gyro_std_radps
@@ -48,11 +57,14 @@ class Noise:
     yaw_rate_psd: float = 1e-5
     range_std_m: float = 0.12
     cauchy_m: float = 0.15
-    bias_std_m: float = 0.10
+    range_error_std_m: float = 0.02
+    range_tau_s: float = 200.0
+    jump: float = 1.0
+    bias_std_m: float = 0.15
     scale_std: float = 0.02
-    gyro_std_radps: float = 0.005
+    gyro_std_radps: float = 0.003
     velocity_scale_std: float = 0.05
-    velocity_bias_std_mps: float = 0.015
+    velocity_bias_std_mps: float = 0.012
     clock_std_s: float = 0.02
     height_std_m: float = 0.04
     gap_speed_mps: float = 0.5
@@ -70,11 +82,8 @@ class Noise:
             self,
             velocity_std_mps=self.velocity_std_mps * grade,
             velocity_white_psd=self.velocity_white_psd * grade**2,
-            bias_std_m=self.bias_std_m * worse,
             scale_std=self.scale_std * worse,
-            gyro_std_radps=self.gyro_std_radps * worse,
             velocity_scale_std=self.velocity_scale_std * worse,
-            velocity_bias_std_mps=self.velocity_bias_std_mps * worse,
         )
 
     def prior_std(self) -> Array:
@@ -114,12 +123,16 @@ class Problem:
         (K - 1, 2) change of the peer's shift per second of clock offset, m/s.
     gap_s
         (K - 1,) share of the interval, in seconds, in which a robot's sensors were silent.
+    silent
+        (K,) whether any sensor, ranges and heights too, was silent for over half a second.
     range_key
         (R,) keyframe at or before each range.
     range_m
         (R,) measured ranges, metres.
     own_to_range, peer_to_range
         R motions from that keyframe to the range.
+    range_level_m
+        (R,) by how much ranges seem to have jumped, metres: a first guess.
     height_m
         (R,) peer's height less the observer's, metres.
     """
@@ -129,10 +142,12 @@ class Problem:
     peer: Increments
     peer_by_clock: Array
     gap_s: Array
+    silent: Mask
     range_key: NDArray[np.intp]
     range_m: Array
     own_to_range: Increments
     peer_to_range: Increments
+    range_level_m: Array
     height_m: Array
 
     @property
@@ -169,9 +184,48 @@ def problem(pair: Pair, rate_hz: float = 10.0) -> Problem:
         peer=peer.increments(start, end),
         peer_by_clock=(after.shift_m - before.shift_m) / (2 * SHIFT_S),
         gap_s=np.diff(gap, prepend=0.0),
+        silent=silence(pair, key_s),
         range_key=range_key,
         range_m=pair.range_m,
         own_to_range=own.increments(key_s[range_key], pair.range_time_s),
         peer_to_range=peer.increments(key_s[range_key], pair.range_time_s),
+        range_level_m=range_levels(pair),
         height_m=np.interp(pair.range_time_s, grid, height),
     )
+
+
+def silence(pair: Pair, time_s: Array) -> Mask:
+    """(K,) whether a sensor of either robot, or the ranges, were silent for over half a second.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    time_s
+        (K,) times asked for, seconds.
+    """
+    gap = pair.own.gap | pair.peer.gap
+    for track in (pair.own, pair.peer):
+        if track.height_gap is not None:
+            gap = gap | track.height_gap
+    low = np.clip(np.searchsorted(pair.time_s, time_s, "right") - 1, 0, len(gap) - 2)
+    edges = np.concatenate([[-np.inf], pair.range_time_s, [np.inf]])
+    after = np.clip(np.searchsorted(edges, time_s), 1, len(edges) - 1)
+    return np.asarray(gap[low] | gap[low + 1] | (edges[after] - edges[after - 1] > LONGEST_GAP_S))
+
+
+def range_levels(pair: Pair) -> Array:
+    """(R,) by how much ranges jumped, metres.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    """
+    if not len(pair.range_m):
+        return pair.range_m
+    block = ((pair.range_time_s - pair.time_s[0]) / BLOCK_S).astype(int)
+    blocks, inverse = np.unique(block, return_inverse=True)
+    ends = np.cumsum(np.bincount(inverse, minlength=len(blocks)))
+    middle = np.array([np.median(part) for part in np.split(pair.range_m, ends[:-1])])
+    return levels(middle, BLOCK_S, JUMP_M, REACH)[inverse]

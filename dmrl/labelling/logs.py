@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import topics
-from dmrl.estimation.pair import RATE_HZ, Array, Pair, Track, resample, usable_ranges
+from dmrl.estimation.pair import RATE_HZ, Array, Pair, Track, usable_ranges
+from dmrl.estimation.sensors import Signals, track
 from dmrl.recording import Summary, read_table
 
 LEAST_S = 5.0
@@ -18,13 +19,6 @@ LEAST_S = 5.0
 LEAST_RANGES = 20
 STEEP_RAD, FAST_RADPS = 0.8, 6.0
 """Tilt and turning rate that no small drone keeps up: probably degrees."""
-
-SMOOTHED_S = 0.5
-"""Window over which heights are smoothed, by parabolas: a range finder errs by 2 cm in every
-sample, which is 4 px at 1 m, and a drone climbs slowly."""
-
-Signals = tuple[Array, Array]
-"""Times (N,), seconds since the recording's start, and (N, C) values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +51,8 @@ class RobotLog:
 
     def track(self, grid_s: Array) -> Track:
         """The sensors on a time grid."""
-        attitude, turn_gap = resample(*self.attitude, grid_s)
-        velocity, gap = resample(*self.velocity, grid_s)
-        height, _ = resample(*self.height, grid_s)
-        smooth_m = _smoothed(height[:, 0], int(SMOOTHED_S * RATE_HZ / 2))
-        return Track(velocity[:, 0], velocity[:, 1], attitude[:, 2], smooth_m, gap | turn_gap)
+        times, attitude = self.attitude
+        return track((times, attitude[:, 2:]), self.velocity, self.height, grid_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,14 +171,6 @@ def _signals(
     return (time_ns[good] - held.start_ns) * 1e-9, values[good]
 
 
-def _smoothed(values: Array, reach: int) -> Array:
-    """Each of (N,) values on the parabola through those within reach (Savitzky and Golay 1964)."""
-    # SciPy's savgol_filter, whose package takes a second to import.
-    weights = np.linalg.pinv(np.vander(np.arange(-reach, reach + 1), 3))[-1]
-    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
-    return np.convolve(padded, weights, mode="valid")
-
-
 def _pair(
     robots: dict[str, RobotLog], one: str, other: str, ranges: list[Signals], warnings: list[str]
 ) -> Pair | None:
@@ -217,8 +200,8 @@ def _pair(
     grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
     good &= time_s <= grid_s[-1]
     tracks = [log.track(grid_s) for log in logs]
-    for robot, track in zip((one, other), tracks, strict=True):
-        if track.gap.any():
-            silent_s = track.gap.sum() / RATE_HZ
+    for robot, sensed in zip((one, other), tracks, strict=True):
+        if sensed.gap.any():
+            silent_s = sensed.gap.sum() / RATE_HZ
             warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
     return Pair(grid_s, tracks[0], tracks[1], time_s[good], range_m[good])

@@ -4,7 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from dmrl.estimation.pair import Array, Pair, Track, resample, usable_ranges
+from dmrl.estimation.pair import Array, Pair, Track, usable_ranges
+from dmrl.estimation.sensors import track as sensed
 from dmrl.flight import NOISE, Flight, RobotLog, Scenario, Trajectory, simulate
 
 
@@ -14,9 +15,9 @@ def flown(trajectory: Trajectory, noise: str, seed: int, duration_s: float = 40.
 
 
 def track(log: RobotLog, grid_s: Array) -> Track:
-    values = np.column_stack([log.vx_mps, log.vy_mps, log.yaw_rate_radps, log.height_m])
-    signals, gap = resample(log.time_s, values, grid_s)
-    return Track(*signals.T, gap)
+    velocity = np.column_stack([log.vx_mps, log.vy_mps])
+    yaw_rate, height = log.yaw_rate_radps[:, None], log.height_m[:, None]
+    return sensed(*((log.time_s, values) for values in (yaw_rate, velocity, height)), grid_s)
 
 
 def pair_of(flight: Flight, own: str = "cf1", peer: str = "cf2") -> Pair:

@@ -5,7 +5,7 @@ import pytest
 
 from dmrl.estimation import banded
 from dmrl.estimation.batch import Solution, equations_of, near, solve_batch
-from dmrl.estimation.linear import SIZE, linearise
+from dmrl.estimation.linear import RANGED, SIZE, linearise
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
 
@@ -38,7 +38,7 @@ def test_the_jacobian_by_the_globals_is_that_of_finite_differences(
         scale = max(1.0, np.abs(slope).max())
         assert np.abs(slope - linear.steps[..., 2 * SIZE + column]).max() < 1e-6 * scale
         slope = (ahead.range - behind.range) / (2 * step)
-        expected = linear.ranges[:, 3 + column] if column < 2 else 0.0
+        expected = linear.ranges[:, 4 + column] if column < 2 else 0.0
         assert np.abs(slope - expected).max() < 1e-5
 
 
@@ -57,7 +57,7 @@ def test_the_jacobian_by_the_keyframes_is_that_of_finite_differences(
         own += np.where(even[1:, None], linear.steps[..., SIZE + column], 0.0)
         assert np.abs(slope - own).max() < 1e-6 * max(1.0, np.abs(slope).max())
         slope = (ahead.range - behind.range) / (2 * step)
-        by_state = linear.ranges[:, column] if column < 3 else 0.0
+        by_state = linear.ranges[:, RANGED.index(column)] if column in RANGED else 0.0
         expected = np.where(even[flight.range_key], by_state, 0.0)
         assert np.abs(slope - expected).max() < 1e-2  # ranges near zero bend sharply
 

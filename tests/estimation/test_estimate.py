@@ -43,12 +43,12 @@ def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
     assert max(batch) < 0.35
 
 
-def test_only_sensors_that_look_calibrated_are_taken_to_have_small_biases() -> None:
+def test_only_sensors_that_look_calibrated_are_taken_to_have_small_scales() -> None:
     medians = []
     for noise in ("calibrated", "realistic", "harsh"):
         pairs = [pair_of(flown("in_view", noise, seed, LONG_S)) for seed in (1000, 1001, 1002)]
-        medians.append(np.median([e.noise.bias_std_m for e, _ in estimate_pairs(pairs)]))
-    assert medians[0] < 0.1 <= medians[1] < medians[2]
+        medians.append(np.median([e.noise.scale_std for e, _ in estimate_pairs(pairs)]))
+    assert medians[0] < 0.02 <= medians[1] < medians[2]
 
 
 def test_both_directions_come_from_one_solve() -> None:

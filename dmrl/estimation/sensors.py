@@ -1,0 +1,69 @@
+"""A robot's logs as they came, on a time grid, without what no robot can have done."""
+
+import numpy as np
+
+from dmrl.estimation.jumps import levelled_height
+from dmrl.estimation.pair import LONGEST_GAP_S, RATE_HZ, Array, Mask, Track, resample
+
+SMOOTHED_S = 0.5
+"""Window over which heights are smoothed, by parabolas: a range finder errs by 2 cm in every
+sample, which is 4 px at 1 m, and a drone climbs slowly."""
+FROZEN_SHARE = 0.5
+"""Where more of a log than this repeats itself, that is how it is written."""
+
+Signals = tuple[Array, Array]
+"""Times (N,), seconds, and (N, C) values."""
+
+
+def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) -> Track:
+    """One robot's sensors on a time grid.
+
+    Parameters
+    ----------
+    yaw_rate
+        Column 0: rad/s.
+    velocity
+        Forward, left, m/s.
+    height
+        Column 0: metres. Steps in it are taken out, and it is smoothed.
+    grid_s
+        (K,) uniform grid at 100 Hz, seconds.
+    """
+    turn, turn_gap = resample(*yaw_rate, grid_s)
+    speed, gap = resample(*velocity, grid_s)
+    gap |= frozen(*velocity, grid_s)
+    level = levelled_height(height[0], height[1][:, 0])
+    above, height_gap = resample(height[0], level[:, None], grid_s)
+    smooth_m = _smoothed(above[:, 0], int(SMOOTHED_S * RATE_HZ / 2))
+    return Track(speed[:, 0], speed[:, 1], turn[:, 0], smooth_m, gap | turn_gap, height_gap)
+
+
+def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
+    """(K,) where a signal did not change for over half a second though it has noise elsewhere.
+
+    Parameters
+    ----------
+    time_s
+        (N,) times, seconds.
+    values
+        (N, C) signals.
+    grid_s
+        (K,) times asked for, seconds.
+    """
+    same = (np.diff(values, axis=0) == 0).all(axis=1)
+    if len(time_s) < 2 or same.mean() > FROZEN_SHARE:
+        return np.zeros(len(grid_s), bool)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]]))).reshape(-1, 2)
+    out = np.zeros(len(grid_s), bool)
+    for first, last in edges:
+        if time_s[last] - time_s[first] > LONGEST_GAP_S:
+            out |= (grid_s >= time_s[first]) & (grid_s <= time_s[last])
+    return out
+
+
+def _smoothed(values: Array, reach: int) -> Array:
+    """Each of (N,) values on the parabola through those within reach (Savitzky and Golay 1964)."""
+    # SciPy's savgol_filter, whose package takes a second to import.
+    weights = np.linalg.pinv(np.vander(np.arange(-reach, reach + 1), 3))[-1]
+    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
+    return np.convolve(padded, weights, mode="valid")
