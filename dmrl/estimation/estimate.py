@@ -4,9 +4,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from dmrl.estimation import ekf, keyframe_filter
-from dmrl.estimation.batch import ROUGH, Solution, evidence, near, solve_batch
+from dmrl.estimation.batch import ROUGH, Solution, near, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
 from dmrl.estimation.gate import (
     AMBIGUOUS,
@@ -15,11 +16,12 @@ from dmrl.estimation.gate import (
     Statuses,
     statuses,
 )
+from dmrl.estimation.grading import noise_of, with_range_noise
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, mirrored, spread_of
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK, OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
 from dmrl.estimation.motion import rotation
-from dmrl.estimation.pair import Array, Pair
+from dmrl.estimation.pair import Array, Mask, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
 
 KEY_HZ = 10.0
@@ -33,19 +35,9 @@ STILL, ALIKE = 0.022, 0.04
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
-GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
-"""Noise against the default's, weighed by how likely each makes the flight."""
-TAKEN = (
-    (0.41, 0.55, 0.65, 0.80, 2.80),
-    (0.45, 0.60, 1.00, 1.00, 3.50),
-    (0.40, 0.45, 1.20, 1.20, 3.50),
-)
-"""The likeliest grade, the grade that velocities are taken for, and that of what is constant.
-The likeliest is a fifth too low and scatters by a tenth, so that the flights that look best
-would be believed too much: sensors are taken for the default's unless they are clearly better.
-A flight shows a bias once at most: only low noise, the mark of sensors that were calibrated,
-speaks for a small one."""
-
+STEADY, REACH_M = 10, 0.5
+"""A position is held against the medians of so many ranges before and after, and may be this
+much farther."""
 SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
 """Order of the globals seen from the peer."""
 
@@ -152,9 +144,10 @@ def estimate_pairs(
 
 def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:
     """Estimates seen from either robot, with their statuses."""
+    estimate, far = within_reach(flight, estimate)
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
-    floor = flight.silent * np.int8(UNCONVERGED)
+    floor = (flight.silent | far) * np.int8(UNCONVERGED)
     here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m), floor)
     there = np.maximum(statuses(back.state, back.covariance, gate_m), floor)
     if own < STILL or relative < ALIKE:
@@ -162,6 +155,29 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     if peer < STILL or relative < ALIKE:
         there[:] = AMBIGUOUS
     return replace(estimate, status=here), replace(back, status=there)
+
+
+def within_reach(flight: Problem, estimate: Estimate) -> tuple[Estimate, Mask]:
+    """An estimate no farther than the ranges around it allow, and (K,) where it was.
+
+    Parameters
+    ----------
+    flight
+        The flight.
+    estimate
+        Its solution.
+    """
+    if not len(flight.range_m):
+        return estimate, np.zeros(len(flight.key_s), bool)
+    smooth_m = median_filter(flight.range_m, 2 * STEADY + 1, mode="nearest")
+    near = np.searchsorted(flight.key_s[flight.range_key], flight.key_s)
+    around = np.clip(near[:, None] + [-STEADY, 0, STEADY], 0, len(smooth_m) - 1)
+    reach_m = smooth_m[around].max(axis=1) + REACH_M
+    distance = np.hypot(*estimate.state[:, :2].T)
+    far = distance > reach_m
+    state = estimate.state.copy()
+    state[far, :2] *= (reach_m[far] / distance[far])[:, None]
+    return replace(estimate, state=state), far
 
 
 def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> list[Estimate]:
@@ -222,7 +238,10 @@ def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Arra
     costs, states = zip(*((s.cost, s.state[:, :3]) for s in solutions), strict=True)
     apart = spread_of(np.array(costs), np.stack(states))
     found, best = (noise, best) if noise else noise_of(flight, first, best)
-    best = solve_batch(flight, found, best.state, best.constants)
+    if noise:
+        best = solve_batch(flight, found, best.state, best.constants)
+    else:
+        found, best = with_range_noise(flight, found, best)
     worse = max(1.0, found.scale_std / Noise().scale_std) ** 0.75
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
     none = np.zeros(len(tracks), np.int8)
@@ -258,42 +277,6 @@ def _start(flight: Problem, track: Array) -> tuple[Array, Array]:
     state[flight.range_key, RANGE_ERROR] = flight.range_level_m
     constants[[OWN_GYRO, PEER_GYRO]] = track[-1, 3:]
     return state, constants
-
-
-def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
-    """What the sensors are like: the grade of noise under which the flight is likeliest.
-
-    And the solution under the nearest of ``GRADES``.
-
-    Parameters
-    ----------
-    flight
-        The flight.
-    noise
-        A first guess.
-    solution
-        The flight's solution under that guess.
-    """
-    tried: dict[int, float] = {}
-    solved: dict[int, Solution] = {}
-    middle, last = 2, len(GRADES) - 2
-    while True:
-        for number in range(middle + 1, middle - 2, -1):
-            if number not in tried:
-                graded = noise.graded(GRADES[number])
-                before = solution.state, solution.constants
-                solution = solve_batch(flight, graded, *before, tolerance=ROUGH)
-                tried[number], solved[number] = evidence(flight, graded, solution), solution
-        best = max(tried, key=lambda number: tried[number])
-        if min(max(best, 1), last) == middle:
-            break
-        middle = min(max(best, 1), last)
-    around = range(middle - 1, middle + 2)
-    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
-    peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
-    likeliest, velocity, constants = TAKEN
-    grades_taken = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
-    return noise.graded(*grades_taken), solved[best]
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:

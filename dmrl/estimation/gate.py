@@ -15,10 +15,10 @@ OK, UNCONVERGED, AMBIGUOUS = range(3)
 
 GATE_M = 0.3
 """A position that is off by more than this is a bad one."""
-EXPECTED_SHARE = 0.035
+EXPECTED_SHARE = 0.045
 """Share of a flight's OK positions that may be expected to be bad. Most flights with calibrated
 sensors are good from end to end and spend little of it: over all of them it is below 1 %."""
-WORST_SHARE = 0.08
+WORST_SHARE = 0.12
 """Probability of being bad that no OK position exceeds."""
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
 """Sigma over distance beyond which a bearing is open rather than imprecise; and the median

@@ -86,6 +86,10 @@ class Noise:
             velocity_scale_std=self.velocity_scale_std * worse,
         )
 
+    def with_range_noise(self, times: float) -> "Noise":
+        """The same with ranges this many times as noisy."""
+        return replace(self, range_std_m=self.range_std_m * times, cauchy_m=self.cauchy_m * times)
+
     def prior_std(self) -> Array:
         """(11,) of the globals, in the order of ``GLOBALS``."""
         pairwise = [self.gyro_std_radps] * 2 + [self.velocity_scale_std] * 2

@@ -1,6 +1,7 @@
 """A robot's logs as they came, on a time grid, without what no robot can have done."""
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, median_filter
 
 from dmrl.estimation.jumps import levelled_height
 from dmrl.estimation.pair import LONGEST_GAP_S, RATE_HZ, Array, Mask, Track, resample
@@ -8,6 +9,9 @@ from dmrl.estimation.pair import LONGEST_GAP_S, RATE_HZ, Array, Mask, Track, res
 SMOOTHED_S = 0.5
 """Window over which heights are smoothed, by parabolas: a range finder errs by 2 cm in every
 sample, which is 4 px at 1 m, and a drone climbs slowly."""
+FAST_MPS, FAST_RADPS, TIMES_USUAL, LASTING_S = 3.0, 5.0, 4.0, 0.2
+"""An estimate runs away after a crash: beyond these, and so many times the flight's median, for so
+long. The robot lies still then, so its rates count as zero and as unknown."""
 FROZEN_SHARE = 0.5
 """Where more of a log than this repeats itself, that is how it is written."""
 
@@ -35,7 +39,27 @@ def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) 
     level = levelled_height(height[0], height[1][:, 0])
     above, height_gap = resample(height[0], level[:, None], grid_s)
     smooth_m = _smoothed(above[:, 0], int(SMOOTHED_S * RATE_HZ / 2))
-    return Track(speed[:, 0], speed[:, 1], turn[:, 0], smooth_m, gap | turn_gap, height_gap)
+    lost = wild(np.hypot(*speed.T), FAST_MPS) | wild(np.abs(turn[:, 0]), FAST_RADPS)
+    known = ~lost
+    gap |= turn_gap | lost
+    return Track(
+        speed[:, 0] * known, speed[:, 1] * known, turn[:, 0] * known, smooth_m, gap, height_gap
+    )
+
+
+def wild(size: Array, fast: float) -> Mask:
+    """(K,) where a rate at 100 Hz, and a second around, is far beyond the flight's: it ran away.
+
+    Parameters
+    ----------
+    size
+        (K,) its size.
+    fast
+        What is slower never is.
+    """
+    limit = max(fast, TIMES_USUAL * float(np.median(size)))
+    lasting = median_filter(size, round(LASTING_S * RATE_HZ), mode="mirror") > limit
+    return np.asarray(maximum_filter1d(lasting, 2 * round(RATE_HZ) + 1))
 
 
 def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,6 +83,34 @@ def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
     inside = (estimate.time_s > 30.05) & (estimate.time_s < 32.95)
     assert (estimate.status[inside] != room.OK).all()
     assert (estimate.status == room.OK).mean() > 0.2
+
+
+def test_where_ranges_are_silent_nothing_is_ok_and_nothing_is_out_of_their_reach() -> None:
+    pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
+    kept = (pair.range_time_s < 30) | (pair.range_time_s > 33)
+    range_time_s, range_m = pair.range_time_s[kept], pair.range_m[kept]
+    ((estimate, _),) = estimate_pairs([replace(pair, range_time_s=range_time_s, range_m=range_m)])
+    inside = (estimate.time_s > 30.05) & (estimate.time_s < 32.95)
+    assert (estimate.status[inside] != room.OK).all()
+    assert (estimate.status == room.OK).mean() > 0.2
+    assert np.hypot(*estimate.state[:, :2].T).max() < range_m.max() + 0.5
+
+
+@pytest.mark.parametrize("fault", ["shadowed", "own bias", "peer bias", "offset"])
+def test_a_fault_does_not_move_the_flight(fault: str) -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1002, LONG_S))
+    if fault in ("shadowed", "offset"):
+        burst = (pair.range_time_s > 30) & (pair.range_time_s < 33)
+        longer = 0.35 if fault == "offset" else 1.0 * burst
+        pair = replace(pair, range_m=pair.range_m + longer)
+    else:
+        side = "own" if fault == "own bias" else "peer"
+        log = getattr(pair, side)
+        biased = replace(log, yaw_rate_radps=log.yaw_rate_radps + 0.05)
+        pair = replace(pair, **{side: biased})
+    ((estimate, _),) = estimate_pairs([pair])
+    assert rmse(estimate, 1002) < 0.16
+    assert (estimate.status == room.OK).mean() > 0.5
 
 
 def test_a_flight_without_ranges_is_ambiguous() -> None:

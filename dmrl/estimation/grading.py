@@ -1,0 +1,104 @@
+"""How good the sensors were: the noise under which a flight is likeliest."""
+
+import numpy as np
+
+from dmrl.estimation.batch import ROUGH, Solution, evidence, solve_batch
+from dmrl.estimation.linear import linearise
+from dmrl.estimation.problem import Noise, Problem
+
+GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
+"""Noise against the default's, weighed by how likely each makes the flight."""
+TAKEN = (
+    (0.41, 0.55, 0.65, 0.80, 2.80),
+    (0.55, 0.60, 1.00, 1.00, 3.50),
+    (0.80, 0.90, 1.20, 1.20, 3.50),
+)
+"""The likeliest grade, the grade that velocities are taken for, and that of what is constant.
+The likeliest is a fifth too low and scatters by a tenth, so that the flights that look best
+would be believed too much: sensors are taken for the default's unless they are clearly better.
+A flight shows a scale once at most: real flow with little noise was seen to be 7 % off."""
+
+NOISIER, NOTICED = 4, 1.1
+"""So often ranges may turn out noisier, and by how much for another solve: less of what is wrong
+with them hides in the solution each time."""
+CORRELATED_S, SOME, FAR = 1.0, 4, 3.0
+"""Ranges are held against their mean over this time where there are some of them, and residuals
+that are further off than so many standard deviations count as so many."""
+
+
+def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
+    """What the sensors are like: the grade of noise under which the flight is likeliest.
+
+    And the solution under the nearest of ``GRADES``.
+
+    Parameters
+    ----------
+    flight
+        The flight.
+    noise
+        A first guess.
+    solution
+        The flight's solution under that guess.
+    """
+    tried: dict[int, float] = {}
+    solved: dict[int, Solution] = {}
+    middle, last = 2, len(GRADES) - 2
+    while True:
+        for number in range(middle + 1, middle - 2, -1):
+            if number not in tried:
+                graded = noise.graded(GRADES[number])
+                before = solution.state, solution.constants
+                solution = solve_batch(flight, graded, *before, tolerance=ROUGH)
+                tried[number], solved[number] = evidence(flight, graded, solution), solution
+        best = max(tried, key=lambda number: tried[number])
+        if min(max(best, 1), last) == middle:
+            break
+        middle = min(max(best, 1), last)
+    around = range(middle - 1, middle + 2)
+    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
+    peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
+    likeliest, velocity, constants = TAKEN
+    grades_taken = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
+    return noise.graded(*grades_taken), solved[best]
+
+
+def with_range_noise(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
+    """The same noise with ranges as noisy as their residuals say, and the solution under it.
+
+    Parameters
+    ----------
+    flight
+        The flight.
+    noise
+        What was found but for the ranges.
+    solution
+        A solution under a similar noise.
+    """
+    for _ in range(NOISIER):
+        solution = solve_batch(flight, noise, solution.state, solution.constants)
+        times = excess(flight, noise, solution)
+        if times < NOTICED:
+            break
+        noise = noise.with_range_noise(times)
+    return noise, solution
+
+
+def excess(flight: Problem, noise: Noise, solution: Solution) -> float:
+    """How many times as noisy the ranges are as was believed, over a second.
+
+    A mean of n independent errors has an n-th of their variance. Where reflections stay with the
+    robots for a second it has more, and a range tells as much less.
+
+    Parameters
+    ----------
+    flight, noise
+        The flight, and what was believed about its sensors.
+    solution
+        The flight's solution.
+    """
+    residual = linearise(flight, noise, solution.state, solution.constants).range
+    second = ((flight.key_s[flight.range_key] - flight.key_s[0]) / CORRELATED_S).astype(int)
+    count = np.bincount(second)
+    total = np.bincount(second, np.clip(residual, -FAR, FAR))[count >= SOME]
+    variance = (total**2 / count[count >= SOME]).mean() if len(total) else 1.0
+    return float(np.sqrt(max(variance, 1.0)))
