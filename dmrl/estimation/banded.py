@@ -64,9 +64,10 @@ def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior:
 
     weighted = ranges * weights.range[:, None]
     keys, sums = _summed(range_key, weighted[:, :4, None] * ranges[:, None, :])
-    diagonal[np.ix_(keys, RANGED, RANGED)] += sums[..., :4]
-    border[np.ix_(keys, RANGED, [0, 1])] += sums[..., 4:6]
-    gradient[np.ix_(keys, RANGED)] += sums[..., 6]
+    states = np.array(RANGED)
+    diagonal[np.ix_(keys, states, states)] += sums[..., :4]
+    border[np.ix_(keys, states, np.arange(2))] += sums[..., 4:6]
+    gradient[np.ix_(keys, states)] += sums[..., 6]
     flat = rooted.reshape(-1, steps.shape[2])[:, 2 * width :]
     rest = flat.T @ flat
     shared = [0, 1, -1]  # bias and scale of the ranges, and the residual
