@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.cli import COMMANDS, app
+from dmrl.estimation.gate import EXPECTED_SHARE
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/*.md"))]
@@ -75,3 +76,10 @@ def _code(page: Path) -> str:
     text = page.read_text(encoding="utf-8")
     found = re.findall(r"```sh\n(.*?)```|`([^`\n]+)`", text, re.DOTALL)
     return " ".join(block or quoted for block, quoted in found)
+
+
+def test_help_and_page_agree_with_the_gate_on_how_many_positions_are_bad() -> None:
+    share = f"{EXPECTED_SHARE:.1%}".replace("%", " %")
+    for name in ("commands.md", "labelling.md"):
+        text = re.sub(r"[\s│]+", " ", (ROOT / "docs" / name).read_text(encoding="utf-8"))
+        assert f"{share} is expected to be bad" in text or f"{share} are expected to be bad" in text

@@ -55,6 +55,8 @@ class Pairs:
         Confidence from which they are to be believed, as the detector says; 0: not known.
     left_out
         Why images and labels were left out, and how many.
+    unseen
+        Images without a Detections message, judged as ones in which nothing was found.
     """
 
     at: list[At]
@@ -62,6 +64,7 @@ class Pairs:
     detections: Points
     threshold: float = 0.0
     left_out: dict[str, int] = field(default_factory=dict)
+    unseen: int = 0
 
     @property
     def images(self) -> int:
@@ -69,8 +72,13 @@ class Pairs:
         return len(self.at)
 
 
-def join(recordings: Sequence[Path], against: str, split: str | None = None) -> Pairs:
+def join(
+    recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
+) -> Pairs:
     """Labels and detections of every image that can be judged, one recording after another.
+
+    In an image without a Detections message nothing was found: what a detector leaves out counts
+    against it.
 
     Parameters
     ----------
@@ -80,6 +88,8 @@ def join(recordings: Sequence[Path], against: str, split: str | None = None) -> 
         Source of the labels.
     split
         Only this split of each recording's source. None: all images.
+    partial
+        Leave out images without a Detections message.
 
     Raises
     ------
@@ -89,23 +99,30 @@ def join(recordings: Sequence[Path], against: str, split: str | None = None) -> 
         If one has no labels of that source, no such split, or no image to judge.
     """
     refuse_twice(recordings)
-    return _together([_join(path, against, split) for path in track(recordings, "Reading")])
+    return _together(
+        [_join(path, against, split, partial) for path in track(recordings, "Reading")]
+    )
 
 
-def _join(recording: Path, against: str, split: str | None) -> Pairs:
+def _join(recording: Path, against: str, split: str | None, partial: bool) -> Pairs:
     held = summary(recording)
     robots = topics.robots(list(held.topics), topics.DETECTIONS)
+    if robots and not partial:
+        labelled = topics.robots(list(held.topics), topics.LABELS)
+        pictured = topics.robots(list(held.topics), topics.CAMERA_IMAGE)
+        robots = sorted({*robots, *(robot for robot in labelled if robot in pictured)})
     if not robots:
         raise RecordingError(
             f"{recording} has no detections. Try: dmrl predict MODEL {recording} OUT.mcap"
         )
     spans = _spans(recording, splits(recording, held), split)
     _require_source(recording, robots, against)
-    pairs = _together([_join_robot(recording, robot, against, spans) for robot in robots])
+    pairs = _together([_join_robot(recording, robot, against, spans, partial) for robot in robots])
     if not pairs.images:
+        seen = " and detections" if partial else ""
         where = f"in split {split}" if split else "in it"
         raise SettingError(
-            f"{recording} has no image with labels from {against} and detections {where}. "
+            f"{recording} has no image with labels from {against}{seen} {where}. "
             f"Try: dmrl info {recording}"
         )
     return pairs
@@ -115,7 +132,7 @@ def labels_of_split(split: Split, rows: Sequence[int]) -> Points:
     """Labels inside the images of some rows of a dataset's split, numbered by their place."""
     height_px, width_px = split.image_shape
     entries = _column(split.table, "peers")
-    labels = _points(entries, None, np.array(rows, np.int64), len(split))
+    labels = _points(entries, None, np.array(rows, np.int64), np.arange(len(rows)))
     return labels.select(_in_view(labels, width_px, height_px))
 
 
@@ -148,25 +165,53 @@ def _require_source(recording: Path, robots: Iterable[str], against: str) -> Non
 
 
 def _join_robot(
-    recording: Path, robot: str, against: str, spans: list[tuple[int, int]] | None
+    recording: Path,
+    robot: str,
+    against: str,
+    spans: list[tuple[int, int]] | None,
+    partial: bool,
 ) -> Pairs:
     left_out: Counter[str] = Counter()
     labelled = read_table(recording, topics.labels(robot), fields=LOOKED)
-    detected = read_table(recording, topics.detections(robot))
+    detected = _detected(recording, robot)
     times, (peers, looked) = _by_time(labelled)
     seen_at = _column(detected, "log_time").to_numpy()
     mine, usable = _usable(peers, looked, against, _within(times, spans), left_out)
-    left_out["images without detections"] += int((usable & ~np.isin(times, seen_at)).sum())
-    judged, in_usable, in_detections = np.intersect1d(times[usable], seen_at, return_indices=True)
-    labels = _points(peers, mine, np.flatnonzero(usable)[in_usable], len(times))
+    seen = np.isin(times, seen_at)
+    if partial:
+        left_out["images without detections"] += int((usable & ~seen).sum())
+    else:
+        seen |= np.isin(times, _image_times(recording, robot))
+        left_out["labels without an image"] += int((usable & ~seen).sum())
+    usable &= seen
+    judged = times[usable]
+    _, in_judged, in_detections = np.intersect1d(judged, seen_at, return_indices=True)
+    labels = _points(peers, mine, np.flatnonzero(usable), np.arange(len(judged)))
     width_px, height_px = _image_size(recording, robot)
-    seen = _in_view(labels, width_px, height_px)
-    left_out["labels outside their image"] += int((~seen).sum())
+    shown = _in_view(labels, width_px, height_px)
+    left_out["labels outside their image"] += int((~shown).sum())
     every = _column(detected, "detections")
-    detections = _points(every, None, in_detections, len(detected))
+    detections = _points(every, None, in_detections, in_judged)
     threshold = float(np.max(_column(detected, "threshold").to_numpy(), initial=0.0))
     at = [At(recording, robot, int(time_ns)) for time_ns in judged]
-    return Pairs(at, labels.select(seen), detections, threshold, left_out)
+    unseen = len(judged) - len(in_judged)
+    return Pairs(at, labels.select(shown), detections, threshold, left_out, unseen)
+
+
+def _detected(recording: Path, robot: str) -> pa.Table:
+    """A robot's detections; no row where it has none."""
+    topic = topics.detections(robot)
+    if topic in summary(recording).topics:
+        return read_table(recording, topic)
+    other = topics.robots(list(summary(recording).topics), topics.DETECTIONS)[0]
+    return read_table(recording, topics.detections(other)).slice(0, 0)
+
+
+def _image_times(recording: Path, robot: str) -> Times:
+    topic = topics.camera_image(robot)
+    if topic not in summary(recording).topics:
+        return np.zeros(0, np.int64)
+    return np.asarray(_column(read_table(recording, topic, fields=()), "log_time").to_numpy())
 
 
 def _by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
@@ -201,10 +246,10 @@ def _usable(
     return mine, within & ~foreign & ~not_ok
 
 
-def _points(entries: pa.Array, mine: Mask | None, rows: Times, count: int) -> Points:
-    """Entries of the chosen rows of a list column, numbered by their place in ``rows``."""
-    place = np.full(count, -1, np.int64)
-    place[rows] = np.arange(len(rows))
+def _points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -> Points:
+    """Entries of the chosen rows of a list column, as of images with these numbers."""
+    place = np.full(len(entries), -1, np.int64)
+    place[rows] = numbers
     image = place[_image_of(entries)]
     keep = np.flatnonzero((image >= 0) if mine is None else (image >= 0) & mine)
     flat = entries.flatten()
@@ -233,6 +278,7 @@ def _together(parts: list[Pairs]) -> Pairs:
         Points.concatenate([p.detections for p in parts], first),
         max(part.threshold for part in parts),
         {why: count for why, count in left_out.items() if count},
+        sum(part.unseen for part in parts),
     )
 
 

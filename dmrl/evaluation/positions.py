@@ -137,6 +137,11 @@ def _covariance(table: pa.Table) -> Array:
     return np.asarray(full[:, :2, :2], float)
 
 
+def lasts_s(pairs: list[Pair]) -> float:
+    """Seconds from the first estimate to the last of the longest pair."""
+    return max(float(pair.judged.time_s[-1]) for pair in pairs)
+
+
 def document(recording: Path, pairs: list[Pair], settle_s: float) -> dict[str, Any]:
     """Everything that was measured, as JSON values; null where there was nothing to measure."""
     source = input_of(recording)

@@ -171,6 +171,11 @@ def _truth(recording: Path, sight: Sight, peers: list[str]) -> tuple[Array, NDAr
     return xyz, shown
 
 
+def lasts_s(judged: list[Judged]) -> float:
+    """Seconds from the first image to the last of the observer that looked longest."""
+    return max(one.length_s for one in judged)
+
+
 def document(recording: Path, judged: list[Judged], settle_s: float) -> dict[str, Any]:
     """Everything that was measured, as JSON values; null where there was nothing to measure."""
     source = input_of(recording)

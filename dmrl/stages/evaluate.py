@@ -18,6 +18,7 @@ from dmrl.evaluation.detections import Pairs, join
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import input_of, summary
+from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
 figures: ModuleType | None
@@ -29,6 +30,8 @@ except MissingExtra:
 Document = dict[str, Any]
 KINDS = {"positions": positions, "tracks": tracks}
 """What can be judged by true positions; both modules offer the same functions."""
+SETTLE_S, SHORT_S = 20.0, 30.0
+"""Time to settle; of what is shorter than this, the first half is."""
 FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
 
 
@@ -45,6 +48,9 @@ class Settings:
         Whose labels.
     split
         Only images of this split of the recording's source, such as test. Without it, all.
+    partial
+        Judge only images that have a Detections message. Without it, one without counts as an
+        image in which nothing was found.
     threshold
         Confidence from which a detection counts in precision, recall and F1, 0 to 1. Without
         it, the one in the recording.
@@ -54,15 +60,17 @@ class Settings:
         Of the bootstrap.
     settle_s
         positions, tracks: errors in the first seconds do not count, but for what is kept.
+        Without it, 20 s, or half of a flight under 30 s.
     """
 
     what: Literal["auto", "detections", "positions", "tracks"] = "auto"
     against: Literal["truth", "estimate", "hand", "published"] = "truth"
     split: str | None = None
+    partial: Annotated[bool, Parameter(negative=())] = False
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
     draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
     seed: int = 0
-    settle_s: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 20.0
+    settle_s: Annotated[float | None, Parameter(validator=validators.Number(gte=0))] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,9 +143,17 @@ def _what(recording: Path) -> str:
 
 
 def _run_document(
-    kind: ModuleType, name: str, recording: Path, out: Path | None, settle_s: float
+    kind: ModuleType, name: str, recording: Path, out: Path | None, settle_s: float | None
 ) -> Document:
     judged = kind.judge(recording)
+    lasts_s = kind.lasts_s(judged)
+    if settle_s is None:
+        settle_s = SETTLE_S if lasts_s >= SHORT_S else round(lasts_s / 2, 3)
+    elif settle_s >= lasts_s:
+        say(
+            f"{recording}: nothing settles before it ends, after {lasts_s:.1f} s: give a smaller "
+            "--settle-s"
+        )
     made: Document = kind.document(recording, judged, settle_s)
     if out is not None:
         with _folder(out, name, made) as folder:
@@ -157,7 +173,7 @@ def _folder(out: Path, name: str, made: Document) -> Iterator[Path]:
 
 def run_detections(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Evaluation:
     """Judge the detections of all recordings, image by image; see `run`."""
-    pairs = join(recordings, settings.against, settings.split)
+    pairs = join(recordings, settings.against, settings.split, partial=settings.partial)
     threshold = settings.threshold
     if threshold is None:
         threshold = pairs.threshold or FALLBACK_THRESHOLD
@@ -189,6 +205,8 @@ def document(
         "images": evaluation.pairs.images,
         "labels": len(evaluation.pairs.labels),
         "detections": len(evaluation.pairs.detections),
+        "partial": settings.partial,
+        "images_without_detections": evaluation.pairs.unseen,
         "left_out": evaluation.pairs.left_out,
         "bootstrap": {"draws": settings.draws, "seed": settings.seed},
         "overall": overall,
@@ -248,13 +266,19 @@ def print_evaluation(
         rows.append([words, *cells])
     split = f", split {settings.split}" if settings.split else ""
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
-    title = f"{name}: {evaluation.pairs.images} images against {settings.against}{split}"
+    part = ", only those with detections" if settings.partial else ""
+    title = f"{name}: {evaluation.pairs.images} images against {settings.against}{split}{part}"
     print_table(title, ["label minus detection", *headers], rows)
     notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
     if overall.unmatched:
         notes.append(f"{overall.unmatched} labels without any detection")
     for note in notes:
         print(f"left out: {note}")
+    if unseen := evaluation.pairs.unseen:
+        print(
+            f"{unseen} images have no Detections message: nothing was found there. "
+            "--partial leaves them out"
+        )
     print(
         f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
         f"confidence {evaluation.threshold:g}, within 16 px"

@@ -154,15 +154,67 @@ def test_images_that_cannot_be_judged_are_left_out_and_counted(
         }
     )
     evaluation = run([path], None, FAST)
-    assert evaluation.pairs.images == 3
-    assert len(evaluation.pairs.labels) == 2
-    assert evaluation.pairs.left_out == {
-        "images without detections": 1,
+    assert evaluation.pairs.images == 4
+    assert len(evaluation.pairs.labels) == 3
+    left_out = {
         "images with labels from other sources only": 1,
         "images with a label that is not OK": 1,
         "labels outside their image": 1,
     }
+    assert evaluation.pairs.left_out == left_out
     assert figures(path)["precision"] == pytest.approx(2 / 3)
+    assert figures(path)["recall"] == pytest.approx(2 / 3)
+    partial = Settings(draws=20, partial=True)
+    assert run([path], None, partial).pairs.left_out == {
+        "images without detections": 1,
+        **left_out,
+    }
+    assert figures(path, partial)["recall"] == 1
+
+
+def test_leaving_messages_out_does_not_flatter(
+    write: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = ([peer(10, 10)], [found(10, 10)]), ([peer(10, 10)], [found(50, 40, 0.2)])
+    unseen, empty = ([peer(10, 10)], None), ([peer(10, 10)], [])
+    whole = figures(write({"cf1": [good, *[bad] * 4]}))
+    picked = write({"cf1": [good, *[unseen] * 4]}, name="picked.mcap")
+    told = figures(write({"cf1": [good, *[empty] * 4]}, name="told.mcap"))
+    got = figures(picked)
+    assert got == told
+    assert got["ap_16_px"] == whole["ap_16_px"] == 0.2
+    assert (got["recall"], got["within_8_px"], got["unmatched_labels"]) == (0.2, 0.2, 4)
+    evaluate.command([picked], settings=FAST)
+    assert "4 images have no Detections message" in capsys.readouterr().out
+    partial = Settings(draws=20, partial=True)
+    assert figures(picked, partial)["ap_16_px"] == 1
+    evaluate.command([picked], settings=partial)
+    assert "1 images against truth, only those with detections" in capsys.readouterr().out
+    said = document([picked], partial, run([picked], None, partial))
+    assert (said["partial"], said["images_without_detections"]) == (True, 0)
+    said = document([picked], FAST, run([picked], None, FAST))
+    assert (said["partial"], said["images_without_detections"]) == (False, 4)
+
+
+def test_a_camera_that_never_detected_counts_too(write: Callable[..., Path]) -> None:
+    good, unseen = ([peer(10, 10)], [found(10, 10)]), ([peer(10, 10)], None)
+    path = write({"cf1": [good], "cf2": [unseen]})
+    assert figures(path)["recall"] == 0.5
+    assert figures(path, Settings(draws=20, partial=True))["recall"] == 1
+
+
+def test_a_label_without_an_image_says_nothing_of_detections(
+    write: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = write({"cf1": [([peer(10, 10)], [found(10, 10)])]})
+    late = tmp_path / "late.mcap"
+    with RecordingWriter(late, Provenance("test")) as sink:
+        sink.write(77, "/cf1/labels", message("PeerLabels")(peers=[peer(20, 20)]))
+    both = tmp_path / "both.mcap"
+    merge.run([path, late], both)
+    evaluation = run([both], None, FAST)
+    assert evaluation.pairs.images == 1
+    assert evaluation.pairs.left_out == {"labels without an image": 1}
 
 
 def test_the_split_of_the_source_is_kept_apart(write: Callable[..., Path]) -> None:
@@ -188,10 +240,11 @@ def test_what_is_missing_is_named(write: Callable[..., Path], dots: Path) -> Non
         run([dots], None, FAST)
 
 
-def test_labels_and_detections_at_other_times_are_not_judged(write: Callable[..., Path]) -> None:
+def test_labels_and_detections_at_other_times_do_not_meet(write: Callable[..., Path]) -> None:
     path = write({"cf1": [([peer(10, 10)], None), (None, [found(10, 10)])]})
+    assert figures(path)["recall"] == 0
     with pytest.raises(SettingError, match="has no image with labels from truth and detections"):
-        run([path], None, FAST)
+        run([path], None, Settings(draws=20, partial=True))
 
 
 def test_the_json_document_is_complete_and_clean(

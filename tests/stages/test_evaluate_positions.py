@@ -77,6 +77,26 @@ def test_the_table_has_a_row_per_pair_and_one_for_all(
     assert json.loads(capsys.readouterr().out)["settle_s"] == 20.0
 
 
+def test_a_short_flight_settles_in_its_first_half(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "short.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(121):
+            sink.write(k * 10**8, "/cf1/peer/cf2/truth", position(1.0, 0.0, 0.0))
+            error = 0.5 if k < 60 else 0.1
+            sink.write(k * 10**8, "/cf1/peer/cf2/position", position(1.0 + error, 0.0))
+    made = run([path], None, Settings())
+    assert isinstance(made, dict)
+    assert made["settle_s"] == 6.0
+    assert made["overall"]["rmse_m"] == pytest.approx(0.1)
+    assert capsys.readouterr().err == ""
+    made = run([path], None, Settings(settle_s=20.0))
+    assert isinstance(made, dict)
+    assert made["overall"]["rmse_m"] is None
+    assert "ends, after 12.0 s: give a smaller --settle-s" in capsys.readouterr().err
+
+
 def test_truth_is_not_interpolated_over_gaps(tmp_path: Path) -> None:
     path = tmp_path / "gap.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
