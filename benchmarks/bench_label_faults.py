@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
+from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
 from dmrl.estimation.gate import GATE_M, OK, statuses
 from dmrl.estimation.pair import RATE_HZ, Mask, Pair, usable_ranges
 from dmrl.estimation.score import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
@@ -127,34 +127,48 @@ def _signals(flight: Flight, robot: str) -> RobotLog:
     return RobotLog(*((log.time_s[at], v[at]) for at, v in zip(sensed, columns, strict=True)))
 
 
-def batch(pair: Pair, time_s: Array) -> list[Found]:
+def batch(pairs: list[Pair]) -> list[tuple[Found, Found]]:
     """`dmrl label`'s: the peer seen by the observer, and the observer seen by the peer."""
-    (both,) = estimate_pairs([pair])
-    found = [estimate.at(time_s) for estimate in both]
-    return [(xy, spread, status == OK) for xy, spread, status in found]
+    both = zip(pairs, estimate_pairs(pairs), strict=True)
+    return [(_at(here, pair), _at(there, pair)) for pair, (here, there) in both]
 
 
-def published(pair: Pair, time_s: Array) -> list[Found]:
+def published(pairs: list[Pair]) -> list[tuple[Found, Found]]:
     """The filter of Li et al. 2020, as ``dmrl label --method ekf``."""
-    both = [estimate_ekf([p], "published-sim")[0].at(time_s) for p in (pair, pair.swapped())]
-    return [(xy, spread, status == OK) for xy, spread, status in both]
+    both = [*pairs, *(pair.swapped() for pair in pairs)]
+    found = [_at(e, p) for e, p in zip(estimate_ekf(both, "published-sim"), both, strict=True)]
+    return list(zip(found[: len(pairs)], found[len(pairs) :], strict=True))
 
 
-def graph(pair: Pair, time_s: Array) -> list[Found]:
+def _at(estimate: Estimate, pair: Pair) -> Found:
+    xy, spread, status = estimate.at(times(pair))
+    return xy, spread, status == OK
+
+
+def graph(pairs: list[Pair]) -> list[tuple[Found, Found]]:
     """The plain factor graph."""
     import graph_peer  # noqa: PLC0415  # gtsam is optional
 
     out = []
-    for one in (pair, pair.swapped()):
-        key_s, state, covariance = graph_peer.solve(one)
-        status = statuses(state, covariance, GATE_M)
-        at = np.clip(np.searchsorted(key_s, time_s), 0, len(key_s) - 1)
-        xy = np.stack([np.interp(time_s, key_s, axis) for axis in state[:, :2].T], axis=1)
-        out.append((xy, covariance[at, :2, :2], status[at] == OK))
+    for pair in pairs:
+        here, there = graph_peer.solve(pair)
+        out.append((_of_graph(pair, *here), _of_graph(pair, *there)))
     return out
 
 
-METHODS: dict[str, Callable[[Pair, Array], list[Found]]] = {
+def _of_graph(pair: Pair, key_s: Array, state: Array, covariance: Array) -> Found:
+    status, time_s = statuses(state, covariance, GATE_M), times(pair)
+    at = np.clip(np.searchsorted(key_s, time_s), 0, len(key_s) - 1)
+    xy = np.stack([np.interp(time_s, key_s, axis) for axis in state[:, :2].T], axis=1)
+    return xy, covariance[at, :2, :2], status[at] == OK
+
+
+def times(pair: Pair) -> Array:
+    """(N,) at which a pair is judged, 20 a second."""
+    return np.arange(pair.time_s[0], pair.time_s[-1], 0.05)
+
+
+METHODS: dict[str, Callable[[list[Pair]], list[tuple[Found, Found]]]] = {
     "batch": batch,
     "published": published,
     "graph": graph,
@@ -220,21 +234,24 @@ def outside(flight: Flight, true_s: Array) -> Mask:
 
 def rows_of(name: str, noise: str, seeds: range, methods: list[str]) -> list[Row]:
     """A fault under every method."""
-    spent = dict.fromkeys(methods, 0.0)
-    seen: dict[str, list[list[tuple[Judged, Mask]]]] = {method: [] for method in methods}
-    for seed in seeds:
-        flight = simulate(Scenario(), NOISE[noise], seed, CASES[name].faults)
-        pair = pair_of(flight, "cf1", "cf2")
-        time_s = np.arange(pair.time_s[0], pair.time_s[-1], 0.05)
-        for method in methods:
-            begun = time.process_time()
-            found = METHODS[method](pair, time_s)
-            spent[method] += time.process_time() - begun
-            both = zip((("cf1", "cf2"), ("cf2", "cf1")), found, strict=True)
-            one = [judged(flight, *names, time_s, what) for names, what in both]
-            calm = outside(flight, flight.clocks["cf1"].true_time(time_s))
-            seen[method].append([(j, calm) for j in one])
-    return [_row(name, noise, m, seen[m], spent[m] / len(seeds)) for m in methods]
+    flights = [simulate(Scenario(), NOISE[noise], seed, CASES[name].faults) for seed in seeds]
+    pairs = [pair_of(flight, "cf1", "cf2") for flight in flights]
+    rows = []
+    for method in methods:
+        begun = time.process_time()
+        found = METHODS[method](pairs)
+        spent_s = (time.process_time() - begun) / len(seeds)
+        seen = [_seen(*one) for one in zip(flights, pairs, found, strict=True)]
+        rows.append(_row(name, noise, method, seen, spent_s))
+    return rows
+
+
+def _seen(flight: Flight, pair: Pair, found: tuple[Found, Found]) -> list[tuple[Judged, Mask]]:
+    """Both directions of a flight beside the truth, and where nothing goes wrong."""
+    time_s = times(pair)
+    calm = outside(flight, flight.clocks["cf1"].true_time(time_s))
+    both = zip((("cf1", "cf2"), ("cf2", "cf1")), found, strict=True)
+    return [(judged(flight, *names, time_s, what), calm) for names, what in both]
 
 
 def _row(
@@ -316,6 +333,9 @@ def main() -> int:
     parser.add_argument("--method", choices=list(METHODS), action="append", help="likewise")
     parser.add_argument("--json", type=Path, help="write the rows there too")
     parser.add_argument("--plot", type=Path, help="draw STEM.png")
+    parser.add_argument(
+        "--beside", type=Path, action="append", default=[], help="JSON of other methods, drawn too"
+    )
     given = parser.parse_args()
     methods = given.method or list(METHODS)
     if "graph" in methods and importlib.util.find_spec("gtsam") is None:
@@ -332,7 +352,8 @@ def main() -> int:
     if given.json:
         given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
     if given.plot:
-        draw(rows, given.plot)
+        others = [Row(**row) for path in given.beside for row in json.loads(path.read_text())]
+        draw([*rows, *others], given.plot)
     return int(any(row.over for row in rows))
 
 

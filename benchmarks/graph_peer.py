@@ -16,7 +16,7 @@ from dmrl.geometry.frames import Array
 
 KEY_HZ = 10.0
 FIRST_S = 20.0
-DIRECTIONS = 6
+DIRECTIONS = 5
 """Bearings, and headings, that are tried."""
 KEPT = 3
 RANGE_STD_M, STEP_STD_M, TURN_STD_RAD = 0.10, 0.02, 0.002
@@ -29,8 +29,12 @@ RANGE = noiseModel.Robust.Create(
 )
 
 
-def solve(pair: Pair) -> tuple[Array, Array, Array]:
-    """Times (K,), states (K, 3) and covariances (K, 3, 3) of the peer, seen by the observer."""
+Solved = tuple[Array, Array, Array]
+"""Times (K,), states (K, 3) and covariances (K, 3, 3) of a peer seen by its observer."""
+
+
+def solve(pair: Pair) -> tuple[Solved, Solved]:
+    """The peer seen by the observer, and the observer seen by the peer."""
     key_s = np.arange(pair.time_s[0], pair.time_s[-1], 1 / KEY_HZ)
     moves = [
         odometry(track, pair.time_s).increments(key_s[:-1], key_s[1:])
@@ -50,8 +54,12 @@ def solve(pair: Pair) -> tuple[Array, Array, Array]:
     values = min(ends, key=whole.error)
     at = np.arange(0, len(key_s), MARGINAL_EVERY)
     marginals = gtsam.Marginals(whole, values)
-    states, covariances = zip(*(_relative(values, marginals, k) for k in at), strict=True)
-    return key_s[at], np.array(states), np.array(covariances)
+    out = []
+    for here, there in ((_own, _peer), (_peer, _own)):
+        found = [_relative(values, marginals, here(k), there(k)) for k in at.tolist()]
+        states, covariances = zip(*found, strict=True)
+        out.append((key_s[at], np.array(states), np.array(covariances)))
+    return out[0], out[1]
 
 
 def _own(k: int) -> int:
@@ -98,13 +106,16 @@ def _optimised(
     return gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
 
 
-def _relative(values: gtsam.Values, marginals: gtsam.Marginals, k: int) -> tuple[Array, Array]:
-    """State (3,) and covariance (3, 3) of the peer in the observer's frame at a keyframe."""
-    keys = gtsam.KeyVector([_own(k), _peer(k)])
-    joint = marginals.jointMarginalCovariance(keys).fullMatrix()
-    apart = values.atPose2(_own(k)).between(values.atPose2(_peer(k)))
-    by_both = np.zeros((3, 6))
-    by_both[:2, :2], by_both[:2, 2] = -np.eye(2), (apart.y(), -apart.x())
-    by_both[:2, 3:5] = rotation(np.array(apart.theta()))
-    by_both[2, [2, 5]] = -1.0, 1.0
-    return np.array([apart.x(), apart.y(), apart.theta()]), by_both @ joint @ by_both.T
+def _relative(
+    values: gtsam.Values, marginals: gtsam.Marginals, here: int, there: int
+) -> tuple[Array, Array]:
+    """State (3,) and covariance (3, 3) of one pose in the frame of another."""
+    joint = marginals.jointMarginalCovariance(gtsam.KeyVector([here, there]))
+    apart = values.atPose2(here).between(values.atPose2(there))
+    by_here, by_there = np.zeros((3, 3)), np.zeros((3, 3))
+    by_here[:2, :2], by_here[:2, 2] = -np.eye(2), (apart.y(), -apart.x())
+    by_there[:2, :2] = rotation(np.array(apart.theta()))
+    by_here[2, 2], by_there[2, 2] = -1.0, 1.0
+    rows = ((here, by_here), (there, by_there))
+    spread = sum(a @ joint.at(i, j) @ b.T for i, a in rows for j, b in rows)
+    return np.array([apart.x(), apart.y(), apart.theta()]), np.asarray(spread)
