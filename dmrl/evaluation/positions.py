@@ -27,6 +27,10 @@ from dmrl.recording import input_of, read_table, summary
 
 TITLE, EACH = "estimated positions against truth", "pair"
 Times = NDArray[np.int64]
+COVERED = (
+    "share of the true positions that lie between two estimates close to each other; all other "
+    "figures are of the estimates that are there"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +45,18 @@ class Pair:
         The estimates that there is truth for.
     without_truth
         How many there is none for.
+    true
+        Samples of the truth.
+    covered
+        How many of them lie between two estimates that are close: what is not told counts.
     """
 
     robot: str
     peer: str
     judged: Judged
     without_truth: int
+    true: int
+    covered: int
 
     @property
     def name(self) -> str:
@@ -122,7 +132,8 @@ def _judge(recording: Path, robot: str, peer: str) -> Pair:
         distance_m=np.linalg.norm(truth, axis=1),
         kept=_column(estimate, "status")[near] == STATUS_OK,
     )
-    return Pair(robot, peer, judged, int((~near).sum()))
+    covered = inside_truth(true_ns.astype(np.int64), time_ns.astype(np.int64))
+    return Pair(robot, peer, judged, int((~near).sum()), len(covered), int(covered.sum()))
 
 
 def _column(table: pa.Table, name: str) -> Array:
@@ -149,18 +160,23 @@ def document(recording: Path, pairs: list[Pair], settle_s: float) -> dict[str, A
     return {
         "recording": {"name": source.name, "sha256": source.sha256},
         "settle_s": settle_s,
-        "overall": _values(overall(each)),
+        "overall": {"covered": _covered(pairs), **_values(overall(each))},
         "pairs": [
             {
                 "robot": pair.robot,
                 "peer": pair.peer,
                 "without_truth": pair.without_truth,
+                "covered": _covered([pair]),
                 **_values(measured),
             }
             for pair, measured in zip(pairs, each, strict=True)
         ],
-        "definitions": DEFINITIONS,
+        "definitions": {**DEFINITIONS, "covered": COVERED},
     }
+
+
+def _covered(pairs: list[Pair]) -> float:
+    return sum(pair.covered for pair in pairs) / sum(pair.true for pair in pairs)
 
 
 def _values(measured: Figures) -> dict[str, float | None]:
@@ -171,6 +187,7 @@ def _values(measured: Figures) -> dict[str, float | None]:
 # Name of a figure, its words in the table, and its format.
 COLUMNS = (
     ("samples", "samples", "d"),
+    ("covered", "covered", ".0%"),
     ("rmse_m", "RMSE, m", ".2f"),
     ("p95_m", "95 %, m", ".2f"),
     ("wrong_basin", "wrong", ".0%"),
@@ -184,6 +201,7 @@ COLUMNS = (
 
 
 NOTE = (
+    "covered: share of the truth that has an estimate; "
     "horizontal errors; kept: status OK, over the whole flight; good: within 0.3 m; "
     "RMSE, 95 %, NEES, ellipse: settled"
 )

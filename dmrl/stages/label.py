@@ -20,6 +20,7 @@ try:
     from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
     from dmrl.estimation.gate import GATE_M
     from dmrl.estimation.pair import Pair
+    from dmrl.estimation.swarm import estimate_swarm
     from dmrl.labelling.camera import camera_given, camera_of, image_times
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import read_logs
@@ -46,7 +47,8 @@ class Settings:
     Parameters
     ----------
     method
-        "batch": the whole flight at once. "smoother": EKF and RTS from the best of 96 starts.
+        "batch": the whole flight at once, pair by pair. "swarm": then all robots together, where
+        ranges connect three or more. "smoother": EKF and RTS from the best of 96 starts.
         "ekf": the published filter, online, from (0, 0, 0).
     preset
         ekf: its noise, as published for simulation or in the firmware.
@@ -68,7 +70,7 @@ class Settings:
         A robot's camera, with mount and delay, as dmrl calibrate wrote it: --camera.cf1 FILE.
     """
 
-    method: Literal["batch", "smoother", "ekf"] = "batch"
+    method: Literal["batch", "swarm", "smoother", "ekf"] = "batch"
     preset: Literal["published-sim", "published-firmware"] = "published-sim"
     gate_m: Positive = GATE_M
     attitude_std_rad: Positive = 0.015
@@ -192,9 +194,14 @@ def _estimates(pairs: Mapping[Names, Pair], settings: Settings) -> dict[Names, E
             out |= dict(zip(group, made, strict=True))
         else:
             chosen = [pairs[name] for name in group]
-            both = estimate_pairs(chosen, settings.method, gate_m=settings.gate_m)
+            method: Literal["batch", "smoother"] = (
+                "smoother" if settings.method == "smoother" else "batch"
+            )
+            both = estimate_pairs(chosen, method, gate_m=settings.gate_m)
             for name, (here, there) in zip(group, both, strict=True):
                 out[name], out[name[::-1]] = here, there
+    if settings.method == "swarm":
+        out = estimate_swarm(pairs, out, gate_m=settings.gate_m)
     return dict(sorted(out.items()))
 
 

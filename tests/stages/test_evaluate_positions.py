@@ -77,6 +77,23 @@ def test_the_table_has_a_row_per_pair_and_one_for_all(
     assert json.loads(capsys.readouterr().out)["settle_s"] == 20.0
 
 
+def test_estimates_that_were_left_out_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "picked.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(400):
+            sink.write(k * 10**8, "/cf1/peer/cf2/truth", position(1.0, 0.0, 0.0))
+            if k < 100:  # the good ones
+                sink.write(k * 10**8, "/cf1/peer/cf2/position", position(1.0, 0.0))
+    made = run([path], None, Settings())
+    assert isinstance(made, dict)
+    assert made["overall"]["covered"] == made["pairs"][0]["covered"] == pytest.approx(0.25)
+    assert made["overall"]["kept"] == 1.0
+    command([path])
+    assert "covered" in capsys.readouterr().out
+
+
 def test_a_short_flight_settles_in_its_first_half(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

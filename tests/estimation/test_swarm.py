@@ -1,0 +1,88 @@
+"""All robots at once: at least as right as pair by pair, and as honest."""
+
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.estimate import Estimate, estimate_pairs
+from dmrl.estimation.gate import AMBIGUOUS, OK
+from dmrl.estimation.pair import Pair
+from dmrl.estimation.swarm import estimate_swarm
+from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
+
+from .flights import pair_of, truth_at
+
+Names = tuple[str, str]
+Estimates = dict[Names, Estimate]
+
+
+@cache
+def solved(
+    trajectory: Trajectory, noise: str, robots: int = 3
+) -> tuple[Flight, dict[Names, Pair], Estimates, Estimates]:
+    flight = simulate(Scenario(robots, 40.0, trajectory), NOISE[noise], 1)
+    pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
+    both: Estimates = {}
+    for names, (here, there) in zip(pairs, estimate_pairs(list(pairs.values())), strict=True):
+        both |= {names: here, names[::-1]: there}
+    return flight, pairs, both, estimate_swarm(pairs, both)
+
+
+def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
+    """Horizontal errors of every ordered pair, metres."""
+    return np.concatenate(
+        [
+            np.linalg.norm(e.state[:, :2] - truth_at(flight, e.time_s, *names), axis=1)
+            for names, e in estimates.items()
+        ]
+    )
+
+
+def test_all_together_are_nearer_the_truth_than_pair_by_pair() -> None:
+    flight, _, pairwise, swarm = solved("random", "calibrated")
+    assert set(swarm) == set(pairwise)
+    one, other = (np.sqrt(np.mean(errors(flight, e) ** 2)) for e in (pairwise, swarm))
+    assert other < 0.9 * one
+
+
+def test_the_ellipses_hold_the_truth_and_what_is_kept_is_good() -> None:
+    flight, _, _, swarm = solved("random", "realistic")
+    inside, bad, kept = [], 0, 0
+    for names, e in swarm.items():
+        error = e.state[:, :2] - truth_at(flight, e.time_s, *names)
+        squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(e.covariance[:, :2, :2]), error)
+        inside.append((squared < 5.991).mean())
+        bad += int((np.linalg.norm(error, axis=1)[e.status == OK] > 0.3).sum())
+        kept += int((e.status == OK).sum())
+    assert np.mean(inside) > 0.9
+    assert kept > 500 and bad <= 0.02 * kept
+
+
+def test_the_frame_is_one_positions_agree_around_a_triangle() -> None:
+    *_, swarm = solved("random", "realistic")
+    one, two, three = (swarm[n].state for n in (("cf1", "cf2"), ("cf2", "cf3"), ("cf1", "cf3")))
+    turn = np.exp(1j * one[:, 2])
+    around = one[:, 0] + 1j * one[:, 1] + turn * (two[:, 0] + 1j * two[:, 1])
+    assert np.allclose(around, three[:, 0] + 1j * three[:, 1])
+
+
+@pytest.mark.parametrize("trajectory", ["parallel", "hover"])
+def test_what_no_motion_tells_is_ambiguous_here_too(trajectory: Trajectory) -> None:
+    *_, swarm = solved(trajectory, "calibrated")
+    for estimate in swarm.values():
+        assert not (estimate.status == OK).any()
+
+
+def test_an_observer_that_stands_still_has_no_bearings() -> None:
+    *_, swarm = solved("observer_static", "calibrated")
+    for peer in ("cf2", "cf3"):
+        assert (swarm["cf1", peer].status == AMBIGUOUS).all()
+
+
+def test_two_robots_stay_a_pair() -> None:
+    _, pairs, both, _ = solved("random", "realistic")
+    names = ("cf1", "cf2")
+    alone = {n: both[n] for n in (names, names[::-1])}
+    assert estimate_swarm({names: pairs[names]}, alone) == alone
