@@ -17,7 +17,7 @@ from dmrl.names import without_middle
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
 COMMANDS = {
     "demo": "Run the whole pipeline, small, on pictures that dmrl draws itself.",
-    "run": "Run every stage of a pipeline recipe, in order; go on where it stopped.",
+    "run": "Run the steps of a pipeline recipe whose outputs are not up to date, side by side.",
     "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",

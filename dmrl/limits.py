@@ -32,8 +32,14 @@ DEPTH = 200
 TOML_CHARACTERS = 100_000
 """Of a recipe or a camera file; long dotted keys take a time that grows with their square."""
 
-STEPS = 2_000
-"""Of a pipeline, and inputs of one of them, after ``each`` is written out."""
+STEPS = 10_000
+"""Of a pipeline, after ``[each]`` is written out; the longest that ships has 1,805."""
+
+GATHERED = 200_000
+"""Values that all steps of a pipeline gather."""
+
+STEP_CHARACTERS = 50 * MB
+"""Of all steps of a pipeline together."""
 
 ANCESTORS = 64
 """How deep a provenance is told: older ancestors keep their hash and lose their story."""

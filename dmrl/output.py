@@ -29,6 +29,11 @@ def partial_of(path: Path) -> Path:
     return path.with_name(path.name + SUFFIX)
 
 
+def note(path: Path) -> None:
+    """Note an output that another process makes for this one, for `standing`."""
+    _begun.append(path)
+
+
 def standing() -> list[Path]:
     """Outputs of this process that are whole and stand under their final name."""
     return [path for path in _begun if path.exists()]

@@ -12,12 +12,13 @@ from dmrl.terminal.tables import print_json, print_table
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """One step that is done: its stage, its output, and whether it was there already."""
+    """What became of a step: made, up to date already, or left out for it could not be made."""
 
     stage: str
     out: Path
     seconds: float
     skipped: bool
+    left_out: bool = False
 
 
 EVALUATION_NAME, POSITIONS_NAME = "evaluation.json", "positions.json"
@@ -42,8 +43,7 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
         Print one JSON document instead: seconds per step, evaluations, pictures.
     """
     evaluations, judged = _documents(done, EVALUATION_NAME), _documents(done, POSITIONS_NAME)
-    # What a stage drew for training is data, not a picture of the result.
-    pictures = [picture for d in done if d.stage != "sketch" for picture in _pictures(d.out)]
+    pictures = [picture for d in done if _is_result(d) for picture in _pictures(d.out)]
     if as_json:
         print_json(
             {
@@ -69,7 +69,7 @@ def _documents(done: Sequence[Done], name: str) -> dict[str, dict[str, Any]]:
     return {
         d.out.name: parse_json((d.out / name).read_text(encoding="utf-8"))
         for d in done
-        if (d.out / name).is_file()
+        if d.stage == "evaluate" and not d.left_out and (d.out / name).is_file()
     }
 
 
@@ -78,6 +78,11 @@ def _row(document: dict[str, Any]) -> list[str]:
     values = [(figures[name]["value"], form) for name, (_, form) in COLUMNS.items()]
     cells = ["-" if value is None else format(value, form) for value, form in values]
     return [document["against"], str(document["images"]), *cells]
+
+
+def _is_result(done: Done) -> bool:
+    # What a stage drew for training is data, not a picture of the result.
+    return done.stage != "sketch" and not done.left_out
 
 
 def _pictures(out: Path) -> list[Path]:

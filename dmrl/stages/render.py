@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -71,11 +71,23 @@ def settings_of(name: str, **changes: Any) -> Settings:
     keys = recipes.read(name)
     if (kind := keys.pop("kind", None)) != "render":
         raise RecipeError(f'{name} is of kind {kind!r}. This command wants: kind = "render"')
-    preset = keys.pop("preset", "plain")
-    if preset not in PRESETS:
-        raise RecipeError(f"{name}: no preset {preset!r}. There are: {', '.join(PRESETS)}")
     given = {key: value for key, value in changes.items() if value is not None}
-    return recipes.check(name, PRESETS[preset] | keys | given, Settings)
+    return recipes.check(name, filled({**keys, **given}), Settings)
+
+
+def filled(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of a recipe over those of its preset.
+
+    Raises
+    ------
+    RecipeError
+        If there is no such preset.
+    """
+    own = dict(keys)
+    preset = own.pop("preset", "plain")
+    if not isinstance(preset, str) or preset not in PRESETS:
+        raise RecipeError(f"no preset {preset!r}. There are: {', '.join(PRESETS)}")
+    return PRESETS[preset] | own
 
 
 def camera_of(settings: Settings) -> Camera:

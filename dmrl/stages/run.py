@@ -1,9 +1,9 @@
-"""run: every stage of a pipeline recipe, in order."""
+"""run: the steps of a pipeline recipe."""
 
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import Parameter
+from cyclopts import Parameter, validators
 
 from dmrl import pipeline
 from dmrl.evaluation.report import report
@@ -15,9 +15,10 @@ def command(
     *,
     out: Path | None = None,
     data: Path | None = None,
+    workers: Annotated[int | None, Parameter(validator=validators.Number(gte=1))] = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Run every stage of a pipeline recipe, in order; go on where it stopped.
+    """Run the steps of a pipeline recipe whose outputs are not up to date, side by side.
 
     Parameters
     ----------
@@ -27,8 +28,10 @@ def command(
         Folder for every output. Without it, the recipe's name.
     data
         Folder with the data that the recipe reads and that does not ship with dmrl.
+    workers
+        Steps that run at a time, at most. Without it, as many as there are cores. Changes no byte.
     as_json
         Print one JSON document in place of the tables.
     """
     folder = Path(Path(recipe).stem) if out is None else out
-    report(pipeline.run(recipe, folder, data), as_json=as_json)
+    report(pipeline.run(recipe, folder, data, workers=workers), as_json=as_json)

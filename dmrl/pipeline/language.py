@@ -1,0 +1,237 @@
+"""The language of pipeline recipes: what one table of a recipe stands for.
+
+``[each]`` gives names a range ("1-144"), a list, or rows with values of their own. A name in a
+step's ``out`` repeats the step; one in another value alone gathers. Nothing of stages is known
+here: a step is a table that is filled in, see `plan` for what it means.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from difflib import get_close_matches
+from itertools import product
+from math import prod
+from typing import Any
+
+from dmrl import limits
+
+NAME = re.compile(r"\{([A-Za-z_]\w*)(?:\.([A-Za-z_]\w*))?\}")
+RANGE = re.compile(r"(0|[1-9]\d{0,8})-(0|[1-9]\d{0,8})")
+DATA = "data"
+"""``{data}`` is no name of a recipe: it stands for the folder given with ``--data``."""
+
+Table = dict[str, Any]
+Values = Sequence[Any]
+Bound = Mapping[str, Any]
+
+
+NOTHING = object()
+"""What a row gives for a value that it does not have: a key that is this is left out."""
+
+
+class _NoStep(Exception):
+    """A row lacks what is amid a text of a step: it has no such step."""
+
+
+def expanded(recipe: Mapping[str, Any], faults: list[str]) -> list[tuple[int, Table]]:
+    """Every step that a recipe stands for, with the number of its table, from 1.
+
+    Parameters
+    ----------
+    recipe
+        Its keys: ``step``, and ``each`` and ``defaults`` where it has them.
+    faults
+        What is wrong is added here. Then some steps may be missing.
+    """
+    each = _each(recipe.get("each", {}), faults)
+    defaults = _defaults(recipe.get("defaults", {}), faults)
+    steps = recipe.get("step")
+    if not isinstance(steps, list) or not steps:
+        faults.append("step: at least one [[step]] is required")
+        return []
+    made: list[tuple[int, Table]] = []
+    room = [limits.STEPS, limits.GATHERED, limits.STEP_CHARACTERS]
+    used = _used(steps, defaults)
+    for number, step in enumerate(steps, start=1):
+        where = f"step.{number}"
+        if wrong := _unfit(step, each, room):
+            faults.append(where + wrong)
+            continue
+        usual = defaults.get(str(step.get("stage")), {})
+        made += [(number, one) for one in _repeated(step, usual, each)]
+    _unused(each, defaults, steps, used, faults)
+    return made
+
+
+def _each(table: Any, faults: list[str]) -> dict[str, Values]:
+    if not isinstance(table, dict):
+        faults.append('each: must be a table, such as [each] and flight = "1-144"')
+        return {}
+    found = {}
+    for name, value in table.items():
+        values = _values(value)
+        if isinstance(values, str):
+            faults.append(f"each.{name}: {values}")
+        elif name == DATA or not NAME.fullmatch(f"{{{name}}}"):
+            faults.append(f"each.{name}: cannot be a name. Use letters, digits and _, not data")
+        else:
+            found[name] = values
+    return found
+
+
+def _values(value: Any) -> Values | str:
+    """What a name stands for, or what is wrong with it."""
+    if isinstance(value, str) and (match := RANGE.fullmatch(value)):
+        first, last = int(match[1]), int(match[2])
+        if first > last:
+            return f"{value} runs backwards. Write the smaller number first"
+        if last - first >= limits.STEPS:
+            return f"{value} is too long. A recipe may have {limits.STEPS} steps"
+        return range(first, last + 1)
+    if not isinstance(value, list) or not value:
+        return 'must be a range, such as "1-144", or a list that is not empty'
+    if len(value) > limits.STEPS:
+        return f"is too long. A recipe may have {limits.STEPS} steps"
+    plain = all(isinstance(v, int | float | str) and not isinstance(v, bool) for v in value)
+    if not plain and not all(isinstance(v, dict) and v for v in value):
+        return "must hold numbers, texts, or tables, all of one kind"
+    if any(value.index(v) != k for k, v in enumerate(value)):
+        return "has a value twice"
+    return value
+
+
+def _defaults(table: Any, faults: list[str]) -> dict[str, Table]:
+    if isinstance(table, dict) and all(isinstance(v, dict) for v in table.values()):
+        return table
+    faults.append("defaults: must hold a table per stage, such as [defaults.train]")
+    return {}
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from _strings(one)
+
+
+def _names(value: Any) -> dict[tuple[str, str | None], None]:
+    """Names in a value, each with its row's key or None, in the order they come."""
+    found = (m.groups() for text in _strings(value) for m in NAME.finditer(text))
+    return {(name, key): None for name, key in found if name != DATA}
+
+
+def _used(steps: list[Any], defaults: Mapping[str, Table]) -> set[tuple[str, str | None]]:
+    return {*_names(steps), *_names(defaults)}
+
+
+def _unfit(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
+    """Why a step cannot be repeated; empty: it can. Takes what it needs from ``room``."""
+    if not isinstance(step, dict):
+        return ": must be a table"
+    for key in ("stage", "out"):
+        if not isinstance(step.get(key), str):
+            return f".{key}: a text is required"
+    for name, field in _names(step):
+        if wrong := _unknown(name, field, each):
+            return f".out: {wrong}"
+    repeats = {name for name, _ in _names(step["out"])}
+    count = prod(len(each[name]) for name in repeats)
+    gathered = sum(
+        prod(len(each[name]) for name in {n for n, _ in _names(text)} - repeats)
+        for text in _strings(step)
+    )
+    for k, needs in enumerate((count, count * gathered, count * len(str(step)))):
+        if needs > room[k]:
+            return f".out: stands for too much. A recipe may have {limits.STEPS} steps in all"
+        room[k] -= needs
+    return ""
+
+
+def _unknown(name: str, key: str | None, each: Mapping[str, Values]) -> str:
+    if name not in each:
+        near = get_close_matches(name, each, n=1)
+        return f"no {name} in [each]. " + (f"Did you mean {near[0]}?" if near else "Add it")
+    rows = isinstance(each[name][0], dict)
+    if rows and key is None:
+        return f"{{{name}}} has rows. Name a value of theirs: {{{name}.{min(each[name][0])}}}"
+    if not rows and key is not None:
+        return f"{{{name}.{key}}}: {name} has no rows. Write {{{name}}}"
+    if rows and not any(key in row for row in each[name]):
+        return f"no row of {name} has {key}. Mend one of them"
+    return ""
+
+
+def _unused(
+    each: Mapping[str, Values],
+    defaults: Mapping[str, Table],
+    steps: list[Any],
+    used: set[tuple[str, str | None]],
+    faults: list[str],
+) -> None:
+    """What no step looks at is a slip of the pen."""
+    for name, values in each.items():
+        keys = {k for row in values if isinstance(row, dict) for k in row} or {None}
+        for key in sorted(keys - {k for n, k in used if n == name}, key=str):
+            what = name if key is None else f"{name}.{key}"
+            faults.append(f"each.{what}: no step names {{{what}}}")
+    stages = {step.get("stage") for step in steps if isinstance(step, dict)}
+    faults += [f"defaults.{s}: no step is of that stage" for s in sorted(set(defaults) - stages)]
+
+
+def _repeated(step: Table, usual: Table, each: Mapping[str, Values]) -> Iterator[Table]:
+    """A step for all values of the names in its ``out``, where their rows have what it names."""
+    names = list(dict.fromkeys(name for name, _ in _names(step["out"])))
+    for values in product(*(each[name] for name in names)):
+        bound = dict(zip(names, values, strict=True))
+        try:
+            own = _filled(step, bound, each)
+            known = _filled({k: v for k, v in usual.items() if k not in own}, bound, each)
+        except _NoStep:
+            continue
+        if "out" in own:
+            yield {**known, **own, "out": str(own["out"])}
+
+
+def _filled(value: Any, bound: Bound, each: Mapping[str, Values]) -> Any:
+    """A value with names replaced; what names a value that its row lacks is left out."""
+    match value:
+        case str():
+            return _text(value, bound, each)
+        case list():
+            found: list[Any] = []
+            for one in value:
+                made = _filled(one, bound, each)
+                found += made if isinstance(made, list) and isinstance(one, str) else [made]
+            kept = [one for one in found if one is not NOTHING]
+            return NOTHING if found and not kept else kept
+        case dict():
+            filled = {key: _filled(one, bound, each) for key, one in value.items()}
+            return {key: one for key, one in filled.items() if one is not NOTHING}
+    return value
+
+
+def _text(text: str, bound: Bound, each: Mapping[str, Values]) -> Any:
+    """A text with names replaced, a list of them where a name gathers, or a value itself."""
+    free = list(dict.fromkeys(name for name, _ in _names(text) if name not in bound))
+    if not free:
+        return _one(text, bound)
+    found = []
+    for choice in product(*(each[name] for name in free)):
+        with suppress(_NoStep):
+            found.append(_one(text, {**bound, **dict(zip(free, choice, strict=True))}))
+    return [one for one in found if one is not NOTHING] or NOTHING
+
+
+def _one(text: str, bound: Bound) -> Any:
+    def value(match: re.Match[str]) -> Any:
+        name, key = match.groups()
+        if name == DATA:
+            return match[0]
+        return bound[name] if key is None else bound[name].get(key, NOTHING)
+
+    if whole := NAME.fullmatch(text):
+        return value(whole)
+    if any(value(match) is NOTHING for match in NAME.finditer(text)):
+        raise _NoStep
+    return NAME.sub(lambda match: str(value(match)), text)

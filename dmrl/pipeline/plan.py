@@ -1,0 +1,269 @@
+"""A recipe as steps that can be run: every stage, input, output and setting checked.
+
+What is wrong is all found, and said in one line, before anything is done.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from dmrl import recipe as recipes
+from dmrl.errors import RecipeError
+from dmrl.geometry.camera_file import KNOWN
+from dmrl.learn import pretrained
+from dmrl.pipeline.interface import Interface, interface_of
+from dmrl.pipeline.language import expanded
+
+KEYS = ("kind", "each", "defaults", "step")
+STEP_KEYS = ("stage", "out", "optional", "recipe")
+DATA = "{data}"
+RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
+RESERVED = (RECIPE_FILE, STATE_FILE, UNFINISHED)
+MOST_BYTES = 200
+"""Of an output's name: what is unfinished has a longer one."""
+
+Table = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One stage of a pipeline, to be run once.
+
+    Parameters
+    ----------
+    stage
+        Command name, such as "convert".
+    out
+        Name of the file or folder it writes in the pipeline's folder.
+    inputs
+        Names by role: outputs of other steps, ``{data}/...``, what ships, absolute paths.
+    settings
+        Keys of its settings, and other arguments; those of a recipe filled in.
+    optional
+        Go on without it where it cannot be done.
+    """
+
+    stage: str
+    out: str
+    inputs: Mapping[str, str | list[str]] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    optional: bool = False
+
+    @property
+    def interface(self) -> Interface:
+        """What its stage takes."""
+        return interface_of(self.stage)
+
+    @property
+    def path_settings(self) -> Table:
+        """Settings that name files or folders."""
+        return {k: v for k, v in self.settings.items() if k in self.interface.paths}
+
+    @property
+    def names(self) -> list[str]:
+        """Everything that it reads, by name."""
+        return [*strings(list(self.inputs.values())), *strings(self.path_settings)]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Steps, and the text of the recipe they were read from."""
+
+    steps: tuple[Step, ...]
+    text: str
+
+    @property
+    def needs_data(self) -> bool:
+        """Whether a step reads below ``--data``."""
+        return any(name.startswith(DATA) for step in self.steps for name in step.names)
+
+    @property
+    def order(self) -> TopologicalSorter[str]:
+        """Which output is made of which."""
+        outs = {step.out for step in self.steps}
+        return TopologicalSorter({step.out: makers(step.names, outs) for step in self.steps})
+
+
+def strings(value: Any) -> Iterator[str]:
+    """Every text in a value of TOML."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from strings(one)
+
+
+def mapped(value: Any, function: Callable[[str], Any]) -> Any:
+    """A value of TOML with ``function`` of every text in it."""
+    if isinstance(value, str):
+        return function(value)
+    if isinstance(value, list):
+        return [mapped(one, function) for one in value]
+    if isinstance(value, dict):
+        return {key: mapped(one, function) for key, one in value.items()}
+    return value
+
+
+def makers(names: Iterable[str], outs: set[str]) -> list[str]:
+    """Outputs of steps that names lie in, each once."""
+    return list(dict.fromkeys(n.split("/")[0] for n in names if n.split("/")[0] in outs))
+
+
+def located(name: str, outs: set[str], folder: Path, data: Path | None) -> Path:
+    """Where something that a step reads lies."""
+    if name.startswith(DATA) and data is not None:
+        return data / name.removeprefix(DATA).lstrip("/")
+    if name.split("/")[0] in outs:
+        return folder / name
+    return pretrained.SHIPPED / name if name in pretrained.names() else Path(name)
+
+
+def load(name: str | Path) -> Plan:
+    """Steps of a pipeline recipe, every fault of it found.
+
+    Parameters
+    ----------
+    name
+        Path, or the name of a shipped recipe.
+
+    Raises
+    ------
+    RecipeError
+        If anything in it is wrong; names every wrong key.
+    MissingExtra
+        If a package that a stage needs is not installed.
+    """
+    text = recipes.text(name)
+    return Plan(tuple(_steps(name, recipes.read(name))), text)
+
+
+def _steps(name: str | Path, recipe: Table) -> list[Step]:
+    recipes.check_kind(name, recipe, "pipeline")
+    faults = [f"{k}: extra inputs are not permitted" for k in recipe if k not in KEYS]
+    found = []
+    for number, table in expanded(recipe, faults):
+        wrong: list[str] = []
+        step = _step(table, wrong)
+        faults += [f"step.{number}.{fault}" for fault in wrong]
+        found.append((number, step))
+    faults += _name_faults(found)
+    if faults:
+        raise recipes.faulty(name, dict.fromkeys(faults))
+    steps = [step for _, step in found]
+    try:
+        Plan(tuple(steps), "").order.prepare()
+    except CycleError as e:
+        circle = " of ".join(e.args[1])
+        raise RecipeError(f"{name}: a circle: {circle}. Break it") from None
+    if not steps:
+        raise RecipeError(f"{name} stands for no step at all. Give its rows what out names")
+    return steps
+
+
+def _step(table: Table, faults: list[str]) -> Step:
+    """A step of a table; what is wrong with it is added to ``faults``."""
+    stage, optional = table["stage"], table.get("optional", False)
+    own = {key: value for key, value in table.items() if key not in STEP_KEYS}
+    try:
+        takes = interface_of(stage)
+        theirs = _of_recipe(table.get("recipe", ""), stage)
+        own = dict(takes.filled({**theirs, **own}))
+    except RecipeError as e:
+        faults.append(f"stage: {e}")
+        return Step(stage, table["out"])
+    if not isinstance(optional, bool):
+        faults.append("optional: must be true or false")
+    inputs = {key: own.pop(key) for key in list(own) if key in takes.roles}
+    faults += [f for role in takes.roles if (f := _input_fault(takes, role, inputs.get(role)))]
+    unknown = [key for key in own if key not in takes.keys]
+    faults += [f"{key}: {_no_key(stage, key, takes)}" for key in unknown]
+    known = {key: value for key, value in own.items() if key not in unknown}
+    faults += _setting_faults(takes, known)
+    return Step(stage, table["out"], inputs, known, optional is True)
+
+
+def _of_recipe(name: Any, stage: str) -> Table:
+    """Settings of a stage's own recipe."""
+    if not isinstance(name, str):
+        raise RecipeError("recipe: must be a path, or the name of a shipped recipe")
+    return dict(_read(name, stage)) if name else {}
+
+
+@cache
+def _read(name: str, stage: str) -> Table:
+    keys = recipes.read(name)
+    recipes.check_kind(name, keys, stage)
+    return {key: value for key, value in keys.items() if key != "kind"}
+
+
+def _input_fault(takes: Interface, role: str, value: Any) -> str:
+    """What is wrong with what a step gives for an input; empty: nothing."""
+    many = takes.roles[role].many
+    if value is None:
+        return f"{role}: is required" if takes.roles[role].required else ""
+    if isinstance(value, str):
+        return ""
+    if not many:
+        return f"{role}: takes one name, a text"
+    right = isinstance(value, list) and value and all(isinstance(v, str) for v in value)
+    return "" if right else f"{role}: must be a name, or a list of names that is not empty"
+
+
+def _no_key(stage: str, key: str, takes: Interface) -> str:
+    near = get_close_matches(key, takes.keys, n=1)
+    hint = f"Did you mean {near[0]}?" if near else f"See: dmrl {stage} --help"
+    return f"{stage} has no such input or setting. {hint}"
+
+
+def _setting_faults(takes: Interface, given: Table) -> list[str]:
+    own = {key: value for key, value in given.items() if key not in takes.others}
+    faults = recipes.faults(own, takes.settings) if takes.settings else []
+    missing = [f"{key}: is required" for key in takes.others if key not in given]
+    others = [
+        f"{key}: {fault}"
+        for key, hint in takes.others.items()
+        if key in given and (fault := recipes.argument_fault(given[key], hint))
+    ]
+    return [*faults, *missing, *others]
+
+
+def _name_faults(found: Sequence[tuple[int, Step]]) -> Iterator[str]:
+    """What is wrong with outputs' names, and with names of what is read."""
+    outs = {step.out for _, step in found}
+    seen: dict[str, str] = {}
+    for number, step in found:
+        before = seen.setdefault(step.out.casefold(), step.out)
+        if wrong := _out_fault(step.out):
+            yield f"step.{number}.out: {wrong}"
+        elif before is not step.out:
+            yield f"step.{number}.out: {step.out} is written by two steps. Name another"
+        for name in step.names:
+            if wrong := _source_fault(name, outs):
+                yield f"step.{number}: {step.stage} reads {name}, {wrong}"
+
+
+def _out_fault(name: str) -> str:
+    plain = name.isprintable() and not any(sign in name for sign in "/\\{}")
+    if not name or not plain or name.startswith(".") or len(name.encode()) > MOST_BYTES:
+        return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
+    if name.casefold() in RESERVED or name.casefold().endswith(".partial"):
+        return f"{name} is a name that dmrl uses itself. Choose another"
+    return ""
+
+
+def _source_fault(name: str, outs: set[str]) -> str:
+    """What is wrong with the name of something that a step reads; empty: nothing."""
+    head, *_ = name.split("/")
+    if ".." in PurePosixPath(name).parts:
+        return "which leads out of its folder. Write it without .."
+    if head in outs or head == DATA or name in KNOWN or name in pretrained.names():
+        return ""
+    if name.startswith("/"):
+        return "" if Path(name).exists() else "which is not there. Check the name"
+    near = get_close_matches(head, outs, n=1)
+    hint = f"Did you mean {near[0]}?" if near else "Name a step's out, or {data}/..."
+    return f"which no step writes. {hint}"

@@ -1,0 +1,131 @@
+"""What one table of a recipe stands for."""
+
+import tomllib
+from typing import Any
+
+import pytest
+
+from dmrl import limits
+from dmrl.pipeline.language import expanded
+
+
+def steps(text: str) -> list[dict[str, Any]]:
+    faults: list[str] = []
+    found = expanded(tomllib.loads(text), faults)
+    assert not faults
+    return [step for _, step in found]
+
+
+def faults(text: str) -> list[str]:
+    found: list[str] = []
+    expanded(tomllib.loads(text), found)
+    return found
+
+
+FLIGHTS = """
+step = [
+  { stage = "fly", seed = "{flight}", title = "no. {flight}", out = "flight-{flight}.mcap" },
+  { stage = "dataset", recordings = ["own.mcap", "flight-{flight}.mcap"], out = "all" },
+]
+[each]
+"""
+
+
+@pytest.mark.parametrize("values", ['"3-5"', "[3, 4, 5]"])
+def test_a_name_in_out_repeats_and_in_inputs_alone_gathers(values: str) -> None:
+    assert steps(FLIGHTS + f"flight = {values}") == [
+        *[
+            {"stage": "fly", "seed": n, "title": f"no. {n}", "out": f"flight-{n}.mcap"}
+            for n in (3, 4, 5)
+        ],
+        {
+            "stage": "dataset",
+            "recordings": ["own.mcap", *[f"flight-{n}.mcap" for n in (3, 4, 5)]],
+            "out": "all",
+        },
+    ]
+
+
+ROUNDS = """
+step = [
+  { stage = "train", epochs = "{round.epochs}", dataset = "{round.of}", out = "model-{round.k}" },
+  { stage = "predict", model = "model-{round.before}", out = "seen-{round.k}-{robot}" },
+]
+[each]
+robot = ["cf1", "cf2"]
+round = [{ k = 1, of = "flown" }, { k = "last", before = 1, epochs = 4, of = "seen" }]
+[defaults]
+train = { epochs = 8, seed = 5 }
+"""
+
+
+def test_rows_bring_values_and_what_a_row_lacks_is_left_out_or_is_no_step() -> None:
+    train, predict = {"stage": "train", "seed": 5}, {"stage": "predict", "model": "model-1"}
+    assert steps(ROUNDS) == [
+        {**train, "epochs": 8, "dataset": "flown", "out": "model-1"},
+        {**train, "epochs": 4, "dataset": "seen", "out": "model-last"},
+        {**predict, "out": "seen-last-cf1"},
+        {**predict, "out": "seen-last-cf2"},
+    ]
+
+
+def test_data_is_not_replaced_and_what_a_value_brings_is_not_looked_at_again() -> None:
+    (step,) = steps(
+        'step = [{ stage = "convert", source = "{data}/{log}.csv", out = "a" }]\n'
+        '[each]\nlog = ["{data}"]'
+    )
+    assert step["source"] == ["{data}/{data}.csv"]
+
+
+ONE = 'step = [{ stage = "fly", out = "f-{a}", seed = "{a}" }]\n[each]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        (ONE + "a = 3", "each.a: must be a range"),
+        (ONE + "a = true", "each.a: must be a range"),
+        (ONE + "a = []", "each.a: must be a range"),
+        (ONE + 'a = "5-3"', "each.a: 5-3 runs backwards"),
+        (ONE + 'a = "001-144"', "each.a: must be a range"),
+        (ONE + "a = [1, 1]", "each.a: has a value twice"),
+        (ONE + "a = [1, { k = 1 }]", "each.a: must hold numbers, texts, or tables"),
+        (ONE + "a = [[1]]", "each.a: must hold"),
+        (ONE + 'a = "1-2"\nb = "1-2"', "each.b: no step names {b}"),
+        (ONE + 'a = "1-2"\ndata = "1-2"', "each.data: cannot be a name"),
+        (ONE + 'ab = "1-2"', "step.1.out: no a in [each]"),
+        (ONE + "a = [{ k = 1 }]", "step.1.out: {a} has rows"),
+        (ONE.replace("f-{a}", "f-{a.k}") + "a = [1]", "step.1.out: {a.k}: a has no rows"),
+        (ONE.replace("{a}", "{a.j}") + "a = [{ k = 1 }]", "step.1.out: no row of a has j"),
+        (ONE.replace("{a}", "{a.k}") + "a = [{ k = 1, epohcs = 2 }]", "each.a.epohcs: no step"),
+        (ONE + 'a = "1-2"\n[defaults.train]\nseed = 1', "defaults.train: no step is of that"),
+        ("each = 3", "each: must be a table"),
+        ("defaults = 3", "defaults: must hold a table"),
+        ("", "step: at least one [[step]] is required"),
+        ("step = 3", "step: at least one"),
+        ("step = [3]", "step.1: must be a table"),
+        ('step = [{ stage = "fly" }]', "step.1.out: a text is required"),
+    ],
+)
+def test_what_cannot_be_meant_is_a_fault(text: str, fault: str) -> None:
+    assert any(found.startswith(fault) for found in faults(text)), faults(text)
+
+
+MANY = '"1-9999"'
+TWO, THREE = f"[each]\na = {MANY}\nb = {MANY}\n", f"[each]\na = {MANY}\nb = {MANY}\nc = {MANY}\n"
+HUGE = [
+    ONE + "a = 100000000",
+    ONE + 'a = "1-100000000"',
+    ONE + f"a = [{', '.join(map(str, range(limits.STEPS + 1)))}]",
+    'step = [{ stage = "fly", out = "{a}{b}{c}" }]\n' + THREE,
+    'step = [{ stage = "merge", out = "m", recordings = "{a}{b}" }]\n' + TWO,
+    'step = [{ stage = "merge", out = "m{a}", recordings = "{b}" }]\n' + TWO,
+    f'step = [{{ stage = "fly", out = "{{a}}", x = "{"x" * 100_000}" }}]\n{ONE[-7:]}a = {MANY}',
+]
+
+
+@pytest.mark.parametrize("text", HUGE)
+def test_what_stands_for_too_much_is_never_written_out(text: str) -> None:
+    found: list[str] = []
+    assert not expanded(tomllib.loads(text), found)
+    assert found

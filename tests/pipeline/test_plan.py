@@ -1,0 +1,221 @@
+"""Recipes checked whole: every stage, input, output and setting."""
+
+import hashlib
+import json
+import re
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dmrl import pipeline, recipe
+from dmrl.errors import RecipeError
+from dmrl.pipeline import Step
+from dmrl.pipeline.interface import interface_of
+
+HEAD = 'kind = "pipeline"\n'
+SMALL = f"""{HEAD}
+[[step]]
+stage = "sketch"
+out = "pictures"
+images = 2
+
+[[step]]
+stage = "convert"
+source = "pictures"
+out = "pictures.mcap"
+
+[[step]]
+stage = "merge"
+recordings = ["pictures.mcap", "{{data}}/other.mcap"]
+out = "both.mcap"
+"""
+
+
+def load(folder: Path, text: str) -> pipeline.Plan:
+    path = folder / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return pipeline.load(path)
+
+
+def test_inputs_go_by_role_and_what_is_none_is_a_setting(tmp_path: Path) -> None:
+    plan = load(tmp_path, SMALL)
+    assert plan.steps == (
+        Step("sketch", "pictures", settings={"images": 2}),
+        Step("convert", "pictures.mcap", {"source": "pictures"}),
+        Step("merge", "both.mcap", {"recordings": ["pictures.mcap", "{data}/other.mcap"]}),
+    )
+    assert plan.needs_data and plan.text == SMALL
+
+
+def test_the_order_of_the_work_is_that_of_the_names_not_of_the_file(tmp_path: Path) -> None:
+    _, *blocks = SMALL.split("[[step]]")
+    plan = load(tmp_path, HEAD + "".join(f"[[step]]{block}\n" for block in reversed(blocks)))
+    assert list(plan.order.static_order()) == ["pictures", "pictures.mcap", "both.mcap"]
+
+
+def test_a_setting_that_names_a_file_is_something_that_is_read(tmp_path: Path) -> None:
+    text = """
+    step = [
+      { stage = "label", recording = "{data}/f.mcap", out = "l.mcap", camera = { cf1 = "c.toml" } },
+      { stage = "calibrate", sources = "{data}/board", board = "9x6", out = "c.toml" },
+      { stage = "render", camera = "aideck", images = 2, out = "r.mcap" },
+    ]
+    """
+    plan = load(tmp_path, HEAD + text)
+    assert plan.steps[0].names == ["{data}/f.mcap", "c.toml"]
+    assert list(plan.order.static_order()).index("c.toml") == 0 or "c.toml" in plan.steps[0].names
+    with pytest.raises(RecipeError, match=r"label reads d\.toml, which no step writes"):
+        load(tmp_path, HEAD + text.replace('cf1 = "c.toml"', 'cf1 = "d.toml"'))
+
+
+def test_keys_come_before_those_of_a_recipe_and_its_preset(tmp_path: Path) -> None:
+    path = tmp_path / "rooms.toml"
+    path.write_text('kind = "render"\npreset = "himax"\nimages = 7\nseed = 3\n')
+    text = f'step = [{{ stage = "render", out = "r.mcap", recipe = "{path}", images = 2 }}]'
+    (step,) = load(tmp_path, HEAD + text).steps
+    assert (step.settings["images"], step.settings["seed"]) == (2, 3)
+    assert "preset" not in step.settings and "shot_noise" in step.settings
+    with pytest.raises(RecipeError, match="is of kind 'render'"):
+        load(tmp_path, HEAD + text.replace('stage = "render"', 'stage = "fly"'))
+
+
+def test_every_fault_is_named_with_its_step(tmp_path: Path) -> None:
+    text = SMALL.replace("images = 2", "imags = 2\nseed = 1.5").replace("source =", "sources =")
+    with pytest.raises(RecipeError) as caught:
+        load(tmp_path, "sed = 3\n" + text)
+    said = str(caught.value)
+    assert "5 wrong keys" in said and "\n" not in said
+    for words in (
+        "sed: extra inputs are not permitted",
+        "step.1.imags: sketch has no such input or setting. Did you mean images?",
+        "step.1.seed: input should be a valid integer",
+        "step.2.source: is required",
+        "step.2.sources: convert has no such input or setting. Did you mean source?",
+    ):
+        assert words in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('stage = "sketch"', 'stage = "skech"', "no stage 'skech'. Did you mean sketch?"),
+        ('stage = "sketch"', 'stage = "../sketch"', "no stage '../sketch'"),
+        ('stage = "sketch"', 'stage = "info"', "info writes nothing, so it can be no step"),
+        ('source = "pictures"', 'source = "picures"', "no step writes. Did you mean pictures?"),
+        ('source = "pictures"', "source = 3", "step.2.source: takes one name, a text"),
+        ('source = "pictures"', 'source = ["pictures"]', "step.2.source: takes one name"),
+        ('source = "pictures"', 'source = "/not/there"', "which is not there"),
+        ('source = "pictures"', 'source = "{data}/../../etc"', "which leads out of its folder"),
+        ('source = "pictures"', 'source = "pictures/../../x"', "which leads out of its folder"),
+        ('source = "pictures"', 'source = "both.mcap"', "a circle: "),
+        ('source = "pictures"', 'source = "pictures.mcap"', "a circle: "),
+        ('["pictures.mcap", "{data}/other.mcap"]', "[]", "step.3.recordings: must be a name"),
+        ('["pictures.mcap", "{data}/other.mcap"]', "[3]", "step.3.recordings: must be a name"),
+        ('out = "pictures.mcap"', 'out = "pictures"', "pictures is written by two steps"),
+        ('out = "pictures.mcap"', 'out = "PICTURES"', "PICTURES is written by two steps"),
+        ('out = "both.mcap"', 'out = "../both.mcap"', "is no plain name"),
+        ('out = "both.mcap"', 'out = "/tmp/both.mcap"', "is no plain name"),
+        ('out = "both.mcap"', 'out = "a/both.mcap"', "is no plain name"),
+        ('out = "both.mcap"', 'out = ".hidden"', "is no plain name"),
+        ('out = "both.mcap"', 'out = ""', "is no plain name"),
+        ('out = "both.mcap"', 'out = "a\\u0000b"', "is no plain name"),
+        ('out = "both.mcap"', f'out = "{"x" * 300}"', "is no plain name"),
+        ('out = "both.mcap"', 'out = "recipe.toml"', "is a name that dmrl uses itself"),
+        ('out = "both.mcap"', 'out = "Pipeline.json"', "is a name that dmrl uses itself"),
+        ('out = "both.mcap"', 'out = "pictures.partial"', "is a name that dmrl uses itself"),
+        ('out = "both.mcap"', 'out = "b"\noptional = 1', "optional: must be true or false"),
+        ('out = "both.mcap"', 'out = "b"\nrecipe = "zzz"', "no recipe zzz"),
+        ("images = 2", "images = 0", "step.1.images: must be >= 1"),
+    ],
+)
+def test_a_wrong_step_is_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+    assert old in SMALL
+    with pytest.raises(RecipeError) as caught:
+        load(tmp_path, SMALL.replace(old, new))
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [
+        *("align", "calibrate", "card", "convert", "dataset", "evaluate", "export", "fly", "label"),
+        *("merge", "predict", "quantize", "record", "recover", "render", "sketch", "track"),
+        *("train", "trim", "verify", "view"),
+    ],
+)
+def test_every_command_that_writes_is_a_step(stage: str) -> None:
+    takes = interface_of(stage)
+    own = takes.settings
+    assert not set(takes.roles) & set(getattr(own, "__dataclass_fields__", {}))
+
+
+def of_interface(stage: str) -> tuple[Any, ...]:
+    takes = interface_of(stage)
+    roles = {name: (role.many, role.required) for name, role in takes.roles.items()}
+    return roles, set(takes.paths), takes.resumes, takes.alone
+
+
+def test_what_a_stage_takes_is_read_from_its_run() -> None:
+    one, maybe, many = (False, True), (False, False), (True, True)
+    train = {"dataset": one, "init": maybe, "teacher": maybe}
+    assert of_interface("train") == (train, set(), True, True)
+    assert of_interface("calibrate") == ({"sources": many}, {"camera"}, False, False)
+    assert of_interface("verify") == ({"folder": one}, {"dataset"}, False, False)
+    assert of_interface("merge") == ({"recordings": many}, set(), False, False)
+    assert list(interface_of("record").others) == ["robots"]
+
+
+def test_other_arguments_of_run_are_checked_as_well(tmp_path: Path) -> None:
+    robots = '{ name = "cf1", uri = "radio://0/80/2M/E7E7E7E7E7" }'
+    text = f'{HEAD}step = [{{ stage = "record", out = "f.mcap", robots = [{robots}] }}]'
+    assert load(tmp_path, text).steps[0].settings["robots"][0]["name"] == "cf1"
+    for wrong, words in ((", robots = 3", "step.1.robots: "), ("", "step.1.robots: is required")):
+        with pytest.raises(RecipeError, match=words):
+            load(tmp_path, text.replace(f", robots = [{robots}]", wrong))
+
+
+SELF_SUPERVISED = "b48563588f4cb89d31ea5f7cb9756e611f05039ee0a33cb01c6c5c916dba6722"
+"""Of 1805 steps: what the recipe stood for when it said each of them, in 326 lines."""
+
+
+def told(step: Step) -> dict[str, Any]:
+    """A step with those of its settings that are not as they usually are."""
+    takes = step.interface
+    assert takes.settings is not None
+    usual = recipe.plain(asdict(takes.settings()))
+    own = recipe.plain(asdict(recipe.check(step.out, step.settings, takes.settings)))
+    inputs = {
+        role: [given] if takes.roles[role].many and isinstance(given, str) else given
+        for role, given in step.inputs.items()
+    }
+    settings = {key: value for key, value in own.items() if value != usual[key]}
+    return {**asdict(step), "inputs": inputs, "settings": settings}
+
+
+def test_self_supervised_is_still_what_it_was() -> None:
+    steps = pipeline.load("self_supervised").steps
+    assert len(recipe.text("self_supervised").splitlines()) <= 100
+    assert Counter(step.stage for step in steps) == {
+        **{"fly": 148, "label": 864, "predict": 748, "dataset": 7, "train": 7},
+        **{"evaluate": 30, "view": 1},
+    }
+    rows = sorted((told(step) for step in steps), key=lambda row: str(row["out"]))
+    text = json.dumps(rows, sort_keys=True)
+    assert hashlib.sha256(text.encode()).hexdigest() == SELF_SUPERVISED
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "pipelines.md"
+
+
+@pytest.mark.parametrize("text", re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL))
+def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
+    assert len(load(tmp_path, text).steps) in (10, 5)
+
+
+@pytest.mark.parametrize("name", recipe.names())
+def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
+    if recipe.read(name)["kind"] == "pipeline":
+        assert pipeline.load(name).steps
