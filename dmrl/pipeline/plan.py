@@ -179,6 +179,7 @@ def _step(table: Table, faults: list[str]) -> Step:
         faults.append("optional: must be true or false")
     inputs = {key: own.pop(key) for key in list(own) if key in takes.roles}
     faults += [f for role in takes.roles if (f := _input_fault(takes, role, inputs.get(role)))]
+    inputs |= {k: [v] for k, v in inputs.items() if takes.roles[k].many and isinstance(v, str)}
     unknown = [key for key in own if key not in takes.keys]
     faults += [f"{key}: {_no_key(stage, key, takes)}" for key in unknown]
     known = {key: value for key, value in own.items() if key not in unknown}

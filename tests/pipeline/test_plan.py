@@ -50,6 +50,11 @@ def test_inputs_go_by_role_and_what_is_none_is_a_setting(tmp_path: Path) -> None
     assert plan.needs_data and plan.text == SMALL
 
 
+def test_one_name_for_an_input_of_many_is_a_list_of_one(tmp_path: Path) -> None:
+    text = 'step = [{ stage = "evaluate", recordings = "{data}/f.mcap", out = "judged" }]'
+    assert load(tmp_path, HEAD + text).steps[0].inputs == {"recordings": ["{data}/f.mcap"]}
+
+
 def test_the_order_of_the_work_is_that_of_the_names_not_of_the_file(tmp_path: Path) -> None:
     _, *blocks = SMALL.split("[[step]]")
     plan = load(tmp_path, HEAD + "".join(f"[[step]]{block}\n" for block in reversed(blocks)))
@@ -187,12 +192,8 @@ def told(step: Step) -> dict[str, Any]:
     assert takes.settings is not None
     usual = recipe.plain(asdict(takes.settings()))
     own = recipe.plain(asdict(recipe.check(step.out, step.settings, takes.settings)))
-    inputs = {
-        role: [given] if takes.roles[role].many and isinstance(given, str) else given
-        for role, given in step.inputs.items()
-    }
     settings = {key: value for key, value in own.items() if value != usual[key]}
-    return {**asdict(step), "inputs": inputs, "settings": settings}
+    return {**asdict(step), "settings": settings}
 
 
 def test_self_supervised_is_still_what_it_was() -> None:
