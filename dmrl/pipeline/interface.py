@@ -25,6 +25,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, get_args, get_origin, get_type_hints
 
+from dmrl import plugins
 from dmrl.errors import RecipeError
 
 ALONE = ("processes", "workers")
@@ -126,6 +127,10 @@ def _module(stage: str) -> Any:
     # By name, because stages stand above this room and not below it.
     package = "dmrl.stages"
     known = [m.name.replace("_", "-") for m in iter_modules(import_module(package).__path__)]
+    added = plugins.found(plugins.STAGES)
+    if stage not in known and stage in added:
+        return added[stage].load()
+    known += list(added)
     if stage not in known:
         near = get_close_matches(stage, known, n=1)
         hint = f"Did you mean {near[0]}?" if near else "See: dmrl --help"

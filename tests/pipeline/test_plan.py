@@ -6,11 +6,12 @@ import re
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from dmrl import pipeline, recipe
+from dmrl import pipeline, plugins, recipe
 from dmrl.errors import RecipeError
 from dmrl.pipeline import Step
 from dmrl.pipeline.interface import interface_of
@@ -171,6 +172,19 @@ def test_what_a_stage_takes_is_read_from_its_run() -> None:
     assert of_interface("verify") == ({"folder": one}, {"dataset"}, False, False)
     assert of_interface("merge") == ({"recordings": many}, set(), False, False)
     assert list(interface_of("record").others) == ["robots"]
+
+
+def test_a_stage_that_a_package_adds_is_a_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(recording: Path, out: Path) -> None: ...
+
+    smooth = SimpleNamespace(load=lambda: SimpleNamespace(run=run))
+    monkeypatch.setattr(plugins, "found", lambda group: {"smooth": smooth} if group else {})
+    text = 'step = [{ stage = "smooth", recording = "{data}/f.mcap", out = "s.mcap" }]'
+    assert load(tmp_path, HEAD + text).steps[0].inputs == {"recording": "{data}/f.mcap"}
+    with pytest.raises(RecipeError, match=r"no stage 'smoth'\. Did you mean smooth\?"):
+        load(tmp_path, HEAD + text.replace("smooth", "smoth"))
 
 
 def test_other_arguments_of_run_are_checked_as_well(tmp_path: Path) -> None:
