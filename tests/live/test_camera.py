@@ -16,7 +16,7 @@ from dmrl.live.camera import GARBAGE_BYTES, CameraClient, address
 from dmrl.live.clocks import HostTime
 from dmrl.live.feed import Feed, Received
 
-PATIENCE_S = 20.0
+PATIENCE_S = 100.0
 RNG = np.random.default_rng(5)
 Start = Callable[[int], tuple[CameraClient, Feed]]
 RAW = Image(320, 224, "raw", RNG.bytes(320 * 224))

@@ -28,7 +28,7 @@ pytest.importorskip("cflib", reason="cflib (extra record) is not installed")
 # cflib's own threads may meet a link that another of them has just closed.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 
-PATIENCE_S = 40.0
+PATIENCE_S = 100.0
 PICTURES_HZ, FIRST_PICTURE_S = 2.0, 0.25
 ANY = ("udp://127.0.0.1:0", "udp://127.0.0.1:0")
 
