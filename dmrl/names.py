@@ -7,7 +7,9 @@ path, a comment of C, Markdown, or a line on a terminal, it goes through one of 
 
 import re
 import unicodedata
+from functools import cache
 from pathlib import Path
+from urllib.parse import quote
 
 from dmrl.errors import UnsafeName
 
@@ -18,7 +20,10 @@ LINE_MAX = 480
 """Of an error: a few lines of a terminal."""
 
 _PLAIN = re.compile(r"[^A-Za-z0-9 ._,:+()=-]")
-_ROBOT = re.compile(r"[A-Za-z0-9_-]+")
+_SPLIT = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
+_MARKUP = re.compile(r"([\\`\[\]<>|])")
+_TAKEN = ("data", "figures", "README.md", "provenance.json", "dataset_dict.json")
+"""What a dataset's folder holds beside its splits."""
 
 
 def inside(folder: Path, name: str, what: str, *, suffix: str = "") -> Path:
@@ -67,19 +72,50 @@ def file_name(name: str, what: str) -> str:
     return name
 
 
-def robot_name(name: str, what: str) -> str:
-    """The name, if it is one of a robot: letters, digits, ``_`` and ``-``.
+def split_name(name: str, what: str) -> str:
+    """The name, if a split can be called so: letters, digits, ``_`` and ``-``, and dots between.
 
     Raises
     ------
     UnsafeName
-        If it is not.
+        If it cannot, or a part of every dataset is called so.
     """
-    if not _ROBOT.fullmatch(name) or len(name) > MOST_BYTES:
+    if not isinstance(name, str) or not _SPLIT.fullmatch(name) or len(name) > MOST_BYTES:
         raise UnsafeName(
-            f"{what} is called {shortened(name)!r}. Robots' names are letters, digits, _ and -"
+            f"{what} is called {shortened(str(name))!r}. Give it up to {MOST_BYTES} letters, "
+            "digits, _ and -"
+        )
+    if name in _TAKEN:
+        raise UnsafeName(f"{what} is called {name}, as a part of every dataset is. Rename it")
+    return name
+
+
+@cache
+def topic_part(name: str, what: str) -> str:
+    """The name, if it can stand between two slashes of a topic.
+
+    Raises
+    ------
+    UnsafeName
+        If it is empty, too long, or holds a slash or a control character.
+    """
+    if not name or "/" in name or not name.isprintable() or len(name) > MOST_BYTES:
+        raise UnsafeName(
+            f"a {what} is called {shortened(name)!r}, which cannot be part of a topic. Names have "
+            "no slashes and no control characters"
         )
     return name
+
+
+def file_of_topic(topic: str) -> str:
+    """A file name for a topic, another for every other: ``/cf1/height`` is ``cf1.height``.
+
+    A dot of the topic itself, and what is not safe in a file's name, is written ``%2E``; a topic
+    without a slash in front begins with ``=``.
+    """
+    parts = topic.removeprefix("/").split("/")
+    name = ".".join(quote(part, safe=" +,@()").replace(".", "%2E") for part in parts)
+    return (name or "%2F") if topic.startswith("/") else f"={name}"
 
 
 def plain(text: str) -> str:
@@ -92,16 +128,16 @@ def plain(text: str) -> str:
 
 
 def markdown(text: str) -> str:
-    """The text for a line of Markdown, a cell of its tables, or between its backticks.
-
-    What HTML or Markdown could take for markup becomes a character that looks alike.
-    """
-    return one_line(text).translate(_LOOK_ALIKE)
+    """The text for a line of Markdown or a cell of its tables: no link, no HTML, no new cell."""
+    return _MARKUP.sub(r"\\\1", one_line(text))
 
 
-_LOOK_ALIKE = str.maketrans(
-    {"<": "‹", ">": "›", "`": "'", "|": "¦", "[": "(", "]": ")", "&": "+", "*": "∗", "\\": "/"}
-)
+def code(text: str) -> str:
+    """The text as a code span of Markdown, which nothing in it can end."""
+    line = one_line(text)
+    fence = "`" * (1 + max((len(run) for run in re.findall("`+", line)), default=0))
+    pad = " " if line.startswith("`") or line.endswith("`") else ""
+    return f"{fence}{pad}{line}{pad}{fence}"
 
 
 def one_line(text: str) -> str:

@@ -10,6 +10,8 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
+from dmrl.names import topic_part
+
 
 @dataclass(frozen=True, slots=True)
 class Curve:
@@ -199,89 +201,94 @@ PAIR_SENSORS = tuple(row for row in SENSORS if row.of_pairs)
 """What a robot measures of a peer."""
 
 
+def _filled(pattern: str, **parts: str) -> str:
+    """The topic. A part that holds a slash would be another topic, and another file's name."""
+    return pattern.format(**{what: topic_part(name, what) for what, name in parts.items()})
+
+
 def camera_image(robot: str) -> str:
     """Topic of a robot's images."""
-    return CAMERA_IMAGE.format(robot=robot)
+    return _filled(CAMERA_IMAGE, robot=robot)
 
 
 def calibration(robot: str) -> str:
     """Topic of a robot's camera calibration."""
-    return CALIBRATION.format(robot=robot)
+    return _filled(CALIBRATION, robot=robot)
 
 
 def attitude(robot: str) -> str:
     """Topic of a robot's attitude."""
-    return ATTITUDE.format(robot=robot)
+    return _filled(ATTITUDE, robot=robot)
 
 
 def velocity(robot: str) -> str:
     """Topic of a robot's velocity."""
-    return VELOCITY.format(robot=robot)
+    return _filled(VELOCITY, robot=robot)
 
 
 def height(robot: str) -> str:
     """Topic of a robot's height."""
-    return HEIGHT.format(robot=robot)
+    return _filled(HEIGHT, robot=robot)
 
 
 def uwb_range(robot: str, peer: str) -> str:
     """Topic of the distances that a robot measures to a peer."""
-    return RANGE.format(robot=robot, peer=peer)
+    return _filled(RANGE, robot=robot, peer=peer)
 
 
 def masks(robot: str) -> str:
     """Topic of images whose values say which peer covers a pixel."""
-    return MASKS.format(robot=robot)
+    return _filled(MASKS, robot=robot)
 
 
 def depths(robot: str) -> str:
     """Topic of images of the distance of peers' surfaces."""
-    return DEPTHS.format(robot=robot)
+    return _filled(DEPTHS, robot=robot)
 
 
 def labels(robot: str) -> str:
     """Topic of the labels of a robot's images."""
-    return LABELS.format(robot=robot)
+    return _filled(LABELS, robot=robot)
 
 
 def detections(robot: str) -> str:
     """Topic of what the network found in a robot's images."""
-    return DETECTIONS.format(robot=robot)
+    return _filled(DETECTIONS, robot=robot)
 
 
 def grid(robot: str) -> str:
     """Topic of the network's output maps for a robot's images."""
-    return GRID.format(robot=robot)
+    return _filled(GRID, robot=robot)
 
 
 def tracks(robot: str) -> str:
     """Topic of the peers that a robot's detections are followed as."""
-    return TRACKS.format(robot=robot)
+    return _filled(TRACKS, robot=robot)
 
 
 def position(robot: str, peer: str) -> str:
     """Topic of where a robot estimates a peer to be."""
-    return POSITION.format(robot=robot, peer=peer)
+    return _filled(POSITION, robot=robot, peer=peer)
 
 
 def truth(robot: str, peer: str) -> str:
     """Topic of where a peer truly is, seen from a robot."""
-    return TRUTH.format(robot=robot, peer=peer)
+    return _filled(TRUTH, robot=robot, peer=peer)
 
 
 def pose(robot: str) -> str:
     """Topic of where a robot estimates itself to be."""
-    return POSE.format(robot=robot)
+    return _filled(POSE, robot=robot)
 
 
 def true_pose(robot: str) -> str:
     """Topic of where a robot truly is."""
-    return TRUE_POSE.format(robot=robot)
+    return _filled(TRUE_POSE, robot=robot)
 
 
 def log(robot: str, event: str) -> str:
     """Topic of a robot's log variables, as they were logged."""
-    return LOG.format(robot=robot, event=event)
+    return _filled(LOG, robot=robot, event=event)
 
 
 @cache

@@ -88,7 +88,12 @@ def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> 
     if plots is None:
         say("card without figures: pip install 'dmrl[plot]', then dmrl card")
         return []
+    if folder.is_symlink():
+        raise DatasetError(f"{folder} is a link to another folder. Remove it")
     folder.mkdir(exist_ok=True)
+    for old in folder.iterdir():
+        if old.is_symlink():  # it would be written through
+            raise DatasetError(f"{old} is a link to another file. Remove it")
     height_px, width_px = next(iter(splits.values())).image_shape
     every = np.concatenate([c.uv_px for c in counts.values()])
     plots.depth_histogram({n: c.depth_m for n, c in counts.items()}, folder / "depth")

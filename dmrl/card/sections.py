@@ -7,6 +7,7 @@ import pyarrow as pa
 from dmrl.card.counts import Counts
 from dmrl.dataset import Split, layout
 from dmrl.geometry.frames import STRIDE_PX
+from dmrl.names import code, markdown
 from dmrl.recording import Provenance
 
 MEANING = {
@@ -39,12 +40,12 @@ def about(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
     height_px, width_px = next(iter(splits.values())).image_shape
     rows, cols = next(iter(splits.values())).grid_shape
     return [
-        f"# {title}",
+        f"# {markdown(title)}",
         "",
         f"{sum(map(len, splits.values()))} camera images of {width_px} x {height_px} px, each with "
         "the pixel position and depth of the peer robots in it, and the same as grid labels of "
         f"{rows} x {cols} cells for training a network. Every row names its recording and time.",
-        f"Made with dmrl {made.dmrl_version}.",
+        f"Made with dmrl {markdown(made.dmrl_version)}.",
         "",
         "Pixels: u right, v down from the top-left corner, pixel-edge coordinates. Lengths in "
         "metres, times in nanoseconds. Depth is measured along the optical axis.",
@@ -67,8 +68,8 @@ split = open_dataset(Path("DATASET")).split("{name}")
 rgb, confidence, depth = split.pixels[0][0], split.confidence[0], split.depth[0]""",
     }
     lines = ["## Load it", ""]
-    for package, code in ways.items():
-        lines += [f"With {package}:", "", "```python", code, "```", ""]
+    for package, snippet in ways.items():
+        lines += [f"With {package}:", "", "```python", snippet, "```", ""]
     if not png:
         lines += [
             "`pixels` need datasets 5.1 or newer. Leave them in its default or `arrow` format: its "
@@ -110,15 +111,17 @@ def numbers(counts: dict[str, Counts]) -> list[str]:
     lines.append("|---|--:|--:|--:|--:|---|")
     for name, c in counts.items():
         low, high = (c.depth_m.min(), c.depth_m.max()) if c.depth_m.size else (0.0, 0.0)
-        sources = ", ".join(f"{source} ({n})" for source, n in sorted(c.label_sources.items()))
+        sources = ", ".join(
+            f"{markdown(source)} ({n})" for source, n in sorted(c.label_sources.items())
+        )
         lines.append(
-            f"| {name} | {c.images} | {int((c.peers > 0).sum())} | {int(c.peers.sum())} "
+            f"| {markdown(name)} | {c.images} | {int((c.peers > 0).sum())} | {int(c.peers.sum())} "
             f"| {low:.2f} to {high:.2f} | {sources} |"
         )
     lines += ["", "Peers and depths: inside the image. Labels: all of them.", ""]
     lines += ["| recording | split | images |", "|---|---|--:|"]
     rows = sorted((r, name, n) for name, c in counts.items() for r, n in c.recordings.items())
-    return [*lines, *(f"| {r} | {name} | {n} |" for r, name, n in rows), ""]
+    return [*lines, *(f"| {markdown(r)} | {markdown(name)} | {n} |" for r, name, n in rows), ""]
 
 
 def features(splits: dict[str, Split]) -> list[str]:
@@ -148,7 +151,7 @@ def ancestry(made: Provenance) -> Iterator[str]:
     yield from _stage(made, "")
     for depth, source in made.ancestry():
         pad = "  " * (2 * depth + 1)
-        yield f"{pad}- input `{source.name}`, SHA-256 `{source.sha256}`"
+        yield f"{pad}- input {code(source.name)}, SHA-256 {code(source.sha256)}"
         if source.provenance is not None:
             yield from _stage(source.provenance, pad + "  ")
 
@@ -156,7 +159,8 @@ def ancestry(made: Provenance) -> Iterator[str]:
 def _stage(made: Provenance, pad: str) -> Iterator[str]:
     seed = "" if made.seed is None else f", seed {made.seed}"
     libraries = "".join(f", {name} {version}" for name, version in made.libraries.items())
-    yield f"{pad}- **{made.stage}**, dmrl {made.dmrl_version}{seed}{libraries}"
+    versions = markdown(f", dmrl {made.dmrl_version}{seed}{libraries}")
+    yield f"{pad}- **{markdown(made.stage)}**{versions}"
     if made.settings:
         settings = ", ".join(f"{key} = {value!r}" for key, value in made.settings.items())
-        yield f"{pad}  - settings: `{settings}`"
+        yield f"{pad}  - settings: {code(settings)}"

@@ -19,6 +19,7 @@ from typing import Any
 import pyarrow as pa
 
 from dmrl.geometry.frames import STRIDE_PX
+from dmrl.names import split_name
 
 PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"
@@ -113,6 +114,7 @@ def dtype_name(kind: pa.DataType) -> str:
 def shard_path(folder: Path, split: str, index: int, count: int, *, parquet: bool) -> Path:
     """File of one shard, named as ``datasets`` and the Hub name it."""
     number = f"{index:05d}-of-{count:05d}"
+    split = split_name(split, f"{folder}: a split")
     if parquet:
         return folder / "data" / f"{split}-{number}.parquet"
     return folder / split / f"data-{number}.arrow"

@@ -17,6 +17,7 @@ from dmrl.documents import parse_json
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.images.codec import decode
+from dmrl.names import inside, split_name
 
 PARQUET_NAME = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")
 
@@ -142,11 +143,12 @@ class Dataset:
         return Split(name, pa.concat_tables(tables))
 
     def _arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
-        folder = self.path / name
+        folder = inside(self.path, name, f"{self.path}: a split")
         files = [item["filename"] for item in _read_json(folder / "state.json")["_data_files"]]
         info = (_read_json(folder / "dataset_info.json").get("splits") or {}).get(name, {})
         rows = info.get("shard_lengths") or [None] * len(files)
-        return list(zip([folder / file for file in files], rows, strict=True))
+        paths = [inside(folder, file, f"{folder}: a shard") for file in files]
+        return list(zip(paths, rows, strict=True))
 
     def _parquet_shards(self, name: str) -> list[tuple[Path, int | None]]:
         found = {index: count for split, index, count in _parquet_names(self.path) if split == name}
@@ -172,6 +174,8 @@ def open_dataset(path: Path) -> Dataset:
     ------
     DatasetError
         If it is not a dataset.
+    UnsafeName
+        If a split is called what could not be a folder's name.
     """
     parquet = not (path / "dataset_dict.json").is_file()
     if not parquet:
@@ -181,7 +185,7 @@ def open_dataset(path: Path) -> Dataset:
     if not splits:
         what = "is not a dataset" if path.exists() else "does not exist"
         raise DatasetError(f"{path} {what}. Make one with: dmrl dataset RECORDING.mcap {path}")
-    return Dataset(path, splits, parquet)
+    return Dataset(path, tuple(split_name(name, f"{path}: a split") for name in splits), parquet)
 
 
 def _parquet_names(folder: Path) -> list[tuple[str, int, int]]:

@@ -3,6 +3,7 @@
 Rooms are loaded by name when they are asked for: each needs packages that the others do not.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -193,7 +194,10 @@ def _described(file: Path) -> tuple[int, float]:
     """Stride and threshold that the description of an export folder says."""
     try:
         said = parse_json(file.read_text(encoding="utf-8"))
-        return int(said["stride_px"]), float(said["threshold"])
+        stride_px, threshold = int(said["stride_px"]), float(said["threshold"])
+        if stride_px < 1 or not math.isfinite(threshold):
+            raise ValueError(f"a stride of {stride_px} px, a threshold of {threshold}")
+        return stride_px, threshold
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise ModelError(f"{file} is damaged: {e}. Export the model again") from None
 

@@ -1,10 +1,12 @@
 """Integer networks on disk: one .npz of arrays and a JSON description; nothing is pickled."""
 
 import json
+import math
 import zipfile
+import zlib
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,14 @@ KINDS: dict[str, type[AnyLayer]] = {kind.kind: kind for kind in (Conv, MaxPool, 
 HEADS = ("confidence", "depth", "offset_u", "offset_v")
 PLAIN = ("name", "architecture", "channels", "height_px", "width_px", "stride_px", "threshold")
 
+DAMAGES = (
+    *(TypeError, ValueError, LookupError, ArithmeticError, AttributeError, RecursionError),
+    *(OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error),
+)
+"""What reading a file of a stranger can raise."""
+
 Arrays = dict[str, NDArray[Any]]
+Part = TypeVar("Part")
 
 
 def save(network: IntegerNetwork, path: Path) -> None:
@@ -73,22 +82,22 @@ def load(path: Path) -> IntegerNetwork:
                 f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Update dmrl"
             )
         return _network(said, arrays)
-    except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as e:
-        raise ModelError(f"{file} is damaged: {e}. Quantise the model again") from None
+    except DAMAGES as e:
+        raise ModelError(f"{file} is damaged: {e!r:.200}. Quantise the model again") from None
 
 
 def _network(said: dict[str, Any], arrays: Arrays) -> IntegerNetwork:
     layers = tuple(
-        KINDS[layer.pop("kind")](**_unpacked(layer, f"layer{k}", arrays))
+        _checked(KINDS[layer.pop("kind")](**_unpacked(layer, f"layer{k}", arrays)))
         for k, layer in enumerate(said["layers"])
     )
     heads = {
-        name: Head(**_unpacked(head, name, arrays))
+        name: _checked(Head(**_unpacked(head, name, arrays)))
         for name, head in said["heads"].items()
         if name in HEADS
     }
     fields: dict[str, Any] = {name: said[name] for name in PLAIN} | heads
-    return IntegerNetwork(layers=layers, **fields)
+    return _checked(IntegerNetwork(layers=layers, **fields))
 
 
 def _unpacked(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, Any]:
@@ -99,3 +108,29 @@ def _unpacked(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, A
     }
     tuples = {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
     return {**tuples, **own}
+
+
+def _checked(part: Part) -> Part:
+    """The part, if its fields are of their types: they become numbers and names of C.
+
+    Raises
+    ------
+    TypeError
+        If one is not.
+    """
+    for field, kind in get_type_hints(type(part)).items():
+        if field not in ("kind", "layers", *HEADS) and not _is_of(getattr(part, field), kind):
+            raise TypeError(f"{field} is {str(getattr(part, field))[:40]!r}")
+    return part
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    if get_origin(kind) is np.ndarray:
+        wanted = get_args(get_args(kind)[1])[0]
+        return isinstance(value, np.ndarray) and value.dtype == wanted
+    if get_origin(kind) is tuple:
+        whole = isinstance(value, tuple) and all(type(v) is int for v in value)
+        return whole and len(value) == len(get_args(kind))
+    if kind is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    return type(value) is kind

@@ -13,6 +13,7 @@ from dmrl.evaluation.detections import Pairs
 from dmrl.images.codec import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored
+from dmrl.names import inside
 from dmrl.plots import Example
 from dmrl.recording import read, summary
 
@@ -37,7 +38,7 @@ def draw_errors(folder: Path, judged: Sequence[HasErrors]) -> None:
     """Write the errors of the first twelve pairs or observers, over time, into a folder."""
     for one in judged[:PLOTTED]:
         trace = one.trace
-        stem = folder / trace.name
+        stem = inside(folder, trace.name, "a trace")
         plots.error_trace(trace.title, trace.time_s, trace.sigma_m, trace.errors_m, stem)
 
 

@@ -1,10 +1,11 @@
 """Every topic of a recording as a table, CSV or Parquet, and its pictures as files.
 
-``/cf1/attitude`` becomes ``cf1.attitude.csv``. The first columns are ``log_time`` and
-``publish_time``, nanoseconds. A field of a sub-message is ``pose.position.x``. Of a list of
-sub-messages, such as the peers of ``PeerLabels``, each is a row; a message without any has one
-row with empty cells. Pictures lie in ``cf1.camera.image/<log_time>.png``, the second of a time in
-``<log_time>-2.png``, and ``data`` names them.
+``/cf1/attitude`` becomes ``cf1.attitude.csv``; a dot in a topic is written ``%2E``. The
+first columns are ``log_time`` and ``publish_time``, nanoseconds. A field of a sub-message is
+``pose.position.x``. Of a list of sub-messages, such as the peers of ``PeerLabels``, each is a
+row; a message without any has one row with empty cells. Pictures lie in
+``cf1.camera.image/<log_time>.png``, the second of a time in ``<log_time>-2.png``, and ``data``
+names them.
 In CSV, lists are JSON and other bytes base64; in Parquet both stay what they are.
 """
 
@@ -19,7 +20,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dmrl.errors import MissingExtra
+from dmrl.errors import MissingExtra, UnsafeName
+from dmrl.names import file_of_topic, inside
 from dmrl.output import partial_folder
 from dmrl.recording import columns, read_table, summary
 from dmrl.terminal.progress import track
@@ -55,19 +57,29 @@ def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
     counts = {}
     with partial_folder(out) as folder:
         for topic, info in track(found.topics.items(), "Writing tables"):
-            name = topic.strip("/").replace("/", ".")
+            path = inside(folder, file_of_topic(topic), f"{recording}: a topic", suffix=f".{kind}")
             if info.schema == "foxglove.CompressedImage":
-                table = _pictures(recording, topic, folder / name)
+                table = _pictures(recording, topic, path.with_suffix(""))
             else:
                 table = read_table(recording, topic)
             table = _flat(table)
-            _write(table, folder / f"{name}.{kind}", kind)
+            _refuse_taken(path, topic)
+            _write(table, path, kind)
             counts[topic] = table.num_rows
     return counts
 
 
+def _refuse_taken(path: Path, topic: str) -> None:
+    """Refuse two topics in one file, as on a disk that does not tell A from a."""
+    if path.exists():
+        raise UnsafeName(
+            f"{topic} and another topic would both become {path.name}. Leave one out: dmrl trim"
+        )
+
+
 def _pictures(recording: Path, topic: str, folder: Path) -> pa.Table:
     """Pictures to files; the table names them in place of their bytes."""
+    _refuse_taken(folder, topic)
     folder.mkdir()
     batches, seen = [], Counter[str]()
     for batch in columns(recording, topic):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from dmrl.errors import SourceError
+from dmrl.names import split_name
 
 POINT = ("u_px", "v_px", "depth_m")
 BOX = ("left_px", "top_px", "right_px", "bottom_px")
@@ -135,6 +136,8 @@ def _row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) ->
         hint = f"Did you mean {near[0]}?" if near else "Add the picture, or delete the line"
         raise SourceError(f"{where}: no picture {row['file']!r} in the folder. {hint}")
     split = row.get("split") or None
+    if split is not None:
+        split_name(split, f"{where}: the split")
     if not row["peer"]:
         return _empty_row(where, row, split)
     box = tuple(_number(where, row, name) for name in BOX if row.get(name))

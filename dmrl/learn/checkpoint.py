@@ -20,6 +20,7 @@ from dmrl.documents import parse_json
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn.model import set_weights, weights_of, write_tensors
 from dmrl.learn.network import Network
+from dmrl.names import inside
 
 STATE_NAME = "checkpoint.json"
 
@@ -88,7 +89,7 @@ def load_checkpoint(
         raise ModelError(f"no checkpoint in {folder} to resume from. Train without --resume")
     try:
         said = parse_json((folder / STATE_NAME).read_text(encoding="utf-8"))
-        tensors = load_file(folder / said.pop("tensors"))
+        tensors = load_file(inside(folder, said.pop("tensors"), f"{folder}: the tensors"))
         state = State(**said)
     except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:
         raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None

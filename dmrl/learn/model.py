@@ -4,6 +4,7 @@ A run folder holds ``model.safetensors`` and ``model.json``. Nothing is ever unp
 """
 
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -277,6 +278,8 @@ def _read_description(path: Path) -> dict[str, Any]:
     if not 0 < said["width_px"] * said["height_px"] <= limits.PIXELS or said["width_px"] < 0:
         size = f"{said['width_px']} x {said['height_px']}"
         raise ModelError(f"{path} is for images of {size}. Give the model.json of dmrl train")
+    if not math.isfinite(said["threshold"]):
+        raise ModelError(f"{path} has no valid threshold. Give the model.json of dmrl train")
     if said["architecture"] not in architecture_names():
         raise ModelError(
             f"{path} asks for architecture {said['architecture']}, this dmrl knows "

@@ -54,4 +54,4 @@ def save(figure: Figure, stem: Path) -> None:
     """Write ``<stem>.png`` and ``<stem>.svg``."""
     for suffix, metadata in METADATA.items():
         with mpl.rc_context(STYLE):
-            figure.savefig(stem.with_suffix(suffix), dpi=150, metadata=metadata)
+            figure.savefig(stem.with_name(stem.name + suffix), dpi=150, metadata=metadata)

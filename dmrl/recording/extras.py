@@ -4,6 +4,7 @@ from pathlib import Path
 
 from dmrl.documents import parse_json
 from dmrl.errors import RecordingError
+from dmrl.names import split_name
 from dmrl.recording import sums
 from dmrl.recording.index import SPLIT_METADATA, Summary
 from dmrl.recording.provenance import METADATA_NAME
@@ -38,11 +39,14 @@ def splits(path: Path, found: Summary) -> dict[str, list[tuple[int, int]]]:
     ------
     RecordingError
         If its metadata is not that.
+    UnsafeName
+        If a split has a name that could not be a folder's.
     """
     out: dict[str, list[tuple[int, int]]] = {}
     try:
         for record in found.metadata.get(SPLIT_METADATA, []):
             for name, ranges in record.items():
+                split_name(name, f"{path}: a split")
                 out.setdefault(name, []).extend((int(a), int(b)) for a, b in parse_json(ranges))
     except (ValueError, TypeError) as e:
         raise RecordingError(

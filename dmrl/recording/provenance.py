@@ -96,10 +96,13 @@ class Provenance:
 
         Raises
         ------
-        KeyError, TypeError
+        KeyError, TypeError, ValueError
             If the document is not one.
         """
-        return cls._read(document, {})
+        try:
+            return cls._read(document, {})
+        except RecursionError:
+            raise ValueError("it is nested too deep") from None
 
     @classmethod
     def _read(cls, document: Mapping[str, Any], known: dict[str, Self]) -> Self:
@@ -108,8 +111,16 @@ class Provenance:
             name, sha256, own = source["name"], source["sha256"], source["provenance"]
             if own:
                 known[sha256] = cls._read(own, known)
-            inputs.append(Input(name, sha256, known.get(sha256)))
-        return cls(**{**document, "inputs": tuple(inputs)})
+            inputs.append(Input(str(name), str(sha256), known.get(sha256)))
+        made = cls(**{**document, "inputs": tuple(inputs)})
+        if not (isinstance(made.settings, dict) and isinstance(made.libraries, dict)):
+            raise TypeError("settings and libraries are no tables")
+        texts = (made.stage, made.dmrl_version)
+        if not all(isinstance(text, str) for text in texts) or not isinstance(
+            made.seed, int | None
+        ):
+            raise TypeError("stage and version are no texts, or the seed is no number")
+        return made
 
     def to_metadata(self) -> dict[str, str]:
         """The same as MCAP metadata: strings, JSON where a value is not one."""

@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 from dmrl.card import write_card
 from dmrl.output import partial_folder
+from dmrl.terminal.tables import print_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,4 +70,4 @@ def command(
     dataset
         Folder of the dataset.
     """
-    print(run(dataset, settings))
+    print_line(str(run(dataset, settings)))

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from dmrl.recording import check as findings_of
 from dmrl.recording import summary
-from dmrl.terminal.tables import print_json
+from dmrl.terminal.tables import print_json, print_line
 
 
 def command(
@@ -32,9 +32,9 @@ def command(
     else:
         for finding in findings:
             where = f" {finding.topic}:" if finding.topic else ""
-            print(f"{finding.level}:{where} {finding.text}")
+            print_line(f"{finding.level}:{where} {finding.text}")
         found = summary(recording)
-        print(
+        print_line(
             f"{recording}: {found.count} messages on {len(found.topics)} topics, "
             f"{errors} errors, {len(findings) - errors} warnings"
         )

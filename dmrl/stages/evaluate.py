@@ -19,7 +19,7 @@ from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import input_of, summary
 from dmrl.terminal.progress import say
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_line, print_table
 
 figures: ModuleType | None
 try:
@@ -273,13 +273,13 @@ def print_evaluation(
     if overall.unmatched:
         notes.append(f"{overall.unmatched} labels without any detection")
     for note in notes:
-        print(f"left out: {note}")
+        print_line(f"left out: {note}")
     if unseen := evaluation.pairs.unseen:
-        print(
+        print_line(
             f"{unseen} images have no Detections message: nothing was found there. "
             "--partial leaves them out"
         )
-    print(
+    print_line(
         f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
         f"confidence {evaluation.threshold:g}, within 16 px"
     )
@@ -290,7 +290,7 @@ def print_document(recording: Path, made: Document) -> None:
     kind = tracks if "robots" in made else positions
     headers = [words for _, words, _ in kind.COLUMNS]
     print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
-    print(f"{kind.NOTE}; settled after {made['settle_s']:g} s")
+    print_line(f"{kind.NOTE}; settled after {made['settle_s']:g} s")
 
 
 def _range(band: BandFigures) -> str:

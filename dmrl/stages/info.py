@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from dmrl.recording import Provenance, Summary, log_times, summary
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_line, print_table
 
 
 def command(
@@ -27,10 +27,10 @@ def command(
     if as_json:
         print_json(document(recording, found))
         return
-    print(headline(recording, found))
+    print_line(headline(recording, found))
     print_table("", ("topic", "message", "messages", "rate, Hz"), topic_rows(recording, found))
     for line in ancestry_lines(found.provenance):
-        print(line)
+        print_line(line)
 
 
 def document(path: Path, found: Summary) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 from dmrl.errors import SettingError
 from dmrl.recording import merge, say_findings
+from dmrl.terminal.tables import print_line
 
 
 def run(recordings: Sequence[Path], out: Path) -> int:
@@ -32,4 +33,4 @@ def command(
         )
     *inputs, out = recordings
     count = run(inputs, out)
-    print(f"{out}: {count} messages of {len(inputs)} recordings")
+    print_line(f"{out}: {count} messages of {len(inputs)} recordings")

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.recording import Recovery, recover
-from dmrl.terminal.tables import print_json
+from dmrl.terminal.tables import print_json, print_line
 
 
 def run(recording: Path, out: Path) -> Recovery:
@@ -40,7 +40,7 @@ def command(
     if as_json:
         print_json(asdict(result))
         return
-    print(f"{out}: {result.messages} messages brought back; {_lost(result)}")
+    print_line(f"{out}: {result.messages} messages brought back; {_lost(result)}")
 
 
 def _lost(result: Recovery) -> str:

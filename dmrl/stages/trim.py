@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from dmrl.errors import SettingError
 from dmrl.recording import summary, trim
+from dmrl.terminal.tables import print_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,4 +89,4 @@ def command(
     out
         Recording to write. Must not exist.
     """
-    print(f"{out}: {run(recording, out, settings)} messages")
+    print_line(f"{out}: {run(recording, out, settings)} messages")

@@ -13,6 +13,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from dmrl.names import one_line
+
 Item = TypeVar("Item")
 
 
@@ -65,4 +67,4 @@ def track(
 
 def say(line: str) -> None:
     """Print one line of news on standard error, terminal or not."""
-    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(line)
+    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(one_line(line))

@@ -194,7 +194,7 @@ def _pools_to_fuse(network: IntegerNetwork) -> set[int]:
 
 def _identifier(name: str, taken: list[str]) -> str:
     """A C identifier like ``name`` that is not taken."""
-    plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "layer"
+    plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower()[:60] or "layer"
     plain = f"layer_{plain}" if plain.startswith(SHARED) or not plain[0].isalpha() else plain
     reserved = {*taken, *RESERVED.split()}
     if plain not in reserved:

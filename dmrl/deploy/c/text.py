@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dmrl import __version__
 from dmrl.deploy.integer import IntegerNetwork
+from dmrl.names import plain
 
 OTHER_FILES = ("main", "harness", "count")
 """C files that stand beside the network's at one time or another."""
@@ -23,13 +24,24 @@ def fill(template: str, **values: object) -> str:
     ------
     KeyError
         If a name has no value.
+
+    What comes from a file must be a number, or have gone through `dmrl.names.plain`: a value
+    becomes code or ends a comment.
     """
     text = files("dmrl.deploy.c").joinpath("templates", template).read_text(encoding="utf-8")
     return Template(text).substitute(values)
 
 
 def array(kind: str, name: str, values: NDArray[np.integer]) -> str:
-    """Definition of a constant array."""
+    """Definition of a constant array.
+
+    Raises
+    ------
+    TypeError
+        If the values are no integers: whatever else they are must not become code.
+    """
+    if values.dtype.kind not in "iu":
+        raise TypeError(f"{name} is of {values.dtype}, not of integers")
     words = [f"{v}," for v in values.ravel().tolist()]
     body = "\n".join(wrapped(words, "    "))
     return f"static const {kind} {name}[{values.size}] = {{\n{body}\n}};\n"
@@ -63,7 +75,7 @@ def names_of(network: IntegerNetwork) -> dict[str, str]:
         "PREFIX": name.upper(),
         "version": __version__,
         "description": (
-            f"{network.name}: int8 network {network.architecture} for images of "
+            f"{plain(network.name)}: int8 network {plain(network.architecture)} for images of "
             f"{network.width_px} x {network.height_px} pixels, as portable C."
         ),
     }

@@ -1,0 +1,75 @@
+"""Names from files never become a path elsewhere, an end of a comment, or markup."""
+
+from pathlib import Path
+
+import pytest
+
+from dmrl import topics
+from dmrl.errors import UnsafeName
+from dmrl.names import (
+    MOST_BYTES,
+    code,
+    file_of_topic,
+    inside,
+    markdown,
+    one_line,
+    plain,
+    split_name,
+)
+
+HOSTILE = (
+    *("", ".", "..", "../x", "../../victim", "/etc/passwd", "a/b", "a\\b", ".hidden", "a/../b"),
+    *("a\nb", "a\0b", "a\x1b[31mb", "a\u202eb", "a" * (MOST_BYTES + 1), "ü" * MOST_BYTES),
+)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_no_name_leads_out_of_its_folder(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UnsafeName) as error:
+        inside(tmp_path, name, "flight.mcap: the split")
+    assert str(error.value).startswith("flight.mcap: the split")
+    assert one_line(str(error.value)) == str(error.value)
+
+
+@pytest.mark.parametrize("name", ["cf1", "Flug 3 (äöü)", "a.b", "x-1_2"])
+def test_honest_names_stay_what_they_are(name: str, tmp_path: Path) -> None:
+    assert inside(tmp_path, name, "it", suffix=".csv") == tmp_path / f"{name}.csv"
+
+
+@pytest.mark.parametrize("name", [*HOSTILE, "data", "figures", "README.md", 'x"]; import os', "`"])
+def test_a_split_is_called_by_a_word(name: str) -> None:
+    with pytest.raises(UnsafeName):
+        split_name(name, "it")
+
+
+def test_every_topic_has_a_file_of_its_own() -> None:
+    known = [
+        *("/cf1/height", "/cf1.height", "cf1/height", "cf1.height", "/cf1%2Eheight", "/=cf1"),
+        *("/cf1/height/", "//cf1/height", "/cf1/../height", "/../../victim", "/", "/cf1 height"),
+        *("/=cf1/height", "=cf1/height", "/%3Dcf1/height", "/cf1\\height", "/cf1\nheight"),
+    ]
+    files = [file_of_topic(topic) for topic in known]
+    assert len(set(files)) == len(known)
+    assert not any(set("/\\\n") & set(name) for name in files)
+    assert files[0] == "cf1.height"
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "a\nb", "a" * 300])
+def test_a_robot_s_name_is_one_part_of_a_topic(name: str) -> None:
+    with pytest.raises(UnsafeName, match="a robot is called"):
+        topics.height(name)
+
+
+@pytest.mark.parametrize(
+    "text", ["*/ int x; /*", "a\nb", "a\\\nb", "??/\n", '"', "$(shell x)", "\r", "\u2028", "`x`"]
+)
+def test_nothing_ends_a_comment(text: str) -> None:
+    assert not set(plain(text)) & set("*/\\\n\r?\"'$`\u2028<>[]#")
+
+
+def test_markup_is_shown_and_not_obeyed() -> None:
+    assert markdown("a|b<img src=x>[x](http://y)\nc") == r"a\|b\<img src=x\>\[x\](http://y) c"
+    assert code("a`b") == "``a`b``"
+    assert code("`") == "`` ` ``"
+    assert code("a\n\n# b") == "`a  # b`"
+    assert one_line("a\x1b]0;x\x07\u202eb\r\nc") == r"a\x1b]0;x\x07\u202eb c"

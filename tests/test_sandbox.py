@@ -1,0 +1,380 @@
+"""Hostile inputs to every command: nothing is written but OUT and temporary files.
+
+Whatever the command says, the tree around it is the same before and after, and Python's own
+trace of file accesses holds no write outside OUT.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from dmrl import boundary
+from dmrl.cli import COMMANDS, app
+from dmrl.deploy.c import write_c
+from dmrl.deploy.store import INTEGER_NAME, save
+from dmrl.images.codec import encode_png
+from dmrl.messages import message
+from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter
+from dmrl.recording.provenance import Input
+
+from .deploy.networks import random_network
+
+ROBOTS = ("cf1", "..", "a\\b", "$(touch victim)", "`*/", "<img src=x>", "a.b")
+CONTROLS = ("cf1", "x\x1b[2J", "n\nm", "\u202ecf2", "-rf")
+PEERS = ("../../victim/keep", "/tmp/victim", "cf2", "|[x](y)|\n# z")
+ELSEWHERE = ("../../victim/keep", "..", "a/b", "{victim}/keep", "data", "x\ny", "", "-rf")
+WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
+CHANGES += ("os.chmod", "os.system", "os.posix_spawn", "os.exec")
+
+
+class Box(NamedTuple):
+    """The folders of a test: where OUT goes, what is around it."""
+
+    root: Path
+
+    def __getattr__(self, name: str) -> Path:
+        return self.root / name
+
+
+_watched: list[tuple[str, str]] | None = None
+
+
+def _hook(event: str, args: tuple[Any, ...]) -> None:
+    if _watched is None:
+        return
+    if event == "open" and isinstance(args[2], int) and args[2] & WRITES:
+        _watched.append((event, os.fsdecode(args[0]) if not isinstance(args[0], int) else ""))
+    elif event == "os.mkdir" and Path(os.fsdecode(args[0])).exists():
+        pass  # asked for in case it is not there
+    elif event in CHANGES and not (event in ("os.remove", "os.rmdir") and args[1] >= 0):
+        # Names within an open folder, as of a folder that is removed, the tree tells of.
+        _watched.extend((event, os.fsdecode(a)) for a in args[:2] if isinstance(a, str | bytes))
+
+
+sys.addaudithook(_hook)
+
+
+def _tree(root: Path) -> dict[str, str]:
+    """Every file and folder outside OUT and the temporary folder, with its content."""
+    found = {}
+    for folder, folders, files in os.walk(root):
+        at = Path(folder)
+        folders[:] = [f for f in folders if at / f not in (root / "out", root / "temp")]
+        for name in [*folders, *files]:
+            path = at / name
+            content = path.read_bytes() if path.is_file() else b""
+            found[str(path.relative_to(root))] = hashlib.sha256(content).hexdigest()
+    return found
+
+
+@contextmanager
+def _untouched(box: Box) -> Iterator[None]:
+    """Nothing is written outside OUT and the temporary folder while the block lasts."""
+    global _watched
+    before = _tree(box.root)
+    _watched = []
+    try:
+        yield
+    finally:
+        seen, _watched = _watched, None
+    assert _tree(box.root) == before
+    free = (box.out, box.temp, Path("/dev"), Path(sys.prefix), Path("/proc"))
+    strange = [
+        (event, path)
+        for event, path in seen
+        if path
+        and not any((Path.cwd() / path).is_relative_to(one) for one in free)
+        and "__pycache__" not in path
+    ]
+    assert strange == []
+
+
+@pytest.fixture
+def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Box:
+    """A folder to work in, a victim beside it, and OUT."""
+    root = tmp_path.resolve()
+    for name in ("cwd", "in", "out", "temp", "victim"):
+        (root / name).mkdir()
+    (root / "victim" / "keep").write_text("precious")
+    monkeypatch.chdir(root / "cwd")
+    monkeypatch.setattr(tempfile, "tempdir", str(root / "temp"))
+    for name in ("TMPDIR", "HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR", "XDG_CONFIG_HOME"):
+        monkeypatch.setenv(name, str(root / "temp"))
+    monkeypatch.delenv("DMRL_DEBUG", raising=False)
+    return Box(root)
+
+
+def _run(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
+    """Exit status of a command that touches nothing; it is 0, or 1 with one line."""
+    with _untouched(box):
+        status = boundary.status_of(lambda: app([str(word) for word in words]))
+    said = capsys.readouterr()
+    assert "internal error" not in said.err, said.err
+    assert "\x1b" not in said.out + said.err
+    assert status in (0, 1), said.err
+    last = said.err.strip().splitlines()[-1:]
+    assert status == 0 or last[0].startswith("dmrl: "), said.err
+    return status
+
+
+def _hostile(
+    path: Path, split: dict[str, str] | None = None, robots: tuple[str, ...] = ROBOTS
+) -> Path:
+    """A recording of robots, peers, sources, metadata and inputs with hostile names."""
+    made = Provenance(
+        "predict\n# x",
+        {"recipe": "../../victim/keep", "x": "`*/"},
+        inputs=(Input("../../victim/keep", "0" * 64), Input("a|b`c\n<b>", "x|y")),
+        libraries={"numpy\n*/": "<script>"},
+    )
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, made) as sink:
+        if split is not None:
+            sink.add_metadata("dmrl.split", split)
+        sink.add_metadata("../../victim/keep", {"../x": "y"})
+        sink.add_attachment("../../victim/keep", "text/plain", b"overwritten")
+        for k in range(4):
+            for robot in robots:
+                rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
+                picture = message("CompressedImage")(data=encode_png(rgb), format="../../x")
+                peer = {"peer": PEERS[k], "u_px": 20, "v_px": 20, "depth_m": 1.0}
+                peers = [{**peer, "source": source} for source in ("truth", "../../victim/keep")]
+                found = [{"u_px": 20, "v_px": 20, "depth_m": 1.0, "confidence": 0.9}]
+                for topic, one in (
+                    ("camera/image", picture),
+                    ("labels", message("PeerLabels")(peers=peers)),
+                    ("detections", message("Detections")(detections=found)),
+                    ("height", message("Height")(height_m=1.0)),
+                    ("attitude", message("Attitude")()),
+                    ("velocity", message("Velocity")()),
+                    (f"range/{robot}", message("UwbRange")(range_m=1.0 + k)),
+                ):
+                    channel = sink._channel_for(f"/{robot}/{topic}", one.DESCRIPTOR)
+                    time_ns = k * 100_000_000
+                    sink.write_raw(RawMessage(time_ns, time_ns, channel, one.SerializeToString()))
+        height = message("Height")(height_m=2.0)
+        for topic in (
+            "/../../victim/keep",
+            "/cf1.height",
+            "../victim",
+            "/",
+            "",
+            "/..",
+            "cf1/height",
+        ):
+            like = sink._channel_for("/cf1/height", height.DESCRIPTOR)
+            channel = Channel(topic, like.schema_name, like.schema_data)
+            sink.write_raw(RawMessage(0, 0, channel, height.SerializeToString()))
+    return path
+
+
+@pytest.mark.parametrize("robots", [ROBOTS, CONTROLS])
+def test_no_command_writes_elsewhere_for_a_hostile_recording(
+    robots: tuple[str, ...], box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, out = _hostile(box.root / "in" / "bad.mcap", robots=robots), box.out
+    other = _hostile(box.root / "in" / "other.mcap", {"x": "[[0, 1]]"}, robots)
+    for words in (
+        ("info", bad),
+        ("check", bad),
+        ("info", bad, "--json"),
+        ("trim", bad, out / "trim.mcap"),
+        ("merge", bad, other, out / "merge.mcap"),
+        ("recover", bad, out / "recovered.mcap"),
+        ("convert", bad, out / "csv", "--to", "csv"),
+        ("convert", bad, out / "parquet", "--to", "parquet"),
+        ("convert", bad, out / "ros", "--to", "ros2"),
+        ("dataset", bad, out / "set"),
+        ("dataset", bad, out / "parquet-set", "--parquet"),
+        ("label", bad, out / "label.mcap"),
+        ("align", bad, out / "align.mcap"),
+        ("track", bad, out / "track.mcap"),
+        ("calibrate", bad, out / "camera.toml"),
+        ("evaluate", bad),
+        ("evaluate", bad, "--plots", out / "judged"),
+        ("predict", bad, bad, out / "predicted.mcap"),
+        ("view", bad, "--save", out / "view.rrd"),
+        ("card", bad),
+        ("fake-drone", "--flight", bad, "--uri", "udp://127.0.0.1:0x"),
+    ):
+        _run(box, capsys, *words)
+
+
+@pytest.mark.parametrize("split", ELSEWHERE)
+def test_a_split_of_a_recording_stays_in_the_dataset(
+    split: str, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = split.replace("{victim}", str(box.victim))
+    bad = _hostile(box.root / "in" / "bad.mcap", {name: "[[0, 900000000]]"})
+    for extra in ((), ("--parquet",)):
+        for mode in ("auto", "recordings"):
+            _run(
+                box,
+                capsys,
+                "dataset",
+                bad,
+                box.out / f"{mode}{len(extra)}",
+                "--split",
+                mode,
+                *extra,
+            )
+    assert not any("keep" in path.name for path in box.out.rglob("*"))
+
+
+@pytest.mark.parametrize("split", ELSEWHERE)
+def test_a_split_of_a_label_table_stays_in_the_dataset(
+    split: str, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = split.replace("{victim}", str(box.victim))
+    folder = box.root / "in" / "pictures"
+    folder.mkdir()
+    (folder / "000000000000.png").write_bytes(encode_png(np.zeros((48, 64, 3), np.uint8)))
+    rows = f'file,peer,u_px,v_px,depth_m,split\n000000000000.png,cf2,3,4,1,"{name}"\n'
+    (folder / "labels.csv").write_text(rows)
+    out = box.out / "x.mcap"
+    if _run(box, capsys, "convert", folder, out, "--from", "images") == 0:
+        _run(box, capsys, "dataset", out, box.out / "set", "--split", "auto")
+
+
+def test_a_hostile_dataset_is_read_and_carded_where_it_is(
+    box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = _hostile(box.root / "in" / "bad.mcap")
+    good = box.out / "set"
+    assert _run(box, capsys, "dataset", bad, good, "--split", "recordings") == 0
+    card = (good / "README.md").read_text()
+    assert "<img" not in card.replace("`", "")
+    assert "\n# x" not in card
+    for edit in (
+        lambda d: (d / "dataset_dict.json").write_text('{"splits": ["../../victim"]}'),
+        lambda d: (d / "dataset_dict.json").write_text('{"splits": [3, null]}'),
+        lambda d: (d / "train/state.json").write_text(
+            json.dumps({"_data_files": [{"filename": "../../../victim/keep"}]})
+        ),
+        lambda d: (shutil.rmtree(d / "figures"), (d / "figures").symlink_to(box.victim)),
+        lambda d: ((d / "README.md").unlink(), (d / "README.md").symlink_to(box.victim / "keep")),
+        lambda d: (d / "provenance.json").write_text('{"stage": "*/", "inputs": [' * 2000),
+        lambda d: (d / "provenance.json").write_text("[" * 100_000),
+        lambda d: (d / "provenance.json").write_text('{"inputs": [], "settings": "x"}'),
+    ):
+        hurt = box.out / "hurt"
+        shutil.copytree(good, hurt)
+        (hurt / "figures").mkdir(exist_ok=True)
+        edit(hurt)
+        _run(box, capsys, "card", hurt)
+        _run(box, capsys, "train", hurt, box.out / "run", "--epochs", "1", "--batch-size", "0")
+        shutil.rmtree(hurt)
+
+
+HOSTILE_TEXT = (
+    '*/\n#include "/etc/passwd"\nint main(void){return 7;}/*\\\n??/\n$(shell touch victim)'
+)
+
+
+def test_a_model_s_names_do_not_become_code(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
+    network = random_network(0)
+    layers = tuple(replace(layer, name=HOSTILE_TEXT) for layer in network.layers)
+    bad = replace(network, name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers)
+    folder = box.root / "in" / "model"
+    folder.mkdir()
+    save(bad, folder / INTEGER_NAME)
+    for words in (
+        ("export", folder, box.out / "exported"),
+        ("verify", folder),
+        ("predict", folder, folder, box.out / "x.mcap"),
+        ("quantize", folder, folder, box.out / "q"),
+    ):
+        _run(box, capsys, *words)
+    written = box.out / "c"
+    written.mkdir()
+    for name in write_c(bad, written, []):
+        text = (written / name).read_text()
+        assert "/etc/passwd" not in text
+        assert "$(shell touch" not in text
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("width_px",), "1); system(0"),
+        (("name",), 3),
+        (("threshold",), float("nan")),
+        (("threshold",), "0.5"),
+        (("layers", 0, "stride"), "1 */"),
+        (("layers", 0, "stride"), 0),
+        (("layers", 0, "source"), 10**30),
+        (("layers", 0, "scale"), float("inf")),
+        (("heads", "confidence", "tensor"), 99),
+        (("heads", "confidence", "channel"), "0"),
+        (("layers",), 7),
+        (("layers", 0), None),
+        (("heads",), []),
+    ],
+)
+def test_a_model_s_numbers_are_numbers(
+    path: tuple[Any, ...], value: Any, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = box.root / "in" / "model"
+    folder.mkdir()
+    save(random_network(0), folder / INTEGER_NAME)
+    with np.load(folder / INTEGER_NAME) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    said = json.loads(arrays.pop("description").tobytes())
+    place = said
+    for step in path[:-1]:
+        place = place[step]
+    place[path[-1]] = value
+    text = np.frombuffer(json.dumps(said).encode(), np.uint8)
+    np.savez(folder / INTEGER_NAME, description=text, **arrays)
+    assert _run(box, capsys, "export", folder, box.out / "x") == 1
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_takes_damaged_inputs_as_errors(
+    name: str, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    deep = {
+        "deep.json": "[" * 50_000,
+        "deep.toml": f"kind = {'[' * 50_000}",
+        "text.mcap": "not a recording",
+        "table.toml": 'kind = "pipeline"\n[[step]]\nstage = "fly"\nout = "x"\nsettings = 3\n',
+    }
+    for file, text in deep.items():
+        (box.root / "in" / file).write_text(text)
+    pattern = {
+        "run": ("run", "IN", "--out", "OUT"),
+        "render": ("render", "IN", "OUT"),
+        "fly": ("fly", "IN", "OUT"),
+        "sketch": ("sketch", "IN", "--images", "1"),
+        "demo": ("demo", "--out", "IN"),
+        "convert": ("convert", "IN", "OUT", "--from", "images", "--camera", "IN"),
+        "calibrate": ("calibrate", "IN", "OUT.toml"),
+        "record": ("record", "OUT.mcap", "--robot", "../../x=udp://127.0.0.1:1"),
+        "fake-drone": ("fake-drone", "--flight", "IN", "--uri", "udp://127.0.0.1:0x"),
+        "train": ("train", "IN", "OUT"),
+        "predict": ("predict", "IN", "IN", "OUT.mcap"),
+        "quantize": ("quantize", "IN", "IN", "OUT"),
+        "view": ("view", "IN", "--save", "OUT.rrd"),
+        "evaluate": ("evaluate", "IN"),
+        "info": ("info", "IN"),
+        "check": ("check", "IN"),
+        "card": ("card", "IN"),
+        "verify": ("verify", "IN"),
+    }.get(name, (name, "IN", "OUT.mcap"))
+    for file in [*deep, "."]:
+        given = str(box.root / "in" / file)
+        words = [w.replace("IN", given).replace("OUT", str(box.out / "x")) for w in pattern]
+        assert _run(box, capsys, *words) == 1
+    assert list(box.out.iterdir()) == []
