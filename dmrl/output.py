@@ -22,6 +22,7 @@ MOST_NAME_BYTES = 255 - len(SUFFIX)
 
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
 _begun: list[Path] = []
+_ended: list[Path] = []
 
 
 def partial_of(path: Path) -> Path:
@@ -37,6 +38,11 @@ def note(path: Path) -> None:
 def standing() -> list[Path]:
     """Outputs of this process that are whole and stand under their final name."""
     return [path for path in _begun if path.exists()]
+
+
+def outputs_done() -> int:
+    """How many outputs of this process are done with, whole or not; inputs may change then."""
+    return len(_ended)
 
 
 def refuse_existing(path: Path) -> None:
@@ -118,6 +124,7 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
                 with suppress(OSError):  # it would hide the error that brought us here
                     partial.unlink(missing_ok=True)
             os.close(held)
+            _ended.append(path)
 
 
 @contextmanager
@@ -183,6 +190,7 @@ def partial_folder(
             if not kept:
                 shutil.rmtree(partial, ignore_errors=True)
             os.close(held)
+            _ended.append(path)
 
 
 @contextmanager

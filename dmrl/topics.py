@@ -201,94 +201,94 @@ PAIR_SENSORS = tuple(row for row in SENSORS if row.of_pairs)
 """What a robot measures of a peer."""
 
 
-def _filled(pattern: str, **parts: str) -> str:
+def filled(pattern: str, **parts: str) -> str:
     """The topic. A part that holds a slash would be another topic, and another file's name."""
     return pattern.format(**{what: topic_part(name, what) for what, name in parts.items()})
 
 
 def camera_image(robot: str) -> str:
     """Topic of a robot's images."""
-    return _filled(CAMERA_IMAGE, robot=robot)
+    return filled(CAMERA_IMAGE, robot=robot)
 
 
 def calibration(robot: str) -> str:
     """Topic of a robot's camera calibration."""
-    return _filled(CALIBRATION, robot=robot)
+    return filled(CALIBRATION, robot=robot)
 
 
 def attitude(robot: str) -> str:
     """Topic of a robot's attitude."""
-    return _filled(ATTITUDE, robot=robot)
+    return filled(ATTITUDE, robot=robot)
 
 
 def velocity(robot: str) -> str:
     """Topic of a robot's velocity."""
-    return _filled(VELOCITY, robot=robot)
+    return filled(VELOCITY, robot=robot)
 
 
 def height(robot: str) -> str:
     """Topic of a robot's height."""
-    return _filled(HEIGHT, robot=robot)
+    return filled(HEIGHT, robot=robot)
 
 
 def uwb_range(robot: str, peer: str) -> str:
     """Topic of the distances that a robot measures to a peer."""
-    return _filled(RANGE, robot=robot, peer=peer)
+    return filled(RANGE, robot=robot, peer=peer)
 
 
 def masks(robot: str) -> str:
     """Topic of images whose values say which peer covers a pixel."""
-    return _filled(MASKS, robot=robot)
+    return filled(MASKS, robot=robot)
 
 
 def depths(robot: str) -> str:
     """Topic of images of the distance of peers' surfaces."""
-    return _filled(DEPTHS, robot=robot)
+    return filled(DEPTHS, robot=robot)
 
 
 def labels(robot: str) -> str:
     """Topic of the labels of a robot's images."""
-    return _filled(LABELS, robot=robot)
+    return filled(LABELS, robot=robot)
 
 
 def detections(robot: str) -> str:
     """Topic of what the network found in a robot's images."""
-    return _filled(DETECTIONS, robot=robot)
+    return filled(DETECTIONS, robot=robot)
 
 
 def grid(robot: str) -> str:
     """Topic of the network's output maps for a robot's images."""
-    return _filled(GRID, robot=robot)
+    return filled(GRID, robot=robot)
 
 
 def tracks(robot: str) -> str:
     """Topic of the peers that a robot's detections are followed as."""
-    return _filled(TRACKS, robot=robot)
+    return filled(TRACKS, robot=robot)
 
 
 def position(robot: str, peer: str) -> str:
     """Topic of where a robot estimates a peer to be."""
-    return _filled(POSITION, robot=robot, peer=peer)
+    return filled(POSITION, robot=robot, peer=peer)
 
 
 def truth(robot: str, peer: str) -> str:
     """Topic of where a peer truly is, seen from a robot."""
-    return _filled(TRUTH, robot=robot, peer=peer)
+    return filled(TRUTH, robot=robot, peer=peer)
 
 
 def pose(robot: str) -> str:
     """Topic of where a robot estimates itself to be."""
-    return _filled(POSE, robot=robot)
+    return filled(POSE, robot=robot)
 
 
 def true_pose(robot: str) -> str:
     """Topic of where a robot truly is."""
-    return _filled(TRUE_POSE, robot=robot)
+    return filled(TRUE_POSE, robot=robot)
 
 
 def log(robot: str, event: str) -> str:
     """Topic of a robot's log variables, as they were logged."""
-    return _filled(LOG, robot=robot, event=event)
+    return filled(LOG, robot=robot, event=event)
 
 
 @cache

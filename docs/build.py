@@ -23,7 +23,8 @@ COMMANDS_HEAD = """\
 What `dmrl COMMAND --help` says, in the order of the work. Written by `make docs`.
 
 Results go to standard output (`--json` gives one document for programs), progress and news to
-standard error. Exit status: 0 done, 1 a known error in one line, 2 a bad command line.
+standard error. Exit status: 0 done, 1 an error in one line, 2 a bad command line; see
+[reliability.md](reliability.md).
 """
 
 

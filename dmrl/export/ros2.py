@@ -192,6 +192,12 @@ def _compressed(types: Any, message: Any, time_ns: int) -> Any:
 
 
 def _camera_info(types: Any, message: Any, time_ns: int) -> Any:
+    sizes = (len(message.K), len(message.R), len(message.P))
+    if sizes != (9, 9, 12):
+        raise RecordingError(
+            f"a camera calibration at {time_ns} ns has {sizes} numbers in K, R and P, not 9, 9 and "
+            "12, as a bag wants. Leave its topic out: dmrl trim"
+        )
     k, p = np.array(message.K), np.array(message.P)
     k[[2, 5]] -= HALF_PX
     p[[2, 6]] -= HALF_PX

@@ -45,6 +45,12 @@ def camera_of(recording: Path, held: Summary, robot: str) -> Camera | None:
             f"{len(found.D)} coefficients, dmrl knows plumb_bob with 5. Give another calibration: "
             "dmrl calibrate --board, then --camera"
         )
+    numbers = [*found.K, *found.D]
+    if len(found.K) != 9 or not np.isfinite(numbers).all() or min(found.K[0], found.K[4]) <= 0:
+        raise RecordingError(
+            f"{recording}: {topic} has no camera matrix of 9 numbers. Give another calibration: "
+            "dmrl calibrate --board, then --camera"
+        )
     fx, _, cx, _, fy, cy, *_ = found.K
     return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D[:5]))
 

@@ -11,6 +11,7 @@ from typing import Any
 from dmrl.documents import parse_json
 from dmrl.errors import RecordingError
 from dmrl.recording.index import summary
+from dmrl.recording.opening import expect_unchanged
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
 
 NO_CONTENT = ("README.md", "figures", "tensorboard")
@@ -88,6 +89,8 @@ def input_of(path: Path) -> Input:
     """
     if not path.exists():
         raise RecordingError(f"no file or folder {path}. Check the name")
+    if path.suffix == ".mcap" and path.is_file():
+        expect_unchanged(path)
     digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
     return Input(path.resolve().name, digest, _own_provenance(path))
 

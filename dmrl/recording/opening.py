@@ -1,6 +1,7 @@
 """A recording's file, opened: it begins and ends as one, and no read goes beyond its end."""
 
 import io
+import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from mcap.exceptions import McapError
 from mcap.stream_reader import CRCValidationError
 
 from dmrl.errors import RecordingError
+from dmrl.output import outputs_done
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")  # opcode, length
@@ -60,6 +62,7 @@ def opened(path: Path) -> Iterator[Bounded]:
         raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
     try:
         with Bounded(path) as stream:
+            _refuse_changed(path, stream)
             _check_ends(path, stream)
             yield stream
     except FileNotFoundError:
@@ -68,6 +71,30 @@ def opened(path: Path) -> Iterator[Bounded]:
         raise RecordingError(f"{path} may not be read. Check its permissions") from None
     except DAMAGE as e:
         raise damaged(path, e) from e
+
+
+Stamp = tuple[int, int, int]
+_HASHED: dict[Path, tuple[int, Stamp]] = {}
+
+
+def _stamp(stream: Bounded) -> Stamp:
+    status = os.fstat(stream.fileno())
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def expect_unchanged(path: Path) -> None:
+    """Refuse to open a recording, whose hash is in a provenance now, once it is another.
+
+    Until the next output of this process is done: what is read belongs to what was hashed.
+    """
+    with Bounded(path) as stream:
+        _HASHED[path] = outputs_done(), _stamp(stream)
+
+
+def _refuse_changed(path: Path, stream: Bounded) -> None:
+    when, stamp = _HASHED.get(path, (-1, None))
+    if when == outputs_done() and stamp != _stamp(stream):
+        raise RecordingError(f"{path} was changed while it was read. Run it again")
 
 
 def damaged(path: Path, cause: object) -> RecordingError:

@@ -131,10 +131,10 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
     if settings.masks and not any(_has_masks(path) for path in recordings):
         raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     with partial_folder(out) as partial:
-        total = sum(count_images(path) for path in recordings)
         made = provenance(
             "dataset", settings, recordings, seed=settings.seed, libraries=("pyarrow", "pillow")
         )
+        total = sum(count_images(path) for path in recordings)
         sources = {path: label_source(path, settings.labels) for path in recordings}
         beside = _beside(sources)
         split_of = _splits(recordings, made, settings)
@@ -203,7 +203,8 @@ def _warn_of_lenses(recordings: Sequence[Path]) -> None:
     for path in recordings:
         for topic in summary(path).topics:
             if topics.names(topics.CALIBRATION, topic):
-                focal_px += [one.message.K[0] for one in islice(read(path, topic), 1)]
+                first = (one.message.K for one in islice(read(path, topic), 1))
+                focal_px += [k[0] for k in first if len(k) == 9 and k[0] > 0]
     if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
         say(
             f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "

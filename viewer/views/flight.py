@@ -110,8 +110,9 @@ def _stills(selection: Selection, seen: Motion, robots: Sequence[str]) -> Iterat
             yield space.still_frame(optical_frame(robot), camera_frame(robot), space.OPTICAL_XYZW)
         yield from space.body(robot)
         topic = topics.calibration(robot)
-        # Zeros: not calibrated.
-        if topic in calibrations and any(calibrations[topic]["K"]):
+        # Zeros: not calibrated. Others than nine: no camera.
+        k = calibrations[topic]["K"] if topic in calibrations else ()
+        if len(k) == 9 and any(k):
             yield space.frustum(robot, topic, calibrations[topic])
 
 
