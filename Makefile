@@ -12,7 +12,7 @@ INSTALL := $(BIN)/pip install --constraint constraints.txt --editable
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all mutants check format lint types imports spell schemas docs layout clean
+.PHONY: help demo test test-all test-faults mutants check format lint types imports spell schemas docs layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -28,6 +28,9 @@ test-all: $(VENV)/.dev ## Run every test, the slow ones too.
 
 mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. ARGS="geometry --seed 1".
 	$(BIN)/python tests/mutants.py $(ARGS)
+
+test-faults: $(VENV)/.dev ## Break disks, processes and files in every way; prints what came of it.
+	$(PYTEST) -m "slow or not slow" --timeout 3600 tests/faults tests/recording/test_flips.py tests/recording/test_budgets.py tests/formats/test_fuzz.py $(ARGS)
 
 check: format lint types imports spell ## Check format, lint, types, imports and spelling.
 

@@ -144,11 +144,17 @@ class Dataset:
 
     def _arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
         folder = inside(self.path, name, f"{self.path}: a split")
-        files = [item["filename"] for item in _read_json(folder / "state.json")["_data_files"]]
-        info = (_read_json(folder / "dataset_info.json").get("splits") or {}).get(name, {})
-        rows = info.get("shard_lengths") or [None] * len(files)
-        paths = [inside(folder, file, f"{folder}: a shard") for file in files]
-        return list(zip(paths, rows, strict=True))
+        state, about = folder / "state.json", folder / "dataset_info.json"
+        try:
+            files = [str(item["filename"]) for item in _read_json(state)["_data_files"]]
+            info = (_read_json(about).get("splits") or {}).get(name, {})
+            rows = info.get("shard_lengths") or [None] * len(files)
+            named = list(zip(files, rows, strict=True))
+        except (KeyError, TypeError, AttributeError, ValueError) as e:
+            raise DatasetError(
+                f"{state} or {about} is not what it should be ({e}). Make the dataset again"
+            ) from None
+        return [(inside(folder, file, f"{folder}: a shard"), count) for file, count in named]
 
     def _parquet_shards(self, name: str) -> list[tuple[Path, int | None]]:
         found = {index: count for split, index, count in _parquet_names(self.path) if split == name}
@@ -179,13 +185,21 @@ def open_dataset(path: Path) -> Dataset:
     """
     parquet = not (path / "dataset_dict.json").is_file()
     if not parquet:
-        splits = tuple(_read_json(path / "dataset_dict.json")["splits"])
+        splits = _splits(path / "dataset_dict.json")
     else:
         splits = tuple(sorted({split for split, _, _ in _parquet_names(path)}, reverse=True))
     if not splits:
         what = "is not a dataset" if path.exists() else "does not exist"
         raise DatasetError(f"{path} {what}. Make one with: dmrl dataset RECORDING.mcap {path}")
     return Dataset(path, tuple(split_name(name, f"{path}: a split") for name in splits), parquet)
+
+
+def _splits(file: Path) -> tuple[str, ...]:
+    said = _read_json(file)
+    found = said.get("splits") if isinstance(said, dict) else None
+    if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
+        raise DatasetError(f"{file} has no list of splits. Make the dataset again")
+    return tuple(found)
 
 
 def _parquet_names(folder: Path) -> list[tuple[str, int, int]]:

@@ -136,7 +136,8 @@ def decode(
         return np.take_along_axis(grid.reshape(images, -1), best, axis=1)
 
     depth = there(depth_m).astype(np.float64)
-    sigma = np.sqrt(2) * depth * there(spread)  # Laplace
+    with np.errstate(invalid="ignore", over="ignore"):  # a network may say anything
+        sigma = np.sqrt(2) * depth * there(spread)  # Laplace
     count = np.maximum((kept >= max(min_confidence, 0.0)).sum(axis=1), 1)
     found = Found(uv[0], uv[1], depth, kept.astype(np.float64), sigma, there(class_id), count)
     return found if offset is None else _without_doubles(found)

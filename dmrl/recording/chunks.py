@@ -119,11 +119,14 @@ def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) 
     Raises
     ------
     McapError
-        If a message is of no channel in ``known``.
+        If a message is of no channel in ``known``, or its time is beyond the year 2262, where 64
+        bits with a sign end.
     """
     present = set(np.unique(block.channel).tolist())
     if unknown := present - set(known):
         raise McapError(f"messages of channel {min(unknown)}, which is not defined")
+    if len(block) and min(int(block.time_ns.min()), int(block.publish_ns.min())) < 0:
+        raise McapError("a message has a time beyond the year 2262")
     return block if present <= set(numbers) else block.take(np.isin(block.channel, list(numbers)))
 
 
@@ -146,8 +149,8 @@ def loose(messages: list[Message]) -> Block:
     return Block(
         np.frombuffer(b"".join(m.data for m in messages), np.uint8),
         np.array([m.channel_id for m in messages], np.int64),
-        np.array([m.log_time for m in messages], np.int64),
-        np.array([m.publish_time for m in messages], np.int64),
+        np.array([m.log_time for m in messages], np.uint64).astype(np.int64),
+        np.array([m.publish_time for m in messages], np.uint64).astype(np.int64),
         end - size,
         end,
     )

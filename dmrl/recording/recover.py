@@ -51,6 +51,8 @@ class Recovery:
         Chunks within the file that failed their CRC and were left out.
     nameless
         Messages left out because what defines their topic was in a damaged chunk.
+    timeless
+        Messages left out because their time is beyond the year 2262.
     lost_bytes
         Bytes that are no whole record: after the last one, or before one that is known.
     missing
@@ -67,6 +69,7 @@ class Recovery:
     messages: int = 0
     damaged_chunks: int = 0
     nameless: int = 0
+    timeless: int = 0
     lost_bytes: int = 0
     missing: dict[str, int] = field(default_factory=dict)
     counted: bool = False
@@ -204,6 +207,9 @@ def _named(walk: _Walk, block: Block) -> Iterator[RawMessage]:
         if channel is None:
             walk.recovery.nameless += 1
             continue
+        if time_ns < 0 or publish_ns < 0:
+            walk.recovery.timeless += 1
+            continue
         walk.found[number] += 1
         yield RawMessage(time_ns, publish_ns, channel, data)
 
@@ -296,6 +302,7 @@ def _account(walk: _Walk) -> None:
         walk.footer
         and walk.chunks == (len(walk.end.chunk_indexes) or walk.chunks)
         and not recovery.doubtful
-        and not (recovery.damaged_chunks or recovery.nameless or recovery.lost_bytes)
+        and not (recovery.damaged_chunks or recovery.lost_bytes)
+        and not (recovery.nameless or recovery.timeless)
         and not recovery.missing
     )

@@ -54,6 +54,7 @@ def _lost(result: Recovery) -> str:
         f"{sum(result.missing.values())} messages missing ({missing})" * bool(missing),
         f"{result.damaged_chunks} damaged chunks left out" * bool(result.damaged_chunks),
         f"{result.nameless} messages left out whose topic they defined" * bool(result.nameless),
+        f"{result.timeless} messages left out whose time is impossible" * bool(result.timeless),
         f"{result.lost_bytes} bytes that are no whole record lost" * bool(result.lost_bytes),
         "metadata or attachments missing, or damaged and kept as they stand" * result.doubtful,
         unknown * (not result.counted),
