@@ -1,6 +1,7 @@
 """What the tests of faults share: inputs, one command run to its end, and the table of counts."""
 
 import io
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -15,6 +16,13 @@ from .works import Inputs, contents, prepare
 
 Count = Callable[..., None]
 ROW = "faults"
+SHARE = float(os.environ.get("DMRL_FAULTS", "1"))
+"""Of the cases that the slow tests try. 0.1 on a machine that has little time."""
+
+
+def cases_of(most: int) -> int:
+    """How many of them are tried."""
+    return max(1, round(SHARE * most))
 
 
 @pytest.fixture(scope="session")
