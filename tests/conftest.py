@@ -4,10 +4,15 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from dmrl.rendering import environment
 
 REPOSITORY = Path(__file__).parents[1]
+
+# On a machine that is busy an example may take long; a test that hangs ends by pytest-timeout.
+settings.register_profile("dmrl", deadline=None)
+settings.load_profile("dmrl")
 
 
 @pytest.fixture(scope="session")
