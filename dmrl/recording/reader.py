@@ -136,10 +136,21 @@ def read(
         kind = classes.get(raw.channel)
         if kind is None:
             kind = classes[raw.channel] = GetMessageClass(descriptor_of(path, raw.channel))
-        try:
-            yield Stamped(raw.time_ns, raw.channel.topic, kind.FromString(raw.data))
-        except DecodeError as e:
-            raise damaged(path, f"{raw.topic} at {raw.time_ns} ns: {e}") from e
+        yield Stamped(raw.time_ns, raw.channel.topic, parsed(raw, kind, path))
+
+
+def parsed(raw: RawMessage, kind: Any, path: Path) -> Any:
+    """The message of a class that a recording's bytes hold.
+
+    Raises
+    ------
+    RecordingError
+        If they hold none.
+    """
+    try:
+        return kind.FromString(raw.data)
+    except DecodeError as e:
+        raise damaged(path, f"{raw.topic} at {raw.time_ns} ns: {e}") from e
 
 
 def descriptor_of(path: Path, channel: Channel) -> Descriptor:

@@ -20,6 +20,7 @@ from dmrl.recording import (
     RecordingWriter,
     Summary,
     copy_extras,
+    parsed,
     provenance,
     read_raw,
     read_table,
@@ -115,7 +116,10 @@ def _earliest_ns(
     for topic in held.topics:
         if topic == topics.TRANSFORMS:  # whose they are stands inside
             raws = list(read_raw(recording, topic))
-            found += [raw.time_ns + _correction_ns(raw, raw.time_ns, clocks, held) for raw in raws]
+            found += [
+                raw.time_ns + _correction_ns(raw, raw.time_ns, clocks, held, recording)
+                for raw in raws
+            ]
             continue
         times = read_table(recording, topic, fields=())["log_time"].to_numpy()
         if len(times):
@@ -222,8 +226,9 @@ def _write(
         sink.add_metadata(METADATA, told)
         for raw in copied:
             even_ns = steady.get(raw.topic, {}).get(raw.time_ns, raw.time_ns)
-            shift_ns = later_ns + _correction_ns(raw, even_ns, clocks, held)
-            sink.write_raw(_at(raw, even_ns + shift_ns, max(raw.publish_ns + shift_ns, 0)))
+            shift_ns = later_ns + _correction_ns(raw, even_ns, clocks, held, recording)
+            times_ns = even_ns + shift_ns, max(raw.publish_ns + shift_ns, 0)
+            sink.write_raw(_at(raw, *times_ns, recording))
 
 
 def _told(clock: Clock, start_ns: int) -> dict[str, float | str]:
@@ -238,8 +243,8 @@ def _told(clock: Clock, start_ns: int) -> dict[str, float | str]:
     }
 
 
-def _at(raw: RawMessage, time_ns: int, publish_ns: int) -> RawMessage:
-    data = raw.data if time_ns == raw.time_ns else _stamped(raw, time_ns)
+def _at(raw: RawMessage, time_ns: int, publish_ns: int, recording: Path) -> RawMessage:
+    data = raw.data if time_ns == raw.time_ns else _stamped(raw, time_ns, recording)
     return replace(raw, time_ns=time_ns, publish_ns=publish_ns, data=data)
 
 
@@ -250,9 +255,13 @@ def _shift_ns(time_ns: int, clock: Clock, start_ns: int) -> int:
 
 
 def _correction_ns(
-    raw: RawMessage, time_ns: int, clocks: Mapping[str, Clock], held: Summary
+    raw: RawMessage,
+    time_ns: int,
+    clocks: Mapping[str, Clock],
+    held: Summary,
+    recording: Path,
 ) -> int:
-    clock = _clock_of(raw.topic, _robot(raw), clocks)
+    clock = _clock_of(raw.topic, _robot(raw, recording), clocks)
     return _shift_ns(time_ns, clock, held.start_ns) if clock else 0
 
 
@@ -265,20 +274,20 @@ def _clock_of(topic: str, robot: str, clocks: Mapping[str, Clock]) -> Clock | No
     return clocks.get(robot)
 
 
-def _robot(raw: RawMessage) -> str:
+def _robot(raw: RawMessage, recording: Path) -> str:
     """Whose message it is; of transforms, whose the first frame is."""
     if raw.topic != topics.TRANSFORMS:
         return raw.topic.split("/")[1] if raw.topic.count("/") > 1 else ""
-    frames = message("FrameTransforms").FromString(raw.data).transforms
+    frames = parsed(raw, message("FrameTransforms"), recording).transforms
     return str(frames[0].child_frame_id.split("/")[0]) if frames else ""
 
 
-def _stamped(raw: RawMessage, time_ns: int) -> bytes:
+def _stamped(raw: RawMessage, time_ns: int, recording: Path) -> bytes:
     """The message with its own time set as well, where it has one."""
     name = raw.schema_name.removeprefix("foxglove.")
     if name not in (*STAMPED, "FrameTransforms"):
         return raw.data
-    decoded = message(name).FromString(raw.data)
+    decoded = parsed(raw, message(name), recording)
     for part in decoded.transforms if name == "FrameTransforms" else [decoded]:
         part.timestamp.seconds, part.timestamp.nanos = divmod(time_ns, 1_000_000_000)
     return bytes(decoded.SerializeToString())

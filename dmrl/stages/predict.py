@@ -25,6 +25,7 @@ from dmrl.recording import (
     RawMessage,
     RecordingWriter,
     copy_extras,
+    parsed,
     provenance,
     read_raw,
     summary,
@@ -163,7 +164,7 @@ def _robot(raw: RawMessage) -> str | None:
 
 def _decode(raw: RawMessage, detector: Detector, recording: Path) -> Rgb:
     what = f"{recording}: the image of {raw.topic} at {raw.time_ns} ns"
-    rgb = decode(message("CompressedImage").FromString(raw.data).data, what)
+    rgb = decode(parsed(raw, message("CompressedImage"), recording).data, what)
     detector.require_size(rgb.shape[1], rgb.shape[0], what)
     return rgb
 
