@@ -107,8 +107,8 @@ def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibr
     tries = _tries(views, camera, start, noise)
     if not tries:
         return None
-    ends = [_refined(views, camera, one, noise) for one in _apart(tries)]
-    ends = sorted((end for end in ends if end is not None), key=lambda end: end[0].cost)
+    refined = [_refined(views, camera, one, noise) for one in _apart(tries)]
+    ends = sorted((end for end in refined if end is not None), key=lambda end: end[0].cost)
     if not ends:
         return None
     found, matched = ends[0]

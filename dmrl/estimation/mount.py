@@ -127,7 +127,7 @@ def solve(
             halves.append(half)
             information += half.information
             score += half.score
-        step = np.linalg.solve(information, score)
+        step = np.asarray(np.linalg.solve(information, score), np.float64)
         errors = [e + h.follow(step) for e, h in zip(errors, halves, strict=True)]
         moved = np.clip(values + step, -LARGEST, LARGEST)
         settled = np.abs(moved - values).max() < SETTLED
@@ -250,4 +250,4 @@ def slopes_of(views: Sequence[View], camera: Camera, matched: Matched, values: A
         - residual(views, camera, matched, values + step)
         for step in np.diag(STEPS)
     ]
-    return np.stack(sides, axis=2) / (2 * STEPS)
+    return np.asarray(np.stack(sides, axis=2) / (2 * STEPS))
