@@ -41,7 +41,7 @@ def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
 
 
 def test_all_together_are_nearer_the_truth_than_pair_by_pair() -> None:
-    flight, _, pairwise, swarm = solved("random", "calibrated")
+    flight, _, pairwise, swarm = solved("in_view", "realistic")
     assert set(swarm) == set(pairwise)
     one, other = (np.sqrt(np.mean(errors(flight, e) ** 2)) for e in (pairwise, swarm))
     assert other < 0.9 * one
