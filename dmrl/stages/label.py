@@ -54,7 +54,7 @@ class Settings:
         ekf: its noise, as published for simulation or in the firmware.
     gate_m
         A position that is off by more than this is a bad one, metres. Of a flight's OK positions
-        at most 3.5 % are expected to be bad; docs/labelling.md says how many were.
+        at most 4.5 % are expected to be bad; docs/labelling.md says how many were.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
     detections
