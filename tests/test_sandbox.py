@@ -451,3 +451,15 @@ def test_an_input_that_is_changed_meanwhile_is_one_line(
     said = capsys.readouterr().err
     assert "flight.mcap was changed while it was read. Run it again" in said
     assert list(box.out.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["../../victim/x", "{victim}/x", "recipe.toml", "..", "a/../../x"])
+def test_a_recipe_s_step_writes_in_the_pipeline_s_folder(
+    name: str, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = name.replace("{victim}", str(box.victim))
+    recipe = box.root / "in" / "recipe.toml"
+    step = f'[[step]]\nstage = "sketch"\nout = "{out}"\n[step.settings]\nimages = 1\n'
+    recipe.write_text(f'kind = "pipeline"\n{step}')
+    assert _run(box, capsys, "run", recipe, "--out", box.out / "a") == 1
+    assert list(box.out.iterdir()) == []
