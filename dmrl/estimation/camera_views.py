@@ -169,9 +169,8 @@ def match(views: Sequence[View], camera: Camera, radius_px: float, noise: Noise)
         time_s = flight.image_s[image]
         whiten = _whitening(jacobian[image, :2], peer.spread(time_s - camera.delay_s), noise)
         parts.append((time_s, flight.uv[nearest], np.full(len(image), number), whiten))
-    return Matched(
-        *(np.concatenate(column) for column in zip(*parts, strict=True)), count, radius_px
-    )
+    time_s, uv, view, whiten = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Matched(time_s, uv, view, whiten, count, radius_px)
 
 
 def _whitening(jacobian: Array, covariance: Array, noise: Noise) -> Array:
