@@ -16,7 +16,7 @@ from pathlib import Path
 from dmrl.errors import OutputError
 from dmrl.locking import UNSUPPORTED, is_held, refuse_locked, take_file, take_folder
 
-SUFFIX, OLD = ".partial", ".old"
+SUFFIX = ".partial"
 MOST_NAME_BYTES = 255 - len(SUFFIX)
 """Of an output's name: file systems take 255, and the unfinished one is called longer."""
 
@@ -191,33 +191,6 @@ def partial_folder(
                 shutil.rmtree(partial, ignore_errors=True)
             os.close(held)
             _ended.append(path)
-
-
-@contextmanager
-def replaced(path: Path) -> Iterator[None]:
-    """The block may write ``path`` anew; what stood there goes when the new one is whole.
-
-    Until then it stands aside as ``<name>.old``, and comes back if the block fails. A kill
-    leaves it there; the next call goes on with it.
-
-    Raises
-    ------
-    OutputError
-        If the system refuses to move or remove it.
-    """
-    old = path.with_name(path.name + OLD)
-    try:
-        if path.exists() or path.is_symlink():
-            _remove(old)
-            path.rename(old)
-        yield
-    except BaseException:
-        with suppress(OSError):
-            if not (path.exists() or path.is_symlink()):
-                old.rename(path)
-        raise
-    with _refusals(path, old):
-        _remove(old)
 
 
 def _remove(path: Path) -> None:

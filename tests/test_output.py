@@ -18,7 +18,6 @@ from dmrl.output import (
     partial_folder,
     partial_of,
     refuse_existing,
-    replaced,
     rewritten_file,
 )
 
@@ -324,28 +323,3 @@ def test_a_folder_removed_while_it_is_written_is_said(tmp_path: Path) -> None:
     with gone, partial_folder(tmp_path / "set") as partial:
         partial.rmdir()
         (partial / "a").write_text("x")
-
-
-@pytest.mark.parametrize("kind", ["file", "folder"])
-def test_an_old_output_goes_when_the_new_one_is_whole(kind: str, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-
-    def make(word: str) -> None:
-        if kind == "folder":
-            with partial_folder(out) as partial:
-                (partial / "a").write_text(word)
-        else:
-            with partial_file(out) as partial:
-                partial.write_text(word)
-
-    with replaced(out):
-        make("first")
-    with pytest.raises(ZeroDivisionError), replaced(out):
-        raise ZeroDivisionError
-    inner = out / "a" if kind == "folder" else out
-    assert inner.read_text() == "first"
-    with replaced(out):
-        assert not out.exists()
-        make("second")
-    assert inner.read_text() == "second"
-    assert list(tmp_path.iterdir()) == [out]
