@@ -59,11 +59,61 @@ def test_generated_parts_are_fresh(page: str) -> None:
     assert (ROOT / page).read_text(encoding="utf-8") == made, "run: make docs"
 
 
+def links(page: Path) -> list[tuple[Path, str]]:
+    """Files of the repository that a page links to, and the heading in each, or ""."""
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    targets = re.findall(r"\]\(([^)\s]+)\)", text)
+    inside = [t.partition("#") for t in targets if not re.match(r"[a-z]+:", t)]
+    return [((page.parent / path).resolve() if path else page, at) for path, _, at in inside]
+
+
+def anchors(page: Path) -> set[str]:
+    """What GitHub calls the headings of a page."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    headings = re.findall(r"^#+ (.*)", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.strip().lower()).replace(" ", "-") for h in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
-def test_links_to_files_of_the_repository_lead_somewhere(page: Path) -> None:
-    targets = re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8"))
-    inside = [t for t in targets if not t.startswith(("http://", "https://"))]
-    assert [t for t in inside if not (page.parent / t).exists()] == []
+def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
+    found = links(page)
+    assert [path for path, _ in found if not path.exists()] == []
+    assert [(p.name, at) for p, at in found if at and at not in anchors(p)] == []
+
+
+def reached(start: Path) -> set[Path]:
+    """Pages that can be reached from one by links."""
+    seen, todo = {start}, [start]
+    while todo:
+        new = {p for p, _ in links(todo.pop()) if p.suffix == ".md" and p.exists()} - seen
+        seen |= new
+        todo += new
+    return seen
+
+
+def test_no_page_is_orphaned() -> None:
+    assert set(ROOT.glob("docs/*.md")) - reached(ROOT / "README.md") == set()
+
+
+def test_the_index_names_every_page() -> None:
+    index = ROOT / "docs/index.md"
+    named = {path for path, _ in links(index)} | {index}
+    assert sorted(p.name for p in set(ROOT.glob("docs/*.md")) - named) == []
+
+
+def test_the_page_on_python_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = ROOT / "docs/python.md"
+    monkeypatch.chdir(tmp_path)
+    for line in command_lines(page):
+        app(shlex.split(line)[1:], result_action="return_value")
+    capsys.readouterr()
+    code = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    exec("\n".join(code), {})
+    said = capsys.readouterr().out
+    assert "/cf1/labels 20\n" in said
+    assert "16 (16, 224, 320, 3) (16, 28, 40) (16, 28, 40)\n" in said
 
 
 def test_the_two_set_up_commands_are_targets_of_make() -> None:
