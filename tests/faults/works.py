@@ -22,15 +22,14 @@ kind = "pipeline"
 [[step]]
 stage = "sketch"
 out = "pictures"
-[step.settings]
 images = 2
 [[step]]
 stage = "convert"
-inputs = ["pictures"]
+source = "pictures"
 out = "pictures.mcap"
 [[step]]
 stage = "dataset"
-inputs = ["pictures.mcap"]
+recordings = ["pictures.mcap"]
 out = "set"
 """
 
