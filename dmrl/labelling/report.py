@@ -8,11 +8,22 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.estimation.estimate import Estimate
-from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
+from dmrl.estimation.gate import OK
+from dmrl.estimation.linear import (
+    BIAS,
+    CLOCK,
+    OWN_GYRO,
+    OWN_SCALE,
+    PEER_GYRO,
+    PEER_SCALE,
+)
 from dmrl.estimation.score import inside_truth
 from dmrl.labelling.labels import Positions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 from dmrl.recording import Summary, read_table
+
+TURNS_RADPS, LONGER_M, FASTER, LATER_S = 0.02, 0.2, 0.12, 0.05
+"""What was solved for is worth a line beyond these: several times what sensors in order have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +103,43 @@ def pair_report(
         rmse_ok_m=_rms(error, ok),
         rmse_m=_rms(error, np.ones_like(ok)),
     )
+
+
+def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
+    """One line for each sensor that a solve found to be off, with what to do about it.
+
+    Parameters
+    ----------
+    pair
+        Observer and peer.
+    estimate
+        Of the peer by the observer.
+    """
+    found, name = estimate.constants, "-".join(pair)
+    lines = []
+    for robot, turn, scale in zip(
+        pair, found[[OWN_GYRO, PEER_GYRO]], found[[OWN_SCALE, PEER_SCALE]], strict=True
+    ):
+        if abs(turn) > TURNS_RADPS:
+            lines.append(
+                f"{name}: {robot}'s yaw rate seems biased by {turn:.2g} rad/s; it was solved for. "
+                "Let its gyroscope settle before the flight"
+            )
+        if abs(scale) > FASTER:
+            lines.append(
+                f"{name}: {robot}'s velocity seems {abs(scale):.0%} too "
+                f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right?"
+            )
+    if abs(found[BIAS]) > LONGER_M:
+        lines.append(
+            f"{name}: ranges seem {found[BIAS]:+.2f} m off; it was solved for. Measure it once, "
+            "and give it with --range-offset-m"
+        )
+    if abs(found[CLOCK]) > LATER_S:
+        lines.append(f"{name}: {pair[1]}'s log seems {found[CLOCK]:+.2f} s off. Try: dmrl align")
+    if not (estimate.status == OK).any():
+        lines.append(f"{name}: no position is good enough to label; see the docs on labelling")
+    return lines
 
 
 def _rms(error: Any, chosen: Any) -> float | None:

@@ -24,7 +24,7 @@ try:
     from dmrl.labelling.camera import camera_given, camera_of, image_times
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import read_logs
-    from dmrl.labelling.report import PairReport, pair_report
+    from dmrl.labelling.report import PairReport, doubts, pair_report
     from dmrl.labelling.sight import read_sight
     from dmrl.labelling.sighted import sighted
     from dmrl.labelling.write import label_messages, position_messages
@@ -154,7 +154,8 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     inputs = [recording, *settings.camera.values()]
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     rewrite(recording, out, origin, without=replaced, fresh=fresh)
-    return Result(reports, labels, [*logs.warnings, *warnings])
+    seen = [line for pair in logs.pairs for line in doubts(pair, estimates[pair])]
+    return Result(reports, labels, [*logs.warnings, *warnings, *seen])
 
 
 def _correct(
