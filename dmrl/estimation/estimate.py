@@ -26,9 +26,12 @@ from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
 
 KEY_HZ = 10.0
 """Keyframes per second."""
-INFLATION = 0.93
+INFLATION = 1.03
 """Sigmas of the batch solve are multiplied by this, and where biases are larger than the
 default's by some more: the 95 % ellipse then holds 92 to 98 % in view."""
+GATE_SIGMA = 0.9
+"""The gate goes by sigmas this much smaller: with the ellipse's it expects more bad positions
+than there are."""
 SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
@@ -148,8 +151,8 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
     floor = (flight.silent | far) * np.int8(UNCONVERGED)
-    here = np.maximum(statuses(estimate.state, estimate.covariance, gate_m), floor)
-    there = np.maximum(statuses(back.state, back.covariance, gate_m), floor)
+    here = np.maximum(statuses(estimate.state, estimate.covariance * GATE_SIGMA**2, gate_m), floor)
+    there = np.maximum(statuses(back.state, back.covariance * GATE_SIGMA**2, gate_m), floor)
     if own < STILL or relative < ALIKE:
         here[:] = AMBIGUOUS
     if peer < STILL or relative < ALIKE:

@@ -8,7 +8,6 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.estimation.estimate import Estimate
-from dmrl.estimation.gate import OK
 from dmrl.estimation.linear import (
     BIAS,
     CLOCK,
@@ -137,8 +136,6 @@ def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
         )
     if abs(found[CLOCK]) > LATER_S:
         lines.append(f"{name}: {pair[1]}'s log seems {found[CLOCK]:+.2f} s off. Try: dmrl align")
-    if not (estimate.status == OK).any():
-        lines.append(f"{name}: no position is good enough to label; see the docs on labelling")
     return lines
 
 

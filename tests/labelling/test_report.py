@@ -32,8 +32,3 @@ def test_a_sensor_that_is_off_is_named_with_what_to_do(
     (line,) = doubts(("cf1", "cf2"), estimate(**{constant: value}))
     assert words in line
     assert line.startswith("cf1-cf2: ")
-
-
-def test_a_flight_of_which_nothing_is_kept_says_so() -> None:
-    (line,) = doubts(("cf1", "cf2"), estimate(status=1))
-    assert "no position is good enough" in line
