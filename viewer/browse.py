@@ -123,6 +123,23 @@ def _sorted_out(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[P
 
 
 def _ranked(folder: Path, recordings: Sequence[Path], settings: Settings) -> Ranked:
+    """The rows that are asked for: by error where a model is given, else as they stand."""
+    rows = _rows(folder, settings)
+    filtered = settings.error_from_px is not None or settings.error_to_px is not None
+    if recordings:
+        return _worst_first(folder, rows, recordings, settings, filtered=filtered)
+    if filtered:
+        raise SettingError(
+            "errors are those of a model: name its recording as well. "
+            "Try: dmrl predict MODEL IN.mcap OUT.mcap"
+        )
+    chosen = np.arange(len(rows))[:: settings.every][: settings.most]
+    unknown = np.full(len(chosen), np.nan)
+    return Ranked(rows.take(chosen), len(rows), unknown, unknown, None)
+
+
+def _rows(folder: Path, settings: Settings) -> pa.Table:
+    """Rows of the split and the robot that are asked for; of all, where none is."""
     dataset = open_dataset(folder)
     splits = dataset.splits if settings.split is None else (settings.split,)
     tables = [dataset.split(name).table for name in splits]
@@ -131,20 +148,16 @@ def _ranked(folder: Path, recordings: Sequence[Path], settings: Settings) -> Ran
         rows = rows.filter(pa.compute.equal(rows["robot"], settings.robot))
     if not len(rows):
         raise DatasetError(f"{folder} has no such rows. Leave --split or --robot out")
-    if not recordings:
-        if settings.error_from_px is not None or settings.error_to_px is not None:
-            raise SettingError(
-                "errors are those of a model: name its recording as well. "
-                "Try: dmrl predict MODEL IN.mcap OUT.mcap"
-            )
-        chosen = np.arange(len(rows))[:: settings.every][: settings.most]
-        unknown = np.full(len(chosen), np.nan)
-        return Ranked(rows.take(chosen), len(rows), unknown, unknown, None)
+    return rows
+
+
+def _worst_first(
+    folder: Path, rows: pa.Table, recordings: Sequence[Path], settings: Settings, *, filtered: bool
+) -> Ranked:
     found = find(recordings, folder, keys(rows))
     error_px, error_m = errors_of_rows(rows, found, _image_size(rows))
     low = -1.0 if settings.error_from_px is None else settings.error_from_px
     high = np.inf if settings.error_to_px is None else settings.error_to_px
-    filtered = settings.error_from_px is not None or settings.error_to_px is not None
     # Images that show nobody have no error; unless errors are asked for, they come last.
     kept = (error_px >= low) & (error_px <= high) | (np.isnan(error_px) & (not filtered))
     order = np.argsort(np.nan_to_num(-error_px, nan=np.inf), kind="stable")

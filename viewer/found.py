@@ -1,6 +1,6 @@
 """What a model found in the rows of a dataset, from the recordings that hold it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,22 +52,30 @@ class Found:
         """Columns of GridMap; None unless every row has one."""
         if any(where is None for where in self.where):
             return None
+        times: dict[tuple[Path, str], list[int]] = {}
+        for path, robot, time_ns in filter(None, self.where):
+            times.setdefault((path, robot), []).append(time_ns)
         held = {}
-        for path, robot in dict.fromkeys((w[0], w[1]) for w in self.where if w):
-            times = sorted(w[2] for w in self.where if w and w[:2] == (path, robot))
-            topic = topics.grid(robot)
-            span = {"start_ns": times[0], "end_ns": times[-1] + 1}
-            for stretch in stretches(path, {topic: None}, **span):
-                batch = stretch[topic]
-                own = np.isin(batch["log_time"].to_numpy(), times)
-                for row in np.flatnonzero(own).tolist():
-                    time_ns = batch["log_time"][row].as_py()
-                    held[path, robot, time_ns] = batch.slice(row, 1)
+        for (path, robot), wanted_ns in times.items():
+            for time_ns, row in _maps_at(path, robot, wanted_ns):
+                held[path, robot, time_ns] = row
         if not all(where in held for where in self.where):
             return None
         rows = pa.Table.from_batches([held[where] for where in self.where if where])
         (batch,) = rows.combine_chunks().to_batches()
         return batch
+
+
+def _maps_at(
+    path: Path, robot: str, wanted_ns: Sequence[int]
+) -> Iterator[tuple[int, pa.RecordBatch]]:
+    """Log time and row of the GridMaps of a robot at some log times."""
+    topic = topics.grid(robot)
+    span = {"start_ns": min(wanted_ns), "end_ns": max(wanted_ns) + 1}
+    for stretch in stretches(path, {topic: None}, **span):
+        times_ns = stretch[topic]["log_time"].to_numpy()
+        for row in np.flatnonzero(np.isin(times_ns, wanted_ns)).tolist():
+            yield int(times_ns[row]), stretch[topic].slice(row, 1)
 
 
 def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Found:
@@ -89,18 +97,7 @@ def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Fou
     """
     parts, keys, where = [], [], []
     for path in recordings:
-        kept = summary(path)
-        robots = topics.robots(list(kept.topics), topics.DETECTIONS)
-        if not robots:
-            raise RecordingError(
-                f"{path} has no detections. Try: dmrl predict MODEL {path} OUT.mcap"
-            )
-        names = {path.name, *_ancestors(kept.provenance)} & {source for source, _, _ in wanted}
-        if not names:
-            raise RecordingError(
-                f"{folder} was not made from {path}, nor from what it was predicted on. "
-                "Predict on the dataset's own recordings"
-            )
+        names, robots = _related(path, folder, {source for source, _, _ in wanted})
         own = {topics.detections(robot): robot for robot in robots}
         for stretch in stretches(path, dict.fromkeys(own)):
             for topic, batch in stretch.items():
@@ -114,6 +111,21 @@ def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Fou
         raise RecordingError(f"no image of {folder} is in {recordings[0]}. Predict on its images")
     found = tuple(where[k] if k >= 0 else None for k in place.tolist())
     return Found(pa.Table.from_batches(parts), place, found)
+
+
+def _related(path: Path, folder: Path, sources: set[str]) -> tuple[set[str], list[str]]:
+    """Sources of the dataset that a recording is or was made from, and robots with detections."""
+    kept = summary(path)
+    robots = topics.robots(list(kept.topics), topics.DETECTIONS)
+    if not robots:
+        raise RecordingError(f"{path} has no detections. Try: dmrl predict MODEL {path} OUT.mcap")
+    names = {path.name, *_ancestors(kept.provenance)} & sources
+    if not names:
+        raise RecordingError(
+            f"{folder} was not made from {path}, nor from what it was predicted on. "
+            "Predict on the dataset's own recordings"
+        )
+    return names, robots
 
 
 def _ancestors(made: Provenance | None) -> set[str]:

@@ -162,31 +162,44 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
         )
     if settings.robot is None:
         _say_blind(every)
-    start_ns = min(kept.start_ns for kept in found.values() if kept.count)
-    last_ns = max(kept.end_ns for kept in found.values() if kept.count)
-    lower_ns, upper_ns = (
-        other if s is None else start_ns + _nanoseconds(s)
-        for s, other in ((settings.from_s, start_ns), (settings.to_s, last_ns + 1))
-    )
-    image_ns = _image_times(found, robots, lower_ns, upper_ns)
+    held = [kept for kept in found.values() if kept.count]
+    whole = min(kept.start_ns for kept in held), max(kept.end_ns for kept in held) + 1
+    asked = _asked(settings, whole)
+    image_ns = _image_times(found, robots, *asked)
     chosen = {r: times[:: settings.every] for r, times in image_ns.items() if times.size}
-    empty = upper_ns <= max(lower_ns, start_ns) or lower_ns > last_ns
+    empty = max(asked[0], whole[0]) >= min(asked[1], whole[1])
     if empty or (robots and not chosen and layout in OF_IMAGES):
         raise SettingError(
             f"no image of {names} in that time; it lasts from 0 to "
-            f"{(last_ns - start_ns) / 1e9:.3f} s. Change --from-s or --to-s"
+            f"{(whole[1] - 1 - whole[0]) / 1e9:.3f} s. Change --from-s or --to-s"
         )
+    shown = _shown(layout, chosen, asked, whole)
+    return Selection(found, layout, whole[0], shown, chosen, settings.every == 1)
+
+
+def _asked(settings: Settings, whole: tuple[int, int]) -> tuple[int, int]:
+    """Log times that the flags ask for, [from, to); where they say nothing, all there are."""
+    seconds = settings.from_s, settings.to_s
+    lower, upper = (
+        edge if s is None else whole[0] + _nanoseconds(s)
+        for s, edge in zip(seconds, whole, strict=True)
+    )
+    return lower, upper
+
+
+def _shown(
+    layout: Layout, image_ns: Mapping[str, Times], asked: tuple[int, int], whole: tuple[int, int]
+) -> tuple[int, int]:
+    """Log times [first, end) of what is shown, images and all else."""
+    lower, upper = max(asked[0], whole[0]), min(asked[1], whole[1])
+    if not image_ns:
+        return lower, upper
+    first_image = min(int(times[0]) for times in image_ns.values())
     if layout in OF_IMAGES:
         # What lies before the first image and after the last belongs to none.
-        lower_ns = min(int(times[0]) for times in chosen.values())
-        upper_ns = max(int(times[-1]) for times in chosen.values()) + 1
-    lower_ns = max(lower_ns, start_ns)
-    first_image_ns = min((int(times[0]) for times in chosen.values()), default=lower_ns)
-    if first_image_ns - lower_ns <= LEAD_NS:
-        # A viewer opens at the start, where it should have something to show.
-        lower_ns = first_image_ns
-    shown_ns = lower_ns, min(upper_ns, last_ns + 1)
-    return Selection(found, layout, start_ns, shown_ns, chosen, settings.every == 1)
+        return first_image, max(int(times[-1]) for times in image_ns.values()) + 1
+    # A viewer opens at the start, where it should have something to show.
+    return (first_image if first_image - lower <= LEAD_NS else lower), upper
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -86,14 +86,9 @@ def quantise(
     SettingError
         If the network gives no confidence or no depth.
     """
-    heads = {
-        HEAD_OF[channel]: _head(graph, ranges, k, HEAD_OF[channel], about.stride_px)
-        for k, channel in enumerate(about.channels)
-        if channel in HEAD_OF
-    }
-    if absent := sorted({"confidence", "depth"} - heads.keys()):
-        raise SettingError(f"{about.name} gives no {absent[0]}, which detections are made of")
+    heads = _heads(graph, ranges, about)
     layers: list[AnyLayer] = []
+    # Scale and type of every tensor that is there by now; the first is the image.
     scales = [1 / PIXEL_ZERO]
     signed = [False]
     for index, layer in enumerate(graph.layers):
@@ -120,6 +115,18 @@ def quantise(
         threshold=about.threshold,
         **heads,
     )
+
+
+def _heads(graph: Graph, ranges: Ranges, about: About) -> dict[str, Head]:
+    """The heads of a network, by name."""
+    heads = {
+        HEAD_OF[channel]: _head(graph, ranges, k, HEAD_OF[channel], about.stride_px)
+        for k, channel in enumerate(about.channels)
+        if channel in HEAD_OF
+    }
+    if absent := sorted({"confidence", "depth"} - heads.keys()):
+        raise SettingError(f"{about.name} gives no {absent[0]}, which detections are made of")
+    return heads
 
 
 def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) -> Head:

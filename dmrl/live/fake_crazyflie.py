@@ -171,24 +171,31 @@ class FakeCrazyflie(threading.Thread):
             self._socket.sendto(bytes([port << 4 | 3 << 2 | channel]) + data, to)
 
     def _answer(self, packet: bytes, sender: Address) -> None:
+        """Send what the firmware would; it has no answer to some packets."""
         port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
-        reply: bytes | None = None
-        if port == LINK:
-            reply = data if channel in (0, 3) else b"Bitcraze Crazyflie\0"
-        elif port == PLATFORM and channel == 1 and data[:1] == b"\0":
-            reply = bytes([0, PROTOCOL_VERSION])
-        elif port == MEMORY and channel == 0 and data[:1] == b"\1":
-            reply = b"\1\0"
-        elif port == LOG and channel == 0:
-            reply = _contents(data, self._rows, zlib.crc32(b"".join(self._rows)))
-        elif port == LOG and channel == 1 and data:
-            reply = self._control(data, sender)
-        elif port == PARAM:
-            reply = _parameter(channel, data)
-        elif port in (COMMANDER, GENERIC):
-            self.setpoints += 1
+        reply = self._reply(port, channel, data, sender)
         if reply is not None:
             self._send(port, channel, reply, sender)
+
+    def _reply(self, port: int, channel: int, data: bytes, sender: Address) -> bytes | None:
+        if port == LINK:
+            return data if channel in (0, 3) else b"Bitcraze Crazyflie\0"
+        if port == LOG:
+            return self._log_reply(channel, data, sender)
+        if port == PARAM:
+            return _parameter(channel, data)
+        question = port, channel, data[:1]
+        if question == (PLATFORM, 1, b"\0"):
+            return bytes([0, PROTOCOL_VERSION])
+        if question == (MEMORY, 0, b"\1"):  # how many memories: none
+            return b"\1\0"
+        self.setpoints += port in (COMMANDER, GENERIC)
+        return None
+
+    def _log_reply(self, channel: int, data: bytes, sender: Address) -> bytes | None:
+        if channel == 0:
+            return _contents(data, self._rows, zlib.crc32(b"".join(self._rows)))
+        return self._control(data, sender) if channel == 1 and data else None
 
     def _control(self, data: bytes, sender: Address) -> bytes:
         """Do what a log command says; the answer is command, block, error number."""

@@ -141,25 +141,34 @@ def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
         if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
-            channels = {n: channel.topic for n, channel in summary.channels.items()}
-            said = metadata_of(path, stream, summary).get(sums.METADATA_NAME)
-            crc = 0
-            for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
-                first = chunk.chunk_start_offset + chunk.chunk_length
-                stream.seek(first)
-                raw = stream.read(chunk.message_index_length)
-                crc = zlib.crc32(raw, crc)
-                for number, at in chunk.message_index_offsets.items():
-                    if channels[number] in parts:
-                        entries = _index_entries(path, raw, at - first, number)
-                        parts[channels[number]].append(entries[:, 0])
-            if said and said[-1].get("indexes") != sums.text(crc):
-                raise damaged(path, "its message indexes fail their CRC")
+            for topic, times in _times_in_indexes(path, stream, summary):
+                if topic in parts:
+                    parts[topic].append(times)
             return {topic: np.concatenate(times) for topic, times in parts.items()}
     for block, found in blocks(path, topics):
         for number, channel in found.items():
             parts[channel.topic].append(block.time_ns[block.channel == number])
     return {topic: np.concatenate(times) for topic, times in parts.items()}
+
+
+def _times_in_indexes(
+    path: Path, stream: Bounded, summary: McapSummary
+) -> Iterator[tuple[str, Ints]]:
+    """Topic and log times of every message index, chunk by chunk; at last their CRC."""
+    said = metadata_of(path, stream, summary).get(sums.METADATA_NAME)
+    crc = 0
+    for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
+        first = chunk.chunk_start_offset + chunk.chunk_length
+        stream.seek(first)
+        raw = stream.read(chunk.message_index_length)
+        crc = zlib.crc32(raw, crc)
+        for number, at in chunk.message_index_offsets.items():
+            yield (
+                summary.channels[number].topic,
+                _index_entries(path, raw, at - first, number)[:, 0],
+            )
+    if said and said[-1].get("indexes") != sums.text(crc):
+        raise damaged(path, "its message indexes fail their CRC")
 
 
 _NO_TIMES: Ints = np.empty(0, np.int64)

@@ -125,31 +125,46 @@ def _row(factor: int, offset: str) -> str:
 
 
 def _conv_body(step: Step, conv: Conv, source: Buffer, out: Buffer) -> str:
-    side, start = conv.kernel, (source.gap - conv.padding) * source.channels
-    spread = conv.dilation > 1 and not conv.depthwise and side > 1
-    taps = side * side if spread else side
-    lines = []
-    terms = [f" - {conv.padding}"] if conv.padding else []
-    if spread:
-        terms.append(f" + k{f' % {taps}' if step.pooled else ''} / {side} * {conv.dilation}")
-        shift = f" + k % {side} * {conv.dilation * source.channels}"
-    else:
-        inner = f"k % {taps}" if step.pooled and taps > 1 else "0" if step.pooled else "k"
-        scale = f" * {conv.dilation}" if conv.dilation > 1 else ""
-        terms += [f" + {inner}{scale}"] if side > 1 else []
-        shift = ""
-    if step.pooled:
-        stride = f" * {conv.stride}" if conv.stride > 1 else ""
-        terms.append(f" + k / {taps}{stride}" if taps > 1 else f" + k{stride}")
+    """Pointers to what the kernel reads, then its call.
+
+    A pointer leads to one row of the kernel, whose columns stand side by side in memory; with
+    dilation they do not, and each weight of the kernel has a pointer of its own. A pooled step
+    makes two rows at once and so has twice as many.
+    """
+    spread = conv.dilation > 1 and not conv.depthwise and conv.kernel > 1
+    taps = conv.kernel**2 if spread else conv.kernel
     count = taps * (2 if step.pooled else 1)
-    row = _row(step.stride, "".join(terms))
-    read = f"{_read(source, row)}{_plus(start)}{shift}"
+    row = _row(step.stride, _row_of_pointer(step, conv, taps))
+    start = _plus((source.gap - conv.padding) * source.channels)
+    column = f" + k % {conv.kernel} * {conv.dilation * source.channels}" if spread else ""
+    read = f"{_read(source, row)}{start}{column}"
     if count == 1:
-        lines.append(f"const uint8_t *const in[1] = {{{read}}};")
+        lines = [f"const uint8_t *const in[1] = {{{read}}};"]
     else:
-        lines += [f"const uint8_t *in[{count}];", f"for (int k = 0; k < {count}; k++)"]
-        lines.append(f"    in[k] = {read};")
+        lines = [
+            f"const uint8_t *in[{count}];",
+            f"for (int k = 0; k < {count}; k++)",
+            f"    in[k] = {read};",
+        ]
     return _lines([*lines, *_conv_call(step, conv, source, out, taps)])
+
+
+def _row_of_pointer(step: Step, conv: Conv, taps: int) -> str:
+    """Input row of pointer ``k``, counted from the first row under the kernel."""
+    terms = [f" - {conv.padding}"] if conv.padding else []
+    within = f"k % {taps}" if step.pooled else "k"
+    if taps > conv.kernel:
+        terms.append(f" + {within} / {conv.kernel} * {conv.dilation}")
+    elif conv.kernel > 1:
+        terms.append(f" + {within}{_times(conv.dilation)}")
+    if step.pooled:
+        output = f"k / {taps}" if taps > 1 else "k"
+        terms.append(f" + {output}{_times(conv.stride)}")
+    return "".join(terms)
+
+
+def _times(factor: int) -> str:
+    return f" * {factor}" if factor > 1 else ""
 
 
 def _conv_call(step: Step, conv: Conv, source: Buffer, out: Buffer, taps: int) -> list[str]:

@@ -1,0 +1,225 @@
+"""Layers of an int8 network: their numbers, the shapes they give, and what they promise.
+
+``reference`` computes them, ``c/layers`` writes their C. A layer is checked when a network is
+made of it, so neither has to ask whether a sum can overflow.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.errors import ModelError
+
+Int8 = NDArray[np.int8]
+Int32 = NDArray[np.int32]
+Array = NDArray[np.float64]
+Shape = tuple[int, int, int]
+
+PIXEL_ZERO = 128
+"""Pixel that is 0.0 to the network, whose input is ``x / 128 - 1``; images are padded with it."""
+Q_LEVELS = 256
+
+
+class Layer(Protocol):
+    """What every layer says of itself."""
+
+    kind: ClassVar[str]
+
+    @property
+    def name(self) -> str:
+        """Of the layer, as the network calls it."""
+
+    @property
+    def sources(self) -> tuple[int, ...]:
+        """Tensors it reads."""
+
+    @property
+    def signed(self) -> bool:
+        """Whether its output is int8; otherwise uint8."""
+
+    @property
+    def scale(self) -> float:
+        """Real value of one step of its output. Of a head: see `integer.Head`."""
+
+    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+        """Channels, rows and columns of its output."""
+
+    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
+        """Nothing, if it keeps its promises on inputs of these shapes and types.
+
+        Raises
+        ------
+        ModelError
+            If not.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Conv:
+    """Convolution, and ReLU where the output is unsigned.
+
+    ``acc = bias + sum(weight * x)`` fits in int32 for every input; then, per output channel,
+    ``q = clamp((acc * multiplier + 2^(shift - 1)) >> shift)``, the product in int64.
+
+    Output row r reads the input rows ``r * stride - padding + dilation * k``, columns likewise;
+    what lies outside reads as ``pad_value``. Rows: ``(h + 2 padding - dilation (k - 1) - 1) //
+    stride + 1``.
+
+    Parameters
+    ----------
+    name
+        As the network calls it.
+    source
+        Tensor it reads.
+    weight
+        (out, in / groups, k, k) int8, -127 to 127, k is 1 or 3.
+    bias
+        (out,) int32. The zero point of the image is folded in.
+    multiplier
+        (out,) int32, 2^30 to 2^31 - 1.
+    shift
+        (out,) int32, 1 to 62. The real factor is ``multiplier / 2^shift``.
+    stride, dilation, padding
+        The same both ways.
+    groups
+        1, or the number of channels (depthwise, as many out as in).
+    signed
+        Whether the output is int8 (no ReLU).
+    pad_value
+        128 for the image, else 0.
+    scale
+        Real value of one step of the output; 1 where the output is read by heads alone.
+    """
+
+    kind: ClassVar[str] = "conv"
+    name: str
+    source: int
+    weight: Int8
+    bias: Int32
+    multiplier: Int32
+    shift: Int32
+    stride: int = 1
+    dilation: int = 1
+    padding: int = 0
+    groups: int = 1
+    signed: bool = False
+    pad_value: int = 0
+    scale: float = 1.0
+
+    @property
+    def sources(self) -> tuple[int, ...]:
+        """Tensors it reads."""
+        return (self.source,)
+
+    @property
+    def kernel(self) -> int:
+        """Side of the kernel."""
+        return int(self.weight.shape[2])
+
+    @property
+    def depthwise(self) -> bool:
+        """Whether every channel is convolved alone."""
+        return self.groups > 1
+
+    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+        """Channels, rows and columns of its output."""
+        reach = self.dilation * (self.kernel - 1) + 1
+        rows, cols = (
+            (side + 2 * self.padding - reach) // self.stride + 1 for side in inputs[0][1:]
+        )
+        return self.weight.shape[0], rows, cols
+
+    def macs(self, inputs: tuple[Shape, ...]) -> int:
+        """Multiplications that an image takes."""
+        channels, rows, cols = self.shape(inputs)
+        return channels * rows * cols * int(np.prod(self.weight.shape[1:]))
+
+    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
+        """Nothing, if its shapes fit and no sum can overflow; else ModelError."""
+        channels = inputs[0][0]
+        outs, ins, *kernel = self.weight.shape
+        if kernel not in ([1, 1], [3, 3]) or ins * self.groups != channels:
+            raise unsound(self, f"has weights {self.weight.shape} for {channels} channels")
+        if self.groups not in (1, channels) or (self.depthwise and outs != channels):
+            raise unsound(self, f"has {self.groups} groups of {channels} channels")
+        # The worst input has the largest value of its type wherever the weight has its sign.
+        largest_input = 128 if signed[0] else 255
+        weights = np.abs(self.weight.astype(np.int64)).sum(axis=(1, 2, 3))
+        if (weights * largest_input + np.abs(self.bias.astype(np.int64))).max() >= 2**31:
+            raise unsound(self, "can overflow int32")
+        if (self.multiplier < 2**30).any() or (self.shift < 1).any() or (self.shift > 62).any():
+            raise unsound(self, "has a multiplier or shift out of range")
+
+
+@dataclass(frozen=True, slots=True)
+class MaxPool:
+    """Largest of each 2x2 block; an odd last row or column is left out. No rounding."""
+
+    kind: ClassVar[str] = "max_pool"
+    name: str
+    source: int
+    signed: bool = False
+    scale: float = 1.0
+
+    @property
+    def sources(self) -> tuple[int, ...]:
+        """Tensors it reads."""
+        return (self.source,)
+
+    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+        """Channels, rows and columns of its output."""
+        channels, rows, cols = inputs[0]
+        return channels, rows // 2, cols // 2
+
+    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
+        """Nothing, if its output is of the type of its input; else ModelError."""
+        if self.signed != signed[0]:
+            raise unsound(self, "changes the type of its input")
+
+
+@dataclass(frozen=True, slots=True)
+class Add:
+    """Sum of two tensors of one shape, and ReLU where the output is unsigned.
+
+    ``q = clamp((a * multipliers[0] + b * multipliers[1] + 2^(shift - 1)) >> shift)``; every
+    term and the sum fit in int32.
+
+    Parameters
+    ----------
+    sources
+        The two tensors, either of them signed or not.
+    multipliers
+        0 to 2^21 - 1; the larger is at least 2^20.
+    shift
+        1 to 30, the same for both.
+    """
+
+    kind: ClassVar[str] = "add"
+    name: str
+    sources: tuple[int, int]
+    multipliers: tuple[int, int]
+    shift: int
+    signed: bool = False
+    scale: float = 1.0
+
+    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+        """Channels, rows and columns of its output."""
+        return inputs[0]
+
+    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
+        """Nothing, if its inputs are of one shape and its numbers in range; else ModelError."""
+        if inputs[0] != inputs[1]:
+            raise unsound(self, f"adds {inputs[0]} to {inputs[1]}")
+        low, high = sorted(self.multipliers)
+        if not (low >= 0 and 2**20 <= high < 2**21 and 1 <= self.shift <= 30):
+            raise unsound(self, "has a multiplier or shift out of range")
+
+
+AnyLayer = Conv | MaxPool | Add
+
+
+def unsound(layer: Layer, what: str) -> ModelError:
+    """The error for a layer that breaks a promise."""
+    return ModelError(f"layer {layer.name} {what}. Quantise the model again")
