@@ -1,34 +1,70 @@
+"""The numbers of a pair."""
+
+from dataclasses import fields
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from dmrl import topics
 from dmrl.estimation.estimate import Estimate
-from dmrl.estimation.problem import GLOBALS, Noise
-from dmrl.labelling.report import doubts
+from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
+from dmrl.labelling.labels import Positions
+from dmrl.labelling.report import PairReport, pair_report
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
+from dmrl.recording import Provenance, RecordingWriter, summary
+
+SECOND_NS = 1_000_000_000
+STATUS = [STATUS_OK, STATUS_OK, STATUS_AMBIGUOUS, STATUS_UNCONVERGED, STATUS_OK]
+OFF_M = [(0.3, 0.4), (0.0, 0.0), (3.0, 4.0), (0.0, 1.0), (9.0, 9.0)]
 
 
-def estimate(status: int = 0, **constants: float) -> Estimate:
-    found = np.array([constants.get(name, 0.0) for name in GLOBALS])
-    state, covariance = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)
-    return Estimate(np.arange(2.0), state, covariance, np.full(2, status, np.int8), found, Noise())
+def found() -> Positions:
+    """Beside the truth, which goes along x, by OFF_M; the last is after its end."""
+    time_ns = np.array([1, 2, 3, 4, 60]) * SECOND_NS // 2
+    true = np.column_stack([time_ns / SECOND_NS, np.zeros(5), np.ones(5)])
+    xyz = true + np.column_stack([OFF_M, np.full(5, 7.0)])
+    spread = [np.diag([0.01, 0.04, 9.0])] * 4 + [np.diag([0.25, 0.01, 9.0])]
+    return Positions(time_ns, xyz, np.array(spread), np.array(STATUS, np.int8))
 
 
-def test_sensors_in_order_are_not_worth_a_line() -> None:
-    assert doubts(("cf1", "cf2"), estimate(range_bias_m=0.1, own_velocity_scale=0.05)) == []
+def estimate() -> Estimate:
+    constants = np.zeros(max(BIAS, OWN_GYRO, PEER_GYRO) + 1)
+    constants[[BIAS, OWN_GYRO, PEER_GYRO]] = 0.35, 0.02, 0.05
+    made = object.__new__(Estimate)
+    object.__setattr__(made, "constants", constants)
+    return made
 
 
-@pytest.mark.parametrize(
-    ("constant", "value", "words"),
-    [
-        ("peer_gyro_bias_radps", 0.05, "cf2's yaw rate seems biased by 0.05 rad/s"),
-        ("own_gyro_bias_radps", -0.05, "cf1's yaw rate seems biased by -0.05 rad/s"),
-        ("own_velocity_scale", 0.2, "cf1's velocity seems 20% too large"),
-        ("range_bias_m", 0.35, "ranges seem +0.35 m off"),
-        ("peer_clock_s", 0.08, "cf2's log seems +0.08 s off"),
-    ],
-)
-def test_a_sensor_that_is_off_is_named_with_what_to_do(
-    constant: str, value: float, words: str
-) -> None:
-    (line,) = doubts(("cf1", "cf2"), estimate(**{constant: value}))
-    assert words in line
-    assert line.startswith("cf1-cf2: ")
+def flight(path: Path, truth_s: list[float]) -> Path:
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for moment in truth_s:
+            at = message("PeerPosition")(x=moment, y=0.0, z=1.0)
+            sink.write(round(moment * SECOND_NS), topics.truth("cf1", "cf2"), at)
+    return path
+
+
+def report(path: Path) -> PairReport:
+    return pair_report(path, summary(path), ("cf1", "cf2"), found(), estimate())
+
+
+def test_a_report_says_how_sure_and_how_right(tmp_path: Path) -> None:
+    got = report(flight(tmp_path / "a.mcap", np.arange(0, 4.1, 0.5).tolist()))
+    assert (got.observer, got.peer, got.positions) == ("cf1", "cf2", 5)
+    assert (got.ok_share, got.ambiguous_share) == pytest.approx((0.6, 0.2))
+    assert (got.range_bias_m, got.gyro_difference_radps) == pytest.approx((0.35, 0.03))
+    assert got.sigma_m == pytest.approx(0.2)
+    assert got.rmse_ok_m == pytest.approx(np.sqrt((0.25 + 0) / 2))
+    assert got.rmse_m == pytest.approx(np.sqrt((0.25 + 0 + 25 + 1) / 4))
+
+
+def test_without_truth_there_is_no_error(tmp_path: Path) -> None:
+    for name, times_s in (("a.mcap", []), ("b.mcap", [0.5])):
+        got = report(flight(tmp_path / name, times_s))
+        assert (got.rmse_ok_m, got.rmse_m) == (None, None)
+
+
+def test_a_row_stands_under_its_headers(tmp_path: Path) -> None:
+    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    assert PairReport.columns() == tuple(field.name for field in fields(PairReport))
+    assert dict(zip(got.columns(), got.row(), strict=True))["range_bias_m"] == pytest.approx(0.35)
