@@ -3,6 +3,7 @@
 import re
 import runpy
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,22 @@ def test_the_index_names_every_page() -> None:
     index = ROOT / "docs/index.md"
     named = {path for path, _ in links(index)} | {index}
     assert sorted(p.name for p in set(ROOT.glob("docs/*.md")) - named) == []
+
+
+def test_the_page_on_the_architecture_has_the_layers_and_homes_that_are_checked() -> None:
+    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| `(\w+)` \| .* \|(.*)\|$", page, re.MULTILINE)
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    contracts = {c["id"]: c for c in tomllib.loads(text)["tool"]["importlinter"]["contracts"]}
+    layers = [layer.split(" | ") for layer in contracts["down"]["layers"]]
+    wanted = [(str(k), room) for k, layer in enumerate(layers, 1) for room in layer]
+    assert [(number, room) for number, room, _ in rows] == wanted
+    homes = {room: set(re.findall(r"\w+", said)) for _, room, said in rows if said.strip()}
+    held: dict[str, set[str]] = {}
+    for arrow in contracts["homes"]["ignore_imports"]:
+        importer, package = arrow.split(" -> ")
+        held.setdefault(importer.split(".")[1], set()).add(package.replace("rerun_cli", "rerun"))
+    assert homes == held
 
 
 def test_the_page_on_python_runs_as_it_stands(

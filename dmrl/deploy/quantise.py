@@ -130,7 +130,10 @@ def _heads(graph: Graph, ranges: Ranges, about: About) -> dict[str, Head]:
 
 
 def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) -> Head:
-    """Scale and zero point of a head: its range, some room, and 0, on the 256 levels."""
+    """Scale and zero point of a head: its range, some room, and 0, on the 256 levels.
+
+    Each head has a scale of its own, since log depths and logits have other ranges.
+    """
     tensor, channel = graph.outputs[output]
     least, most = ranges.low[tensor][channel], ranges.high[tensor][channel]
     room = HEAD_ROOM * (most - least)
@@ -165,6 +168,7 @@ MEANINGS: dict[str, Callable[[Array, int], Array]] = {
 
 
 def _activation_scale(ranges: Ranges, tensor: int, *, signed: bool) -> float:
+    # Symmetric, zero point 0: then no product of zero points stands in the inner sum.
     low, high = float(ranges.low[tensor].min()), float(ranges.high[tensor].max())
     return max(-low, high) / 127 if signed else high / 255
 
@@ -185,6 +189,7 @@ def _conv(
     weight, bias, factor = _integers(
         layer, scales[layer.sources[0]], out_scale, zero_point * out_scale, moments
     )
+    # The image alone has a zero point: sum(w * (q - 128)) = sum(w * q) - 128 * sum(w).
     if layer.sources[0] == 0:
         bias -= PIXEL_ZERO * weight.sum(axis=(1, 2, 3))
     multiplier, shift = _fixed_point(factor)
@@ -213,6 +218,7 @@ def _integers(
     The scale of a channel's weights is set by its largest weight; by its bias, where that would
     not fit beside the sum; or by the smallest factor that a shift of 62 can express.
     """
+    # What is left of an int32 for the bias beside the largest sum of weights times inputs.
     largest = np.abs(layer.weight).max(axis=(1, 2, 3))
     room = 2**31 - 1 - 128 * 255 * layer.weight[0].size
     bias = layer.bias + zero
@@ -229,9 +235,13 @@ def _integers(
 
 
 def _fixed_point(factor: Array) -> tuple[Int32, Int32]:
-    """Multipliers of 31 bits and shifts: ``factor = multiplier / 2^shift``."""
+    """Requantisation factors as integers: ``factor = multiplier / 2^shift``, 31 bits each.
+
+    Integers, because they round the same on every machine, also on those without floats.
+    """
     mantissa, exponent = np.frexp(factor)
     multiplier = np.rint(mantissa * 2**31).astype(np.int64)
+    # A mantissa just below 1 rounds up to 2^31, one more than fits: half of it, one shift less.
     carried = multiplier == 2**31
     multiplier = np.where(carried, 2**30, multiplier)
     return multiplier.astype(np.int32), (31 - exponent - carried).astype(np.int32)
@@ -242,10 +252,11 @@ def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> A
     a, b = (scales[source] for source in layer.sources)
     # A sum that cancels may be small; a shift below 1 cannot be.
     scale = max(_activation_scale(ranges, tensor, signed=signed), max(a, b) * 2.0**-19)
+    # 21 bits for the larger one: two terms of 8 and 21 bits and their sum fit in int32.
     _, exponent = np.frexp(max(a, b) / scale)
     shift = 21 - int(exponent)
     multipliers = [round(part / scale * 2**shift) for part in (a, b)]
-    if max(multipliers) == 2**21:
+    if max(multipliers) == 2**21:  # rounded up to one bit more
         shift -= 1
         multipliers = [round(part / scale * 2**shift) for part in (a, b)]
     return Add(

@@ -166,14 +166,18 @@ class Tracker:
         t, dt = self.tuning, motion.dt_s
         c, s = np.cos(motion.turn_rad), np.sin(motion.turn_rad)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # new from old axes
+        # The depth error is a first-order Gauss-Markov process: it fades with ``depth_bias_s``,
+        # and its noise below makes up for that, so that its variance stays.
         keep = np.exp(-dt / t.depth_bias_s)
         ekf = track.filter
         ekf.F = np.zeros((7, 7))
         ekf.F[P, P], ekf.F[P, V], ekf.F[V, V], ekf.F[BIAS, BIAS] = turn, dt * turn, turn, keep
         x, y, _ = ekf.x[P]
+        # A wrong yaw rate moves the peer sideways, the more the further away it is.
         across = np.array([y, -x, 0.0]) * t.yaw_rate_std_radps * dt
         own = (t.own_velocity_std_mps * dt) ** 2 * np.diag([1.0, 1.0, 0.0])
         power = t.acceleration_std_mps2**2 * np.eye(3)
+        # White noise of acceleration, integrated over dt (Bar-Shalom et al. 2001, 6.2).
         ekf.Q = np.zeros((7, 7))
         ekf.Q[P, P] = power * dt**3 / 3 + own + np.outer(across, across)
         ekf.Q[P, V] = ekf.Q[V, P] = power * dt**2 / 2
@@ -188,6 +192,7 @@ class Tracker:
         t = self.tuning
         attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
         uv, depth_m, by = pixels_from_horizontal(track.position_m[None], *attitude, self.camera)
+        # The logarithm, because the error of a depth grows with it. Its derivative is 1 / depth.
         by = by[0] / np.array([[1.0], [1.0], [depth_m[0]]])
         row = np.zeros((3, 7))
         row[:, P], row[2, BIAS] = by[:, :3], 1.0
@@ -217,6 +222,7 @@ class Tracker:
                 spread = row @ track.filter.P @ row.T + noise + of_depth
                 gain[k] = self._likelihood(seen - mean, spread)
         free = set(range(len(seen)))
+        # The solver refuses rows without any finite entry, so "never" is a large loss here.
         rows, columns = linear_sum_assignment(np.maximum(gain, -1e6), maximize=True)
         taken = {k: j for k, j in zip(rows, columns, strict=True) if np.isfinite(gain[k, j])}
         for k, track in enumerate(self.tracks):
@@ -225,6 +231,7 @@ class Tracker:
                 free.discard(taken[k])
                 self._update(track, seen[taken[k]], mean, row, noise + of_depth[taken[k]])
                 track.score += gain[k, taken[k]]
+            # Unseen counts against a peer only where the camera looks.
             elif np.isfinite(mean).all() and self._in_view(mean):
                 track.score += np.log1p(-self.tuning.detection_share)
         return sorted(free)
@@ -274,6 +281,8 @@ class Tracker:
             _, row, noise = self._measured(track, view)
             noise += of_depth[k]
             noise[2, 2] += t.depth_bias_ratio**2
+            # The first position is the detection turned round: position = inverse of (seen - bias).
+            # So it carries the noise of the pixels, and its bias with the sign reversed.
             by_pixel = np.linalg.inv(row[:, P])
             ekf.P[P, P] = by_pixel @ noise @ by_pixel.T
             ekf.P[P, BIAS] = ekf.P[BIAS, P] = -by_pixel[:, 2] * t.depth_bias_ratio**2

@@ -91,20 +91,8 @@ def _together(data: bytes, at: int, events: list[Event]) -> list[Group]:
     As the first records have it. What is always together is found and gathered as one.
     """
     by_number = {event.number: event for event in events}
-    sizes = {event.number: event.dtype.itemsize for event in events}
-    order: list[int] = []
-    while len(order) < SAMPLE and (number := int.from_bytes(data[at : at + 2], "little")) in sizes:
-        order.append(number)
-        at += sizes[number]
-    pairs = set(pairwise(order))
-    firsts, seconds = [a for a, _ in pairs], [b for _, b in pairs]
-    after = {
-        a: b
-        for a, b in pairs
-        if firsts.count(a) == 1 == seconds.count(b)
-        and b != order[0]
-        and order.count(a) >= SAMPLE // 8
-    }
+    order = _first_numbers(data, at, {event.number: event.dtype.itemsize for event in events})
+    after = _always_next(order)
     groups = []
     for number in [event.number for event in events if event.number not in after.values()]:
         group = [number]
@@ -112,6 +100,30 @@ def _together(data: bytes, at: int, events: list[Event]) -> list[Group]:
             group.append(after[group[-1]])
         groups.append(tuple(by_number[number] for number in group))
     return groups
+
+
+def _first_numbers(data: bytes, at: int, sizes: dict[int, int]) -> list[int]:
+    """Numbers of the first records; fewer where one is not known."""
+    order: list[int] = []
+    while len(order) < SAMPLE and (number := int.from_bytes(data[at : at + 2], "little")) in sizes:
+        order.append(number)
+        at += sizes[number]
+    return order
+
+
+def _always_next(order: list[int]) -> dict[int, int]:
+    """Number to the one that always comes next, and comes after no other."""
+    pairs = set(pairwise(order))
+    firsts, seconds = [a for a, _ in pairs], [b for _, b in pairs]
+    return {
+        a: b
+        for a, b in pairs
+        if firsts.count(a) == 1 == seconds.count(b)
+        # Else a chain could close to a ring, which has no first event.
+        and b != order[0]
+        # What was seen a few times only may be followed by another later.
+        and order.count(a) >= SAMPLE // 8
+    }
 
 
 def _rows_of(data: Bytes, groups: list[Group]) -> tuple[dict[str, Rows], int]:

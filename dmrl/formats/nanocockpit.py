@@ -76,12 +76,7 @@ def _nearest(ticks: Times) -> Times:
 
 def _read(path: Path) -> tuple[list[str], dict[str, Times]]:
     """Names of the pictures, and the other columns as integers."""
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as e:
-        raise SourceError(f"{path} cannot be read as CSV: {e}. Restore the file") from None
-    head = rows.pop(0) if rows else []
+    head, rows = _lines(path)
     if missing := [name for name in NEEDED if name not in head]:
         raise SourceError(f"{path}:1: no column {', '.join(missing)}. Restore the file")
     if rows and len(rows[-1]) != len(head):
@@ -89,17 +84,30 @@ def _read(path: Path) -> tuple[list[str], dict[str, Times]]:
         rows.pop()
     if not rows:
         raise SourceError(f"{path} has no rows. Name another folder")
-    values = []
-    for number, row in enumerate(rows, 2):
-        try:
-            values.append([int(row[head.index(name)]) for name in NEEDED[1:]])
-        except (ValueError, IndexError):
-            raise SourceError(f"{path}:{number}: not a file and whole numbers. Mend it") from None
+    places = [head.index(name) for name in NEEDED[1:]]
+    values = [_integers(row, places, f"{path}:{line}") for line, row in enumerate(rows, 2)]
     try:
         columns = np.array(values, np.int64).T
     except OverflowError:
         raise SourceError(f"{path}: a number beyond 64 bits. Restore the file") from None
     return [row[head.index(FILE)] for row in rows], dict(zip(NEEDED[1:], columns, strict=True))
+
+
+def _lines(path: Path) -> tuple[list[str], list[list[str]]]:
+    """The names of the columns, and the rows below them."""
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            head, *rows = list(csv.reader(stream)) or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as e:
+        raise SourceError(f"{path} cannot be read as CSV: {e}. Restore the file") from None
+    return head, rows
+
+
+def _integers(row: list[str], places: list[int], where: str) -> list[int]:
+    try:
+        return [int(row[place]) for place in places]
+    except (ValueError, IndexError):
+        raise SourceError(f"{where}: not a file and whole numbers. Mend it") from None
 
 
 def _picture(source: Path, name: str) -> Path:

@@ -236,9 +236,12 @@ def pixels_from_horizontal(
     point = xyz_horizontal[:, :, None]
     by_state = np.concatenate([turn, by_roll @ point, by_pitch @ point], axis=2)
     depth, left, up = (turn @ point)[..., 0].T
+    # What lies behind has no pixel. A division by its depth would give one, upside down.
     ahead = np.where(depth > 0, depth, np.nan)
     plane = np.stack([-left / ahead, -up / ahead], axis=-1)
 
+    # The chain rule, from the inside: state to camera, to the plane at unit depth, through the
+    # lens, to pixels.
     by_camera = np.zeros((len(plane), 2, 3))
     by_camera[:, :, 0] = -plane / ahead[:, None]
     by_camera[:, 0, 1] = by_camera[:, 1, 2] = -1 / ahead
@@ -279,5 +282,6 @@ def horizontal_from_pixels(
     plane = undistort(plane, camera.distortion if distorted else ())
     ahead = np.column_stack([np.ones(len(plane)), -plane]) * depth_m[:, None]
     turns = [camera_from_horizontal(r, p) for r, p in zip(roll_rad, pitch_rad, strict=True)]
+    # Points are rows, so a product from the right turns by the transpose, back to the body.
     ahead = ahead @ camera.camera_from_body
     return np.asarray(np.einsum("nji,nj->ni", np.reshape(turns, (-1, 3, 3)), ahead))

@@ -35,6 +35,7 @@ def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
     square = x**2 + y**2
     radial = 1 + square * (k1 + square * (k2 + square * k3))
     slope = k1 + square * (2 * k2 + square * 3 * k3)
+    # Below 0, places further out appear further in: the derivative of r * radial(r^2) by r.
     radial = np.where(radial + 2 * square * slope > 0, radial, np.nan)
     bent = np.stack(
         [
@@ -43,6 +44,7 @@ def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
         ],
         axis=-1,
     )
+    # Both mixed derivatives are the same, so the Jacobian is symmetric.
     across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
     along_x = radial + 2 * x**2 * slope + 2 * p1 * y + 6 * p2 * x
     along_y = radial + 2 * y**2 * slope + 6 * p1 * y + 2 * p2 * x
@@ -65,6 +67,7 @@ def undistort(bent: Array, distortion: tuple[float, ...]) -> Array:
     Array
         NaN where the lens shows nothing: beyond the fold of its model.
     """
+    # Newton, from where the lens shows the place: lenses move places by little.
     plane = np.array(bent, float)
     for _ in range(ROUNDS if any(distortion) else 0):
         shown, jacobian = distort(plane, distortion)

@@ -93,6 +93,7 @@ def camera_clock(
         before = after
     if len(times) < 2:
         return None
+    # A shift between two images is the mean rate between them, so it belongs to the middle.
     middle, speed = rates(_seconds(np.array(times), held), np.array(moved))
     # A camera that turns left sees the scene move right; nose down, up.
     seen = {"yaw rate": (middle, speed[:, 0]), "pitch rate": (middle, -speed[:, 1])}
@@ -133,6 +134,7 @@ def _seconds(time_ns: NDArray[np.int64], held: Summary) -> Array:
 
 
 def _increasing(time_s: Array, values: Array) -> tuple[Array, Array]:
+    # Interpolation and gradients need times that increase: of equal times the first counts.
     good = np.isfinite(values) & np.concatenate([[True], np.diff(time_s) > 0])[: len(values)]
     return time_s[good], values[good]
 
@@ -150,6 +152,7 @@ def _turns(recording: Path, held: Summary, robot: str) -> Signals:
     slow_s, pitch = _increasing(time_s, pitch)
     signals = {"yaw rate": _increasing(time_s, yaw_rate)}
     if len(slow_s) > 1:
+        # The camera sees the nose go down and up; logs have the yaw rate, not the pitch rate.
         signals["pitch rate"] = slow_s, np.gradient(pitch, slow_s)
     return signals
 
@@ -164,6 +167,7 @@ def _own(recording: Path, held: Summary, robot: str) -> Signals:
             signals[name] = _increasing(time_s, column)
     if topics.velocity(robot) in held.topics:
         time_s, vx, vy = _columns(recording, held, topics.velocity(robot), "vx_mps", "vy_mps")
+        # The length alone: it is the same in every frame, however the robot is turned.
         signals["speed"] = _increasing(time_s, np.hypot(vx, vy))
     if topics.height(robot) in held.topics:
         time_s, height = _columns(recording, held, topics.height(robot), "height_m")
@@ -173,6 +177,7 @@ def _own(recording: Path, held: Summary, robot: str) -> Signals:
 
 def _of_pose(time_s: Array, rows: Array) -> Signals:
     """The same from poses (N, 7): x, y, z, and a quaternion x, y, z, w."""
+    # A rate is a difference over a time; over a short one it is noise of the poses.
     keep = [0]
     for k, moment in enumerate(time_s.tolist()):
         if moment - time_s[keep[-1]] >= MOCAP_STEP_S:
@@ -180,6 +185,8 @@ def _of_pose(time_s: Array, rows: Array) -> Signals:
     time_s, rows = time_s[keep], rows[keep]
     if len(keep) < 2:
         return {}
+    # Angles of Rz(yaw) Ry(pitch) Rx(roll), as `geometry.frames` has them. Yaw jumps by a whole
+    # turn where it passes half of one; its rate must not.
     x, y, z, w = rows[:, 3:].T
     yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
     middle, step = (time_s[1:] + time_s[:-1]) / 2, np.diff(time_s)

@@ -80,39 +80,51 @@ def targets(
     """
     robots = robots.to(torch.float32)
     ahead = torch.isfinite(robots[..., :3]).all(dim=-1) & (robots[..., DEPTH] > 0)
+    # ``ahead`` removes robots by a product with 0, which NaN would survive.
     clean = torch.nan_to_num(robots, nan=0.0)
-    centre = clean[..., (U, V)] / stride_px
     sigma_px = (clean[..., SIGMA_U].square() + clean[..., SIGMA_V].square()).div(2).sqrt()
-    rows, cols = (torch.arange(n, device=robots.device) + 0.5 for n in shape)
-    du = centre[..., 0, None, None] - cols  # (N, K, 1, cols)
-    dv = centre[..., 1, None, None] - rows[:, None]  # (N, K, rows, 1)
+    du, dv = _from_middles(clean[..., (U, V)] / stride_px, shape)
     present = _presence(du, dv, sigma_cells, sigma_px / stride_px, soften=label_noise == "soften")
     present = present * ahead[..., None, None]
     # A hair more presence for the nearer of equals.
     rank = present * (1 + 1e-3 / (1 + clean[..., DEPTH, None, None]))
     best = rank.argmax(dim=1, keepdim=True)
-
-    def of_best(values: Tensor) -> Tensor:
-        return values.expand(present.shape).gather(1, best)[:, 0]
-
     confidence = present.amax(dim=1)
     near = confidence * (confidence >= PRESENT)
     trust_px, trust_depth = torch.ones_like(near), torch.ones_like(near)
     if label_noise == "weight":
         relative = clean[..., SIGMA_DEPTH] / clean[..., DEPTH].clamp(min=1e-3)
-        trust_px = of_best(_trust(sigma_px / TOLERANCE_PX))
-        trust_depth = of_best(_trust(relative / TOLERANCE_DEPTH))
+        trust_px = _of(best, _trust(sigma_px / TOLERANCE_PX))
+        trust_depth = _of(best, _trust(relative / TOLERANCE_DEPTH))
     found = near > 0
     class_id = torch.nan_to_num(robots[..., CLASS_ID, None, None], nan=-1.0)
     return Targets(
         confidence,
+        # Background cells count in full: that nobody is there does not depend on a label's sigma.
         torch.where(confidence > 0.01, trust_px, 1.0),
         near * trust_depth,
         near * trust_px,
-        torch.where(found, of_best(clean[..., DEPTH, None, None]), 1.0),
-        torch.stack((of_best(du), of_best(dv)), dim=1) * found[:, None],
-        torch.where(found, of_best(class_id), -1.0).to(torch.int64),
+        # 1 m where there is no robot, so that its logarithm exists; the weight there is 0.
+        torch.where(found, _of(best, clean[..., DEPTH, None, None]), 1.0),
+        torch.stack((_of(best, du), _of(best, dv)), dim=1) * found[:, None],
+        torch.where(found, _of(best, class_id), -1.0).to(torch.int64),
     )
+
+
+def _from_middles(centre: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(N, K, 1, cols) and (N, K, rows, 1) from the middle of each cell to each centre, cells."""
+    rows, cols = (torch.arange(n, device=centre.device) + 0.5 for n in shape)
+    return centre[..., 0, None, None] - cols, centre[..., 1, None, None] - rows[:, None]
+
+
+def _of(best: Tensor, values: Tensor) -> Tensor:
+    """(N, rows, cols) value in each cell of the robot that is most present there.
+
+    ``best`` is (N, 1, rows, cols), the robot's place in the image's list; ``values`` are
+    (N, K, ...), stretched over the cells.
+    """
+    every = values.expand(*values.shape[:2], *best.shape[2:])
+    return every.gather(1, best)[:, 0]
 
 
 def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Targets:

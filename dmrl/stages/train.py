@@ -110,6 +110,7 @@ class Given(NamedTuple):
 def _run(
     dataset: Path, out: Path, settings: Settings, given: Given, group: Group, *, resume: bool
 ) -> Result:
+    """One process of a training. All compute; the leading one alone writes and says."""
     if group.leads:
         refuse_existing(out)
         _refuse_unfinished(partial_of(out), resume=resume)
@@ -138,11 +139,10 @@ def _run(
         if group.leads:
             made.write(folder)
         result = _train(training, settings, len(examples), group)
-        if not group.leads:
-            return result
-        threshold = _threshold(training.network, held_out, settings)
-        save_model(_model(training, settings, train, len(examples), threshold), folder)
-        remove_checkpoint(folder)
+        if group.leads:
+            threshold = _threshold(training.network, held_out, settings)
+            save_model(_model(training, settings, train, len(examples), threshold), folder)
+            remove_checkpoint(folder)
     return result
 
 
