@@ -1,9 +1,9 @@
 """Recordings in rerun: a window, a file, a web page or a picture. The only home of rerun.
 
 ``entities`` (images), ``space`` (3D) and ``plots`` turn a topic's columns into archetypes,
-``layouts`` arranges them; ``pictures``, ``flight``, ``compare`` and ``browse`` say what a layout
-shows, ``follow`` joins what a flight's topics say together;
-``session`` logs what ``selection`` chose; ``window`` and ``web`` run rerun's viewer.
+``layouts`` arranges them. Each file of ``views`` is a layout, and ``browse`` that of datasets;
+``follow`` joins what a flight's topics say together. ``session`` logs what ``selection`` chose;
+``window`` and ``web`` run rerun's viewer.
 """
 
 from dmrl.errors import MissingExtra

@@ -1,4 +1,4 @@
-"""What of a selection is drawn, and how: read in one pass, stretch by stretch."""
+"""Which topics of a selection are drawn, and by what: read in one pass, stretch by stretch."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field

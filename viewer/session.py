@@ -1,4 +1,4 @@
-"""What is asked for, into a rerun stream or file."""
+"""Log what is asked for into a rerun stream or file."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""What is to be logged, and how a stream logs it."""
+"""A show: entities to log, their timeline and their layout; and how a stream logs them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

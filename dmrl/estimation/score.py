@@ -1,4 +1,6 @@
-"""How good estimated positions are, and how well they know it. Horizontal errors only.
+"""Errors of estimated positions against the ground truth, and whether their covariance fits.
+
+Horizontal errors only.
 
 The vertical comes straight from two height sensors and says nothing about an estimator.
 """

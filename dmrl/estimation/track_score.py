@@ -1,4 +1,4 @@
-"""How good tracks are, beside what single images said."""
+"""Errors of tracks against the ground truth, beside those of single images."""
 
 import math
 from dataclasses import dataclass

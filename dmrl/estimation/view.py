@@ -1,4 +1,4 @@
-"""What an observer sees and how it moves: the input of the tracker, without its filter."""
+"""The tracker's input: an observer's motion between two images, and its detections."""
 
 from dataclasses import dataclass
 

@@ -1,1 +1,1 @@
-"""Detections, positions and tracks, joined with what is true and judged."""
+"""Detections, positions and tracks, joined with the ground truth and judged."""

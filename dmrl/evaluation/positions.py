@@ -1,4 +1,4 @@
-"""Estimated positions of a recording beside the true ones, pair by pair."""
+"""Estimated positions of a recording against the ground truth, pair by pair."""
 
 import math
 from collections.abc import Mapping

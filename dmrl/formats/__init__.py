@@ -1,1 +1,1 @@
-"""Foreign formats, one file each: bytes in, rows for a recording out."""
+"""Foreign formats, one file each: bytes in, samples out. Stages write these; nothing here does."""

@@ -1,4 +1,4 @@
-"""Raw pictures of colour sensors made into RGB. The only home of OpenCV."""
+"""Raw pictures of colour sensors made into RGB (demosaicing), by OpenCV."""
 
 from types import ModuleType
 

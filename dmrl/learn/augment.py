@@ -1,4 +1,4 @@
-"""New images out of old ones, with labels that stay true.
+"""Augmentation: new images out of old ones, with labels that stay right.
 
 An image is made of layers. A layer shows a window of one source image, turned, mirrored and
 zoomed, in a rectangle of the canvas: the whole canvas, the parts of a mosaic, or a patch cut

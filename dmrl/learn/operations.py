@@ -1,4 +1,7 @@
-"""What a network consists of, told without torch. ``trace`` makes such lists."""
+"""The operations that a network consists of, as data without torch.
+
+``trace`` makes such lists; whatever takes a network elsewhere, such as ``deploy``, reads them.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,4 +1,4 @@
-"""What turns gradients into steps: Adam as published, or Muon for the kernels that mix channels."""
+"""Optimizers: Adam as published, or Muon for the kernels that mix channels."""
 
 from collections.abc import Callable
 from typing import Any, Literal

@@ -1,4 +1,4 @@
-"""What the network shall say in every cell, from the robots of an image.
+"""Training targets: what the network should say in every cell, from the robots of an image.
 
 One rule gives both the paper's labels and softer ones. A robot is present in a cell by
 g = exp(-d^2 / 2 s^2), d the distance from the middle of the cell to the robot's centre in

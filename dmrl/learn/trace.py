@@ -1,4 +1,4 @@
-"""A network as a list of plain operations, for whoever takes it elsewhere.
+"""A network as a list of plain operations (``operations``), traced by torch.
 
 The list is what the network's own ``forward`` does with an image, so it cannot fall behind it. A
 ``forward`` that decides by the values it sees shows the operation that it decides by.

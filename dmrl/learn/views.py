@@ -1,4 +1,4 @@
-"""One image seen many times, shifted by parts of a cell and mirrored. NumPy only.
+"""Test-time augmentation: one image, shifted by parts of a cell and mirrored. NumPy only.
 
 What a network errs by depends on where in its cell a robot lies, and on left and right: the median
 over views errs less. A camera in flight has no time for it; labels have.

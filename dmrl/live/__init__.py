@@ -1,4 +1,4 @@
-"""Robots on the network: links, cameras and their clocks; and drones that are not there.
+"""Robots on the network: links, cameras and their clocks; and simulated drones to try them with.
 
 Samples come out and flights go in as arrays: nothing here knows recordings.
 """

@@ -1,4 +1,4 @@
-"""An AI-deck that is not there: a flight's pictures over CPX, in any of the layouts."""
+"""A simulated AI-deck: a flight's pictures over CPX, in any of the layouts."""
 
 import socket
 import threading

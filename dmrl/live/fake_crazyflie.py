@@ -1,4 +1,4 @@
-"""A Crazyflie that is not there: the CRTP log protocol over UDP.
+"""A simulated Crazyflie: the CRTP log protocol over UDP.
 
 One CRTP packet per datagram, as cflib's ``udp://`` driver sends them: a header byte
 ``port:4 link:2 channel:2``, then at most 30 bytes. Answered is what cflib asks for until it

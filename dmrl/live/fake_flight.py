@@ -1,4 +1,4 @@
-"""A flight as a drone that is not there would log it."""
+"""A recorded or simulated flight, as the log variables of a Crazyflie."""
 
 import math
 import threading

@@ -1,4 +1,4 @@
-"""Pipelines: recipes of many steps, of which those are run whose output is not what it would be.
+"""Pipelines: recipes of many steps. A step is run unless its output is there and up to date.
 
 An output is made again when a setting that matters, or the content of something that it is made
 of, has changed. Until the new one is whole the old one stays. See docs/pipelines.md.

@@ -1,4 +1,4 @@
-"""How every figure looks, and how it is written. The only home of matplotlib."""
+"""How every figure looks, and how it is written."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Some messages from all over a recording: what it is like, before it is read."""
+"""A few messages from all over a recording, to guess what it is like before it is read."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""Who looked at an image: the sources that a PeerLabels message names."""
+"""Sources of labels (truth, published, ...), as a PeerLabels message names them.
+
+A source that looked at an image and saw nobody is named as well: no label is then a fact.
+"""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What flying cameras see, rendered: one place for a flight, robots that keep their looks.
+"""Rendered images of simulated flights: one place for a flight, robots that keep their looks.
 
 A flight happens in one panorama under one sun, which turn with the camera; every robot has its
 colours and every camera its sensor for all of the flight.

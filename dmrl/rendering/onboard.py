@@ -1,4 +1,4 @@
-"""What a robot's own camera sees of others: poses in the world in, poses in the camera out."""
+"""Poses in the world to poses in a robot's camera: which other robots it sees, and where."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Samples: messages to be, named but not yet built, as every format and simulation gives them."""
+"""A sample: a message by its fields, not built yet, as every format and simulation gives it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

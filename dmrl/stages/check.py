@@ -1,4 +1,4 @@
-"""check: whether a recording is what it should be."""
+"""``dmrl check``: whether a recording is what it should be."""
 
 from dataclasses import asdict
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""demo: the whole pipeline, small, on what ships with dmrl."""
+"""``dmrl demo``: the whole pipeline, small, on what ships with dmrl."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""info: what a recording holds and where it comes from."""
+"""``dmrl info``: what a recording holds and where it comes from."""
 
 from pathlib import Path
 from typing import Annotated, Any

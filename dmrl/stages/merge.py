@@ -1,4 +1,4 @@
-"""merge: several recordings into one."""
+"""``dmrl merge``: several recordings into one."""
 
 from collections.abc import Sequence
 from pathlib import Path

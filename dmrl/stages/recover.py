@@ -1,4 +1,4 @@
-"""recover: bring back the messages of a recording that was cut short."""
+"""``dmrl recover``: bring back the messages of a recording that was cut short."""
 
 from dataclasses import asdict
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""run: the steps of a pipeline recipe."""
+"""``dmrl run``: the steps of a pipeline recipe."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""trim: a stretch of a recording, or some of its topics."""
+"""``dmrl trim``: a stretch of a recording, or some of its topics."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""Ctrl-C and kills as an event: an exception comes anywhere, and can do harm or be lost."""
+"""Ctrl-C and SIGTERM as an event that a loop asks for.
+
+Not as an exception: that comes at any line, where it can do harm or be lost.
+"""
 
 import signal
 import threading
