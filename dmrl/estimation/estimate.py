@@ -64,6 +64,9 @@ class Estimate:
         (G,) what was constant, as in ``GLOBALS``; zeros where the method estimates none.
     noise
         What the sensors turned out to be like.
+    range_error_m
+        (K,) by how much the ranges were too long for a while, as behind something; None where the
+        method does not say.
     """
 
     time_s: Array
@@ -72,6 +75,7 @@ class Estimate:
     status: Statuses
     constants: Array
     noise: Noise
+    range_error_m: Array | None = None
 
     def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
         """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
@@ -248,7 +252,8 @@ def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Arra
     worse = max(1.0, found.scale_std / Noise().scale_std) ** 0.75
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
     none = np.zeros(len(tracks), np.int8)
-    return Estimate(flight.key_s, best.state[:, :3], spread, none, best.constants, found)
+    state, error_m = best.state[:, :3], best.state[:, RANGE_ERROR]
+    return Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)
 
 
 def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> list[Solution]:

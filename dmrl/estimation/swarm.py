@@ -8,10 +8,11 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from scipy.stats import chi2
 
 from dmrl.estimation.confidence import RESTLESS_S, noise_energy, shrunk
 from dmrl.estimation.estimate import KEY_HZ, STILL, Estimate
-from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, statuses
+from dmrl.estimation.gate import AMBIGUOUS, GATE_M, OK, UNCONVERGED, statuses
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.estimation.motion import odometry, rotation
@@ -20,6 +21,9 @@ from dmrl.estimation.problem import GLOBALS
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Link, Swarm, inverse, solved
 
 Names = tuple[str, str]
+INSIDE, CONTRADICTED = 0.99, 0.2
+"""A solution over all is not believed where more than this share of a pair's sure positions lie
+outside that pair's 99 % ellipse."""
 LEAST_S = 5.0
 """Shortest time that all robots share and that is worth a solve."""
 
@@ -46,8 +50,33 @@ def estimate_swarm(
         )
         if len(group) > 2 and shared_s >= LEAST_S:
             theirs = {names: e for names, e in estimates.items() if names[0] in group}
-            out |= _estimates(mine, theirs, gate_m)
+            together = _estimates(mine, theirs, gate_m)
+            out |= {} if contradicts(together, theirs) else together
     return out
+
+
+def contradicts(together: Mapping[Names, Estimate], pairs: Mapping[Names, Estimate]) -> bool:
+    """Whether one solve over all lies where a pair that was sure says that nobody was.
+
+    What the solve over all has no model of, a pair's has: ranges that are off for seconds. A
+    solution that is bent by them stands against the pairs.
+
+    Parameters
+    ----------
+    together, pairs
+        Estimates of the same ordered pairs.
+    """
+    for names, found in pairs.items():
+        other = together[names]
+        xy, spread, status = found.at(other.time_s)
+        sure = status == OK
+        if not sure.any():
+            continue
+        apart = (other.state[:, :2] - xy)[sure]
+        squared = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(spread[sure]), apart)
+        if (squared > chi2.ppf(INSIDE, 2)).mean() > CONTRADICTED:
+            return True
+    return False
 
 
 def _groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
@@ -63,7 +92,7 @@ def _groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
 def _estimates(
     pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], gate_m: float
 ) -> dict[Names, Estimate]:
-    flight = flight_of(pairs)
+    flight = flight_of(pairs, estimates)
     # How good the sensors are: as the pair in the middle found them.
     ordered = sorted(estimates.values(), key=lambda estimate: estimate.noise.velocity_std_mps)
     noise = ordered[len(ordered) // 2].noise
@@ -79,12 +108,12 @@ def _estimates(
     return out
 
 
-def flight_of(pairs: Mapping[Names, Pair]) -> Flight:
+def flight_of(pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]) -> Flight:
     """Keyframes of the time that all robots share.
 
     Parameters
     ----------
-    pairs
+    pairs, estimates
         As in `estimate_swarm`.
     """
     start_s = max(pair.time_s[0] for pair in pairs.values())
@@ -107,10 +136,19 @@ def flight_of(pairs: Mapping[Names, Pair]) -> Flight:
         shifts = [ways[name].increments(key_s[key], at_s).shift_m for name in (one, other)]
         height_m = np.interp(at_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
         both = names.index(one), names.index(other)
-        links.append(Link(both, key, pair.range_m[inside], shifts[0], shifts[1], height_m))
+        # Behind something, ranges are too long for seconds: the pair's solve tells by how much.
+        range_m = pair.range_m[inside] - _error(estimates.get((one, other)), at_s)
+        links.append(Link(both, key, range_m, shifts[0], shifts[1], height_m))
     moves = [ways[name].increments(key_s[:-1], key_s[1:]) for name in names]
     paths = [ways[name].at(key_s)[:2] for name in names]
     return Flight(names, key_s, moves, paths, np.array(gaps), links)
+
+
+def _error(estimate: Estimate | None, at_s: Array) -> Array:
+    """(R,) by how much ranges are too long, as the pair's own solve found, metres."""
+    if estimate is None or estimate.range_error_m is None:
+        return np.zeros(len(at_s))
+    return np.interp(at_s, estimate.time_s, estimate.range_error_m)
 
 
 def _start(flight: Flight, estimates: Mapping[Names, Estimate]) -> Array:
