@@ -14,15 +14,20 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 STEP_S = 0.05
+"""Both series are compared on a grid of such steps."""
 SMOOTH_S = 0.15
 """Standard deviation of the Gaussian that both series are smoothed with."""
 SLOW_S = 20.0
 """Slower than this tells little of an offset: removed before the rough search."""
 GAP_S = 1.0
+"""A series is not known between samples further apart than this."""
 OVERLAP_S = 20.0
+"""Two series must share at least so much."""
 ITERATIONS = 30
 HUBER = 1.5
+"""Residuals beyond so many standard deviations count less."""
 TOGETHER = 2 * np.sqrt(np.pi) * SMOOTH_S / STEP_S
+"""Samples of smoothed white noise that count as one: the integral of its autocorrelation."""
 DRIFT_STD = 30e-6
 """Standard deviation of the drift of two quartz clocks, before anything is seen."""
 CONVINCING = 0.5
@@ -160,13 +165,17 @@ def _rough(one: _Series, other: _Series) -> float | None:
     def correlated(x: Array, y: Array) -> Array:
         return np.asarray(np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size))
 
+    # At every lag, the correlation coefficient over the samples that both know: sums of products
+    # and of squares are correlations too, so an FFT gives those of all lags at once.
     shared = correlated(one.known.astype(float), other.known.astype(float))
     energy = correlated(a**2, other.known.astype(float)) * correlated(one.known.astype(float), b**2)
     score = correlated(a, b) / np.sqrt(np.maximum(energy, 1e-12))
     score[shared * STEP_S < OVERLAP_S] = -1
     best = int(np.argmax(score))
+    # Half as much as in the end: this search knows neither the drift nor parts of a step.
     if score[best] < CONVINCING / 2:
         return None
+    # The second half of a circular correlation has the negative lags.
     lag = best if best < size // 2 else best - size
     return one.start_s - other.start_s + lag * STEP_S
 
@@ -197,6 +206,7 @@ def _linearised(one: _Series, then: Array, from_middle: Array, wanted: Array, dr
     jacobian = np.stack([rate, rate * from_middle, seen, np.ones(len(seen))], axis=1)[known]
     scale_bias = np.linalg.lstsq(jacobian[:, 2:], wanted[known], rcond=None)[0]
     residual = wanted[known] - jacobian[:, 2:] @ scale_bias
+    # The median absolute deviation of a normal distribution is its sigma / 1.4826.
     spread = 1.4826 * np.median(np.abs(residual)) + 1e-12
     weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-12))
     full = jacobian * (scale_bias[0], scale_bias[0], 1.0, 1.0)
@@ -204,6 +214,7 @@ def _linearised(one: _Series, then: Array, from_middle: Array, wanted: Array, dr
     variance = float((weight * residual**2).mean()) * TOGETHER
     normal = full.T @ (weight[:, None] * full)
     gradient = full.T @ (weight * residual)
+    # The prior of the drift, in the units of the normal equations: short flights tell little of it.
     normal[1, 1] += variance / DRIFT_STD**2
     gradient[1] -= variance / DRIFT_STD**2 * drift
     correlation = float(np.corrcoef(seen[known], wanted[known])[0, 1])

@@ -87,6 +87,7 @@ class _Row(NamedTuple):
 
 
 def _judge(recording: Path, robot: str, peers: list[str]) -> Judged:
+    """Tracks of one observer. A track is false if for most of its life it is at no peer."""
     held = summary(recording)
     sight = read_sight(recording, held, robot, _camera(recording, held, robot), 0.0)
     truth, shown = _truth(recording, sight, peers)

@@ -154,16 +154,11 @@ def _samples(
     states: dict[str, list[float]],
     options: Options,
 ) -> Iterator[Sample]:
+    """The calibration, then of each picture: itself, its labels, and what the firmware said."""
     for k, (time_ns, path) in enumerate(pictures):
-        data = path.read_bytes()
-        rgb = _colours(data, path) if options.raw else codec.decode(data, path)
-        crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
+        crop, data, kind = _stored(path, options)
         if options.camera is not None and k == 0:
             yield calibration(time_ns, options.robot, crop.camera(options.camera))
-        if crop.changes:
-            data, kind = codec.encode_png(crop.pixels(rgb)), "png"
-        elif options.raw or (kind := codec.size(data)[2]) not in ("png", "jpeg"):
-            data, kind = codec.encode_png(rgb), "png"
         yield image(time_ns, options.robot, data, kind)
         if path.name in rows:
             peers = [crop.label(row) for row in rows[path.name] if row.peer]
@@ -174,6 +169,19 @@ def _samples(
             camera = crop.camera(known) if known else None
             peer = options.names.get("0", "cf2")
             yield from aideck.samples(time_ns, options.robot, peer, states[path.name], camera)
+
+
+def _stored(path: Path, options: Options) -> tuple[Crop, bytes, str]:
+    """How a picture is cropped, and its bytes and format: as they are, where nothing changes."""
+    data = path.read_bytes()
+    rgb = _colours(data, path) if options.raw else codec.decode(data, path)
+    crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
+    if crop.changes:
+        return crop, codec.encode_png(crop.pixels(rgb)), "png"
+    kind = "raw" if options.raw else codec.size(data)[2]
+    if kind in ("png", "jpeg"):
+        return crop, data, kind
+    return crop, codec.encode_png(rgb), "png"
 
 
 def _colours(data: bytes, path: Path) -> codec.Rgb:

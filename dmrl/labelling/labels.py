@@ -90,12 +90,16 @@ def image_labels(
     uv, depth_m, jacobian = pixels_from_horizontal(
         positions.xyz_m, roll_rad, pitch_rad, camera, distorted=look.distorted
     )
+    # To first order, the covariance of (u, v, depth) is J C J^T; C has position and attitude,
+    # whose errors are taken for independent. Only its diagonal is needed.
     joint = np.zeros((len(uv), 5, 5))
     joint[:, :3, :3] = positions.covariance
     joint[:, [3, 4], [3, 4]] = look.attitude_std_rad**2
     variance = np.einsum("nij,njk,nik->ni", jacobian, joint, jacobian)
     sigma = np.sqrt(np.maximum(variance, 0.0))
     size = np.array([camera.width_px, camera.height_px])
+    # No wider than some images: a peer close by with a large sigma would be named everywhere.
+    # Comparisons with the NaN of a peer behind the camera are false.
     reach = MARGIN_SIGMAS * np.minimum(sigma[:, :2], size)
     near = ((uv > -reach) & (uv < size + reach)).all(axis=1) & (depth_m > NEAREST_M)
     distance = np.linalg.norm(positions.xyz_m, axis=1)

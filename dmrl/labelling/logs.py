@@ -117,6 +117,7 @@ def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
         pair = _pair(robots, one, other, usable, warnings)
         if pair is not None:
             pairs[one, other] = pair
+    # Who flies may be in view. Without a position of it, no image can say that nobody is there.
     kinds = [row.pattern for row in topics.OWN_SENSORS]
     flying = frozenset(name for kind in kinds for name in topics.robots(list(held.topics), kind))
     paired = {name for pair in pairs for name in pair}
@@ -163,6 +164,7 @@ def _signals(
     good = np.isfinite(values).all(axis=1)
     if bad := int((~good).sum()):
         warnings.append(f"{topic}: {bad} of {len(good)} samples are not finite; left out")
+    # Messages are in log-time order, but the order they came in tells of a clock that was set back.
     if back := int((np.diff(received_ns) < -1_000_000_000).sum()):
         warnings.append(f"{topic}: its clock goes back {back} times; samples overlap there")
     if not good.any():
@@ -186,6 +188,7 @@ def _pair(
             "left out. Do their clocks agree?"
         )
         return None
+    # Both directions measure the same distance, so they count as one series.
     time_s = np.concatenate([r[0] for r in ranges])
     range_m = np.concatenate([r[1][:, 0] for r in ranges])
     order = np.argsort(time_s, kind="stable")

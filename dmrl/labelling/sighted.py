@@ -24,6 +24,8 @@ def sighted(sight: Sight, found: Positions, pixel_std_px: float) -> tuple[Positi
         Error of a detection in u and in v.
     """
     good = np.flatnonzero(found.status == STATUS_OK)
+    # The image that each detection belongs to, and the place of that image's time in ``good``.
+    # A detection in an image without a good position corrects nothing.
     image = np.repeat(np.arange(len(sight.time_ns)), np.diff(sight.first))
     place = np.searchsorted(found.time_ns[good], sight.time_ns[image])
     there = place < len(good)
@@ -35,6 +37,7 @@ def sighted(sight: Sight, found: Positions, pixel_std_px: float) -> tuple[Positi
     roll_rad, pitch_rad = attitude.T
     points_m = horizontal_from_pixels(uv, depth_m, roll_rad, pitch_rad, sight.camera)
     seen = np.isfinite(points_m).all(axis=1)
+    # Near the axis a pixel is an angle of 1 / focal length.
     focal_px = (sight.camera.fx_px + sight.camera.fy_px) / 2
     xyz_m, covariance, used = corrected(
         (found.time_ns[good] - found.time_ns[0]) * 1e-9,

@@ -11,8 +11,9 @@ from mcap.summary import Summary as McapSummary
 from dmrl.recording.block import Block, joined
 from dmrl.recording.blocks import blocks, chunks_between, in_chunk
 from dmrl.recording.index import mcap_summary, summary
+from dmrl.recording.kinds import require_types
 from dmrl.recording.opening import opened
-from dmrl.recording.reader import by_topic, require_types
+from dmrl.recording.reader import by_topic
 from dmrl.recording.walk import channel_of
 from dmrl.recording.writer import Channel
 

@@ -13,16 +13,15 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 from numpy.typing import NDArray
 
-from dmrl.errors import MissingTopic, RecordingError
-from dmrl.messages import descriptor, pool_of
+from dmrl.errors import MissingTopic
 from dmrl.recording.block import EMPTY, Block, joined
 from dmrl.recording.blocks import blocks, indexed_times
-from dmrl.recording.index import TopicInfo, channel_on, summary
+from dmrl.recording.index import channel_on, summary
+from dmrl.recording.kinds import descriptor_of, one_type, require_types
 from dmrl.recording.opening import damaged
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
 from dmrl.recording.writer import Channel, RawMessage
-from dmrl.topics import row_of
 
 STRETCH_BYTES = 4 << 20
 """Bytes of messages that `stretches` decodes at once: few calls, little memory."""
@@ -64,23 +63,6 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
         found |= hits
     require_types(path, topics, found)
     return frozenset(found)
-
-
-def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> None:
-    """Nothing, if topics of dmrl's carry the types they should.
-
-    Raises
-    ------
-    RecordingError
-        If one does not.
-    """
-    for topic in sorted(chosen):
-        row = row_of(topic)
-        if row is not None and not row.carries(topics[topic].schema):
-            raise RecordingError(
-                f"{path}: {topic} carries {topics[topic].schema or 'no schema'}, not "
-                f"{row.message}. Convert the recording: dmrl convert --help"
-            )
 
 
 def read_raw(
@@ -151,29 +133,6 @@ def parsed(raw: RawMessage, kind: Any, path: Path) -> Any:
         return kind.FromString(raw.data)
     except DecodeError as e:
         raise damaged(path, f"{raw.topic} at {raw.time_ns} ns: {e}") from e
-
-
-def descriptor_of(path: Path, channel: Channel) -> Descriptor:
-    """Type of a channel's messages: dmrl's own where it knows it, else the recording's.
-
-    Raises
-    ------
-    RecordingError
-        If the channel is not protobuf, or its schema cannot be read.
-    """
-    if channel.encoding != "protobuf" or channel.schema_encoding != "protobuf":
-        raise RecordingError(
-            f"{path}: {channel.topic} is {channel.encoding or 'without encoding'}, not protobuf. "
-            "Leave it out, or convert it: dmrl convert --help"
-        )
-    try:
-        return descriptor(channel.schema_name)
-    except KeyError:
-        pass
-    try:
-        return pool_of(channel.schema_data).FindMessageTypeByName(channel.schema_name)
-    except (DecodeError, TypeError, KeyError) as e:
-        raise damaged(path, f"schema {channel.schema_name}: {e}") from e
 
 
 def columns(
@@ -309,19 +268,6 @@ def by_topic(
         kind = one_type(path, topic, {descriptor_of(path, channels[number]) for number in own})
         out[topic] = _decoded(path, topic, mine, kind, fields[topic])
     return out
-
-
-def one_type(path: Path, topic: str, kinds: set[Descriptor]) -> Descriptor:
-    """The type of a topic's messages. It may have several channels, after a merge for instance.
-
-    Raises
-    ------
-    RecordingError
-        If they differ.
-    """
-    if len(kinds) != 1:
-        raise RecordingError(f"{path}: {topic} mixes message types. Split it: dmrl trim --help")
-    return kinds.pop()
 
 
 def _decoded(

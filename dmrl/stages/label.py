@@ -1,6 +1,6 @@
 """``dmrl label``: where every robot's peers are, from ranges and odometry, as labels."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.output import refuse_existing
-from dmrl.recording import Summary, provenance, rewrite, summary
+from dmrl.recording import Summary, Timed, provenance, rewrite, summary
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -23,7 +23,7 @@ try:
     from dmrl.estimation.swarm import estimate_swarm
     from dmrl.labelling.camera import camera_given, camera_of, image_times
     from dmrl.labelling.labels import SOURCE, Look, Positions
-    from dmrl.labelling.logs import read_logs
+    from dmrl.labelling.logs import Logs, read_logs
     from dmrl.labelling.report import PairReport, doubts, pair_report
     from dmrl.labelling.sight import read_sight
     from dmrl.labelling.sighted import sighted
@@ -114,24 +114,13 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     """
     refuse_existing(out)
     held = summary(recording)
-    logs = read_logs(recording, held, settings.range_offset_m)
-    if not logs.pairs:
-        why = "; ".join(logs.warnings) or "there are no ranges"
-        raise RecordingError(f"{recording}: no pair can be estimated: {why}. Try: dmrl info")
-    if unknown := set(settings.camera) - set(logs.robots):
-        raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(logs.robots)}")
+    logs = _logs(recording, held, settings)
     cameras = {
         robot: camera_given(recording, held, robot, path) for robot, path in settings.camera.items()
     }
     look = Look(settings.attitude_std_rad, not settings.undistorted, cameras)
     estimates = _estimates(logs.pairs, settings)
     images = {robot: image_times(recording, held, robot) for robot in logs.robots}
-    warnings = [
-        f"{robot}: no {topics.calibration(robot)}; its images get no labels. Give one: "
-        f"--camera.{robot} FILE"
-        for robot, times in images.items()
-        if len(times) and robot not in cameras and topics.calibration(robot) not in held.topics
-    ]
     exposures = {robot: look.exposures_ns(robot, times) for robot, times in images.items()}
     positions = {
         pair: _positions(logs.start_ns, _oriented(logs.pairs, pair), estimate, exposures[pair[0]])
@@ -142,20 +131,53 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     reports = [
         pair_report(recording, held, pair, positions[pair], estimates[pair]) for pair in positions
     ]
+    filming = [robot for robot, times in images.items() if len(times)]
+    made = {
+        robot: list(label_messages(recording, held, logs, robot, _of(positions, robot), look))
+        for robot in filming
+    }
     fresh = [position_messages(*pair, found) for pair, found in positions.items()]
-    labels = 0
-    for robot in (robot for robot, times in images.items() if len(times)):
-        mine = {peer: found for (one, peer), found in positions.items() if one == robot}
-        made = list(label_messages(recording, held, logs, robot, mine, look))
-        labels += sum(peer.source == SOURCE for m in made for peer in m.message.peers)
-        fresh.append(iter(made))
-    replaced = [topics.labels(robot) for robot, times in images.items() if len(times)]
+    fresh += [iter(messages) for messages in made.values()]
+    replaced = [topics.labels(robot) for robot in filming]
     replaced += [topic for topic in held.topics if topics.names(topics.POSITION, topic)]
     inputs = [recording, *settings.camera.values()]
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     rewrite(recording, out, origin, without=replaced, fresh=fresh)
-    seen = [line for pair in logs.pairs for line in doubts(pair, estimates[pair])]
-    return Result(reports, labels, [*logs.warnings, *warnings, *seen])
+    warnings = [*logs.warnings, *_blind(held, filming, cameras)]
+    warnings += [line for pair in logs.pairs for line in doubts(pair, estimates[pair])]
+    return Result(reports, _count(made.values()), warnings)
+
+
+def _logs(recording: Path, held: Summary, settings: Settings) -> Logs:
+    """Logs of all pairs, if there is a pair, and a robot for every camera file."""
+    logs = read_logs(recording, held, settings.range_offset_m)
+    if not logs.pairs:
+        why = "; ".join(logs.warnings) or "there are no ranges"
+        raise RecordingError(f"{recording}: no pair can be estimated: {why}. Try: dmrl info")
+    if unknown := set(settings.camera) - set(logs.robots):
+        raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(logs.robots)}")
+    return logs
+
+
+def _of(positions: Mapping[Names, Positions], robot: str) -> dict[str, Positions]:
+    """Positions of its peers, by name."""
+    return {peer: found for (one, peer), found in positions.items() if one == robot}
+
+
+def _blind(held: Summary, filming: Iterable[str], cameras: Collection[str]) -> list[str]:
+    """Warnings for robots whose images get no labels, as their camera is not known."""
+    return [
+        f"{robot}: no {topics.calibration(robot)}; its images get no labels. Give one: "
+        f"--camera.{robot} FILE"
+        for robot in filming
+        if robot not in cameras and topics.calibration(robot) not in held.topics
+    ]
+
+
+def _count(made: Iterable[Iterable[Timed]]) -> int:
+    """Labels made here, without those of other sources that are kept."""
+    peers = (peer for messages in made for m in messages for peer in m.message.peers)
+    return sum(peer.source == SOURCE for peer in peers)
 
 
 def _correct(
