@@ -115,22 +115,8 @@ def _read(path: Path, table: ColumnMap) -> tuple[Times, dict[str, Array]]:
         raise SourceError(f"{path}:1: no column {', '.join(missing)}. Mend the table of columns")
     if len(set(names)) < len(names):
         raise SourceError(f"{path}:1: a column appears twice. Rename one")
+    rows = _rows(path, separator, len(names))
     time = table.columns["time"]
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream, delimiter=separator)
-            next(reader)
-            rows = [(reader.line_num, row) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as e:
-        raise SourceError(f"{path} cannot be read as CSV: {e}. Name another file") from None
-    if rows and len(rows[-1][1]) < len(names):
-        say(f"{path}: its last line is cut short; left out")
-        rows.pop()
-    if not rows:
-        raise SourceError(f"{path} has no rows. Name another file")
-    for line, row in rows:
-        if len(row) != len(names):
-            raise SourceError(f"{path}:{line}: {len(row)} cells, not {len(names)}. Mend the line")
     at = names.index(time.name)
     moments = np.array([_time_ns(path, line, row[at], time.scale) for line, row in rows], np.int64)
     order = np.argsort(moments, kind="stable")
@@ -141,6 +127,26 @@ def _read(path: Path, table: ColumnMap) -> tuple[Times, dict[str, Array]]:
         for k, name in enumerate(names)
         if (values := _numbers(path, [(n, row[k]) for n, row in rows], name, table)) is not None
     }
+
+
+def _rows(path: Path, separator: str, cells: int) -> list[tuple[int, list[str]]]:
+    """Line number and cells of every row below the header, as many cells in each."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.reader(stream, delimiter=separator)
+            next(reader)
+            rows = [(reader.line_num, row) for row in reader if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as e:
+        raise SourceError(f"{path} cannot be read as CSV: {e}. Name another file") from None
+    if rows and len(rows[-1][1]) < cells:
+        say(f"{path}: its last line is cut short; left out")
+        rows.pop()
+    if not rows:
+        raise SourceError(f"{path} has no rows. Name another file")
+    for line, row in rows:
+        if len(row) != cells:
+            raise SourceError(f"{path}:{line}: {len(row)} cells, not {cells}. Mend the line")
+    return rows
 
 
 def _time_ns(path: Path, line: int, cell: str, scale: float) -> int:

@@ -108,24 +108,29 @@ def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
             robots[name] = log
     pairs = {}
     for one, other in combinations(names, 2):
-        ranges = [
+        both_ways = topics.uwb_range(one, other), topics.uwb_range(other, one)
+        found = [
             _signals(path, held, topic, ("range_m",), warnings)
-            for topic in (topics.uwb_range(one, other), topics.uwb_range(other, one))
+            for topic in both_ways
             if topic in held.topics
         ]
-        usable = [(r[0], r[1] - range_offset_m) for r in ranges if r is not None]
-        pair = _pair(robots, one, other, usable, warnings)
+        ranges = [(r[0], r[1] - range_offset_m) for r in found if r is not None]
+        pair = _pair(robots, one, other, ranges, warnings)
         if pair is not None:
             pairs[one, other] = pair
-    # Who flies may be in view. Without a position of it, no image can say that nobody is there.
-    kinds = [row.pattern for row in topics.OWN_SENSORS]
-    flying = frozenset(name for kind in kinds for name in topics.robots(list(held.topics), kind))
+    flying = _flying(held)
     paired = {name for pair in pairs for name in pair}
     warnings += [
         f"{name}: it has a log but no position, so no image counts as one without it"
         for name in sorted(flying - paired if pairs else ())
     ]
     return Logs(held.start_ns, robots, pairs, flying, warnings)
+
+
+def _flying(held: Summary) -> frozenset[str]:
+    """Robots with a log of their own. They may be in view, also where no position is known."""
+    kinds = [row.pattern for row in topics.OWN_SENSORS]
+    return frozenset(name for kind in kinds for name in topics.robots(list(held.topics), kind))
 
 
 def _robot(path: Path, held: Summary, name: str, warnings: list[str]) -> RobotLog | None:
