@@ -6,6 +6,7 @@ from dmrl.estimation.batch import ROUGH, Solution, evidence, solve_batch
 from dmrl.estimation.linear import linearise
 from dmrl.estimation.problem import Noise, Problem
 
+_Z = np.linspace(-8.0, 8.0, 1601)
 GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
 """Noise against the default's, weighed by how likely each makes the flight."""
 TAKEN = (
@@ -21,9 +22,12 @@ A flight shows a scale once at most: real flow with little noise was seen to be 
 NOISIER, NOTICED = 4, 1.1
 """So often ranges may turn out noisier, and by how much for another solve: less of what is wrong
 with them hides in the solution each time."""
-CORRELATED_S, SOME, FAR = 1.0, 4, 3.0
-"""Ranges are held against their mean over this time where there are some of them, and residuals
-that are further off than so many standard deviations count as so many."""
+CORRELATED_S, SOME, FAR = 1.0, 4, 2.0
+"""Ranges are held against their mean over this time where there are some of them. A residual of so
+many standard deviations counts half, one much further off next to nothing: outliers are no noise
+that lasts, and on one side they would seem to be."""
+ONE = float(np.average((_Z / (1 + (_Z / FAR) ** 2)) ** 2, weights=np.exp(-(_Z**2) / 2)))
+"""Mean square of what so counts of residuals that are as large as was believed."""
 
 
 def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
@@ -99,6 +103,7 @@ def excess(flight: Problem, noise: Noise, solution: Solution) -> float:
     residual = linearise(flight, noise, solution.state, solution.constants).range
     second = ((flight.key_s[flight.range_key] - flight.key_s[0]) / CORRELATED_S).astype(int)
     count = np.bincount(second)
-    total = np.bincount(second, np.clip(residual, -FAR, FAR))[count >= SOME]
-    variance = (total**2 / count[count >= SOME]).mean() if len(total) else 1.0
+    counted = residual / (1 + (residual / FAR) ** 2)
+    total = np.bincount(second, counted)[count >= SOME]
+    variance = (total**2 / count[count >= SOME]).mean() / ONE if len(total) else 1.0
     return float(np.sqrt(max(variance, 1.0)))
