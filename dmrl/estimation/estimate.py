@@ -1,6 +1,7 @@
 """Relative positions of many pairs with covariance and status: the entrance of this room."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -23,6 +24,7 @@ from dmrl.estimation.linear import CLOCK, OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array, Mask, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+from dmrl.estimation.stretches import mended
 
 KEY_HZ = 10.0
 """Keyframes per second."""
@@ -146,7 +148,8 @@ def estimate_pairs(
             else:
                 made = _from_batch(flight, noise, *starts)
             out[number] = _both(flight, made, gate_m)
-    return [out[number] for number in range(len(pairs))]
+    solve = partial(estimate_pairs, method=method, noise=noise, gate_m=gate_m)
+    return [mended(pair, out[number], solve) for number, pair in enumerate(pairs)]
 
 
 def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:

@@ -8,22 +8,19 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import chi2
 
 from dmrl.estimation.confidence import RESTLESS_S, noise_energy, shrunk
 from dmrl.estimation.estimate import KEY_HZ, STILL, Estimate
-from dmrl.estimation.gate import AMBIGUOUS, GATE_M, OK, UNCONVERGED, statuses
+from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, statuses
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.estimation.motion import odometry, rotation
 from dmrl.estimation.pair import Array, Pair, Track
 from dmrl.estimation.problem import GLOBALS
+from dmrl.estimation.stretches import contradicts
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Link, Swarm, inverse, solved
 
 Names = tuple[str, str]
-INSIDE, CONTRADICTED = 0.99, 0.2
-"""A solution over all is not believed where more than this share of a pair's sure positions lie
-outside that pair's 99 % ellipse."""
 LEAST_S = 5.0
 """Shortest time that all robots share and that is worth a solve."""
 
@@ -51,32 +48,10 @@ def estimate_swarm(
         if len(group) > 2 and shared_s >= LEAST_S:
             theirs = {names: e for names, e in estimates.items() if names[0] in group}
             together = _estimates(mine, theirs, gate_m)
-            out |= {} if contradicts(together, theirs) else together
+            # What the solve over all has no model of bends it: then it stands against the pairs.
+            bent = any(contradicts(together[names], found) for names, found in theirs.items())
+            out |= {} if bent else together
     return out
-
-
-def contradicts(together: Mapping[Names, Estimate], pairs: Mapping[Names, Estimate]) -> bool:
-    """Whether one solve over all lies where a pair that was sure says that nobody was.
-
-    What the solve over all has no model of, a pair's has: ranges that are off for seconds. A
-    solution that is bent by them stands against the pairs.
-
-    Parameters
-    ----------
-    together, pairs
-        Estimates of the same ordered pairs.
-    """
-    for names, found in pairs.items():
-        other = together[names]
-        xy, spread, status = found.at(other.time_s)
-        sure = status == OK
-        if not sure.any():
-            continue
-        apart = (other.state[:, :2] - xy)[sure]
-        squared = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(spread[sure]), apart)
-        if (squared > chi2.ppf(INSIDE, 2)).mean() > CONTRADICTED:
-            return True
-    return False
 
 
 def _groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:

@@ -10,7 +10,8 @@ import pytest
 from dmrl.estimation.estimate import Estimate, estimate_pairs
 from dmrl.estimation.gate import AMBIGUOUS, OK
 from dmrl.estimation.pair import Pair
-from dmrl.estimation.swarm import contradicts, estimate_swarm
+from dmrl.estimation.stretches import contradicts
+from dmrl.estimation.swarm import estimate_swarm
 from dmrl.flight import NOISE, Fault, Flight, Scenario, Trajectory, simulate
 
 from .flights import pair_of, truth_at
@@ -101,6 +102,7 @@ def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
 
 def test_one_solve_that_contradicts_a_sure_pair_is_not_believed() -> None:
     *_, pairwise, swarm = solved("in_view", "calibrated")
-    assert not contradicts(swarm, pairwise)
-    bent = {n: replace(e, state=e.state + np.array([0.5, 0.0, 0.0])) for n, e in swarm.items()}
-    assert contradicts(bent, pairwise)
+    names = ("cf1", "cf2")
+    assert not contradicts(swarm[names], pairwise[names])
+    bent = replace(swarm[names], state=swarm[names].state + np.array([0.5, 0.0, 0.0]))
+    assert contradicts(bent, pairwise[names])
