@@ -222,7 +222,8 @@ def _streams(log: Log, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
         yield flight.truth(own, name(peer), time_ns[known], xyz[known])
     for row in OTHERS:
         for peer, columns in _columns_of(row, log):
-            topic = topics.filled(row.pattern, robot=own, peer=name(peer))
+            who = {"robot": own} | ({"peer": name(peer)} if peer else {})
+            topic = topics.filled(row.pattern, **who)
             yield flight.sensor(topic, row.message, time_ns, columns)
 
 
