@@ -31,7 +31,8 @@ def test_long_silences_of_the_ranges_part_a_flight() -> None:
     assert stretches(pair) == []
     early, late = stretches(silent(pair, 20.0, 40.0))
     assert early.time_s[-1] <= 20.1 and late.time_s[0] >= 39.9
-    assert len(early.range_m) + len(late.range_m) == len(silent(pair, 20.0, 40.0).range_m)
+    lost = len(silent(pair, 20.0, 40.0).range_m) - len(early.range_m) - len(late.range_m)
+    assert 0 <= lost <= 2  # between two samples of the grid
     assert len(stretches(silent(pair, 5.0, 20.0))) == 1  # five seconds tell nothing
 
 
