@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from dmrl.estimation.gate import OK
-from dmrl.estimation.pair import Array, Mask, Pair, Track
+from dmrl.estimation.pair import Mask, Pair, Track
 
 if TYPE_CHECKING:
     from dmrl.estimation.estimate import Estimate
@@ -111,6 +111,6 @@ def _cut(pair: Pair, start_s: float, end_s: float) -> Pair:
 
 
 def _cut_track(track: Track, at: Mask) -> Track:
-    signals: tuple[Array, ...] = tuple(signal[at] for signal in track.values())
+    vx, vy, yaw_rate, height = (signal[at] for signal in track.values())
     silent = None if track.height_gap is None else track.height_gap[at]
-    return Track(*signals, track.gap[at], silent)
+    return Track(vx, vy, yaw_rate, height, track.gap[at], silent)
