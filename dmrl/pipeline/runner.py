@@ -74,7 +74,10 @@ class Runner:
             while ready and not self.failed and self._has_room(ready[0][0]):
                 self._start(*ready.popleft())
             if self.running:
-                self._finish(*wait(self.running, return_when=FIRST_COMPLETED).done)
+                over = wait(self.running, return_when=FIRST_COMPLETED).done
+                self._finish(
+                    *sorted(over, key=lambda one: self._places[self.running[one].step.out])
+                )
             elif self.failed:
                 break
         for error in self.failed[1:]:
