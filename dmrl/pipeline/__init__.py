@@ -95,6 +95,8 @@ def _check_data(name: str | Path, plan: Plan, data: Path | None) -> None:
 @contextmanager
 def _owned(out: Path) -> Iterator[Path]:
     """The folder of outputs, for this process alone."""
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out} is a file. Name a folder: --out DIR")
     try:
         (out / UNFINISHED).mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):

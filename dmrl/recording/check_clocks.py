@@ -55,10 +55,11 @@ def _zeros(times: Times) -> Found:
 def _apart(times: Times) -> Found:
     robots: dict[str, dict[str, tuple[int, int]]] = {}
     for topic, moments in times.items():
-        robot = topic.split("/")[1]
+        root, _, rest = topic.partition("/")
+        robot = rest.split("/")[0]
         moments = moments[moments > 0]  # those at 0 are said already
-        if topic == TRANSFORMS or len(moments) < SPARSE or names(CALIBRATION, topic):
-            continue
+        if root or topic == TRANSFORMS or len(moments) < SPARSE or names(CALIBRATION, topic):
+            continue  # a stranger's topic without a robot in front has no clock to compare
         robots.setdefault(robot, {})[topic] = (int(moments[0]), int(moments[-1]))
     for spans in robots.values():
         for topic, span in spans.items():

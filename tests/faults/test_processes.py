@@ -28,8 +28,10 @@ PATIENCE_S = 60.0
 def race(name: str, inputs: Inputs, folder: Path, count: Count) -> None:
     """Six processes write one output: one succeeds, the others say why not."""
     work = next(work for work in WORKS if work.name == name)
-    ended(lambda: work.run(inputs, folder / "first"))
-    whole = contents(folder / "first")
+    alone = folder / f"first{Path(work.out).suffix}"
+    ended(lambda: work.run(inputs, alone))
+    whole = contents(alone)
+    assert whole
     out = folder / work.out
     numbers = []
     for _ in range(WRITERS):
@@ -40,7 +42,7 @@ def race(name: str, inputs: Inputs, folder: Path, count: Count) -> None:
     statuses = [os.waitstatus_to_exitcode(os.waitpid(number, 0)[1]) for number in numbers]
     assert sorted(statuses) == [0] + [1] * (WRITERS - 1)
     assert contents(out) == whole
-    assert sorted(path.name for path in folder.iterdir()) == sorted(["first", work.out])
+    assert sorted(path.name for path in folder.iterdir()) == sorted([alone.name, work.out])
     count("six writers of one output", cases=WRITERS, refused=WRITERS - 1, right=1)
 
 

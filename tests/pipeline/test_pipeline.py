@@ -145,12 +145,13 @@ def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signa
 
 
 def test_a_killed_worker_is_one_line(tmp_path: Path) -> None:
+    before = set(children(os.getpid()))
     with Crew(1) as crew:
         line = job("sketch", tmp_path / "a", {}, {"images": 9000}, resume=False)
         answer = crew.give(line, alone=False)
         while not (tmp_path / "a.partial").exists():
             time.sleep(0.05)
-        (worker,) = children(os.getpid())
+        (worker,) = set(children(os.getpid())) - before
         os.kill(worker, signal.SIGKILL)
         assert answer.result()["error"].startswith("its process was killed (signal 9)")
         line = job("sketch", tmp_path / "b", {}, {"images": 1}, resume=False)
