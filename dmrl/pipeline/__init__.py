@@ -98,6 +98,9 @@ def _owned(out: Path) -> Iterator[Path]:
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Name a folder: --out DIR")
     try:
+        known = (out / STATE_FILE).exists() or (out / UNFINISHED).exists()
+        if not known and out.exists() and any(out.iterdir()):
+            raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
         (out / UNFINISHED).mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise OutputError(f"{out} is a file. Name a folder: --out DIR") from None
