@@ -102,7 +102,13 @@ LONG = SMALL.replace("images = 2", "images = 900")
 def started(recipe: Path, out: Path) -> tuple["subprocess.Popen[str]", list[int]]:
     """A run that has begun two steps, and its processes."""
     command = [sys.executable, "-m", "dmrl.cli", "run", str(recipe), "--out", str(out)]
-    running = subprocess.Popen([*command, "--workers", "2"], stderr=subprocess.PIPE, text=True)
+    running = subprocess.Popen(
+        [*command, "--workers", "2"],
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell's background jobs inherit an ignored SIGINT; a run at a terminal does not.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     places = [out / "unfinished" / f"pictures-{n}.partial" for n in (1, 2)]
     while not all(place.exists() for place in places):
         assert running.poll() is None, running.communicate()
