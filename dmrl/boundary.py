@@ -25,8 +25,8 @@ from contextlib import suppress
 from types import FrameType
 
 from dmrl import output
+from dmrl.border.names import one_line, without_middle
 from dmrl.errors import DmrlError
-from dmrl.names import one_line, without_middle
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
 

@@ -11,7 +11,7 @@ from cyclopts import App, CoercionError, CycloptsError, UnknownCommandError
 from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
-from dmrl.names import without_middle
+from dmrl.border.names import without_middle
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from dmrl.border.locking import UNSUPPORTED, is_held, refuse_locked, take_file, take_folder
 from dmrl.errors import OutputError
-from dmrl.locking import UNSUPPORTED, is_held, refuse_locked, take_file, take_folder
 
 SUFFIX = ".partial"
 MOST_NAME_BYTES = 255 - len(SUFFIX)

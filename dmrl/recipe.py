@@ -16,8 +16,8 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 
-from dmrl import limits
-from dmrl.documents import parse_toml
+from dmrl.border import limits
+from dmrl.border.documents import parse_toml
 from dmrl.errors import RecipeError
 
 Settings = TypeVar("Settings")

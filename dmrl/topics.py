@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-from dmrl.names import topic_part
+from dmrl.border.names import topic_part
 
 
 @dataclass(frozen=True, slots=True)

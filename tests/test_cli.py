@@ -14,9 +14,9 @@ import pytest
 from rich.console import Console
 
 from dmrl import __version__, cli
+from dmrl.border.names import without_middle
 from dmrl.cli import COMMANDS, app
 from dmrl.errors import DmrlError
-from dmrl.names import without_middle
 
 HEAVY = {
     *("bpy", "datasets", "h5py", "matplotlib", "mcap", "numpy", "pandas", "PIL", "pyarrow"),

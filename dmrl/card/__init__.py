@@ -9,12 +9,12 @@ from types import ModuleType
 
 import numpy as np
 
+from dmrl.border.documents import parse_json
 from dmrl.card import sections
 from dmrl.card.counts import Counts, count, sigmas_of
 from dmrl.card.facts import cautions, read_facts
 from dmrl.card.front import check_license, front_matter, read_front
 from dmrl.dataset import Split, open_dataset
-from dmrl.documents import parse_json
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.output import rewritten_file

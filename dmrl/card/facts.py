@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dmrl.border.names import markdown
 from dmrl.errors import DatasetError
-from dmrl.names import markdown
 
 FILE = "facts.json"
 

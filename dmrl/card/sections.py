@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import pyarrow as pa
 
+from dmrl.border.names import code, markdown
 from dmrl.card.counts import Counts
 from dmrl.dataset import Split, layout
 from dmrl.geometry.frames import STRIDE_PX
-from dmrl.names import code, markdown
 from dmrl.recording import Provenance
 
 MEANING = {

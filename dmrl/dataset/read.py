@@ -12,12 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from dmrl.border.documents import parse_json
+from dmrl.border.names import inside, split_name
 from dmrl.dataset import layout
-from dmrl.documents import parse_json
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.images.codec import decode
-from dmrl.names import inside, split_name
 
 PARQUET_NAME = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")
 

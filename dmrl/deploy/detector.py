@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.border.documents import parse_json
 from dmrl.deploy.backends import Backend, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
 from dmrl.deploy.compiled import Compiled
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.store import INTEGER_NAME, load
-from dmrl.documents import parse_json
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids

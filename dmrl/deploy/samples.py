@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.documents import load_npz
+from dmrl.border.documents import load_npz
 from dmrl.errors import ModelError
 
 SAMPLES_NAME = "samples.npz"

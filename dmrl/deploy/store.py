@@ -11,8 +11,8 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.border.documents import load_npz, parse_json
 from dmrl.deploy.integer import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
-from dmrl.documents import load_npz, parse_json
 from dmrl.errors import ModelError
 
 INTEGER_NAME = "integer.npz"

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
+from dmrl.border.names import inside
 from dmrl.estimation.score import ErrorTrace
 from dmrl.evaluation.detections import Pairs
 from dmrl.images.codec import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored
-from dmrl.names import inside
 from dmrl.plots import Example
 from dmrl.recording import read, summary
 

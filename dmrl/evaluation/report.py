@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dmrl.documents import parse_json
+from dmrl.border.documents import parse_json
 from dmrl.evaluation import positions
 from dmrl.terminal.tables import print_json, print_table
 

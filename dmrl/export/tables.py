@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from dmrl.border.names import file_of_topic, inside
 from dmrl.errors import MissingExtra, UnsafeName
-from dmrl.names import file_of_topic, inside
 from dmrl.output import partial_folder
 from dmrl.recording import columns, read_table, summary
 from dmrl.terminal.progress import track

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.documents import load_npz
+from dmrl.border.documents import load_npz
 from dmrl.errors import SourceError
 from dmrl.formats.format import Content, Format, Options
 from dmrl.geometry.frames import Array

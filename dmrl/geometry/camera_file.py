@@ -3,7 +3,7 @@
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
-from dmrl.documents import parse_toml
+from dmrl.border.documents import parse_toml
 from dmrl.errors import SourceError
 from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dmrl import limits
+from dmrl.border import limits
 from dmrl.errors import SourceError
 
 Rgb = NDArray[np.uint8]

@@ -16,11 +16,11 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.optim import Optimizer
 
-from dmrl.documents import parse_json
+from dmrl.border.documents import parse_json
+from dmrl.border.names import inside
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn.model import set_weights, weights_of, write_tensors
 from dmrl.learn.network import Network
-from dmrl.names import inside
 
 STATE_NAME = "checkpoint.json"
 

@@ -16,8 +16,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from dmrl import limits
-from dmrl.documents import parse_json
+from dmrl.border import limits
+from dmrl.border.documents import parse_json
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids

@@ -14,7 +14,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
 
-from dmrl import limits
+from dmrl.border import limits
 from dmrl.recording.block import Block, Bytes, Ints
 from dmrl.recording.opening import damaged, too_large
 

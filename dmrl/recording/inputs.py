@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from dmrl.documents import parse_json
+from dmrl.border.documents import parse_json
 from dmrl.errors import RecordingError
 from dmrl.recording.index import summary
 from dmrl.recording.opening import expect_unchanged

@@ -13,8 +13,9 @@ from typing import Any, Self
 
 import tomli_w
 
-from dmrl import __version__, limits
-from dmrl.documents import parse_json
+from dmrl import __version__
+from dmrl.border import limits
+from dmrl.border.documents import parse_json
 
 FILE_NAME = "provenance.json"
 METADATA_NAME = "dmrl.provenance"

@@ -24,7 +24,7 @@ from mcap.records import (
 from mcap.records import Channel as McapChannel
 from mcap.summary import Summary as McapSummary
 
-from dmrl import limits
+from dmrl.border import limits
 from dmrl.errors import RecordingError
 from dmrl.recording import sums
 from dmrl.recording.block import Block

@@ -23,7 +23,7 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
-from dmrl import limits
+from dmrl.border import limits
 from dmrl.recording.opening import MAGIC, RECORD, Bounded, damaged, too_large
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC

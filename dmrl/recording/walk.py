@@ -10,7 +10,7 @@ from mcap.records import Attachment, Chunk, McapRecord, Message, Metadata, Schem
 from mcap.records import Channel as McapChannel
 from mcap.stream_reader import StreamReader
 
-from dmrl import limits
+from dmrl.border import limits
 from dmrl.recording.block import Block
 from dmrl.recording.chunks import definitions, loose, of_channels, scanned, unpacked
 from dmrl.recording.opening import Bounded, too_large

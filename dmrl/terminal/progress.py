@@ -13,7 +13,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from dmrl.names import one_line
+from dmrl.border.names import one_line
 
 Item = TypeVar("Item")
 

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Schema
 from mcap.writer import Writer
 
-from dmrl import limits
+from dmrl.border import limits
 from dmrl.messages import schema_bytes
 
 MAGIC = b"\x89MCAP0\r\n"

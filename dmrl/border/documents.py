@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl import limits
+from dmrl.border import limits
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from dmrl import topics
-from dmrl.errors import UnsafeName
-from dmrl.names import (
+from dmrl.border.names import (
     MOST_BYTES,
     code,
     file_of_topic,
@@ -16,6 +15,7 @@ from dmrl.names import (
     plain,
     split_name,
 )
+from dmrl.errors import UnsafeName
 
 HOSTILE = (
     *("", ".", "..", "../x", "../../victim", "/etc/passwd", "a/b", "a\\b", ".hidden", "a/../b"),
