@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots
-from dmrl.dataset import Dataset, Split, open_dataset
-from dmrl.dataset.for_training import examples_of
+from dmrl.datasets import Dataset, Split, open_dataset
+from dmrl.datasets.for_training import examples_of
 from dmrl.deploy.accuracy import figures_of, points_of
 from dmrl.deploy.backends import integer
 from dmrl.deploy.c import write_c

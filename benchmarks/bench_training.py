@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from dmrl import recipe
-from dmrl.dataset import open_dataset
-from dmrl.dataset.for_training import examples_of
+from dmrl.datasets import open_dataset
+from dmrl.datasets.for_training import examples_of
 from dmrl.images.codec import encode_png
 from dmrl.learn.augment import Augmenter
 from dmrl.learn.batches import Batch, Examples, gathered, order

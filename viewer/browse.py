@@ -16,7 +16,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.dataset import layout, open_dataset
+from dmrl.datasets import layout, open_dataset
 from dmrl.errors import DatasetError, SettingError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.viewer import entities, layouts, plots

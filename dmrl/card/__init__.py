@@ -14,7 +14,7 @@ from dmrl.card import sections
 from dmrl.card.counts import Counts, count, sigmas_of
 from dmrl.card.facts import cautions, read_facts
 from dmrl.card.front import check_license, front_matter, read_front
-from dmrl.dataset import Split, open_dataset
+from dmrl.datasets import Split, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.output import rewritten_file

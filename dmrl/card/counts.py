@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from dmrl.dataset import Split
+from dmrl.datasets import Split
 from dmrl.geometry.frames import inside
 
 

@@ -9,7 +9,7 @@ import pyarrow as pa
 from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
 from dmrl.border.documents import parse_json
-from dmrl.dataset import Split, layout
+from dmrl.datasets import Split, layout
 from dmrl.errors import SettingError
 
 HUB_LICENSES = ("unknown", "other", "odc-by", "odbl", "pddl", "c-uda")

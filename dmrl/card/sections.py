@@ -6,7 +6,7 @@ import pyarrow as pa
 
 from dmrl.border.names import code, markdown
 from dmrl.card.counts import Counts
-from dmrl.dataset import Split, layout
+from dmrl.datasets import Split, layout
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.recording import Provenance
 
@@ -62,7 +62,7 @@ def loading(splits: dict[str, Split], *, parquet: bool) -> list[str]:
         "pyarrow": _with_pyarrow(name, parquet=parquet),
         "dmrl": f"""from pathlib import Path
 
-from dmrl.dataset import open_dataset
+from dmrl.datasets import open_dataset
 
 split = open_dataset(Path("DATASET")).split("{name}")
 rgb, confidence, depth = split.pixels[0][0], split.confidence[0], split.depth[0]""",

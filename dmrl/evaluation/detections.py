@@ -1,7 +1,7 @@
 """Labels and detections of recordings, joined by robot and log time.
 
 The images are those that a dataset would take: with labels from the source that is asked
-for, all of them OK, or without any, if it looked. See ``dmrl.dataset.rows``.
+for, all of them OK, or without any, if it looked. See ``dmrl.datasets.rows``.
 """
 
 from collections import Counter
@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.dataset import Split
+from dmrl.datasets import Split
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import inside
 from dmrl.images.codec import size

@@ -14,7 +14,7 @@ from dmrl import topics
 from dmrl.card import write_card
 from dmrl.card.facts import Facts
 from dmrl.card.front import check_license
-from dmrl.dataset.rows import (
+from dmrl.datasets.rows import (
     Tally,
     count_images,
     label_source,
@@ -22,9 +22,9 @@ from dmrl.dataset.rows import (
     rows_of,
     sources_of,
 )
-from dmrl.dataset.splits import SplitOf, held_out, of_source
-from dmrl.dataset.twins import Twins
-from dmrl.dataset.write import Row, write_dataset
+from dmrl.datasets.splits import SplitOf, held_out, of_source
+from dmrl.datasets.twins import Twins
+from dmrl.datasets.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
 from dmrl.output import partial_folder
 from dmrl.recording import (

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter, validators
 
-from dmrl.dataset import Dataset, Split, open_dataset
+from dmrl.datasets import Dataset, Split, open_dataset
 from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
 from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
 from dmrl.deploy.equalise import equalise

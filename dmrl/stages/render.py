@@ -13,7 +13,7 @@ from cyclopts import Parameter, validators
 
 from dmrl import recipe as recipes
 from dmrl import topics
-from dmrl.dataset.backgrounds import photos_of
+from dmrl.datasets.backgrounds import photos_of
 from dmrl.errors import RecipeError, SettingError
 from dmrl.geometry.camera_file import KNOWN, camera_named
 from dmrl.geometry.frames import Camera

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from cyclopts import Parameter
 
 from dmrl import recipe as recipes
-from dmrl.dataset import Split, open_dataset
+from dmrl.datasets import Split, open_dataset
 from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, partial_of, refuse_existing
@@ -20,7 +20,7 @@ from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.dataset.for_training import material
+    from dmrl.datasets.for_training import material
     from dmrl.learn.batches import Examples
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.fit import Step, Training, device_of, new_network

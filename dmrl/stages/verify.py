@@ -10,7 +10,7 @@ import numpy as np
 from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
-from dmrl.dataset import open_dataset
+from dmrl.datasets import open_dataset
 from dmrl.deploy.backends import seen_by
 from dmrl.deploy.compiled import require_c
 from dmrl.deploy.integer import IntegerNetwork

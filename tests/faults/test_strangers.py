@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dmrl import pipeline
-from dmrl.dataset import open_dataset
+from dmrl.datasets import open_dataset
 from dmrl.formats.format import Options
 from dmrl.formats.known import FORMATS
 from dmrl.stages import convert, export, predict

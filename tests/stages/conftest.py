@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dmrl import card
-from dmrl.dataset import open_dataset
+from dmrl.datasets import open_dataset
 from dmrl.images.codec import encode_png
 from dmrl.learn.model import Model, save_model
 from dmrl.learn.network import build, to_input

@@ -12,8 +12,8 @@ import pytest
 
 from dmrl import card, recipe
 from dmrl.cli import app
-from dmrl.dataset import open_dataset
-from dmrl.dataset.for_training import examples_of, material
+from dmrl.datasets import open_dataset
+from dmrl.datasets.for_training import examples_of, material
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
 from dmrl.learn.batches import FIELDS
 from dmrl.learn.model import load_model

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.dataset import open_dataset
+from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import message

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.dataset import Split, is_dataset, open_dataset
+from dmrl.datasets import Split, is_dataset, open_dataset
 from dmrl.errors import SettingError
 from dmrl.images.bayer import load_opencv
 from dmrl.images.codec import Rgb

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl.dataset import open_dataset
+from dmrl.datasets import open_dataset
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message, schema_bytes

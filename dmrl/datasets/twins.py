@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Iterator
 
-from dmrl.dataset.write import Row
+from dmrl.datasets.write import Row
 
 
 class Twins:

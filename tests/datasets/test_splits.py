@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.dataset import open_dataset
-from dmrl.dataset.splits import held_out, of_source
+from dmrl.datasets import open_dataset
+from dmrl.datasets.splits import held_out, of_source
 from dmrl.errors import RecordingError, SettingError
 from dmrl.recording import (
     SPLIT_METADATA,

@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.dataset import open_dataset
-from dmrl.dataset.layout import schema
+from dmrl.datasets import open_dataset
+from dmrl.datasets.layout import schema
 from dmrl.errors import DatasetError
 from dmrl.stages.dataset import Settings, run
 

@@ -4,6 +4,6 @@
 `write` and `read` store and open them.
 """
 
-from dmrl.dataset.read import Dataset, Split, is_dataset, open_dataset
+from dmrl.datasets.read import Dataset, Split, is_dataset, open_dataset
 
 __all__ = ["Dataset", "Split", "is_dataset", "open_dataset"]

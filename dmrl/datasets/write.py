@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from dmrl.dataset import layout
+from dmrl.datasets import layout
 from dmrl.images.codec import encode_png
 
 BATCH_IMAGES = 64

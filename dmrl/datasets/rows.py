@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.dataset.layout import PEER
-from dmrl.dataset.splits import SplitOf
-from dmrl.dataset.write import Row
+from dmrl.datasets.layout import PEER
+from dmrl.datasets.splits import SplitOf
+from dmrl.datasets.write import Row
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import STRIDE_PX, grid_label
 from dmrl.images.codec import decode

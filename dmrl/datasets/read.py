@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dmrl.border.documents import parse_json
 from dmrl.border.names import inside, split_name
-from dmrl.dataset import layout
+from dmrl.datasets import layout
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.images.codec import decode

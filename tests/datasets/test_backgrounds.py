@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.dataset.backgrounds import painted_over, photos_of
+from dmrl.datasets.backgrounds import painted_over, photos_of
 from dmrl.errors import SettingError
 from dmrl.images.codec import encode_png
 from dmrl.stages import dataset

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from dmrl.dataset import Dataset, Split
+from dmrl.datasets import Dataset, Split
 from dmrl.errors import SettingError
 from dmrl.learn.batches import BOX, CLASS_ID, FIELDS, Examples
 from dmrl.learn.settings import FitSettings
