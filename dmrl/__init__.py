@@ -1,3 +1,51 @@
-"""dmrl: recordings in, recordings out; teach tiny camera drones to see each other."""
+"""dmrl: recordings in, recordings out; teach tiny camera drones to see each other.
+
+`dmrl.api` is loaded when one of its names is used, and with each name only what that needs.
+"""
+
+from importlib import import_module
 
 __version__ = "0.1.0"
+
+# Where each public name lives. `__init__.pyi` says the same to type checkers, a test holds them
+# together; imports here would be a circle, since every room asks for the version.
+_PLACES = {
+    "Data": "data",
+    "Detection": "models",
+    "Images": "images",
+    "Model": "models",
+    "Recording": "recordings",
+    "Rows": "data",
+    "Topic": "recordings",
+    "Writer": "writing",
+    "align": "stages",
+    "calibrate": "stages",
+    "convert": "stages",
+    "dataset": "data",
+    "evaluate": "stages",
+    "fly": "stages",
+    "label": "stages",
+    "load": "models",
+    "make_dataset": "stages",
+    "merge": "stages",
+    "open": "recordings",
+    "predict": "stages",
+    "quantize": "stages",
+    "render": "stages",
+    "sketch": "stages",
+    "track": "stages",
+    "train": "stages",
+    "trim": "stages",
+    "writer": "writing",
+}
+__all__ = ["__version__", *_PLACES]
+
+
+def __getattr__(name: str) -> object:
+    if name in _PLACES:
+        return getattr(import_module(f"dmrl.api.{_PLACES[name]}"), name)
+    raise AttributeError(f"dmrl has no {name}. It has: {', '.join(sorted(_PLACES))}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PLACES})

@@ -64,6 +64,13 @@ def descriptor(name: str) -> Descriptor:
     raise KeyError(name)
 
 
+def status_name(number: int) -> str:
+    """Name of a status of a label or position; one that dmrl does not know stays a number."""
+    kind = descriptor("PeerLabel").fields_by_name["status"].enum_type
+    known = kind.values_by_number if kind is not None else {}
+    return str(known[number].name) if number in known else str(number)
+
+
 @dataclass(frozen=True, slots=True)
 class LogType:
     """A message type made for one block of log variables, whatever they are.

@@ -129,8 +129,9 @@ def test_the_page_on_python_runs_as_it_stands(
     code = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     exec("\n".join(code), {})
     said = capsys.readouterr().out
-    assert "/cf1/labels 20\n" in said
-    assert "16 (16, 224, 320, 3) (16, 28, 40) (16, 28, 40)\n" in said
+    assert "/cf1/labels dmrl.v1.PeerLabels 20\n" in said
+    assert "16 (16, 28, 40)\n" in said
+    assert "torch.Size([8, 3, 224, 320]) torch.Size([8, 28, 40])" in said
 
 
 def test_the_two_set_up_commands_are_targets_of_make() -> None:

@@ -24,7 +24,7 @@ from dmrl.datasets.write import Row
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import STRIDE_PX, grid_label
 from dmrl.images.codec import decode
-from dmrl.messages import STATUS_OK, descriptor
+from dmrl.messages import STATUS_OK, status_name
 from dmrl.recording import Stamped, columns, matching, read, summary
 from dmrl.recording.sources import LOOKED, looked_at, sources_in
 
@@ -222,13 +222,7 @@ def _robot(image: Stamped) -> str:
 
 def _peer(label: Any) -> dict[str, Any]:
     peer = {field.name: getattr(label, field.name) for field in PEER}
-    return {**peer, "box_px": list(label.box_px), "status": _status(label.status)}
-
-
-def _status(number: int) -> str:
-    kind = descriptor("PeerLabel").fields_by_name["status"].enum_type
-    known = kind.values_by_number if kind is not None else {}
-    return known[number].name if number in known else str(number)
+    return {**peer, "box_px": list(label.box_px), "status": status_name(label.status)}
 
 
 def _row(path: Path, image: Stamped, peers: list[dict[str, Any]]) -> Row:

@@ -62,7 +62,7 @@ def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
                 table = _pictures(recording, topic, path.with_suffix(""))
             else:
                 table = read_table(recording, topic)
-            table = _flat(table)
+            table = flat(table)
             _refuse_taken(path, topic)
             _write(table, path, kind)
             counts[topic] = table.num_rows
@@ -103,7 +103,7 @@ def _suffix(kind: str) -> str:
     return kind if kind in ("png", "jpeg", "webp") else "bin"
 
 
-def _flat(table: pa.Table) -> pa.Table:
+def flat(table: pa.Table) -> pa.Table:
     """Lists of structs as rows, structs as columns, until there are none."""
     while True:
         lists = [f.name for f in table.schema if _holds_structs(f.type)]

@@ -1,4 +1,4 @@
-"""Progress on standard error, silent when that is not a terminal."""
+"""Progress on standard error or in a notebook, silent when that is neither."""
 
 from collections.abc import Callable, Iterable, Iterator, Sized
 from typing import TypeVar
@@ -46,7 +46,7 @@ def track(
     if total is None and isinstance(items, Sized):
         total = len(items)
     console = Console(stderr=True)
-    if not console.is_terminal:
+    if not (console.is_terminal or console.is_jupyter):
         yield from items
         return
     columns = (

@@ -1,0 +1,29 @@
+from dmrl.api.data import Data as Data
+from dmrl.api.data import Rows as Rows
+from dmrl.api.data import dataset as dataset
+from dmrl.api.images import Images as Images
+from dmrl.api.models import Detection as Detection
+from dmrl.api.models import Model as Model
+from dmrl.api.models import load as load
+from dmrl.api.recordings import Recording as Recording
+from dmrl.api.recordings import Topic as Topic
+from dmrl.api.recordings import open as open
+from dmrl.api.stages import align as align
+from dmrl.api.stages import calibrate as calibrate
+from dmrl.api.stages import convert as convert
+from dmrl.api.stages import evaluate as evaluate
+from dmrl.api.stages import fly as fly
+from dmrl.api.stages import label as label
+from dmrl.api.stages import make_dataset as make_dataset
+from dmrl.api.stages import merge as merge
+from dmrl.api.stages import predict as predict
+from dmrl.api.stages import quantize as quantize
+from dmrl.api.stages import render as render
+from dmrl.api.stages import sketch as sketch
+from dmrl.api.stages import track as track
+from dmrl.api.stages import train as train
+from dmrl.api.stages import trim as trim
+from dmrl.api.writing import Writer as Writer
+from dmrl.api.writing import writer as writer
+
+__version__: str

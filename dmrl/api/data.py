@@ -1,0 +1,264 @@
+"""A dataset as an object: arrays, data frames, and torch loaders."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from dmrl.api import pages
+from dmrl.datasets import Dataset, Split, layout, open_dataset
+from dmrl.errors import DatasetError, MissingExtra
+from dmrl.export.tables import flat
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from torch.utils.data import DataLoader
+    from torch.utils.data import Dataset as TorchDataset
+
+HEAVY = (layout.PIXELS, layout.IMAGE, layout.MASKS, layout.CONFIDENCE, layout.DEPTH)
+
+
+class Rows:
+    """The rows of one split: an image each, with its peers and grid labels.
+
+    It has what a map-style dataset of torch has, so a DataLoader takes it as it is; `loader`
+    gathers whole batches, which is faster.
+
+    Parameters
+    ----------
+    split
+        Mapped into memory: nothing is read before it is used.
+    """
+
+    def __init__(self, split: Split) -> None:
+        self._split = split
+
+    @property
+    def name(self) -> str:
+        """Name of the split."""
+        return self._split.name
+
+    def __len__(self) -> int:
+        return len(self._split)
+
+    def __getitem__(self, index: int) -> dict[str, NDArray[Any]]:
+        """A row as arrays.
+
+        Returns
+        -------
+        dict
+            ``image`` (H, W, 3) uint8 RGB; ``confidence`` (rows, cols) float32, 1 in the cell of a
+            peer's centre, else 0; ``depth`` (rows, cols) float32, metres in such a cell, else 0.
+
+        Raises
+        ------
+        IndexError
+            If there is no such row.
+        """
+        return {name: array[0] for name, array in self.gathered([index]).items()}
+
+    def __iter__(self) -> Iterator[dict[str, NDArray[Any]]]:
+        return (self[index] for index in range(len(self)))
+
+    def gathered(self, rows: Sequence[int]) -> dict[str, NDArray[Any]]:
+        """Some rows as arrays, stacked: as ``rows[index]``, with a first axis for the rows.
+
+        Raises
+        ------
+        IndexError
+            If there is no such row.
+        """
+        chosen = np.asarray(rows, np.int64)
+        if chosen.size and not -len(self) <= chosen.min() <= chosen.max() < len(self):
+            raise IndexError(f"split {self.name} has {len(self)} rows, from 0")
+        chosen %= max(len(self), 1)
+        return {
+            "image": np.stack(list(self._split.images(chosen.tolist()))),
+            "confidence": self._split.confidence[chosen],
+            "depth": self._split.depth[chosen],
+        }
+
+    @property
+    def confidence(self) -> NDArray[np.float32]:
+        """(N, rows, cols): 1 in the cell of a peer's centre, else 0."""
+        return self._split.confidence
+
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        """(N, rows, cols): depth in metres where the confidence is 1, else 0."""
+        return self._split.depth
+
+    @property
+    def images(self) -> list[NDArray[np.uint8]]:
+        """Images, (n_i, H, W, 3) RGB for each shard or batch; views of the files where raw."""
+        return self._split.pixels
+
+    def to_arrow(self) -> pa.Table:
+        """All columns, mapped from the files."""
+        return self._split.table
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """A row per peer of an image, without pixels and grids; one, empty, of an image without.
+
+        Raises
+        ------
+        MissingExtra
+            If pandas is not installed.
+        """
+        if find_spec("pandas") is None:
+            raise MissingExtra("pandas", "table", "a data frame")
+        table = self._split.table
+        light = table.drop_columns([name for name in HEAVY if name in table.column_names])
+        light = light.append_column("row", pa.array(np.arange(len(self))))
+        found = flat(light)
+        return found.rename_columns(
+            [name.removeprefix("peers.") for name in found.column_names]
+        ).to_pandas()
+
+    def torch(self) -> "TorchDataset[Any]":
+        """The same as a dataset of torch: images (3, H, W) uint8, grids float32.
+
+        Raises
+        ------
+        MissingExtra
+            If torch is not installed.
+        """
+        found: TorchDataset[Any] = _torch_rows().TorchRows(self)
+        return found
+
+    def loader(
+        self, batch_size: int = 32, *, shuffle: bool = False, seed: int = 0, workers: int = 0
+    ) -> "DataLoader[Any]":
+        """Batches for a training, as a DataLoader of torch; each is gathered at once.
+
+        Parameters
+        ----------
+        batch_size
+            Rows of a batch; the last may have fewer.
+        shuffle
+            In another order every epoch.
+        seed
+            Of those orders.
+        workers
+            Processes that gather ahead; 0: this one.
+
+        Returns
+        -------
+        DataLoader
+            Of dictionaries: ``image`` (N, 3, H, W) uint8, ``confidence`` and ``depth``
+            (N, rows, cols) float32.
+
+        Raises
+        ------
+        MissingExtra
+            If torch is not installed.
+        """
+        found: DataLoader[Any] = _torch_rows().loader_of(
+            self, batch_size, shuffle=shuffle, seed=seed, workers=workers
+        )
+        return found
+
+    def __repr__(self) -> str:
+        height, width = self._split.image_shape
+        return f"<split {self.name}: {len(self)} images of {width} x {height} px>"
+
+
+class Data(Mapping[str, Rows]):
+    """A dataset: its splits by name.
+
+    Parameters
+    ----------
+    found
+        The folder, opened.
+    """
+
+    def __init__(self, found: Dataset) -> None:
+        self._found = found
+
+    @property
+    def path(self) -> Path:
+        """The folder."""
+        return self._found.path
+
+    def __getitem__(self, split: str) -> Rows:
+        """A split.
+
+        Raises
+        ------
+        KeyError
+            If there is none of that name.
+        DatasetError
+            If a shard is missing or cut short.
+        """
+        if split not in self._found.splits:
+            raise KeyError(f"no split {split} in {self.path}; it has {', '.join(self)}")
+        return Rows(self._found.split(split))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found.splits)
+
+    def __len__(self) -> int:
+        """Splits."""
+        return len(self._found.splits)
+
+    def card(self) -> str:
+        """Its card, Markdown.
+
+        Raises
+        ------
+        DatasetError
+            If it has none.
+        """
+        try:
+            return (self.path / "README.md").read_text(encoding="utf-8")
+        except OSError:
+            raise DatasetError(f"{self.path} has no card. Try: dmrl card {self.path}") from None
+
+    def show(self) -> object:
+        """Show it in rerun, row by row: in a notebook's cell, or else in a window."""
+        return pages.shown([self.path], None)
+
+    def __repr__(self) -> str:
+        return f"<dataset {self.path}: {', '.join(self)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, len(split), "{1} x {0}".format(*split._split.image_shape))
+            for name, split in self.items()
+        ]
+        return pages.table(f"dataset {self.path}", ("split", "images", "size, px"), rows)
+
+
+def dataset(path: str | os.PathLike[str]) -> Data:
+    """Open a dataset.
+
+    Parameters
+    ----------
+    path
+        A folder that ``dmrl dataset`` wrote.
+
+    Raises
+    ------
+    DatasetError
+        If it is not one.
+
+    Examples
+    --------
+    >>> import dmrl
+    >>> for batch in dmrl.dataset("set")["train"].loader(shuffle=True):  # doctest: +SKIP
+    ...     train(batch["image"], batch["confidence"], batch["depth"])
+    """
+    return Data(open_dataset(Path(path)))
+
+
+def _torch_rows() -> Any:
+    try:
+        return import_module("dmrl.learn.torch_rows")
+    except ModuleNotFoundError as e:
+        raise MissingExtra(str(e.name), "train", "a loader") from None

@@ -1,0 +1,48 @@
+"""How things look in a notebook: tables as HTML, recordings in rerun."""
+
+import sys
+from collections.abc import Sequence
+from html import escape
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from dmrl.border.names import one_line
+
+MOST_ROWS = 200
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A title and a table as HTML; names from files cannot become markup."""
+    head = "".join(f"<th>{_cell(column)}</th>" for column in columns)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{_cell(value)}</td>" for value in row) + "</tr>"
+        for row in rows[:MOST_ROWS]
+    )
+    more = f"<p>and {len(rows) - MOST_ROWS} more</p>" if len(rows) > MOST_ROWS else ""
+    return f"<p><b>{_cell(title)}</b></p><table><tr>{head}</tr>{body}</table>{more}"
+
+
+def _cell(value: object) -> str:
+    return escape(f"{value:.4g}" if isinstance(value, float) else one_line(str(value)))
+
+
+def in_notebook() -> bool:
+    """Whether a notebook's kernel runs this."""
+    shell = sys.modules.get("IPython")
+    return shell is not None and hasattr(shell.get_ipython(), "kernel")
+
+
+def shown(recordings: Sequence[Path], layout: str | None) -> object:
+    """Recordings or a dataset in rerun: in a notebook's cell, else a window until it is closed.
+
+    Raises
+    ------
+    MissingExtra
+        If rerun is not installed.
+    """
+    viewer = import_module("dmrl.viewer")
+    settings = viewer.Settings() if layout is None else viewer.Settings(layout=layout)
+    if in_notebook():
+        return viewer.Page(recordings, settings)
+    return viewer.view(recordings, settings)

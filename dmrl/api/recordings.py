@@ -1,0 +1,361 @@
+"""A recording as an object: topics as tables, images and labels, and how it looks."""
+
+import os
+import shutil
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.api import pages
+from dmrl.api.images import Images
+from dmrl.errors import MissingExtra, MissingTopic, SettingError
+from dmrl.export.tables import flat
+from dmrl.messages import status_name
+from dmrl.recording import (
+    Finding,
+    Provenance,
+    Stamped,
+    TopicInfo,
+    check,
+    matching,
+    read,
+    read_table,
+    summary,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PathLike = str | os.PathLike[str]
+
+
+class Topic:
+    """One topic of a recording, as a table whose rows are its messages in log-time order.
+
+    Parameters
+    ----------
+    recording
+        Where it stands.
+    name
+        Of the topic.
+    """
+
+    def __init__(self, recording: "Recording", name: str) -> None:
+        self.recording, self.name = recording, name
+        self._info = recording.topics[name]
+
+    @property
+    def schema(self) -> str:
+        """Full name of its message type."""
+        return self._info.schema
+
+    def __len__(self) -> int:
+        """Messages on it."""
+        return self._info.count
+
+    def to_arrow(
+        self,
+        *,
+        fields: Sequence[str] | None = None,
+        start_s: float | None = None,
+        end_s: float | None = None,
+    ) -> pa.Table:
+        """An Arrow table with a column for each field of the message.
+
+        Parameters
+        ----------
+        fields
+            Only these. None: all.
+        start_s, end_s
+            Only messages in [start_s, end_s), seconds from the start of the recording.
+
+        Returns
+        -------
+        pa.Table
+            ``log_time`` and ``publish_time`` (int64, nanoseconds), then the fields: a message
+            within is a struct, a repeated field a list, an enum an int32.
+
+        Raises
+        ------
+        RecordingError
+            If the recording is damaged.
+        """
+        start_ns, end_ns = self.recording.log_time(start_s), self.recording.log_time(end_s)
+        path = self.recording.path
+        return read_table(path, self.name, fields=fields, start_ns=start_ns, end_ns=end_ns)
+
+    def to_pandas(
+        self,
+        *,
+        fields: Sequence[str] | None = None,
+        start_s: float | None = None,
+        end_s: float | None = None,
+    ) -> "pd.DataFrame":
+        """A data frame over ``time_s``, seconds from the start of the recording.
+
+        Fields of a message within are columns of their own, ``pose.position.x``; of a list of
+        messages, such as the peers of PeerLabels, each is a row.
+
+        Raises
+        ------
+        MissingExtra
+            If pandas is not installed.
+        RecordingError
+            If the recording is damaged.
+        """
+        table = flat(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
+        return self.recording.framed(table)
+
+    def to_numpy(
+        self,
+        *,
+        fields: Sequence[str] | None = None,
+        start_s: float | None = None,
+        end_s: float | None = None,
+    ) -> NDArray[np.void]:
+        """(N,) structured array: ``array["height_m"]`` is a field of all messages.
+
+        Texts, bytes and lists are objects.
+        """
+        table = flat(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
+        columns = {name: table[name].to_numpy() for name in table.column_names}
+        out = np.empty(table.num_rows, [(name, c.dtype) for name, c in columns.items()])
+        for name, column in columns.items():
+            out[name] = column
+        return out
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {len(self)} messages of {self.schema}>"
+
+
+class Recording:
+    """A recording, opened: its summary is read, its messages only when they are asked for.
+
+    Parameters
+    ----------
+    path
+        A whole .mcap file.
+    temporary
+        Folder that it lies in and that goes with this object. None: it stays.
+
+    Raises
+    ------
+    RecordingError
+        If it is absent, not a recording, cut short or damaged.
+    """
+
+    def __init__(self, path: PathLike, temporary: Path | None = None) -> None:
+        self.path = Path(path)
+        self._summary = summary(self.path)
+        if temporary is not None:
+            weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    @property
+    def topics(self) -> Mapping[str, TopicInfo]:
+        """Message type and number of messages, by topic."""
+        return MappingProxyType(self._summary.topics)
+
+    @property
+    def robots(self) -> list[str]:
+        """Names of the robots that have a topic here."""
+        parts = (topics.names(row.pattern, t) for row in topics.TOPICS for t in self.topics)
+        return sorted({found["robot"] for found in parts if found and "robot" in found})
+
+    @property
+    def start_ns(self) -> int:
+        """First log time, nanoseconds."""
+        return self._summary.start_ns
+
+    @property
+    def duration_s(self) -> float:
+        """From the first log time to the last, seconds."""
+        return (self._summary.end_ns - self._summary.start_ns) / 1e9
+
+    @property
+    def provenance(self) -> Provenance | None:
+        """How it was made; None for a recording that dmrl did not write."""
+        return self._summary.provenance
+
+    def log_time(self, time_s: float | None) -> int | None:
+        """Nanoseconds of log time of seconds from the start; None stays None."""
+        return None if time_s is None else self.start_ns + round(time_s * 1e9)
+
+    def __getitem__(self, topic: str) -> Topic:
+        """A topic.
+
+        Raises
+        ------
+        MissingTopic
+            If there is none of that name.
+        """
+        if topic not in self.topics:
+            raise MissingTopic(topic, self.topics, self.path)
+        return Topic(self, topic)
+
+    def __contains__(self, topic: object) -> bool:
+        return topic in self.topics
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.topics)
+
+    def __len__(self) -> int:
+        """Topics."""
+        return len(self.topics)
+
+    def messages(
+        self, *wanted: str, start_s: float | None = None, end_s: float | None = None
+    ) -> Iterator[Stamped]:
+        """Messages one by one, in log-time order, of topics or patterns: ``/*/labels``.
+
+        Raises
+        ------
+        MissingTopic
+            If one of them matches nothing.
+        """
+        start_ns, end_ns = self.log_time(start_s), self.log_time(end_s)
+        return read(self.path, *wanted, start_ns=start_ns, end_ns=end_ns)
+
+    def images(
+        self, robot: str | None = None, *, start_s: float | None = None, end_s: float | None = None
+    ) -> Images:
+        """A camera's images, decoded when they are used.
+
+        Parameters
+        ----------
+        robot
+            Who carries the camera. None: the only one who does.
+        start_s, end_s
+            Only images in [start_s, end_s), seconds from the start of the recording.
+
+        Raises
+        ------
+        MissingTopic
+            If there are no such images.
+        SettingError
+            If no robot is named and several have images.
+        """
+        filming = topics.robots(list(self.topics))
+        if robot is None and len(filming) > 1:
+            raise SettingError(f"{self.path} has images of {', '.join(filming)}. Name one of them")
+        topic = topics.camera_image(robot or (filming[0] if filming else "*"))
+        matching(self.path, [topic])
+        return Images.of(self.path, topic, self.start_ns).between(start_s, end_s)
+
+    def labels(self, robot: str | None = None) -> "pd.DataFrame":
+        """A row per labelled peer of an image: where it is, its sigmas, status and source.
+
+        Parameters
+        ----------
+        robot
+            Whose images. None: everybody's; the column ``robot`` tells.
+
+        Raises
+        ------
+        MissingTopic
+            If there are no labels.
+        """
+        return self._of_images(topics.LABELS, "peers", robot)
+
+    def detections(self, robot: str | None = None) -> "pd.DataFrame":
+        """A row per detection: where, how far, how sure, and the threshold of the network.
+
+        Raises
+        ------
+        MissingTopic
+            If there are none.
+        """
+        return self._of_images(topics.DETECTIONS, "detections", robot)
+
+    def _of_images(self, pattern: str, within: str, robot: str | None) -> "pd.DataFrame":
+        found = sorted(matching(self.path, [topics.filled(pattern, robot=robot or "*")]))
+        tables = []
+        for topic in found:
+            table = flat(self[topic].to_arrow())
+            names = [name.removeprefix(f"{within}.") for name in table.column_names]
+            who = (topics.names(pattern, topic) or {})["robot"]
+            column = pa.array([who] * len(table), pa.string())
+            tables.append(table.rename_columns(names).append_column("robot", column))
+        return self.framed(pa.concat_tables(tables).sort_by("log_time"))
+
+    def framed(self, table: pa.Table) -> "pd.DataFrame":
+        """A table with ``log_time`` as a data frame over ``time_s``; a status has its name.
+
+        Raises
+        ------
+        MissingExtra
+            If pandas is not installed.
+        """
+        if find_spec("pandas") is None:
+            raise MissingExtra("pandas", "table", "a data frame")
+        frame = table.to_pandas()
+        if "status" in frame.columns:
+            known = frame["status"].notna()  # of an image without peers it is not
+            names = [status_name(int(number)) for number in frame["status"][known]]
+            frame["status"] = frame["status"].astype(object)
+            frame.loc[known, "status"] = names
+        frame.index = (frame["log_time"] - self.start_ns) / 1e9
+        frame.index.name = "time_s"
+        return frame
+
+    def check(self) -> list[Finding]:
+        """What is doubtful about it, as ``dmrl check`` finds it; best read as a table."""
+        return list(check(self.path))
+
+    def show(self, *, layout: str | None = None) -> object:
+        """Show it in rerun: in a notebook's cell, or else in a window until that is closed.
+
+        Parameters
+        ----------
+        layout
+            "image", "flight", "compare"; None: what fits.
+
+        Raises
+        ------
+        MissingExtra
+            If rerun is not installed.
+        """
+        return pages.shown([self.path], layout)
+
+    def __repr__(self) -> str:
+        count = self._summary.count
+        return f"<{self.path}: {count} messages over {self.duration_s:.3f} s, {len(self)} topics>"
+
+    def _repr_html_(self) -> str:
+        rows = [(name, info.schema, info.count) for name, info in self.topics.items()]
+        return pages.table(repr(self)[1:-1], ("topic", "message", "messages"), rows)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.topics)
+
+
+def open(path: PathLike) -> Recording:
+    """Open a recording.
+
+    Parameters
+    ----------
+    path
+        A whole .mcap file.
+
+    Raises
+    ------
+    RecordingError
+        If it is absent, not a recording, cut short or damaged.
+
+    Examples
+    --------
+    >>> import dmrl
+    >>> flight = dmrl.open("flight.mcap")  # doctest: +SKIP
+    >>> flight["/cf1/height"].to_pandas()["height_m"].plot()  # doctest: +SKIP
+    """
+    return Recording(path)

@@ -1,0 +1,192 @@
+"""A recording of one's own: messages by topic and fields, images as arrays."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dmrl import topics
+from dmrl.api.recordings import PathLike, Recording
+from dmrl.errors import RecordingError, SettingError
+from dmrl.geometry.camera_file import read_camera
+from dmrl.geometry.frames import Camera
+from dmrl.images.codec import encode_jpeg, encode_png
+from dmrl.messages import message
+from dmrl.recording import RecordingWriter, provenance
+from dmrl.samples import sample
+
+
+class Writer:
+    """Writes a recording; it has its name once the ``with`` block has ended without an error.
+
+    Parameters
+    ----------
+    path
+        File to write. Must not exist.
+    settings
+        What made it, as plain values; they stand in its provenance.
+
+    Raises
+    ------
+    OutputError
+        If the file exists, is not called ``.mcap``, or cannot be written.
+    """
+
+    def __init__(self, path: PathLike, settings: Mapping[str, Any]) -> None:
+        self.path = Path(path)
+        self._sink = RecordingWriter(self.path, provenance("python", dict(settings)))
+
+    def write(self, topic: str, time_s: float, fields: Mapping[str, Any]) -> None:
+        """Append a message. Times need not increase.
+
+        Parameters
+        ----------
+        topic
+            One of dmrl's, such as ``/cf1/height``; README.md has the table.
+        time_s
+            The sensor's time, seconds.
+        fields
+            Of the message, as in its schema: ``{"height_m": 0.4}``. A message within is a
+            mapping, a repeated one a list of mappings.
+
+        Raises
+        ------
+        RecordingError
+            If dmrl has no such topic, or its message no such field.
+        """
+        kind = _message_of(topic)
+        try:
+            made = message(kind)(**fields)
+        except (TypeError, ValueError) as e:
+            raise RecordingError(
+                f"{self.path}: {topic} carries {kind}: {e}. Mend its fields"
+            ) from e
+        self._sink.write(round(time_s * 1e9), topic, made)
+
+    def write_columns(self, topic: str, time_s: ArrayLike, fields: Mapping[str, ArrayLike]) -> None:
+        """Append many messages of one topic.
+
+        Parameters
+        ----------
+        topic, time_s, fields
+            As `write` takes them; times (N,), and of each field (N, ...).
+
+        Raises
+        ------
+        RecordingError
+            As `write`.
+        SettingError
+            If a column is not as long as the times.
+        """
+        times = np.asarray(time_s, float)
+        columns = {name: np.asarray(values) for name, values in fields.items()}
+        if wrong := [name for name, column in columns.items() if len(column) != len(times)]:
+            raise SettingError(
+                f"{topic}: {len(columns[wrong[0]])} values of {wrong[0]} at {len(times)} times. "
+                "Give as many of each"
+            )
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        for time, row in zip(times.tolist(), rows, strict=True):
+            self.write(topic, time, dict(zip(columns, row, strict=True)))
+
+    def image(
+        self, robot: str, time_s: float, rgb: NDArray[np.uint8], *, quality: int | None = None
+    ) -> None:
+        """Append an image.
+
+        Parameters
+        ----------
+        robot
+            Who carries the camera.
+        time_s
+            Time of its exposure, seconds.
+        rgb
+            (H, W, 3) uint8, or (H, W) grey.
+        quality
+            Of a JPEG, 1 to 100. None: PNG, which loses nothing.
+
+        Raises
+        ------
+        SettingError
+            If it is no image.
+        """
+        grey = rgb.ndim == 2
+        if rgb.dtype != np.uint8 or not (grey or (rgb.ndim == 3 and rgb.shape[2] == 3)):
+            raise SettingError(
+                f"image of {robot}: shape {rgb.shape}, type {rgb.dtype}. Give (H, W, 3), uint8"
+            )
+        every = np.repeat(rgb[..., None], 3, axis=2) if grey else rgb
+        whole = np.ascontiguousarray(every)
+        data = encode_png(whole) if quality is None else encode_jpeg(whole, quality)
+        kind = "png" if quality is None else "jpeg"
+        self._send(sample.image(round(time_s * 1e9), robot, data, kind))
+
+    def camera(self, robot: str, camera: Camera | PathLike, time_s: float = 0.0) -> None:
+        """Append the calibration of a robot's camera, or what a camera file says of it.
+
+        Raises
+        ------
+        SourceError
+            If the file cannot be read.
+        """
+        known = camera if isinstance(camera, Camera) else read_camera(Path(camera))
+        self._send(sample.calibration(round(time_s * 1e9), robot, known))
+
+    def _send(self, made: sample.Sample) -> None:
+        self._sink.write(made.time_ns, made.topic, message(made.message)(**made.fields))
+
+    def flush(self) -> None:
+        """Hand everything to the system, so that a killed process loses none of it."""
+        self._sink.flush()
+
+    def open(self) -> Recording:
+        """What was written, once the ``with`` block has ended."""
+        return Recording(self.path)
+
+    def __enter__(self) -> Self:
+        self._sink.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._sink.__exit__(kind, error, traceback)
+
+
+def writer(path: PathLike, /, **settings: Any) -> Writer:
+    """A recording to write.
+
+    Parameters
+    ----------
+    path
+        File to write. Must not exist.
+    settings
+        What made it, as plain values; they stand in its provenance.
+
+    Raises
+    ------
+    OutputError
+        If the file exists, is not called ``.mcap``, or cannot be written.
+
+    Examples
+    --------
+    >>> import dmrl
+    >>> with dmrl.writer("own.mcap", sensor="my tags") as out:  # doctest: +SKIP
+    ...     out.write("/cf1/range/cf2", 0.02, {"range_m": 1.83})
+    """
+    return Writer(path, settings)
+
+
+def _message_of(topic: str) -> str:
+    row = topics.row_of(topic)
+    if row is None or row.message.endswith("*"):
+        raise RecordingError(
+            f"dmrl has no topic {topic} of a known message. Name one of the table in README.md"
+        )
+    return row.message

@@ -1,0 +1,49 @@
+"""A network from Python finds what ``dmrl predict`` finds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dmrl
+from dmrl.errors import ModelError, SettingError
+
+
+def test_detections_are_those_of_predict(flight: Path, tmp_path: Path) -> None:
+    model = dmrl.load("dmrl-nano")
+    images = dmrl.open(flight).images("cf1")
+    found = model.detect(images, threshold=0.05)
+    predicted = dmrl.predict("dmrl-nano", flight, min_confidence=0.05)
+    said = predicted.detections("cf1")
+    said = said[said["confidence"] >= 0.05]
+    assert len(found) == len(images)
+    # predict has other images in its batches, so its sums are rounded otherwise.
+    for name, most in (("u_px", 1e-3), ("depth_m", 1e-4), ("confidence", 1e-4)):
+        ours = [getattr(d, name) for image in found for d in image]
+        assert np.allclose(ours, said[name], rtol=0, atol=most)
+    assert all(d.confidence >= model.threshold for image in model.detect(images) for d in image)
+
+
+def test_one_image_is_a_sequence_of_one(flight: Path) -> None:
+    model = dmrl.load("dmrl-nano")
+    images = dmrl.open(flight).images("cf1")
+    assert model.detect(images[0], threshold=0.01) == model.detect(images[:1], threshold=0.01)
+    assert model.grids(images[:2].to_numpy()).confidence.shape == (2, 28, 40)
+
+
+@pytest.mark.parametrize(
+    "images", [np.zeros((2, 224, 320), np.uint8), np.zeros((1, 224, 320, 3), np.float32)]
+)
+def test_what_is_no_image_is_said(images: np.ndarray) -> None:
+    with pytest.raises(SettingError, match="RGB"):
+        dmrl.load("dmrl-nano").detect(images)
+
+
+def test_sizes_that_do_not_divide_are_said() -> None:
+    with pytest.raises(SettingError, match="Crop or scale"):
+        dmrl.load("dmrl-nano").detect(np.zeros((1, 225, 320, 3), np.uint8))
+
+
+def test_no_model_of_a_name_is_said() -> None:
+    with pytest.raises(ModelError, match="dmrl-nano"):
+        dmrl.load("dmrl-mini")

@@ -1,0 +1,95 @@
+"""A recording from Python says what the file says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dmrl
+from dmrl.errors import MissingTopic, RecordingError, SettingError
+from dmrl.images.codec import decode
+from dmrl.recording import read, read_table
+
+
+def test_topics_robots_and_time(flight: Path) -> None:
+    rec = dmrl.open(flight)
+    assert rec.robots == ["cf1", "cf2"]
+    assert "/cf1/attitude" in rec and rec.topics["/cf1/attitude"].schema == "dmrl.v1.Attitude"
+    assert len(rec["/cf1/attitude"]) == rec.topics["/cf1/attitude"].count > 300
+    assert rec.duration_s == pytest.approx(6.0, abs=0.1)
+    assert rec.provenance is not None and rec.provenance.stage == "fly"
+
+
+def test_a_topic_as_arrow_pandas_and_numpy_is_the_same(flight: Path) -> None:
+    topic = dmrl.open(flight)["/cf1/attitude"]
+    table = topic.to_arrow()
+    assert table.equals(read_table(flight, "/cf1/attitude"))
+    frame, array = topic.to_pandas(), topic.to_numpy()
+    for name in ("log_time", "roll_rad", "yaw_rate_radps"):
+        assert np.array_equal(frame[name], table[name].to_numpy())
+        assert np.array_equal(array[name], table[name].to_numpy())
+    assert frame.index[0] == pytest.approx(
+        (table["log_time"][0].as_py() - dmrl.open(flight).start_ns) / 1e9
+    )
+
+
+def test_a_stretch_of_time_and_fewer_fields(flight: Path) -> None:
+    rec = dmrl.open(flight)
+    frame = rec["/cf1/height"].to_pandas(fields=["height_m"], start_s=1.0, end_s=2.0)
+    assert list(frame.columns) == ["log_time", "publish_time", "height_m"]
+    assert frame.index.min() >= 1.0 and frame.index.max() < 2.0
+    assert 90 <= len(frame) <= 110
+
+
+def test_a_message_within_is_columns_of_its_own(flight: Path) -> None:
+    frame = dmrl.open(flight)["/tf"].to_pandas()
+    assert "transforms.translation.x" in frame.columns
+
+
+def test_labels_have_a_row_per_peer_and_a_status_by_name(flight: Path) -> None:
+    labels = dmrl.open(flight).labels()
+    said = [
+        (m.time_ns, peer.peer, peer.u_px)
+        for m in read(flight, "/*/labels")
+        for peer in m.message.peers
+    ]
+    known = labels.dropna(subset=["u_px"])
+    found = zip(known["log_time"], known["peer"], known["u_px"], strict=True)
+    assert sorted(found) == sorted(said) and said
+    assert set(known["status"]) == {"OK"}
+    assert set(labels["robot"]) == {"cf1", "cf2"}
+
+
+def test_images_are_decoded_one_by_one_sliced_and_near_a_time(flight: Path) -> None:
+    images = dmrl.open(flight).images("cf1")
+    every = [decode(m.message.data) for m in read(flight, "/cf1/camera/image")]
+    assert len(images) == len(every) == 12
+    assert all(np.array_equal(a, b) for a, b in zip(images, every, strict=True))
+    assert np.array_equal(images[-1], every[-1]) and np.array_equal(images[2], every[2])
+    assert np.array_equal(images[2:4].to_numpy(), np.stack(every[2:4]))
+    late = images.between(1.9)
+    assert len(late) == 8 and np.array_equal(late[0], every[4])
+    assert np.array_equal(images.nearest(float(images.time_s[3]) + 0.1), every[3])
+    with pytest.raises(IndexError):
+        images[12]
+
+
+def test_images_of_several_robots_want_a_name(flight: Path) -> None:
+    with pytest.raises(SettingError, match="Name one"):
+        dmrl.open(flight).images()
+    with pytest.raises(MissingTopic):
+        dmrl.open(flight).images("cf9")
+
+
+def test_what_is_not_there_is_said(flight: Path, tmp_path: Path) -> None:
+    with pytest.raises(MissingTopic, match="Did you mean /cf1/attitude"):
+        dmrl.open(flight)["/cf1/atitude"]
+    with pytest.raises(RecordingError, match="no recording"):
+        dmrl.open(tmp_path / "none.mcap")
+
+
+def test_html_of_names_that_are_markup(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "odd.mcap") as out:
+        out.write("/<b>/height", 0.0, {"height_m": 1.0})
+    html = dmrl.open(tmp_path / "odd.mcap")._repr_html_()
+    assert "<b>/height" not in html and "&lt;b&gt;" in html

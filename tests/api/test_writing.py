@@ -1,0 +1,51 @@
+"""A recording of one's own holds what was written, and is checked as any other."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dmrl
+from dmrl.errors import OutputError, RecordingError, SettingError
+from dmrl.geometry.frames import Camera
+
+
+def test_fields_columns_images_and_a_camera_come_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    rgb = rng.integers(0, 255, (16, 24, 3), np.uint8)
+    grey = rng.integers(0, 255, (16, 24), np.uint8)
+    times = np.arange(5) / 10
+    with dmrl.writer(tmp_path / "own.mcap", sensor="tags") as out:
+        out.write("/a/range/b", 0.25, {"range_m": 1.5})
+        out.write_columns("/a/height", times, {"height_m": times * 2})
+        out.image("a", 0.1, rgb)
+        out.image("a", 0.2, grey)
+        out.camera("a", Camera(24, 16, 20.0, 20.0, 12.0, 8.0))
+    rec = out.open()
+    assert rec["/a/range/b"].to_numpy()["log_time"].tolist() == [250_000_000]
+    assert rec["/a/height"].to_numpy()["height_m"].tolist() == (times * 2).tolist()
+    assert np.array_equal(rec.images("a")[0], rgb)
+    assert np.array_equal(rec.images("a")[1][..., 2], grey)
+    assert rec["/a/camera/calibration"].to_arrow()["K"][0].as_py()[0] == 20.0
+    assert rec.provenance is not None
+    assert (rec.provenance.stage, rec.provenance.settings) == ("python", {"sensor": "tags"})
+
+
+def test_an_error_in_the_block_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), dmrl.writer(tmp_path / "own.mcap") as out:
+        out.write("/a/height", 0.0, {"height_m": 1 / 0})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_topics_fields_and_lengths_are_said(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "own.mcap") as out:
+        with pytest.raises(RecordingError, match="no topic /a/smell"):
+            out.write("/a/smell", 0.0, {})
+        with pytest.raises(RecordingError, match="altitude"):
+            out.write("/a/height", 0.0, {"altitude": 1.0})
+        with pytest.raises(SettingError, match="3 values of height_m at 2 times"):
+            out.write_columns("/a/height", [0.0, 0.1], {"height_m": [1.0, 2.0, 3.0]})
+        with pytest.raises(SettingError, match=r"Give \(H, W, 3\)"):
+            out.image("a", 0.0, np.zeros((4, 4, 4), np.uint8))
+    with pytest.raises(OutputError, match="exists"):
+        dmrl.writer(tmp_path / "own.mcap")
