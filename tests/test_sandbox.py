@@ -342,7 +342,7 @@ def test_a_model_s_numbers_are_numbers(
     assert _run(box, capsys, "export", folder, box.out / "x") == 1
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "doctor"])  # it reads none
 def test_every_command_takes_damaged_inputs_as_errors(
     name: str, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,69 @@
+"""``dmrl doctor`` says what is there and what is not, and ends well where the base works."""
+
+import importlib.metadata
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dmrl import boundary
+from dmrl.cli import app
+from dmrl.stages import doctor
+
+ROOT = Path(__file__).parents[2]
+
+
+def _said(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, object]]:
+    app(["doctor", "--json"], result_action="return_value")
+    return {part["name"]: part for part in json.loads(capsys.readouterr().out)}
+
+
+def test_the_base_is_there(capsys: pytest.CaptureFixture[str]) -> None:
+    said = _said(capsys)
+    assert said["base packages"]["there"] and said["Python"]["there"]
+    assert "pyarrow" in str(said["base packages"]["found"])
+    assert all(part["there"] or not part["needed"] for part in said.values())
+    app(["doctor"], result_action="return_value")
+    assert "The base works." in capsys.readouterr().out
+
+
+def test_every_extra_is_named_with_what_it_is_for() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    section = text.partition("[project.optional-dependencies]")[2].partition("\n\n")[0]
+    said = dict(re.findall(r"^(\w+) = \[.*?#\s*(.+)$", section, re.MULTILINE))
+    assert said == doctor.EXTRAS
+
+
+def test_what_is_missing_or_too_old_is_said_with_the_line_to_type(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = {"filterpy": "", "rosbags": "0.1"}
+    real = importlib.metadata.version
+    monkeypatch.setattr(doctor, "_version", lambda name: known.get(name, real(name)))
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    said = _said(capsys)
+    assert said["dmrl[label]"]["found"] == "no filterpy"
+    assert said["dmrl[label]"]["way"] == "pip install 'dmrl[label]'"
+    assert str(said["dmrl[ros]"]["found"]).startswith("rosbags 0.1, not ")
+    assert said["C compiler"]["way"] == "apt-get install gcc"
+    assert not said["NVIDIA GPU"]["there"]
+
+
+def test_a_base_that_does_not_work_is_an_error(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = importlib.metadata.version
+    monkeypatch.setattr(doctor, "_version", lambda name: "" if name == "mcap" else real(name))
+    assert boundary.status_of(lambda: app(["doctor"], result_action="return_value")) == 1
+    assert capsys.readouterr().err == "dmrl: base packages: no mcap. Try: pip install dmrl\n"
+
+
+def test_no_vulkan_driver_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(doctor, "DRIVERS", (str(tmp_path),))
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)
+    monkeypatch.delenv("VK_DRIVER_FILES", raising=False)
+    assert not doctor._vulkan().there
+    assert doctor._vulkan().way == "apt-get install mesa-vulkan-drivers"
