@@ -25,7 +25,8 @@ from dmrl.recording.reader import (
 from dmrl.recording.recover import Recovery, recover
 from dmrl.recording.resume import Interrupted, interrupted
 from dmrl.recording.rewrite import Timed, rewrite
-from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
+from dmrl.recording.channel import Channel, RawMessage
+from dmrl.recording.writer import RecordingWriter
 
 __all__ = [
     "LICENCES_METADATA",

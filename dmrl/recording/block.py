@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
+HEAD_BYTES = 31
+"""Of a message's record: opcode, length, channel, sequence, log and publish time."""
 ROWS = 10_000  # that become Python objects at a time
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Messages whose payloads lie in one run of bytes.
+    """Messages whose records lie in one run of bytes.
 
     Parameters
     ----------
@@ -23,7 +25,7 @@ class Block:
     channel, time_ns, publish_ns
         (N,) channel number and times of each message.
     start, end
-        (N,) where its payload lies in ``data``.
+        (N,) where its payload lies in ``data``; the head of its record stands before it.
     """
 
     data: Bytes
@@ -60,20 +62,22 @@ class Block:
 
     def compact(self) -> "Block":
         """A copy that holds no bytes but its own messages'."""
-        view = self.data.data
-        size = self.end - self.start
-        end = np.cumsum(size)
-        data = b"".join(
-            view[a:b] for a, b in zip(self.start.tolist(), self.end.tolist(), strict=True)
-        )
+        records, at = self.records()
         return Block(
-            np.frombuffer(data, np.uint8),
-            self.channel,
-            self.time_ns,
-            self.publish_ns,
-            end - size,
-            end,
+            records, self.channel, self.time_ns, self.publish_ns, at[:-1] + HEAD_BYTES, at[1:]
         )
+
+    def records(self) -> tuple[Bytes, Ints]:
+        """A copy of the records, one after another, and (N + 1,) where they start and end."""
+        first = self.start - HEAD_BYTES
+        at = np.concatenate([[0], np.cumsum(self.end - first)])
+        # Records that follow each other are copied together.
+        breaks = np.flatnonzero(first[1:] != self.end[:-1]) + 1
+        starts = np.concatenate([[0], breaks])[: len(self)]
+        ends = np.concatenate([breaks, [len(self)]])[: len(self)] - 1
+        runs = zip(first[starts].tolist(), self.end[ends].tolist(), strict=True)
+        view = self.data.data
+        return np.frombuffer(bytearray().join(view[a:b] for a, b in runs), np.uint8), at
 
     def sorted(self) -> "Block":
         """By log time; messages of one time keep their order in the file."""

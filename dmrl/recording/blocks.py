@@ -19,10 +19,9 @@ from mcap.records import Chunk, ChunkIndex
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording import sums
-from dmrl.recording.block import EMPTY, Block, Ints, concatenate, joined
+from dmrl.recording.block import EMPTY, HEAD_BYTES, Block, Ints, concatenate, joined
 from dmrl.recording.chunks import (
     RECORD_HEADER,
-    SMALLEST_MESSAGE,
     messages_at,
     of_channels,
     scanned,
@@ -31,7 +30,7 @@ from dmrl.recording.chunks import (
 from dmrl.recording.index import mcap_summary, metadata_of
 from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.walk import channel_of, walked
-from dmrl.recording.writer import Channel
+from dmrl.recording.channel import Channel
 
 
 def blocks(
@@ -256,7 +255,7 @@ def in_chunk(
     entries = np.concatenate(parts)
     entries = entries[np.argsort(entries[:, 1])]
     # Indexes carry no CRC of their own, so they are held against the records they point at.
-    if entries.size and not 0 <= entries[0, 1] <= entries[-1, 1] <= len(data) - SMALLEST_MESSAGE:
+    if entries.size and not 0 <= entries[0, 1] <= entries[-1, 1] <= len(data) - HEAD_BYTES:
         raise damaged(path, f"index beyond the chunk at byte {chunk.chunk_start_offset}")
     block = messages_at(data, entries[:, 1])
     if not (

@@ -15,12 +15,12 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
 
 from dmrl.border import limits
-from dmrl.recording.block import Block, Bytes, Ints
+from dmrl.recording.block import HEAD_BYTES, Block, Bytes, Ints
+from dmrl.recording.container import laid_out
 from dmrl.recording.opening import damaged, too_large
 
 RECORD_HEADER = 1 + 8  # opcode, length
-MESSAGE_HEADER = 2 + 4 + 8 + 8  # channel id, sequence, log time, publish time
-SMALLEST_MESSAGE = RECORD_HEADER + MESSAGE_HEADER
+MESSAGE_HEADER = HEAD_BYTES - RECORD_HEADER  # channel id, sequence, log time, publish time
 
 
 def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
@@ -70,7 +70,7 @@ def messages_at(data: Bytes, at_record: Ints) -> Block:
         view = np.ndarray((max(len(data) - size + 1, 0),), dtype, data, 0, (1,))
         return view[at_record + offset].astype(np.int64)
 
-    start = at_record + RECORD_HEADER + MESSAGE_HEADER
+    start = at_record + HEAD_BYTES
     return Block(
         data,
         field(RECORD_HEADER, "<u2"),
@@ -79,6 +79,20 @@ def messages_at(data: Bytes, at_record: Ints) -> Block:
         start,
         at_record + RECORD_HEADER + field(1, "<u8"),
     )
+
+
+def set_heads(records: Bytes, at: Ints, number: Ints, time_ns: Ints, publish_ns: Ints) -> None:
+    """Write channel number and times into message records that start at these offsets."""
+
+    def put(offset: int, dtype: str, values: Ints) -> None:
+        # A view with a stride of one byte writes unaligned integers in one go.
+        size = np.dtype(dtype).itemsize
+        view = np.ndarray((max(len(records) - size + 1, 0),), dtype, records.data, 0, (1,))
+        view[at + offset] = values
+
+    put(RECORD_HEADER, "<u2", number)
+    put(RECORD_HEADER + 6, "<u8", time_ns)
+    put(RECORD_HEADER + 14, "<u8", publish_ns)
 
 
 def headers(data: Bytes) -> Iterator[tuple[int, int, int]]:
@@ -144,13 +158,6 @@ def definitions(data: Bytes) -> Iterator[Schema | Channel]:
 
 def loose(messages: list[Message]) -> Block:
     """Messages that stand outside of chunks, as a block."""
-    size = np.array([len(m.data) for m in messages], np.int64)
-    end = np.cumsum(size)
-    return Block(
-        np.frombuffer(b"".join(m.data for m in messages), np.uint8),
-        np.array([m.channel_id for m in messages], np.int64),
-        np.array([m.log_time for m in messages], np.uint64).astype(np.int64),
-        np.array([m.publish_time for m in messages], np.uint64).astype(np.int64),
-        end - size,
-        end,
-    )
+    records = [laid_out(message) for message in messages]
+    size = np.array([len(record) for record in records], np.int64)
+    return messages_at(np.frombuffer(b"".join(records), np.uint8), np.cumsum(size) - size)

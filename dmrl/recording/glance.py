@@ -15,7 +15,7 @@ from dmrl.recording.kinds import require_types
 from dmrl.recording.opening import opened
 from dmrl.recording.reader import by_topic
 from dmrl.recording.walk import channel_of
-from dmrl.recording.writer import Channel
+from dmrl.recording.channel import Channel
 
 CHUNKS = 16
 """Chunks that are read of each topic: some 2 MB at most, wherever they lie in the file."""

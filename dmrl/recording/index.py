@@ -21,7 +21,7 @@ from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.recording.section import section
 from dmrl.recording.walk import channel_of, walked
-from dmrl.recording.writer import Channel
+from dmrl.recording.channel import Channel
 
 SPLIT_METADATA = "dmrl.split"
 

@@ -21,7 +21,7 @@ from dmrl.recording.kinds import descriptor_of, one_type, require_types
 from dmrl.recording.opening import damaged
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
-from dmrl.recording.writer import Channel, RawMessage
+from dmrl.recording.channel import Channel, RawMessage
 
 STRETCH_BYTES = 4 << 20
 """Bytes of messages that `stretches` decodes at once: few calls, little memory."""

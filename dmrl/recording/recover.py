@@ -36,7 +36,8 @@ from dmrl.recording.opening import DAMAGE, MAGIC, RECORD, Bounded, too_large
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.section import places, stated
 from dmrl.recording.walk import channel_of
-from dmrl.recording.writer import Channel, RawMessage, RecordingWriter
+from dmrl.recording.channel import Channel, RawMessage
+from dmrl.recording.writer import RecordingWriter
 
 
 @dataclass(slots=True)
@@ -265,7 +266,7 @@ def _parsed(opcode: int, body: bytes, walk: _Walk) -> McapRecord | None:
     ):
         walk.recovery.doubtful = True
     if isinstance(record, Metadata) and record.name != sums.METADATA_NAME:
-        walk.summed.add(RECORD.pack(opcode, len(body)) + body)
+        walk.summed.add_metadata(RECORD.pack(opcode, len(body)) + body)
     return record
 
 

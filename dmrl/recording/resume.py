@@ -9,9 +9,10 @@ from dmrl.errors import OutputError, RecordingError
 from dmrl.output import partial_of
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import Provenance
-from dmrl.recording.reader import read_raw
+from dmrl.recording.reader import log_times, read_raw
 from dmrl.recording.recover import recover
-from dmrl.recording.writer import RawMessage, RecordingWriter
+from dmrl.recording.channel import RawMessage, holds_pictures
+from dmrl.recording.writer import RecordingWriter
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,14 +28,16 @@ class Interrupted:
     path: Path | None
 
     def moments(self) -> Iterator[tuple[int, list[RawMessage]]]:
-        """Time and messages of every moment but the last, which may lack some."""
+        """Time and messages of every moment that is whole, numbers before pictures.
+
+        The last one of either may lack some: they stand in other chunks.
+        """
         if self.path is None:
             return
-        before: tuple[int, list[RawMessage]] | None = None
-        for time_ns, group in groupby(read_raw(self.path), key=lambda raw: raw.time_ns):
-            if before is not None:
-                yield before
-            before = time_ns, list(group)
+        end_ns = _whole_until_ns(self.path)
+        messages = read_raw(self.path, end_ns=end_ns)
+        for time_ns, group in groupby(messages, key=lambda raw: raw.time_ns):
+            yield time_ns, sorted(group, key=lambda raw: raw.channel.pictured)
 
     def check(self, made: Provenance) -> None:
         """Nothing, if it was made as ``made`` says.
@@ -118,3 +121,14 @@ def _mend(partial: Path, kept: Path) -> None:
 
 def _count(path: Path) -> int:
     return sum(info.count for info in summary(path).topics.values())
+
+
+def _whole_until_ns(path: Path) -> int:
+    """Log time before which nothing is missing, of pictures or of numbers."""
+    last: dict[bool, int] = {}
+    held = summary(path).topics
+    for topic, times in log_times(path, held).items():
+        pictured = holds_pictures(held[topic].schema)
+        last[pictured] = max(last.get(pictured, 0), int(times.max(initial=0)))
+    # Where there are pictures, there are numbers that tell of them: those of none were lost.
+    return min(last.values()) if False in last else 0

@@ -8,10 +8,6 @@ is there.
 import zlib
 from dataclasses import dataclass
 
-from mcap.opcode import Opcode
-
-from dmrl.recording.opening import MAGIC, RECORD
-
 METADATA_NAME = "dmrl.crc"
 
 
@@ -22,17 +18,13 @@ class Sums:
     metadata: int = 0
     indexes: int = 0
 
-    def add(self, written: bytes) -> None:
-        """Some whole records that were written, or the magic bytes."""
-        at = len(MAGIC) if written[: len(MAGIC)] == MAGIC else 0
-        while at < len(written):
-            opcode, length = RECORD.unpack_from(written, at)
-            end = at + RECORD.size + length
-            if opcode == Opcode.METADATA:
-                self.metadata = zlib.crc32(written[at:end], self.metadata)
-            elif opcode == Opcode.MESSAGE_INDEX:
-                self.indexes = zlib.crc32(written[at:end], self.indexes)
-            at = end
+    def add_metadata(self, record: bytes) -> None:
+        """A whole metadata record that was written."""
+        self.metadata = zlib.crc32(record, self.metadata)
+
+    def add_indexes(self, records: bytes) -> None:
+        """Whole message indexes that were written."""
+        self.indexes = zlib.crc32(records, self.indexes)
 
     def to_metadata(self) -> dict[str, str]:
         """As they stand in a recording."""

@@ -14,7 +14,7 @@ from dmrl.border import limits
 from dmrl.recording.block import Block
 from dmrl.recording.chunks import definitions, loose, of_channels, scanned, unpacked
 from dmrl.recording.opening import Bounded, too_large
-from dmrl.recording.writer import Channel
+from dmrl.recording.channel import Channel
 
 
 @dataclass(slots=True)

@@ -1,91 +1,41 @@
-"""Writing a recording: whole or absent, with its provenance at the front."""
+"""Writing a recording: whole or absent, with its provenance at the front.
 
-import io
+Pictures stand in chunks of their own, so that whoever reads numbers unpacks no picture.
+"""
+
+from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 from google.protobuf.descriptor import Descriptor
-from mcap.writer import CompressionType, Writer
+from mcap.records import Channel as McapChannel
 
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
 from dmrl.output import as_output_error, partial_file
-from dmrl.recording import sums
+from dmrl.recording.block import Block, Ints
+from dmrl.recording.channel import Channel, RawMessage
+from dmrl.recording.chunks import set_heads
+from dmrl.recording.container import Container
+from dmrl.recording.defined import Defined
+from dmrl.recording.open_chunk import OpenChunk
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.topics import row_of
 
-# 256 KiB costs no size against 1 MiB and bounds what a crash can lose.
-CHUNK_BYTES = 256 * 1024
 SUFFIX = ".mcap"
 RECIPE_NAME = "recipe.toml"
-
-
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """What a recording says of one topic: its name, schema and encodings."""
-
-    topic: str
-    schema_name: str
-    schema_data: bytes
-    schema_encoding: str = "protobuf"
-    encoding: str = "protobuf"
-    metadata: tuple[tuple[str, str], ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class RawMessage:
-    """One message as it stands in the file.
-
-    Parameters
-    ----------
-    time_ns
-        Log time: the sensor's time, nanoseconds.
-    publish_ns
-        Publish time: when it was received, nanoseconds.
-    channel
-        Topic and schema.
-    data
-        Serialized message.
-    """
-
-    time_ns: int
-    publish_ns: int
-    channel: Channel
-    data: bytes = field(repr=False)
-
-    @property
-    def topic(self) -> str:
-        """Topic of the message."""
-        return self.channel.topic
-
-    @property
-    def schema_name(self) -> str:
-        """Full name of the message's type."""
-        return self.channel.schema_name
-
-
-class _WriteThrough(io.BufferedWriter):
-    """Hands every finished chunk to the system, so that a killed process keeps it."""
-
-    def __init__(self, raw: io.RawIOBase) -> None:
-        super().__init__(raw)
-        self.sums = sums.Sums()
-
-    def write(self, data: Any) -> int:
-        self.sums.add(data)
-        count = super().write(data)
-        self.flush()
-        return count
+OLDEST = 16
+"""A chunk is written, full or not, once so many of the other kind were written after its start."""
 
 
 class RecordingWriter:
     """Writes one recording; the file appears under its name only when complete.
 
     A killed process leaves ``<name>.partial``, which ``dmrl recover`` reads: everything
-    before the open chunk is in it.
+    before the open chunks, one of pictures and one of the rest, is in it.
 
     Parameters
     ----------
@@ -116,22 +66,17 @@ class RecordingWriter:
         if SUFFIX not in path.suffixes:  # a resumed one is out.mcap.kept for a while
             raise OutputError(f"{path} is no name of a recording. Call it {path.name}{SUFFIX}")
         self._path = path
-        self._channels: dict[Channel, int] = {}
-        self._known: dict[str, Channel] = {}
-        self._schemas: dict[tuple[str, bytes], int] = {}
+        self._defined = Defined()
+        self._begun: set[int] = set()  # channels whose records are in a chunk
+        self._begun_schemas: set[int] = {0}
+        self._topics: dict[str, tuple[type, int, OpenChunk]] = {}
+        self._numbers, self._pictures = OpenChunk(), OpenChunk()
         self._resources = ExitStack()
         partial = self._resources.enter_context(partial_file(path, keep_on_error=keep_on_error))
         try:
-            raw = self._resources.enter_context(io.FileIO(partial, "wb"))
-            self._stream = _WriteThrough(raw)
-            self._writer = Writer(
-                self._stream,
-                chunk_size=CHUNK_BYTES,
-                compression=CompressionType.ZSTD,
-                enable_data_crcs=True,
-            )
-            self._writer.start(profile="dmrl", library=f"dmrl {provenance.dmrl_version}")
-            self._writer.add_metadata(METADATA_NAME, provenance.to_metadata())
+            self._file = Container(partial, f"dmrl {provenance.dmrl_version}")
+            self._resources.callback(self._file.close)
+            self._file.add_metadata(METADATA_NAME, provenance.to_metadata())
             text = provenance.to_recipe() if recipe is None else recipe
             self.add_attachment(RECIPE_NAME, "application/toml", text.encode())
         except OSError as e:
@@ -162,56 +107,116 @@ class RecordingWriter:
         RecordingError
             If the topic is dmrl's and carries another message type, or the time is negative.
         """
-        channel = self._known.get(topic)
-        if channel is None or channel.schema_name != message.DESCRIPTOR.full_name:
-            channel = self._known[topic] = self._channel_for(topic, message.DESCRIPTOR)
+        known = self._topics.get(topic)
+        if known is None or known[0] is not type(message):
+            channel = channel_for(topic, message.DESCRIPTOR)
+            known = type(message), *self._begin(channel)
+            self._topics[topic] = known
+        _, number, chunk = known
         publish_ns = time_ns if publish_ns is None else publish_ns
-        self.write_raw(RawMessage(time_ns, publish_ns, channel, message.SerializeToString()))
+        if time_ns < 0 or publish_ns < 0:
+            raise self._negative(time_ns, topic)
+        chunk.add(number, time_ns, publish_ns, message.SerializeToString())
+        if chunk.full:
+            self._close(chunk)
 
     def write_raw(self, raw: RawMessage) -> None:
         """Append a message of another recording, bit for bit."""
         if raw.time_ns < 0 or raw.publish_ns < 0:
-            raise RecordingError(
-                f"{self._path}: time {raw.time_ns} ns on {raw.topic} is negative, which MCAP "
-                "cannot hold. Shift the recording's times"
-            )
-        try:
-            number = self._channels.get(raw.channel)
-            if number is None:
-                number = self._channels[raw.channel] = self._register(raw.channel)
-            self._writer.add_message(number, raw.time_ns, raw.data, raw.publish_ns)
-        except OSError as e:
-            raise as_output_error(self._path, e) from e
+            raise self._negative(raw.time_ns, raw.topic)
+        number, chunk = self._begin(raw.channel)
+        chunk.add(number, raw.time_ns, raw.publish_ns, raw.data)
+        if chunk.full:
+            self._close(chunk)
+
+    def adopt(
+        self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]
+    ) -> None:
+        """Number channels of a recording that is copied as they are there; see `Defined`."""
+        self._defined.adopt(channels, records)
+
+    def append(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        """Append many messages, bit for bit but for their heads.
+
+        Parameters
+        ----------
+        block
+            The messages.
+        channels
+            By their numbers in it.
+
+        Raises
+        ------
+        RecordingError
+            If a time is negative.
+        """
+        present = np.unique(block.channel).tolist()
+        for pictured in (False, True):
+            own = [number for number in present if channels[number].pictured == pictured]
+            if own:
+                part = block if len(own) == len(present) else _of(block, own)
+                self._append(part, {number: channels[number] for number in own})
+
+    def _append(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        """Append messages that are all pictures, or none of them."""
+        if min(int(block.time_ns.min()), int(block.publish_ns.min())) < 0:
+            worst = int(np.argmin(np.minimum(block.time_ns, block.publish_ns)))
+            topic = channels[int(block.channel[worst])].topic
+            raise self._negative(int(block.time_ns[worst]), topic)
+        numbers = np.zeros(max(channels) + 1, np.int64)
+        for number, channel in channels.items():
+            numbers[number], chunk = self._begin(channel)
+        records, at = block.records()
+        set_heads(records, at[:-1], numbers[block.channel], block.time_ns, block.publish_ns)
+        while len(at) > 1:
+            at = at[chunk.fill(records, at) :]
+            if chunk.full:
+                self._close(chunk)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Append named strings, such as the source's own split."""
-        self._writer.add_metadata(name, values)
+        self._file.add_metadata(name, values)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Append a named file."""
-        self._writer.add_attachment(0, 0, name, media_type, data)
+        self._file.add_attachment(name, media_type, data)
 
     def flush(self) -> None:
-        """Close the open chunk, so that a killed process keeps it."""
-        self._writer.flush()
+        """Close the open chunks, so that a killed process keeps them."""
+        for chunk in (self._numbers, self._pictures):
+            self._close(chunk)
 
-    def _channel_for(self, topic: str, kind: Descriptor) -> Channel:
-        schema_name = str(kind.full_name)
-        row = row_of(topic)
-        if row is not None and not row.carries(schema_name):
-            raise RecordingError(
-                f"{topic} carries {row.message}, not {schema_name}. Use its own topic"
-            )
-        return Channel(topic, schema_name, schema_bytes(kind))
+    def _begin(self, channel: Channel) -> tuple[int, OpenChunk]:
+        """Number of a channel, defined before its first message, and the chunk it goes to."""
+        number = self._defined.number(channel)
+        chunk = self._pictures if channel.pictured else self._numbers
+        if number not in self._begun:
+            schema, own = self._defined.records(number)
+            schema_id = self._defined.channels[number].schema_id
+            if schema_id not in self._begun_schemas:
+                self._begun_schemas.add(schema_id)
+                chunk.define(schema)
+            chunk.define(own)
+            self._begun.add(number)
+        return number, chunk
 
-    def _register(self, channel: Channel) -> int:
-        key = (channel.schema_name, channel.schema_data)
-        if key not in self._schemas:
-            self._schemas[key] = self._writer.register_schema(
-                channel.schema_name, channel.schema_encoding, channel.schema_data
-            )
-        return self._writer.register_channel(
-            channel.topic, channel.encoding, self._schemas[key], dict(channel.metadata)
+    def _close(self, chunk: OpenChunk) -> None:
+        """Write a chunk that holds messages, and the other one if it is old."""
+        if not chunk.starts:
+            return
+        other = self._pictures if chunk is self._numbers else self._numbers
+        try:
+            self._file.add_chunk(chunk.packed())
+        except OSError as e:
+            raise as_output_error(self._path, e) from e
+        other.age += bool(other.starts)
+        if other.age >= OLDEST:
+            self._close(other)
+
+    def _negative(self, time_ns: int, topic: str) -> RecordingError:
+        return RecordingError(
+            f"{self._path}: time {time_ns} ns on {topic} is negative, which MCAP cannot hold. "
+            "Shift the recording's times"
         )
 
     def _abandon(self, error: BaseException) -> None:
@@ -227,10 +232,28 @@ class RecordingWriter:
             self._resources.__exit__(kind, error, traceback)
             return
         try:
-            self._writer.flush()  # its sums are to cover the last chunk, too
-            self._writer.add_metadata(sums.METADATA_NAME, self._stream.sums.to_metadata())
-            self._writer.finish()
-        except OSError as e:
+            self.flush()
+            self._file.finish(self._defined.schemas.values(), self._defined.channels.values())
+        except (OSError, OutputError) as e:
             self._abandon(e)
-            raise as_output_error(self._path, e) from e
+            raise (e if isinstance(e, OutputError) else as_output_error(self._path, e)) from e
         self._resources.close()
+
+
+def channel_for(topic: str, kind: Descriptor) -> Channel:
+    """The channel of a topic that carries a type of message.
+
+    Raises
+    ------
+    RecordingError
+        If the topic is dmrl's and carries another.
+    """
+    schema_name = str(kind.full_name)
+    row = row_of(topic)
+    if row is not None and not row.carries(schema_name):
+        raise RecordingError(f"{topic} carries {row.message}, not {schema_name}. Use its own topic")
+    return Channel(topic, schema_name, schema_bytes(kind))
+
+
+def _of(block: Block, numbers: list[int]) -> Block:
+    return block.take(np.isin(block.channel, numbers))

@@ -46,7 +46,6 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         if jpeg
         else encode_png(shot.rgb)
     )
-    yield image(time_ns, ROBOT, data, settings.image_format)
     yield labels(time_ns, ROBOT, list(_peers(scene, shot)), ["truth"])
     attitude = {"roll_rad": scene.roll_rad, "pitch_rad": scene.pitch_rad}
     yield Sample(time_ns, topics.attitude(ROBOT), "Attitude", attitude)
@@ -55,6 +54,8 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
         yield _truth(time_ns, peer(k, robot), xyz)
     yield _transforms(time_ns, scene, horizontal_from_camera)
+    # Pictures last: so a resumed recording is copied, and its chunks become the same.
+    yield image(time_ns, ROBOT, data, settings.image_format)
     if settings.masks:
         mask = encode_png(_mask(shot))
         yield replace(image(time_ns, ROBOT, mask, "png"), topic=topics.masks(ROBOT))

@@ -16,13 +16,13 @@ from dmrl.recording import (
     columns,
     glance,
     log_times,
+    open_chunk,
     read,
     read_raw,
     read_table,
     reader,
     stretches,
     summary,
-    writer,
 )
 
 HEIGHT = message("Height")
@@ -282,7 +282,7 @@ def test_a_glance_sees_every_topic_all_over_the_recording_in_a_few_chunks(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "chunks.mcap"
-    monkeypatch.setattr(writer, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(open_chunk, "CHUNK_BYTES", 1000)
     with RecordingWriter(path, Provenance("test")) as sink:
         for raw in read_raw(flight):
             sink.write_raw(raw)

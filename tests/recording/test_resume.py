@@ -1,5 +1,6 @@
 """Going on with an interrupted recording."""
 
+import random
 from pathlib import Path
 
 import pytest
@@ -79,3 +80,31 @@ def test_what_is_left_is_not_silently_overwritten(stopped: Path) -> None:
 def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"to resume\. Run without --resume"):
         interrupted(tmp_path / "none.mcap", resume=True)
+
+
+def write_pictures(sink: RecordingWriter, first: int, last: int) -> None:
+    """At every moment what tells of a picture, then the picture, which does not compress."""
+    for k in range(first, last):
+        sink.write(k, "/cf1/labels", message("PeerLabels")(sources=["truth"]))
+        picture = message("CompressedImage")(data=random.Random(k).randbytes(20_000))
+        sink.write(k, "/cf1/camera/image", picture)
+
+
+def test_pictures_without_what_was_said_of_them_are_not_whole(tmp_path: Path) -> None:
+    whole, out = tmp_path / "whole.mcap", tmp_path / "out.mcap"
+    with RecordingWriter(whole, MADE) as sink:
+        write_pictures(sink, 0, 600)
+    for stop, most in ((50, 0), (550, 549)):
+        with (
+            pytest.raises(KeyboardInterrupt),
+            RecordingWriter(out, MADE, keep_on_error=True) as sink,
+        ):
+            write_pictures(sink, 0, stop)
+            raise KeyboardInterrupt
+        before = interrupted(out, resume=True)
+        with RecordingWriter(tmp_path / f"{stop}.mcap", MADE) as sink:
+            done = before.copy(sink)
+            assert done <= most
+            write_pictures(sink, done, 600)
+        assert (tmp_path / f"{stop}.mcap").read_bytes() == whole.read_bytes()
+    assert done > 300

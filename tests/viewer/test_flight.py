@@ -10,7 +10,7 @@ import pytest
 
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
-from dmrl.recording import blocks, glance, reader, writer
+from dmrl.recording import blocks, glance, open_chunk, reader
 from dmrl.viewer import Settings, save, scene
 from dmrl.viewer.session import prepare
 
@@ -215,7 +215,7 @@ def test_a_robot_that_is_not_there_is_named_with_those_that_are(fly: Make, rrd: 
 def test_images_come_first_and_wait_for_no_more_of_the_flight(
     fly: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writer, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(open_chunk, "CHUNK_BYTES", 1)
     monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
     monkeypatch.setattr(sys.modules[glance.__module__], "CHUNKS", 2)
     opened: list[int] = []
@@ -247,7 +247,7 @@ def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_e
         }
 
     whole = saved("whole")
-    monkeypatch.setattr(writer, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(open_chunk, "CHUNK_BYTES", 1)
     monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
     monkeypatch.setattr(scene, "ROWS_AT_ONCE", 1)
     pieces = saved("pieces")

@@ -1,0 +1,206 @@
+"""The bytes of an MCAP file, written front to back: records, chunks, and the summary at the end.
+
+What stands in it is decided above. mcap lays out the records that are few; chunks and message
+indexes are laid out here, from arrays.
+"""
+
+import io
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from dmrl.recording import sums
+from dmrl.recording.block import Ints
+from dmrl.recording.opening import MAGIC, RECORD
+
+CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of a name
+INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+ENTRY_BYTES = 16  # of a message index: log time, offset
+FOOTER = struct.Struct("<BQQQ")  # opcode, length, summary start, summary offset start
+
+
+def laid_out(*records: McapRecord) -> bytes:
+    """The bytes of some records."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """A chunk, compressed, and where its messages are.
+
+    Parameters
+    ----------
+    compression, data
+        How its records are compressed, and to what.
+    size, crc
+        Length of its records, and their CRC-32.
+    channel, time_ns, at
+        (N,) channel number and log time of each message, and where its record starts.
+    """
+
+    compression: str
+    data: bytes
+    size: int
+    crc: int
+    channel: Ints
+    time_ns: Ints
+    at: Ints
+
+
+class Container:
+    """An MCAP file that is being written.
+
+    Every finished piece is handed to the system at once, so that a killed process keeps it.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    library
+        What the header says of the writer.
+    """
+
+    def __init__(self, path: Path, library: str) -> None:
+        self._stream = io.FileIO(path, "wb")
+        self._at = self._crc = 0
+        self._sums = sums.Sums()
+        self._said = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
+        self._counts: Counter[int] = Counter()
+        self._chunks: list[ChunkIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._attachments: list[AttachmentIndex] = []
+        try:
+            self._put(MAGIC + laid_out(Header("dmrl", library)))
+        except OSError:
+            self.close()
+            raise
+
+    def _put(self, data: bytes) -> int:
+        """Write some bytes; where they stand."""
+        at = self._at
+        left = memoryview(data)
+        while left:
+            left = left[self._stream.write(left) :]
+        self._crc = zlib.crc32(data, self._crc)
+        self._at += len(data)
+        return at
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """Append named strings."""
+        record = laid_out(Metadata(name, values))
+        self._sums.add_metadata(record)
+        self._metadata.append(MetadataIndex(self._put(record), len(record), name))
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Append a named file."""
+        record = laid_out(Attachment(0, 0, name, media_type, data))
+        at = self._put(record)
+        self._attachments.append(
+            AttachmentIndex(at, len(record), 0, 0, len(data), name, media_type)
+        )
+
+    def add_chunk(self, chunk: Packed) -> None:
+        """Append a chunk with its message indexes."""
+        first, last = int(chunk.time_ns.min()), int(chunk.time_ns.max())
+        name = chunk.compression.encode()
+        length = CHUNK.size - RECORD.size + len(name) + 8 + len(chunk.data)
+        head = CHUNK.pack(Opcode.CHUNK, length, first, last, chunk.size, chunk.crc, len(name))
+        head += name + struct.pack("<Q", len(chunk.data))
+        places, indexes = _indexes(chunk, self._at + RECORD.size + length)
+        self._sums.add_indexes(indexes)
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=RECORD.size + length,
+                chunk_start_offset=self._put(head + chunk.data + indexes),
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=last,
+                message_index_length=len(indexes),
+                message_index_offsets=places,
+                message_start_time=first,
+                uncompressed_size=chunk.size,
+            )
+        )
+        self._count(chunk, first, last)
+
+    def _count(self, chunk: Packed, first: int, last: int) -> None:
+        said = self._said
+        earlier = said.message_count > 0
+        said.message_start_time = min(said.message_start_time, first) if earlier else first
+        said.message_end_time = max(said.message_end_time, last)
+        said.message_count += len(chunk.channel)
+        for number, count in enumerate(np.bincount(chunk.channel).tolist()):
+            if count:
+                self._counts[number] += count
+
+    def finish(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
+        """Write the sums and the summary, with what defines every message."""
+        self.add_metadata(sums.METADATA_NAME, self._sums.to_metadata())
+        self._put(laid_out(DataEnd(self._crc)))
+        said, schemas, channels = self._said, list(schemas), list(channels)
+        said.schema_count, said.channel_count = len(schemas), len(channels)
+        said.chunk_count, said.metadata_count = len(self._chunks), len(self._metadata)
+        said.attachment_count = len(self._attachments)
+        said.channel_message_counts = dict(sorted(self._counts.items()))
+        start, body, offsets = self._at, b"", b""
+        groups = (schemas, channels, [said], self._chunks, self._attachments, self._metadata)
+        for group in groups:
+            records = laid_out(*group)
+            if records:
+                at = start + len(body)
+                offsets += laid_out(SummaryOffset(records[0], at, len(records)))
+            body += records
+        self._end(start, body, offsets)
+
+    def _end(self, start: int, body: bytes, offsets: bytes) -> None:
+        """The summary section and the footer."""
+        places = start, start + len(body)
+        footer = FOOTER.pack(Opcode.FOOTER, FOOTER.size - RECORD.size + 4, *places)
+        crc = zlib.crc32(body + offsets + footer)
+        self._put(body + offsets + laid_out(Footer(*places, crc)) + MAGIC)
+
+    def close(self) -> None:
+        """Close the file, whole or not."""
+        self._stream.close()
+
+
+def _indexes(chunk: Packed, at: int) -> tuple[dict[int, int], bytes]:
+    """Where the message index of each channel stands, and all of them one after another."""
+    order = np.argsort(chunk.channel, kind="stable")
+    numbers, first = np.unique(chunk.channel[order], return_index=True)
+    entries = np.column_stack([chunk.time_ns, chunk.at])[order].astype("<i8").tobytes()
+    places: dict[int, int] = {}
+    parts: list[bytes] = []
+    bounds = [*(ENTRY_BYTES * first).tolist(), len(entries)]
+    for number, (start, end) in zip(numbers.tolist(), pairwise(bounds), strict=True):
+        places[number] = at
+        parts.append(INDEX.pack(Opcode.MESSAGE_INDEX, end - start + 6, number, end - start))
+        parts.append(entries[start:end])
+        at += INDEX.size + end - start
+    return places, b"".join(parts)
