@@ -65,7 +65,7 @@ class OpenChunk:
         data = np.frombuffer(bytes(self.data), np.uint8)
         block = messages_at(data, np.array(self.starts, np.int64))
         squeezed = zstandard.ZstdCompressor(level=LEVEL).compress(data.data)
-        crc = zlib.crc32(data)
+        crc = zlib.crc32(data.data)
         self.data, self.starts, self.age = bytearray(), array("q"), 0
         at = block.start - HEAD_BYTES
         return Packed("zstd", squeezed, len(data), crc, block.channel, block.time_ns, at)
