@@ -3,9 +3,12 @@
 The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
 """
 
-from dmrl.recording.check import Finding, check, label_findings, say_findings
+from dmrl.recording.channel import Channel, RawMessage
+from dmrl.recording.check import check, label_findings, say_findings
+from dmrl.recording.contents import Contents
 from dmrl.recording.edit import merge, trim
 from dmrl.recording.extras import copy_extras, splits
+from dmrl.recording.finding import Finding
 from dmrl.recording.glance import glance
 from dmrl.recording.index import SPLIT_METADATA, Summary, TopicInfo, summary
 from dmrl.recording.inputs import input_of, provenance
@@ -25,13 +28,13 @@ from dmrl.recording.reader import (
 from dmrl.recording.recover import Recovery, recover
 from dmrl.recording.resume import Interrupted, interrupted
 from dmrl.recording.rewrite import Timed, rewrite
-from dmrl.recording.channel import Channel, RawMessage
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [
     "LICENCES_METADATA",
     "SPLIT_METADATA",
     "Channel",
+    "Contents",
     "Finding",
     "Input",
     "Interrupted",

@@ -20,6 +20,7 @@ from mcap.summary import Summary as McapSummary
 
 from dmrl.recording import sums
 from dmrl.recording.block import EMPTY, HEAD_BYTES, Block, Ints, concatenate, joined
+from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import (
     RECORD_HEADER,
     messages_at,
@@ -30,7 +31,6 @@ from dmrl.recording.chunks import (
 from dmrl.recording.index import mcap_summary, metadata_of
 from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.walk import channel_of, walked
-from dmrl.recording.channel import Channel
 
 
 def blocks(

@@ -2,16 +2,11 @@
 
 from collections.abc import Iterator, Mapping
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from dmrl.errors import RecordingError
-from dmrl.recording.index import Summary
-from dmrl.recording.reader import columns, log_times
+from dmrl.recording.check_seen import Seen
 from dmrl.topics import CALIBRATION, TRANSFORMS, names
 
 Times = Mapping[str, NDArray[np.int64]]
@@ -23,25 +18,14 @@ SPARSE = 2
 """Topics with fewer messages tell nothing of a clock."""
 
 
-def clocks(path: Path, found: Summary) -> Found:
-    """Robots, or topics of a robot, that share no time; times and stamps of 0.
-
-    Parameters
-    ----------
-    path
-        A complete recording.
-    found
-        Its summary.
-
-    Raises
-    ------
-    RecordingError
-        If the file is not a complete recording.
-    """
-    times = {topic: t for topic, t in log_times(path, found.topics).items() if len(t)}
+def clocks(seen: Seen) -> Found:
+    """Robots, or topics of a robot, that share no time; times and stamps of 0."""
+    times = {topic: np.sort(t) for topic, t in seen.times.items() if len(t)}
     yield from _zeros(times)
     yield from _apart(times)
-    yield from _stamps(path, found)
+    for topic, wrong in seen.unset.items():
+        if wrong:
+            yield topic, f"{wrong} messages have a time stamp of 0"
 
 
 def _zeros(times: Times) -> Found:
@@ -85,26 +69,3 @@ def _around(spans: list[tuple[int, int]]) -> tuple[int, int]:
 def _gap_s(one: tuple[int, int], other: tuple[int, int]) -> float:
     """Seconds between two stretches of time; 0 or less where they overlap."""
     return (max(one[0], other[0]) - min(one[1], other[1])) * 1e-9
-
-
-def _stamps(path: Path, found: Summary) -> Found:
-    """Messages that say of themselves that they are of time 0, and stand at another."""
-    for topic, info in found.topics.items():
-        if info.schema.rpartition(".")[2] not in ("CompressedImage", "PoseInFrame"):
-            continue
-        wrong = 0
-        try:
-            for batch in columns(path, topic, fields=["timestamp"]):
-                stamp = batch["timestamp"]
-                zero = pc.equal(_filled(stamp, "seconds"), 0)
-                zero = pc.and_(zero, pc.equal(_filled(stamp, "nanos"), 0))
-                zero = pc.and_(zero, stamp.is_valid())  # without any stamp, nothing is said
-                wrong += pc.sum(pc.and_(zero, pc.not_equal(batch["log_time"], 0))).as_py() or 0
-        except RecordingError:
-            continue  # said already: its messages are not of their type
-        if wrong:
-            yield topic, f"{wrong} messages have a time stamp of 0"
-
-
-def _filled(stamp: pa.Array, name: str) -> pa.Array:
-    return pc.fill_null(pc.struct_field(stamp, name), 0)

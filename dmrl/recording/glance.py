@@ -10,12 +10,12 @@ from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.block import Block, joined
 from dmrl.recording.blocks import blocks, chunks_between, in_chunk
+from dmrl.recording.channel import Channel
 from dmrl.recording.index import mcap_summary, summary
 from dmrl.recording.kinds import require_types
 from dmrl.recording.opening import opened
 from dmrl.recording.reader import by_topic
 from dmrl.recording.walk import channel_of
-from dmrl.recording.channel import Channel
 
 CHUNKS = 16
 """Chunks that are read of each topic: some 2 MB at most, wherever they lie in the file."""

@@ -17,11 +17,11 @@ from mcap.summary import Summary as McapSummary
 
 from dmrl.errors import RecordingError
 from dmrl.recording import sums
+from dmrl.recording.channel import Channel
 from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.recording.section import section
 from dmrl.recording.walk import channel_of, walked
-from dmrl.recording.channel import Channel
 
 SPLIT_METADATA = "dmrl.split"
 

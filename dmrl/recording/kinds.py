@@ -11,9 +11,9 @@ from google.protobuf.message import DecodeError
 
 from dmrl.errors import RecordingError
 from dmrl.messages import descriptor, pool_of
+from dmrl.recording.channel import Channel
 from dmrl.recording.index import TopicInfo
 from dmrl.recording.opening import damaged
-from dmrl.recording.channel import Channel
 from dmrl.topics import row_of
 
 

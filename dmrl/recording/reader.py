@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from dmrl.errors import MissingTopic
 from dmrl.recording.block import EMPTY, Block, joined
 from dmrl.recording.blocks import blocks, indexed_times
+from dmrl.recording.channel import Channel, RawMessage
 from dmrl.recording.index import channel_on, summary
 from dmrl.recording.kinds import descriptor_of, one_type, require_types
 from dmrl.recording.opening import damaged
 from dmrl.recording.values import WireError
 from dmrl.recording.wire import decode
-from dmrl.recording.channel import Channel, RawMessage
 
 STRETCH_BYTES = 4 << 20
 """Bytes of messages that `stretches` decodes at once: few calls, little memory."""
@@ -170,8 +170,7 @@ def columns(
         If the file is not a complete recording, or a message is not of its type.
     """
     for block, channels in blocks(path, matching(path, [topic]), start_ns=start_ns, end_ns=end_ns):
-        kinds = {descriptor_of(path, channel) for channel in channels.values()}
-        yield _decoded(path, topic, block, one_type(path, topic, kinds), fields)
+        yield decoded(path, topic, block, channels, fields)
 
 
 def stretches(
@@ -259,15 +258,44 @@ def by_topic(
     fields: Mapping[str, Sequence[str] | None],
 ) -> dict[str, pa.RecordBatch]:
     """The messages of a block as columns, by topic."""
-    numbers: dict[str, list[int]] = {}
-    for number in np.unique(block.channel).tolist():
-        numbers.setdefault(channels[number].topic, []).append(number)
-    out = {}
-    for topic, own in numbers.items():
-        mine = block.take(np.isin(block.channel, own))
-        kind = one_type(path, topic, {descriptor_of(path, channels[number]) for number in own})
-        out[topic] = _decoded(path, topic, mine, kind, fields[topic])
-    return out
+    return {
+        topic: decoded(path, topic, mine, channels, fields[topic])
+        for topic, mine in apart(block, channels).items()
+    }
+
+
+def apart(block: Block, channels: Mapping[int, Channel]) -> dict[str, Block]:
+    """The messages of a block by topic, in the order they have in it."""
+    topics = sorted({channels[number].topic for number in np.unique(block.channel).tolist()})
+    place = np.full(max(channels, default=0) + 1, -1, np.int64)
+    for number, channel in channels.items():
+        if channel.topic in topics:
+            place[number] = topics.index(channel.topic)
+    key = place[block.channel]
+    order = np.argsort(key, kind="stable")
+    ends = np.searchsorted(key[order], np.arange(len(topics)), side="right")
+    rows = np.split(order, ends[:-1])
+    return {topic: block.take(own) for topic, own in zip(topics, rows, strict=False)}
+
+
+def decoded(
+    path: Path,
+    topic: str,
+    block: Block,
+    channels: Mapping[int, Channel],
+    fields: Sequence[str] | None,
+) -> pa.RecordBatch:
+    """The messages of one topic as columns.
+
+    Raises
+    ------
+    RecordingError
+        If they are of several types, or not what they should be.
+    """
+    numbers = np.unique(block.channel).tolist()
+    own = [n for n, channel in channels.items() if channel.topic == topic]
+    kinds = {descriptor_of(path, channels[number]) for number in numbers or own}
+    return _decoded(path, topic, block, one_type(path, topic, kinds), fields)
 
 
 def _decoded(

@@ -28,6 +28,7 @@ from dmrl.border import limits
 from dmrl.errors import RecordingError
 from dmrl.recording import sums
 from dmrl.recording.block import Block
+from dmrl.recording.channel import Channel, RawMessage
 from dmrl.recording.chunks import definitions, loose, scanned, unpacked
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import Summary
@@ -36,7 +37,6 @@ from dmrl.recording.opening import DAMAGE, MAGIC, RECORD, Bounded, too_large
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.section import places, stated
 from dmrl.recording.walk import channel_of
-from dmrl.recording.channel import Channel, RawMessage
 from dmrl.recording.writer import RecordingWriter
 
 

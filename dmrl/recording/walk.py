@@ -12,9 +12,9 @@ from mcap.stream_reader import StreamReader
 
 from dmrl.border import limits
 from dmrl.recording.block import Block
+from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import definitions, loose, of_channels, scanned, unpacked
 from dmrl.recording.opening import Bounded, too_large
-from dmrl.recording.channel import Channel
 
 
 @dataclass(slots=True)

@@ -16,7 +16,7 @@ from mcap.records import Channel as McapChannel
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
 from dmrl.output import as_output_error, partial_file
-from dmrl.recording.block import Block, Ints
+from dmrl.recording.block import Block
 from dmrl.recording.channel import Channel, RawMessage
 from dmrl.recording.chunks import set_heads
 from dmrl.recording.container import Container
@@ -129,9 +129,7 @@ class RecordingWriter:
         if chunk.full:
             self._close(chunk)
 
-    def adopt(
-        self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]
-    ) -> None:
+    def adopt(self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]) -> None:
         """Number channels of a recording that is copied as they are there; see `Defined`."""
         self._defined.adopt(channels, records)
 
