@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
@@ -25,7 +26,7 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import STRIDE_PX, grid_label
 from dmrl.images.codec import decode
 from dmrl.messages import STATUS_OK, status_name
-from dmrl.recording import Stamped, columns, matching, read, summary
+from dmrl.recording import Contents, Stamped, matching, read, summary
 from dmrl.recording.sources import LOOKED, looked_at, sources_in
 
 SOURCES = ("truth", "estimate", "hand", "published")
@@ -78,23 +79,27 @@ def count_images(path: Path) -> int:
     return sum(present[t].count for t in found if topics.names(topics.CAMERA_IMAGE, t))
 
 
-def sources_of(path: Path) -> set[str]:
+def sources_of(held: Contents) -> set[str]:
     """Every source of labels that a recording has."""
     present: set[str] = set()
-    for topic in summary(path).topics:
+    for topic in held.topics:
         if topics.names(topics.LABELS, topic):
-            for batch in columns(path, topic, fields=LOOKED):
-                present.update(sources_in(*(batch.column(name) for name in LOOKED)))
+            table = held.table(topic, LOOKED).combine_chunks()
+            present.update(sources_in(*(_chunk(table, name) for name in LOOKED)))
     return present
 
 
-def label_source(path: Path, wanted: str) -> str:
+def _chunk(table: pa.Table, name: str) -> pa.Array:
+    return table.column(name).chunk(0)
+
+
+def label_source(held: Contents, wanted: str) -> str:
     """The source whose labels are used for a recording.
 
     Parameters
     ----------
-    path
-        A recording that `count_images` accepts.
+    held
+        A recording that `count_images` accepts, best with its labels.
     wanted
         One of `SOURCES`; "best" for the first of them that the recording has; "auto" for the first
         of `TAUGHT`.
@@ -104,26 +109,27 @@ def label_source(path: Path, wanted: str) -> str:
     SettingError
         If the recording has labels, but none from that source.
     """
-    present = sources_of(path)
+    present = sources_of(held)
     order = {"best": SOURCES, "auto": TAUGHT}.get(wanted, (wanted,))
     if not present:
         return order[0]
     usable = [source for source in order if source in present]
     if not usable:
         has = ", ".join(sorted(present))
-        raise SettingError(f"{path} has no labels from {wanted}. Try one of --labels {has}")
+        raise SettingError(f"{held.path} has no labels from {wanted}. Try one of --labels {has}")
     return usable[0]
 
 
 def rows_of(
-    path: Path, source: str, split_of: SplitOf, tally: Tally, *, keep_all: bool, masks: bool
+    held: Contents, source: str, split_of: SplitOf, tally: Tally, *, keep_all: bool, masks: bool
 ) -> Iterator[tuple[str, Row] | None]:
     """Split and row of each image of a recording, in time order; None for one left out.
 
     Parameters
     ----------
-    path
-        A recording that `count_images` accepts.
+    held
+        A recording that `count_images` accepts, best with its labels: then each of its chunks is
+        unpacked once.
     source
         Whose labels; see `label_source`.
     split_of
@@ -136,7 +142,7 @@ def rows_of(
         Rows have masks. Images that show a peer and have none are left out: an empty mask would
         say that nobody is there.
     """
-    for image, labels, covered in labelled_images(path, masks=masks):
+    for image, labels, covered in labelled_images(held, masks=masks):
         if labels is None:
             tally.without_labels += 1
             yield None
@@ -153,36 +159,64 @@ def rows_of(
             tally.not_ok += 1
         else:
             tally.kept += 1
-            row = _row(path, image, [_peer(label) for label in mine])
-            yield split, replace(row, mask=_mask(path, row, covered)) if masks else row
+            row = _row(held.path, image, [_peer(label) for label in mine])
+            yield split, replace(row, mask=_mask(held.path, row, covered)) if masks else row
             continue
         yield None
 
 
 def labelled_images(
-    path: Path, *, masks: bool = False
+    held: Contents, *, masks: bool = False
 ) -> Iterator[tuple[Stamped, Any, Stamped | None]]:
     """Each image with PeerLabels and, if asked for, masks of its robot and log time, or None."""
-    patterns = [*PATTERNS]
-    if masks and any(topics.names(topics.MASKS, topic) for topic in summary(path).topics):
-        patterns.append(topics.masks("*"))
-    for _, same_time in groupby(read(path, *patterns), key=lambda stamped: stamped.time_ns):
+    labels = _labels(held)
+    wanted = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
+    wanted += [t for t in held.topics if masks and topics.names(topics.MASKS, t)]
+    for _, same_time in groupby(read(held.path, *wanted), key=lambda stamped: stamped.time_ns):
         images: list[Stamped] = []
-        labels: dict[str, Any] = {}
         covered: dict[str, Stamped] = {}
         for stamped in same_time:
-            if found := topics.names(topics.LABELS, stamped.topic):
-                # Two recordings of the same images, merged, each with its own source.
-                labels.setdefault(found["robot"], type(stamped.message)()).MergeFrom(
-                    stamped.message
-                )
-            elif found := topics.names(topics.MASKS, stamped.topic):
-                covered[found["robot"]] = stamped
+            if link := topics.names(topics.MASKS, stamped.topic):
+                covered[link["robot"]] = stamped
             else:
                 images.append(stamped)
-        _refuse_two_of_one_time(path, images)
+        _refuse_two_of_one_time(held.path, images)
         for image in images:
-            yield image, labels.get(_robot(image)), covered.get(_robot(image))
+            robot = _robot(image)
+            yield (
+                image,
+                labels[robot].at(image.time_ns) if robot in labels else None,
+                covered.get(robot),
+            )
+
+
+def _labels(held: Contents) -> dict[str, "_Series"]:
+    """Labels by robot."""
+    found = ((topic, topics.names(topics.LABELS, topic)) for topic in held.topics)
+    return {n["robot"]: _Series(held.messages(topic)) for topic, n in found if n is not None}
+
+
+class _Series:
+    """Messages in the order of time, looked up at times that only increase."""
+
+    def __init__(self, messages: Iterator[Stamped]) -> None:
+        self._groups = groupby(messages, key=lambda stamped: stamped.time_ns)
+        self._next = next(self._groups, None)
+
+    def at(self, time_ns: int) -> Any:
+        """All messages of a time as one, or None.
+
+        Two recordings of the same images, merged, have each its own source.
+        """
+        while self._next is not None and self._next[0] < time_ns:
+            self._next = next(self._groups, None)
+        if self._next is None or self._next[0] > time_ns:
+            return None
+        first, *more = (stamped.message for stamped in self._next[1])
+        for other in more:
+            first.MergeFrom(other)
+        self._next = next(self._groups, None)
+        return first
 
 
 def _refuse_two_of_one_time(path: Path, images: list[Stamped]) -> None:

@@ -22,7 +22,7 @@ from dmrl.geometry.frames import inside
 from dmrl.images.codec import size
 from dmrl.learn.matching import Points
 from dmrl.messages import STATUS_OK
-from dmrl.recording import read, read_table, splits, summary
+from dmrl.recording import Contents, read, splits
 from dmrl.recording.inputs import refuse_twice
 from dmrl.recording.sources import LOOKED, sources_in
 from dmrl.terminal.progress import track
@@ -105,7 +105,7 @@ def join(
 
 
 def _join(recording: Path, against: str, split: str | None, partial: bool) -> Pairs:
-    held = summary(recording)
+    held = Contents(recording, topics.LABELS, topics.DETECTIONS)
     robots = topics.robots(list(held.topics), topics.DETECTIONS)
     if robots and not partial:
         labelled = topics.robots(list(held.topics), topics.LABELS)
@@ -115,9 +115,9 @@ def _join(recording: Path, against: str, split: str | None, partial: bool) -> Pa
         raise RecordingError(
             f"{recording} has no detections. Try: dmrl predict MODEL {recording} OUT.mcap"
         )
-    spans = _spans(recording, splits(recording, held), split)
-    _require_source(recording, robots, against)
-    pairs = _together([_join_robot(recording, robot, against, spans, partial) for robot in robots])
+    spans = _spans(recording, splits(recording, held.summary), split)
+    _require_source(held, robots, against)
+    pairs = _together([_join_robot(held, robot, against, spans, partial) for robot in robots])
     if not pairs.images:
         seen = " and detections" if partial else ""
         where = f"in split {split}" if split else "in it"
@@ -152,28 +152,28 @@ def _spans(
     return own[split]
 
 
-def _require_source(recording: Path, robots: Iterable[str], against: str) -> None:
+def _require_source(held: Contents, robots: Iterable[str], against: str) -> None:
     present: set[str] = set()
     for robot in robots:
-        table = read_table(recording, topics.labels(robot), fields=LOOKED)
+        table = held.table(topics.labels(robot), LOOKED)
         present |= sources_in(*(_column(table, name) for name in LOOKED))
     if present and against not in present:
         has = ", ".join(sorted(present))
         raise SettingError(
-            f"{recording} has no labels from {against}. Give --against one of: {has}"
+            f"{held.path} has no labels from {against}. Give --against one of: {has}"
         )
 
 
 def _join_robot(
-    recording: Path,
+    held: Contents,
     robot: str,
     against: str,
     spans: list[tuple[int, int]] | None,
     partial: bool,
 ) -> Pairs:
     left_out: Counter[str] = Counter()
-    labelled = read_table(recording, topics.labels(robot), fields=LOOKED)
-    detected = _detected(recording, robot)
+    labelled = held.table(topics.labels(robot), LOOKED)
+    detected = _detected(held, robot)
     times, (peers, looked) = _by_time(labelled)
     seen_at = _column(detected, "log_time").to_numpy()
     mine, usable = _usable(peers, looked, against, _within(times, spans), left_out)
@@ -181,37 +181,30 @@ def _join_robot(
     if partial:
         left_out["images without detections"] += int((usable & ~seen).sum())
     else:
-        seen |= np.isin(times, _image_times(recording, robot))
+        seen |= np.isin(times, held.times(topics.camera_image(robot)))
         left_out["labels without an image"] += int((usable & ~seen).sum())
     usable &= seen
     judged = times[usable]
     _, in_judged, in_detections = np.intersect1d(judged, seen_at, return_indices=True)
     labels = _points(peers, mine, np.flatnonzero(usable), np.arange(len(judged)))
-    width_px, height_px = _image_size(recording, robot)
+    width_px, height_px = _image_size(held.path, robot)
     shown = _in_view(labels, width_px, height_px)
     left_out["labels outside their image"] += int((~shown).sum())
     every = _column(detected, "detections")
     detections = _points(every, None, in_detections, in_judged)
     threshold = float(np.max(_column(detected, "threshold").to_numpy(), initial=0.0))
-    at = [At(recording, robot, int(time_ns)) for time_ns in judged]
+    at = [At(held.path, robot, int(time_ns)) for time_ns in judged]
     unseen = len(judged) - len(in_judged)
     return Pairs(at, labels.select(shown), detections, threshold, left_out, unseen)
 
 
-def _detected(recording: Path, robot: str) -> pa.Table:
+def _detected(held: Contents, robot: str) -> pa.Table:
     """A robot's detections; no row where it has none."""
     topic = topics.detections(robot)
-    if topic in summary(recording).topics:
-        return read_table(recording, topic)
-    other = topics.robots(list(summary(recording).topics), topics.DETECTIONS)[0]
-    return read_table(recording, topics.detections(other)).slice(0, 0)
-
-
-def _image_times(recording: Path, robot: str) -> Times:
-    topic = topics.camera_image(robot)
-    if topic not in summary(recording).topics:
-        return np.zeros(0, np.int64)
-    return np.asarray(_column(read_table(recording, topic, fields=()), "log_time").to_numpy())
+    if topic in held.topics:
+        return held.table(topic)
+    other = topics.robots(list(held.topics), topics.DETECTIONS)[0]
+    return held.table(topics.detections(other)).slice(0, 0)
 
 
 def _by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:

@@ -23,7 +23,7 @@ from dmrl.estimation.score import (
 )
 from dmrl.geometry.frames import Array
 from dmrl.messages import STATUS_OK
-from dmrl.recording import input_of, read_table, summary
+from dmrl.recording import Contents, input_of, summary
 
 TITLE, EACH = "estimated positions against truth", "pair"
 Times = NDArray[np.int64]
@@ -106,7 +106,8 @@ def judge(recording: Path) -> list[Pair]:
     if not estimated:
         raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
     known = set(_pairs(recording, topics.TRUTH))
-    pairs = [_judge(recording, *names) for names in estimated if names in known]
+    held = Contents(recording, topics.POSITION, topics.TRUTH)
+    pairs = [_judge(held, *names) for names in estimated if names in known]
     pairs = [pair for pair in pairs if len(pair.judged.time_s)]
     if not pairs:
         raise RecordingError(
@@ -116,9 +117,9 @@ def judge(recording: Path) -> list[Pair]:
     return pairs
 
 
-def _judge(recording: Path, robot: str, peer: str) -> Pair:
-    estimate = read_table(recording, topics.position(robot, peer))
-    true = read_table(recording, topics.truth(robot, peer))
+def _judge(held: Contents, robot: str, peer: str) -> Pair:
+    estimate = held.table(topics.position(robot, peer))
+    true = held.table(topics.truth(robot, peer))
     time_ns, true_ns = _column(estimate, "log_time"), _column(true, "log_time")
     near = inside_truth(time_ns.astype(np.int64), true_ns.astype(np.int64))
     truth = np.stack(

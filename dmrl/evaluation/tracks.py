@@ -21,8 +21,8 @@ from dmrl.geometry.frames import (
     pixels_from_horizontal,
 )
 from dmrl.labelling.camera import camera_of
-from dmrl.labelling.sight import Sight, read_sight
-from dmrl.recording import Summary, input_of, read, read_table, summary
+from dmrl.labelling.sight import SEEN, Sight, read_sight
+from dmrl.recording import Contents, input_of, summary
 
 TITLE, EACH = "tracks against truth", "observer"
 CAMERAS_METADATA = "dmrl.cameras"
@@ -57,7 +57,8 @@ def judge(recording: Path) -> list[Judged]:
     robots = topics.robots(held, topics.TRACKS)
     if not robots:
         raise RecordingError(f"{recording} has no tracks. Try: dmrl track {recording} OUT.mcap")
-    judged = [_judge(recording, robot, peers) for robot in robots if (peers := _peers(held, robot))]
+    contents = Contents(recording, *SEEN, topics.TRACKS, topics.TRUTH)
+    judged = [_judge(contents, robot, peers) for robot in robots if (peers := _peers(held, robot))]
     if not judged:
         raise RecordingError(
             f"{recording} has no true position of any peer. Judge a simulated flight, or one with "
@@ -66,12 +67,12 @@ def judge(recording: Path) -> list[Judged]:
     return judged
 
 
-def _camera(recording: Path, held: Summary, robot: str) -> Camera:
+def _camera(held: Contents, robot: str) -> Camera:
     """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
-    used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
-    camera = parse_camera(used, recording) if used else camera_of(recording, held, robot)
+    used = held.summary.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
+    camera = parse_camera(used, held.path) if used else camera_of(held, robot)
     if camera is None:
-        raise MissingTopic(topics.calibration(robot), held.topics, recording)
+        raise MissingTopic(topics.calibration(robot), held.topics, held.path)
     return camera
 
 
@@ -86,16 +87,15 @@ class _Row(NamedTuple):
     covariance: Array
 
 
-def _judge(recording: Path, robot: str, peers: list[str]) -> Judged:
+def _judge(held: Contents, robot: str, peers: list[str]) -> Judged:
     """Tracks of one observer. A track is false if for most of its life it is at no peer."""
-    held = summary(recording)
-    sight = read_sight(recording, held, robot, _camera(recording, held, robot), 0.0)
-    truth, shown = _truth(recording, sight, peers)
+    sight = read_sight(held, robot, _camera(held, robot), 0.0)
+    truth, shown = _truth(held, sight, peers)
     rows: list[_Row] = []
     lives: Counter[int] = Counter()
     strays: Counter[int] = Counter()
     place = {int(time_ns): k for k, time_ns in enumerate(sight.logged_ns)}
-    for stamped in read(recording, topics.tracks(robot)):
+    for stamped in held.messages(topics.tracks(robot)):
         k, tracks = place.get(stamped.time_ns), list(stamped.message.tracks)
         if k is None:
             continue
@@ -154,12 +154,12 @@ def _places(tracks: list[Any]) -> Array:
     return np.array([[t.x, t.y, t.z] for t in tracks]).reshape(-1, 3)
 
 
-def _truth(recording: Path, sight: Sight, peers: list[str]) -> tuple[Array, NDArray[np.bool_]]:
+def _truth(held: Contents, sight: Sight, peers: list[str]) -> tuple[Array, NDArray[np.bool_]]:
     """(J, K, 3) true positions at the images, NaN where unknown; (J, K) whether in the image."""
     xyz = np.full((len(peers), len(sight.time_ns), 3), np.nan)
     shown = np.zeros(xyz.shape[:2], bool)
     for j, peer in enumerate(peers):
-        true = read_table(recording, topics.truth(sight.robot, peer), fields=("x", "y", "z"))
+        true = held.table(topics.truth(sight.robot, peer), ("x", "y", "z"))
         true_ns = true["log_time"].to_numpy()
         known = inside_truth(sight.time_ns, true_ns)
         at = sight.time_ns[known]

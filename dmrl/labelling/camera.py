@@ -1,32 +1,21 @@
-"""What a recording says of a robot's camera: its calibration, and when it took images."""
+"""What a recording says of a robot's camera: its calibration, if none is given."""
 
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
 from dmrl.images.codec import size
-from dmrl.recording import Summary, read, read_table
-
-Times = NDArray[np.int64]
+from dmrl.recording import Contents, read
 
 LENSES = ("", "plumb_bob", "rational_polynomial")
 """Models of a lens that are the plumb bob's, the last if its further coefficients are 0."""
 
 
-def image_times(recording: Path, held: Summary, robot: str) -> Times:
-    """(N,) log times of a robot's images."""
-    topic = topics.camera_image(robot)
-    if topic not in held.topics:
-        return np.zeros(0, np.int64)
-    return np.asarray(read_table(recording, topic, fields=())["log_time"].to_numpy())
-
-
-def camera_of(recording: Path, held: Summary, robot: str) -> Camera | None:
+def camera_of(held: Contents, robot: str) -> Camera | None:
     """A robot's camera; None where the recording has no calibration.
 
     Raises
@@ -35,27 +24,27 @@ def camera_of(recording: Path, held: Summary, robot: str) -> Camera | None:
         If its lens is of a model that dmrl does not know.
     """
     topic = topics.calibration(robot)
-    first = next(read(recording, topic), None) if topic in held.topics else None
+    first = next(held.messages(topic), None) if topic in held.topics else None
     if first is None:
         return None
     found = first.message
     if found.distortion_model not in LENSES or any(found.D[5:]):
         raise RecordingError(
-            f"{recording}: {topic} has a lens of model {found.distortion_model!r} with "
+            f"{held.path}: {topic} has a lens of model {found.distortion_model!r} with "
             f"{len(found.D)} coefficients, dmrl knows plumb_bob with 5. Give another calibration: "
             "dmrl calibrate --board, then --camera"
         )
     numbers = [*found.K, *found.D]
     if len(found.K) != 9 or not np.isfinite(numbers).all() or min(found.K[0], found.K[4]) <= 0:
         raise RecordingError(
-            f"{recording}: {topic} has no camera matrix of 9 numbers. Give another calibration: "
+            f"{held.path}: {topic} has no camera matrix of 9 numbers. Give another calibration: "
             "dmrl calibrate --board, then --camera"
         )
     fx, _, cx, _, fy, cy, *_ = found.K
     return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D[:5]))
 
 
-def camera_given(recording: Path, held: Summary, robot: str, path: Path) -> Camera:
+def camera_given(held: Contents, robot: str, path: Path) -> Camera:
     """The camera of a TOML file, for a robot's images.
 
     Raises
@@ -66,12 +55,12 @@ def camera_given(recording: Path, held: Summary, robot: str, path: Path) -> Came
         If it is of images of another size.
     """
     camera, topic = read_camera(path), topics.camera_image(robot)
-    first = next(read(recording, topic), None) if topic in held.topics else None
+    first = next(read(held.path, topic), None) if topic in held.topics else None
     if first is not None:
-        taken = size(first.message.data, f"{recording}: the first image of {robot}")[:2]
+        taken = size(first.message.data, f"{held.path}: the first image of {robot}")[:2]
         if taken != (camera.width_px, camera.height_px):
             raise SettingError(
                 f"{path} is for images of {camera.width_px}x{camera.height_px}, those of {robot} "
-                f"in {recording} are {taken[0]}x{taken[1]}. Calibrate with such images"
+                f"in {held.path} are {taken[0]}x{taken[1]}. Calibrate with such images"
             )
     return camera

@@ -7,7 +7,6 @@ are tried, and the surest counts.
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from dmrl.estimation.exchanges import estimate_from_exchanges
 from dmrl.estimation.image_motion import rates, shift, small
 from dmrl.geometry.frames import Array
 from dmrl.images import codec
-from dmrl.recording import Summary, read, read_table
+from dmrl.recording import Contents, read
 from dmrl.terminal.progress import track
 
 Signals = dict[str, tuple[Array, Array]]
@@ -28,12 +27,12 @@ MOCAP_STEP_S = 0.02
 """Differences of poses that are nearer to each other than this are noise."""
 
 
-def range_clocks(recording: Path, held: Summary) -> dict[tuple[str, str], Clock]:
+def range_clocks(held: Contents) -> dict[tuple[str, str], Clock]:
     """By pair: how to correct the times of the second to those of the first.
 
     Parameters
     ----------
-    recording, held
+    held
         With ranges of robots to each other, both ways.
     """
     links = ranging(held)
@@ -41,7 +40,7 @@ def range_clocks(recording: Path, held: Summary) -> dict[tuple[str, str], Clock]
     for one, other in combinations(sorted({name for link in links for name in link}), 2):
         if (one, other) in links and (other, one) in links:
             here, there = (
-                _increasing(*_columns(recording, held, topics.uwb_range(*link), "range_m"))
+                _increasing(*_columns(held, topics.uwb_range(*link), "range_m"))
                 for link in ((one, other), (other, one))
             )
             clock = estimate_from_exchanges(*here, *there)
@@ -50,19 +49,17 @@ def range_clocks(recording: Path, held: Summary) -> dict[tuple[str, str], Clock]
     return pairs
 
 
-def ranging(held: Summary) -> set[tuple[str, str]]:
+def ranging(held: Contents) -> set[tuple[str, str]]:
     """Who ranges to whom."""
     return {(n["robot"], n["peer"]) for t in held.topics if (n := topics.names(topics.RANGE, t))}
 
 
-def camera_clock(
-    recording: Path, held: Summary, robot: str, even_ns: Mapping[int, int]
-) -> Clock | None:
+def camera_clock(held: Contents, robot: str, even_ns: Mapping[int, int]) -> Clock | None:
     """How to correct the times of a robot's camera to those of its attitude.
 
     Parameters
     ----------
-    recording, held
+    held
         With images and attitude of the robot.
     robot
         Its name.
@@ -84,8 +81,8 @@ def camera_clock(
         return None
     times, moved, before = [], [], None
     count = held.topics[topic].count
-    for stamped in track(read(recording, topic), f"Turns of {robot}'s camera", count):
-        at = f"{topic} at {stamped.time_ns} ns in {recording}"
+    for stamped in track(read(held.path, topic), f"Turns of {robot}'s camera", count):
+        at = f"{topic} at {stamped.time_ns} ns in {held.path}"
         after = small(codec.decode(stamped.message.data, at))
         if before is not None:
             moved.append(shift(before, after) or (np.nan, np.nan))
@@ -97,15 +94,15 @@ def camera_clock(
     middle, speed = rates(_seconds(np.array(times), held), np.array(moved))
     # A camera that turns left sees the scene move right; nose down, up.
     seen = {"yaw rate": (middle, speed[:, 0]), "pitch rate": (middle, -speed[:, 1])}
-    return _surest(_turns(recording, held, robot), seen)
+    return _surest(_turns(held, robot), seen)
 
 
-def mocap_clocks(recording: Path, held: Summary) -> dict[str, Clock | None]:
+def mocap_clocks(held: Contents) -> dict[str, Clock | None]:
     """How to correct the times of robots to those of motion capture.
 
     Parameters
     ----------
-    recording, held
+    held
         With poses of robots on ``/tf`` (frames ``<robot>`` or ``<robot>/horizontal``) or
         ``/<robot>/pose/truth``, and their attitude, velocity or height.
 
@@ -115,8 +112,8 @@ def mocap_clocks(recording: Path, held: Summary) -> dict[str, Clock | None]:
         By robot that motion capture has poses of; None where the two do not agree.
     """
     return {
-        robot: _surest(_of_pose(*poses), _own(recording, held, robot))
-        for robot, poses in sorted(_poses(recording, held).items())
+        robot: _surest(_of_pose(*poses), _own(held, robot))
+        for robot, poses in sorted(_poses(held).items())
     }
 
 
@@ -129,7 +126,7 @@ def _surest(reference: Signals, other: Signals) -> Clock | None:
     return min(found, key=lambda clock: clock.sigma_s, default=None)
 
 
-def _seconds(time_ns: NDArray[np.int64], held: Summary) -> Array:
+def _seconds(time_ns: NDArray[np.int64], held: Contents) -> Array:
     return np.asarray((time_ns - held.start_ns) * 1e-9)
 
 
@@ -139,16 +136,16 @@ def _increasing(time_s: Array, values: Array) -> tuple[Array, Array]:
     return time_s[good], values[good]
 
 
-def _columns(recording: Path, held: Summary, topic: str, *names: str) -> list[Array]:
+def _columns(held: Contents, topic: str, *names: str) -> list[Array]:
     """Times and fields of a topic."""
-    table = read_table(recording, topic, fields=list(names))
+    table = held.table(topic, list(names))
     values = [np.asarray(table[name].to_numpy(), float) for name in names]
     return [_seconds(table["log_time"].to_numpy(), held), *values]
 
 
-def _turns(recording: Path, held: Summary, robot: str) -> Signals:
+def _turns(held: Contents, robot: str) -> Signals:
     names = ("pitch_rad", "yaw_rate_radps")
-    time_s, pitch, yaw_rate = _columns(recording, held, topics.attitude(robot), *names)
+    time_s, pitch, yaw_rate = _columns(held, topics.attitude(robot), *names)
     slow_s, pitch = _increasing(time_s, pitch)
     signals = {"yaw rate": _increasing(time_s, yaw_rate)}
     if len(slow_s) > 1:
@@ -157,20 +154,20 @@ def _turns(recording: Path, held: Summary, robot: str) -> Signals:
     return signals
 
 
-def _own(recording: Path, held: Summary, robot: str) -> Signals:
+def _own(held: Contents, robot: str) -> Signals:
     """What a robot measured of itself that motion capture sees as well."""
     signals = {}
     if topics.attitude(robot) in held.topics:
         names = ("roll_rad", "pitch_rad", "yaw_rate_radps")
-        time_s, *values = _columns(recording, held, topics.attitude(robot), *names)
+        time_s, *values = _columns(held, topics.attitude(robot), *names)
         for name, column in zip(("roll", "pitch", "yaw rate"), values, strict=True):
             signals[name] = _increasing(time_s, column)
     if topics.velocity(robot) in held.topics:
-        time_s, vx, vy = _columns(recording, held, topics.velocity(robot), "vx_mps", "vy_mps")
+        time_s, vx, vy = _columns(held, topics.velocity(robot), "vx_mps", "vy_mps")
         # The length alone: it is the same in every frame, however the robot is turned.
         signals["speed"] = _increasing(time_s, np.hypot(vx, vy))
     if topics.height(robot) in held.topics:
-        time_s, height = _columns(recording, held, topics.height(robot), "height_m")
+        time_s, height = _columns(held, topics.height(robot), "height_m")
         signals["height"] = _increasing(time_s, height)
     return signals
 
@@ -199,16 +196,16 @@ def _of_pose(time_s: Array, rows: Array) -> Signals:
     }
 
 
-def _poses(recording: Path, held: Summary) -> dict[str, tuple[Array, Array]]:
+def _poses(held: Contents) -> dict[str, tuple[Array, Array]]:
     """Of each robot that motion capture sees: times, and (N, 7) poses."""
     rows: dict[str, dict[int, list[float]]] = {}
     true = {t: n["robot"] for t in held.topics if (n := topics.names(topics.TRUE_POSE, t))}
     for topic, robot in true.items():
-        for stamped in read(recording, topic):
+        for stamped in held.messages(topic):
             pose = stamped.message.pose
             rows.setdefault(robot, {})[stamped.time_ns] = _row(pose.position, pose.orientation)
     if topics.TRANSFORMS in held.topics:
-        for stamped in read(recording, topics.TRANSFORMS):
+        for stamped in held.messages(topics.TRANSFORMS):
             for frame in stamped.message.transforms:
                 robot, _, part = frame.child_frame_id.partition("/")
                 if part in ("", "horizontal") and robot not in true.values():

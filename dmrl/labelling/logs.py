@@ -5,18 +5,19 @@ What cannot be used is left out with a line that says so.
 
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
 from dmrl import topics
 from dmrl.estimation.pair import RATE_HZ, Array, Pair, Track, usable_ranges
 from dmrl.estimation.sensors import Signals, track
-from dmrl.recording import Summary, read_table
+from dmrl.recording import Contents
 
 LEAST_S = 5.0
 """Shortest common stretch of two logs that is worth estimating."""
 LEAST_RANGES = 20
+SENSED = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE)
+"""What positions are estimated from."""
 STEEP_RAD, FAST_RADPS = 0.8, 6.0
 """Tilt and turning rate that no small drone keeps up: probably degrees."""
 
@@ -81,15 +82,13 @@ class Logs:
     warnings: list[str]
 
 
-def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
+def read_logs(held: Contents, range_offset_m: float = 0.0) -> Logs:
     """The logs of a recording.
 
     Parameters
     ----------
-    path
-        A complete recording.
     held
-        Its summary.
+        A recording, best with what `SENSED` names.
     range_offset_m
         Subtracted from every range.
 
@@ -103,14 +102,14 @@ def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
     names = sorted({name for link in links for name in link.values()})
     robots = {}
     for name in names:
-        log = _robot(path, held, name, warnings)
+        log = _robot(held, name, warnings)
         if log is not None:
             robots[name] = log
     pairs = {}
     for one, other in combinations(names, 2):
         both_ways = topics.uwb_range(one, other), topics.uwb_range(other, one)
         found = [
-            _signals(path, held, topic, ("range_m",), warnings)
+            _signals(held, topic, ("range_m",), warnings)
             for topic in both_ways
             if topic in held.topics
         ]
@@ -127,13 +126,13 @@ def read_logs(path: Path, held: Summary, range_offset_m: float = 0.0) -> Logs:
     return Logs(held.start_ns, robots, pairs, flying, warnings)
 
 
-def _flying(held: Summary) -> frozenset[str]:
+def _flying(held: Contents) -> frozenset[str]:
     """Robots with a log of their own. They may be in view, also where no position is known."""
     kinds = [row.pattern for row in topics.OWN_SENSORS]
     return frozenset(name for kind in kinds for name in topics.robots(list(held.topics), kind))
 
 
-def _robot(path: Path, held: Summary, name: str, warnings: list[str]) -> RobotLog | None:
+def _robot(held: Contents, name: str, warnings: list[str]) -> RobotLog | None:
     wanted = {
         topics.attitude(name): ("roll_rad", "pitch_rad", "yaw_rate_radps"),
         topics.velocity(name): ("vx_mps", "vy_mps"),
@@ -142,7 +141,7 @@ def _robot(path: Path, held: Summary, name: str, warnings: list[str]) -> RobotLo
     if missing := [topic for topic in wanted if topic not in held.topics]:
         warnings.append(f"{name}: no {' and no '.join(missing)}; its pairs are left out")
         return None
-    signals = [_signals(path, held, t, fields, warnings) for t, fields in wanted.items()]
+    signals = [_signals(held, t, fields, warnings) for t, fields in wanted.items()]
     attitude, velocity, height = signals
     if attitude is None or velocity is None or height is None:
         return None
@@ -160,10 +159,10 @@ def _warn_of_degrees(name: str, attitude: Array, warnings: list[str]) -> None:
 
 
 def _signals(
-    path: Path, held: Summary, topic: str, fields: tuple[str, ...], warnings: list[str]
+    held: Contents, topic: str, fields: tuple[str, ...], warnings: list[str]
 ) -> Signals | None:
     """Finite samples of a topic; None, with a warning, where there is none."""
-    table = read_table(path, topic, fields=fields)
+    table = held.table(topic, fields)
     values = np.column_stack([table[field].to_numpy() for field in fields]).astype(float)
     time_ns, received_ns = (table[c].to_numpy() for c in ("log_time", "publish_time"))
     good = np.isfinite(values).all(axis=1)

@@ -1,7 +1,6 @@
 """What was estimated of each ordered pair, in numbers."""
 
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from dmrl.estimation.linear import (
 from dmrl.estimation.score import inside_truth
 from dmrl.labelling.labels import Positions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
-from dmrl.recording import Summary, read_table
+from dmrl.recording import Contents
 
 TURNS_RADPS, LONGER_M, FASTER, LATER_S = 0.02, 0.2, 0.12, 0.05
 """What was solved for is worth a line beyond these: several times what sensors in order have."""
@@ -69,8 +68,7 @@ class PairReport:
 
 
 def pair_report(
-    recording: Path,
-    held: Summary,
+    held: Contents,
     pair: tuple[str, str],
     positions: Positions,
     estimate: Estimate,
@@ -79,8 +77,8 @@ def pair_report(
 
     Parameters
     ----------
-    recording, held
-        Where the truth may be, and its summary.
+    held
+        Where the truth may be.
     pair
         Observer and peer.
     positions
@@ -89,7 +87,7 @@ def pair_report(
         Where they come from.
     """
     ok = positions.status == STATUS_OK
-    error = _errors(recording, held, pair, positions)
+    error = _errors(held, pair, positions)
     sigma = np.sqrt(np.linalg.eigvalsh(positions.covariance[:, :2, :2])[:, -1])
     return PairReport(
         *pair,
@@ -146,12 +144,12 @@ def _rms(error: Any, chosen: Any) -> float | None:
     return float(np.sqrt(square.mean())) if len(square) else None
 
 
-def _errors(recording: Path, held: Summary, pair: tuple[str, str], positions: Positions) -> Any:
+def _errors(held: Contents, pair: tuple[str, str], positions: Positions) -> Any:
     """(N,) horizontal errors, metres, NaN outside the truth; None where there is no truth."""
     topic = topics.truth(*pair)
     if topic not in held.topics or held.topics[topic].count < 2:
         return None
-    truth = read_table(recording, topic, fields=("x", "y"))
+    truth = held.table(topic, ("x", "y"))
     time_ns = truth["log_time"].to_numpy()
     offsets = [
         np.interp(positions.time_ns, time_ns, truth[axis].to_numpy()) - values

@@ -1,7 +1,6 @@
 """What a recording says of one observer: its detections, how it moved, and its ranges."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pyarrow.compute as pc
@@ -13,8 +12,17 @@ from dmrl.estimation.camera_views import Flight, PeerPath
 from dmrl.estimation.view import Motion, View
 from dmrl.geometry.frames import Array, Camera
 from dmrl.messages import STATUS_OK
-from dmrl.recording import Summary, read_table
+from dmrl.recording import Contents
 
+SEEN = (
+    topics.DETECTIONS,
+    topics.CALIBRATION,
+    topics.ATTITUDE,
+    topics.VELOCITY,
+    topics.HEIGHT,
+    topics.RANGE,
+)
+"""What an observer's sight is made of."""
 LONGEST_GAP_S = 0.1
 """A range further from an image than this says nothing about it."""
 UNSAID = np.eye(3) * 0.1**2
@@ -85,15 +93,13 @@ class Sight:
         return {peer: value for peer, value in near if np.isfinite(value)}
 
 
-def read_sight(
-    recording: Path, held: Summary, robot: str, camera: Camera, threshold: float | None
-) -> Sight:
+def read_sight(held: Contents, robot: str, camera: Camera, threshold: float | None) -> Sight:
     """One observer of a recording.
 
     Parameters
     ----------
-    recording, held
-        With detections, and its summary.
+    held
+        A recording with detections, best with what `SEEN` names.
     robot
         The observer.
     camera
@@ -106,11 +112,11 @@ def read_sight(
     RecordingError
         If it cannot be read, or has no attitude of that robot.
     """
-    logged_ns, detections, first = _detections(recording, robot, threshold)
+    logged_ns, detections, first = _detections(held, robot, threshold)
     time_ns = logged_ns - round(camera.delay_s * 1e9)
-    attitude = _attitude(recording, held, robot)
+    attitude = _attitude(held, robot)
     warnings: list[str] = []
-    yaw_rad, path_m = _path(recording, held, robot, attitude, time_ns, warnings)
+    yaw_rad, path_m = _path(held, robot, attitude, time_ns, warnings)
     return Sight(
         robot,
         camera,
@@ -121,20 +127,18 @@ def read_sight(
         np.column_stack([np.interp(time_ns, attitude[0], c) for c in attitude[1].T[:2]]),
         path_m,
         yaw_rad,
-        _ranges(recording, held, robot, time_ns),
+        _ranges(held, robot, time_ns),
         warnings,
     )
 
 
-def camera_flight(
-    recording: Path, held: Summary, robot: str, threshold: float | None, positions: str
-) -> Flight:
+def camera_flight(held: Contents, robot: str, threshold: float | None, positions: str) -> Flight:
     """What one observer saw and where its peers were, to calibrate its camera with.
 
     Parameters
     ----------
-    recording, held
-        With detections, attitude and positions, and its summary.
+    held
+        A recording with detections, attitude and positions.
     robot
         The observer.
     threshold
@@ -150,14 +154,14 @@ def camera_flight(
     links = {topic: topics.names(positions, topic) for topic in held.topics}
     peers = {n["peer"]: topic for topic, n in links.items() if n and n["robot"] == robot}
     if not peers:
-        raise MissingTopic(positions.format(robot=robot, peer="*"), held.topics, recording)
-    time_ns, detections, first = _detections(recording, robot, threshold)
-    attitude_ns, attitude = _attitude(recording, held, robot)
+        raise MissingTopic(positions.format(robot=robot, peer="*"), held.topics, held.path)
+    time_ns, detections, first = _detections(held, robot, threshold)
+    attitude_ns, attitude = _attitude(held, robot)
 
     def seconds(at_ns: Times) -> Array:
         return np.asarray((at_ns - held.start_ns) * 1e-9)
 
-    paths = ((peer, _known(recording, topic, held.start_ns)) for peer, topic in peers.items())
+    paths = ((peer, _known(held, topic)) for peer, topic in peers.items())
     return Flight(
         seconds(time_ns),
         np.repeat(np.arange(len(time_ns)), np.diff(first)),
@@ -168,33 +172,33 @@ def camera_flight(
     )
 
 
-def _known(recording: Path, topic: str, start_ns: int) -> PeerPath:
+def _known(held: Contents, topic: str) -> PeerPath:
     """The positions of a topic that are OK."""
-    table = read_table(recording, topic)
+    table = held.table(topic)
     table = table.filter(pc.equal(table["status"], STATUS_OK))
     rows = table["covariance"].to_pylist()
     covariance = [row if len(row) == 9 else UNSAID.ravel() for row in rows]
     return PeerPath(
-        (table["log_time"].to_numpy() - start_ns) * 1e-9,
+        (table["log_time"].to_numpy() - held.start_ns) * 1e-9,
         np.column_stack([table[axis].to_numpy() for axis in "xyz"]),
         np.reshape(covariance, (-1, 3, 3)),
     )
 
 
-def _attitude(recording: Path, held: Summary, robot: str) -> tuple[Times, Array]:
+def _attitude(held: Contents, robot: str) -> tuple[Times, Array]:
     """Times, and (N, 3) roll, pitch and yaw rate."""
     topic = topics.attitude(robot)
     if topic not in held.topics:
-        raise MissingTopic(topic, held.topics, recording)
-    found = _columns(recording, topic, "roll_rad", "pitch_rad", "yaw_rate_radps")
+        raise MissingTopic(topic, held.topics, held.path)
+    found = _columns(held, topic, "roll_rad", "pitch_rad", "yaw_rate_radps")
     if found is None:
-        raise RecordingError(f"{recording}: {topic} holds no numbers. Try: dmrl info {recording}")
+        raise RecordingError(f"{held.path}: {topic} holds no numbers. Try: dmrl info {held.path}")
     return found
 
 
-def _detections(recording: Path, robot: str, threshold: float | None) -> tuple[Times, Array, Times]:
+def _detections(held: Contents, robot: str, threshold: float | None) -> tuple[Times, Array, Times]:
     """Log times of the images, what was detected, and where each image's begin."""
-    table = read_table(recording, topics.detections(robot)).combine_chunks()
+    table = held.table(topics.detections(robot)).combine_chunks()
     lists = table["detections"].combine_chunks()
     if hasattr(lists, "chunks"):
         lists = lists.chunk(0)
@@ -212,17 +216,16 @@ def _detections(recording: Path, robot: str, threshold: float | None) -> tuple[T
     return table["log_time"].to_numpy(), values[keep, :4].astype(float), first
 
 
-def _columns(recording: Path, topic: str, *fields: str) -> tuple[Times, Array] | None:
+def _columns(held: Contents, topic: str, *fields: str) -> tuple[Times, Array] | None:
     """Times and finite values of a topic; None where there are none."""
-    table = read_table(recording, topic, fields=fields)
+    table = held.table(topic, fields)
     values = np.column_stack([table[name].to_numpy() for name in fields]).astype(float)
     good = np.isfinite(values).all(axis=1)
     return (table["log_time"].to_numpy()[good], values[good]) if good.any() else None
 
 
 def _path(
-    recording: Path,
-    held: Summary,
+    held: Contents,
     robot: str,
     attitude: tuple[Times, Array],
     time_ns: Times,
@@ -232,7 +235,7 @@ def _path(
     at_ns, values = attitude
     yaw_rad = _summed(at_ns, values[:, 2:])[:, 0]
     path_m = np.zeros((len(time_ns), 3))
-    moving = _if_there(recording, held, topics.velocity(robot), "vx_mps", "vy_mps")
+    moving = _if_there(held, topics.velocity(robot), "vx_mps", "vy_mps")
     if moving is None:
         warnings.append(f"{topics.velocity(robot)}: not there; {robot} is taken to stand still")
     else:
@@ -241,7 +244,7 @@ def _path(
         along = _summed(moving[0], np.column_stack([forward.real, forward.imag]))
         for axis in range(2):
             path_m[:, axis] = np.interp(time_ns, moving[0], along[:, axis])
-    high = _if_there(recording, held, topics.height(robot), "height_m")
+    high = _if_there(held, topics.height(robot), "height_m")
     if high is None:
         warnings.append(f"{topics.height(robot)}: not there; {robot} is taken to keep its height")
     else:
@@ -249,10 +252,8 @@ def _path(
     return np.interp(time_ns, at_ns, yaw_rad), path_m
 
 
-def _if_there(
-    recording: Path, held: Summary, topic: str, *fields: str
-) -> tuple[Times, Array] | None:
-    return _columns(recording, topic, *fields) if topic in held.topics else None
+def _if_there(held: Contents, topic: str, *fields: str) -> tuple[Times, Array] | None:
+    return _columns(held, topic, *fields) if topic in held.topics else None
 
 
 def _summed(time_ns: Times, rate: Array) -> Array:
@@ -261,7 +262,7 @@ def _summed(time_ns: Times, rate: Array) -> Array:
     return np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(steps, axis=0)])
 
 
-def _ranges(recording: Path, held: Summary, robot: str, time_ns: Times) -> dict[str, Array]:
+def _ranges(held: Contents, robot: str, time_ns: Times) -> dict[str, Array]:
     """(K,) distance to each peer at the images, measured by either."""
     found: dict[str, Array] = {}
     for topic in held.topics:
@@ -269,7 +270,7 @@ def _ranges(recording: Path, held: Summary, robot: str, time_ns: Times) -> dict[
         if link is None or robot not in link.values():
             continue
         peer = link["peer"] if link["robot"] == robot else link["robot"]
-        measured = _columns(recording, topic, "range_m")
+        measured = _columns(held, topic, "range_m")
         if measured is None:
             continue
         at_ns, values = measured

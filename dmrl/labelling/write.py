@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,11 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.estimation.pair import Array
 from dmrl.geometry.frames import Camera
-from dmrl.labelling.camera import camera_of, image_times
+from dmrl.labelling.camera import camera_of
 from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
 from dmrl.labelling.logs import Logs
 from dmrl.messages import message
-from dmrl.recording import Summary, Timed, read
+from dmrl.recording import Contents, Timed
 from dmrl.recording.sources import looked_at
 
 Times = NDArray[np.int64]
@@ -32,8 +31,7 @@ def position_messages(observer: str, peer: str, found: Positions) -> Iterator[Ti
 
 
 def label_messages(
-    recording: Path,
-    held: Summary,
+    held: Contents,
     logs: Logs,
     robot: str,
     positions: Mapping[str, Positions],
@@ -46,8 +44,8 @@ def label_messages(
 
     Parameters
     ----------
-    recording, held
-        Where the images, their labels and the calibration are, and its summary.
+    held
+        Where the images, their labels and the calibration are.
     logs
         Attitude of the robot.
     robot
@@ -57,9 +55,9 @@ def label_messages(
     look
         How positions become pixels.
     """
-    kept, looked = _of_other_sources(recording, held, topics.labels(robot))
-    camera = look.cameras.get(robot) or camera_of(recording, held, robot)
-    images_ns = image_times(recording, held, robot)
+    kept, looked = _of_other_sources(held, topics.labels(robot))
+    camera = look.cameras.get(robot) or camera_of(held, robot)
+    images_ns = held.times(topics.camera_image(robot))
     fresh = _fresh(logs, robot, positions, look, camera, images_ns) if camera else {}
     for time_ns in sorted({*kept, *fresh}):
         peers = [*kept.get(time_ns, []), *fresh.get(time_ns, [])]
@@ -94,12 +92,12 @@ def _fresh(
 
 
 def _of_other_sources(
-    recording: Path, held: Summary, topic: str
+    held: Contents, topic: str
 ) -> tuple[dict[int, list[Any]], dict[int, set[str]]]:
     """Entries of the labels that are there, and who looked, without earlier estimates."""
     kept: dict[int, list[Any]] = defaultdict(list)
     looked: dict[int, set[str]] = defaultdict(set)
-    for stamped in read(recording, topic) if topic in held.topics else ():
+    for stamped in held.messages(topic) if topic in held.topics else ():
         labels = stamped.message
         kept[stamped.time_ns] += [peer for peer in labels.peers if peer.source != SOURCE]
         looked[stamped.time_ns] |= looked_at(labels) - {SOURCE}

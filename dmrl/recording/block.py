@@ -1,6 +1,6 @@
 """Some thousand messages as arrays of offsets into the bytes that hold them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,11 +79,14 @@ class Block:
         view = self.data.data
         return np.frombuffer(bytearray().join(view[a:b] for a, b in runs), np.uint8), at
 
-    def sorted(self) -> "Block":
-        """By log time; messages of one time keep their order in the file."""
-        if len(self) < 2 or bool((self.time_ns[1:] >= self.time_ns[:-1]).all()):
+    def sorted(self, last: Collection[int] = ()) -> "Block":
+        """By log time; messages of one time keep their order, but for some channels after them."""
+        step_ns = np.diff(self.time_ns)
+        if len(self) < 2 or step_ns.min() > 0 or (not last and step_ns.min() >= 0):
             return self
-        return self.take(np.argsort(self.time_ns, kind="stable"))
+        if not last:
+            return self.take(np.argsort(self.time_ns, kind="stable"))
+        return self.take(np.lexsort((np.isin(self.channel, list(last)), self.time_ns)))
 
 
 def concatenate(first: Block | None, second: Block) -> Block:

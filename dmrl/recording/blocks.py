@@ -42,6 +42,8 @@ def blocks(
 ) -> Iterator[tuple[Block, dict[int, Channel]]]:
     """Messages in log-time order, some thousands at a time, with their channels by number.
 
+    Of one time, numbers come before pictures, wherever they stand in the file.
+
     Memory is bounded by the chunks that overlap in time; in a recording without an index,
     by the recording.
 
@@ -182,11 +184,12 @@ def _in_time_order(
     high: int,
 ) -> Iterator[Block]:
     chunks = chunks_between(summary, channels.keys(), low, high)
+    last = _pictured(channels)
     held: Block | None = None
     for k, chunk in enumerate(chunks):
         block = in_chunk(path, stream, chunk, channels, summary.channels)
         block = block.take((block.time_ns >= low) & (block.time_ns < high))
-        held = concatenate(held, block).sorted()
+        held = concatenate(held, block).sorted(last)
         if k + 1 == len(chunks):
             break
         # A later chunk may still hold messages from its start time on.
@@ -196,6 +199,12 @@ def _in_time_order(
             held = held.take(np.arange(split, len(held))).compact()
     if held is not None and len(held):
         yield held
+
+
+def _pictured(channels: dict[int, Channel]) -> list[int]:
+    """Channels of pictures, if there are others beside them."""
+    found = [number for number, channel in channels.items() if channel.pictured]
+    return found if len(found) < len(channels) else []
 
 
 def chunks_between(
@@ -313,4 +322,4 @@ def _unindexed(
     for whole in walk.blocks:
         block = of_channels(whole, channels, walk.channels)
         kept.append(block.take((block.time_ns >= low) & (block.time_ns < high)))
-    return joined(kept).sorted() if kept else EMPTY, channels
+    return joined(kept).sorted(_pictured(channels)) if kept else EMPTY, channels

@@ -16,9 +16,9 @@ from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, rang
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.recording import (
+    Contents,
     RawMessage,
     RecordingWriter,
-    Summary,
     copy_extras,
     parsed,
     provenance,
@@ -35,6 +35,8 @@ MOCAP = "mocap"
 """Stands where a robot's name does."""
 ALL = "*"
 """Stands for all of a recording, where all of it had to be moved."""
+TELLING = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE, topics.TRUE_POSE)
+"""What clocks are told by, beside images and transforms."""
 STAMPED = ("CompressedImage", "CameraCalibration", "PoseInFrame")
 
 
@@ -88,26 +90,25 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
         If ``out`` exists.
     """
     refuse_existing(out)
-    held = summary(recording)
-    if splits(recording, held):
+    held = Contents(recording, *TELLING)
+    if splits(recording, held.summary):
         raise SettingError(f"{recording} has a split by time already. Align before that")
-    steady = _steady(recording, held) if settings.steady_cameras else {}
+    steady = _steady(held) if settings.steady_cameras else {}
     clocks = {}
     if ranging(held) or settings.mocap or not (settings.cameras or settings.steady_cameras):
-        clocks = _robots(recording, held, settings)
+        clocks = _robots(held, settings)
     if settings.cameras:
-        clocks |= _cameras(recording, held, clocks, steady)
-    later_ns = max(0, -_earliest_ns(recording, held, clocks, steady))
+        clocks |= _cameras(held, clocks, steady)
+    later_ns = max(0, -_earliest_ns(held, clocks, steady))
     if later_ns:
         say(f"{recording}: all times are moved by {later_ns / 1e9:.9g} s, as one would be before 0")
         clocks[ALL] = Clock(later_ns * 1e-9, by="no time before 0")
-    _write(recording, held, out, clocks, steady, later_ns, settings)
+    _write(held, out, clocks, steady, later_ns, settings)
     return clocks
 
 
 def _earliest_ns(
-    recording: Path,
-    held: Summary,
+    held: Contents,
     clocks: Mapping[str, Clock],
     steady: Mapping[str, Mapping[int, int]],
 ) -> int:
@@ -115,13 +116,10 @@ def _earliest_ns(
     found = []
     for topic in held.topics:
         if topic == topics.TRANSFORMS:  # whose they are stands inside
-            raws = list(read_raw(recording, topic))
-            found += [
-                raw.time_ns + _correction_ns(raw, raw.time_ns, clocks, held, recording)
-                for raw in raws
-            ]
+            raws = list(read_raw(held.path, topic))
+            found += [raw.time_ns + _correction_ns(raw, raw.time_ns, clocks, held) for raw in raws]
             continue
-        times = read_table(recording, topic, fields=())["log_time"].to_numpy()
+        times = held.times(topic)
         if len(times):
             first = int(min(steady.get(topic, {}).values(), default=times.min()))
             clock = _clock_of(topic, topic.split("/")[1] if topic.count("/") > 1 else "", clocks)
@@ -129,15 +127,15 @@ def _earliest_ns(
     return min(found, default=0)
 
 
-def _robots(recording: Path, held: Summary, settings: Settings) -> dict[str, Clock]:
+def _robots(held: Contents, settings: Settings) -> dict[str, Clock]:
     """Of every robot that ranges or motion capture tie to the reference."""
-    pairs = range_clocks(recording, held)
+    pairs = range_clocks(held)
     robots = {name for link in ranging(held) for name in link}
     if settings.mocap:
-        seen = mocap_clocks(recording, held)
+        seen = mocap_clocks(held)
         if not seen:
             raise RecordingError(
-                f"{recording} has no poses of robots on /tf or /<robot>/pose/truth. "
+                f"{held.path} has no poses of robots on /tf or /<robot>/pose/truth. "
                 "Leave out --mocap"
             )
         pairs |= {(MOCAP, robot): clock for robot, clock in seen.items() if clock is not None}
@@ -145,7 +143,7 @@ def _robots(recording: Path, held: Summary, settings: Settings) -> dict[str, Clo
     reference = settings.reference or min(robots - {MOCAP}, default="")
     if not robots:
         raise RecordingError(
-            f"{recording}: no robot ranged to another. --mocap and --cameras set clocks by other "
+            f"{held.path}: no robot ranged to another. --mocap and --cameras set clocks by other "
             "signals"
         )
     if reference not in robots:
@@ -154,55 +152,54 @@ def _robots(recording: Path, held: Summary, settings: Settings) -> dict[str, Clo
     clocks = connected(pairs, reference)
     if len(clocks) == 1 and not (settings.cameras or settings.steady_cameras):
         raise RecordingError(
-            f"{recording}: no robot saw what {reference} saw, for 20 s at least. Ranges of both "
+            f"{held.path}: no robot saw what {reference} saw, for 20 s at least. Ranges of both "
             "to each other are wanted, or motion capture (--mocap)"
         )
     for robot in sorted(robots - clocks.keys()):
-        say(f"{recording}: nothing ties the clock of {robot} to that of {reference}; it stays")
+        say(f"{held.path}: nothing ties the clock of {robot} to that of {reference}; it stays")
     return clocks
 
 
 def _cameras(
-    recording: Path,
-    held: Summary,
+    held: Contents,
     clocks: Mapping[str, Clock],
     steady: Mapping[str, Mapping[int, int]],
 ) -> dict[str, Clock]:
     """Of every camera whose images show the turns of its robot."""
     found = {}
-    for topic, robot in _pictured(recording, held).items():
-        clock = camera_clock(recording, held, robot, steady.get(topic, {}))
+    for topic, robot in _pictured(held).items():
+        clock = camera_clock(held, robot, steady.get(topic, {}))
         if clock is None:
             say(
-                f"{recording}: images and attitude of {robot} show no common turn, for 20 s at "
+                f"{held.path}: images and attitude of {robot} show no common turn, for 20 s at "
                 "least; its camera's times stay with the robot's"
             )
             continue
         found[f"{robot}/camera"] = clocks.get(robot, Clock(0.0)).after(clock)
     if not found and len(clocks) < 2 and not steady:
         raise RecordingError(
-            f"{recording}: no camera saw its robot turn. Fly before a background with texture, "
+            f"{held.path}: no camera saw its robot turn. Fly before a background with texture, "
             "and turn now and then"
         )
     return found
 
 
-def _pictured(recording: Path, held: Summary) -> dict[str, str]:
+def _pictured(held: Contents) -> dict[str, str]:
     """Robot by topic of images; none may have results that know their times."""
     found = {t: n["robot"] for t in held.topics if (n := topics.names(topics.CAMERA_IMAGE, t))}
     for topic, robot in found.items():
         for made in (topics.LABELS, topics.DETECTIONS, topics.TRACKS):
             if made.format(robot=robot) in held.topics:
                 what = made.rpartition("/")[2]
-                raise SettingError(f"{recording}: {topic} has {what} already. Align before that")
+                raise SettingError(f"{held.path}: {topic} has {what} already. Align before that")
     return found
 
 
-def _steady(recording: Path, held: Summary) -> dict[str, dict[int, int]]:
+def _steady(held: Contents) -> dict[str, dict[int, int]]:
     """New times by old ones of every topic of pictures that were stamped when they arrived."""
     found = {}
-    for topic in _pictured(recording, held):
-        table = read_table(recording, topic, fields=[])
+    for topic in _pictured(held):
+        table = read_table(held.path, topic, fields=[])
         arrival = table["log_time"].to_numpy()
         if (arrival == table["publish_time"].to_numpy()).all():
             found[topic] = dict(zip(arrival.tolist(), dejitter(arrival).tolist(), strict=True))
@@ -210,25 +207,24 @@ def _steady(recording: Path, held: Summary) -> dict[str, dict[int, int]]:
 
 
 def _write(
-    recording: Path,
-    held: Summary,
+    held: Contents,
     out: Path,
     clocks: dict[str, Clock],
     steady: dict[str, dict[int, int]],
     later_ns: int,
     settings: Settings,
 ) -> None:
-    made = provenance("align", settings, [recording], libraries=("numpy",))
-    copied = track(read_raw(recording), "Writing", held.count)
+    made = provenance("align", settings, [held.path], libraries=("numpy",))
+    copied = track(read_raw(held.path), "Writing", held.summary.count)
     with RecordingWriter(out, made) as sink:
-        copy_extras(held, sink)
+        copy_extras(held.summary, sink)
         told = {robot: json.dumps(_told(c, held.start_ns)) for robot, c in clocks.items()}
         sink.add_metadata(METADATA, told)
         for raw in copied:
             even_ns = steady.get(raw.topic, {}).get(raw.time_ns, raw.time_ns)
-            shift_ns = later_ns + _correction_ns(raw, even_ns, clocks, held, recording)
+            shift_ns = later_ns + _correction_ns(raw, even_ns, clocks, held)
             times_ns = even_ns + shift_ns, max(raw.publish_ns + shift_ns, 0)
-            sink.write_raw(_at(raw, *times_ns, recording))
+            sink.write_raw(_at(raw, *times_ns, held.path))
 
 
 def _told(clock: Clock, start_ns: int) -> dict[str, float | str]:
@@ -258,10 +254,9 @@ def _correction_ns(
     raw: RawMessage,
     time_ns: int,
     clocks: Mapping[str, Clock],
-    held: Summary,
-    recording: Path,
+    held: Contents,
 ) -> int:
-    clock = _clock_of(raw.topic, _robot(raw, recording), clocks)
+    clock = _clock_of(raw.topic, _robot(raw, held.path), clocks)
     return _shift_ns(time_ns, clock, held.start_ns) if clock else 0
 
 

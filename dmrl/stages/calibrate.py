@@ -15,7 +15,7 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
 from dmrl.images.codec import decode
 from dmrl.output import partial_file, refuse_existing
-from dmrl.recording import read, summary
+from dmrl.recording import Contents, read, summary
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -24,7 +24,7 @@ try:
     from dmrl.estimation.camera_pose import LEAST, Calibration, calibrate
     from dmrl.estimation.camera_views import Noise
     from dmrl.labelling.camera import camera_given, camera_of
-    from dmrl.labelling.sight import camera_flight
+    from dmrl.labelling.sight import SEEN, camera_flight
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "calibrate", "dmrl calibrate") from e
 
@@ -185,13 +185,13 @@ def _flights(sources: list[Path], settings: Settings) -> Result:
     camera = None
     flights = []
     for source, robot in zip(track(sources, "Reading"), robots, strict=True):
-        held = summary(source)
+        held = Contents(source, *SEEN, positions)
         if settings.camera:
-            camera = camera_given(source, held, robot, settings.camera)
-        camera = camera or camera_of(source, held, robot)
+            camera = camera_given(held, robot, settings.camera)
+        camera = camera or camera_of(held, robot)
         if camera is None:
             raise MissingTopic(topics.calibration(robot), held.topics, source)
-        flights.append(camera_flight(source, held, robot, settings.threshold, positions))
+        flights.append(camera_flight(held, robot, settings.threshold, positions))
     assert camera is not None
     found = calibrate(flights, camera, Noise(settings.pixel_std_px, settings.attitude_std_rad))
     if found is None:

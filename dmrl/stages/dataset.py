@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -28,12 +28,12 @@ from dmrl.datasets.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
 from dmrl.output import partial_folder
 from dmrl.recording import (
+    Contents,
     Input,
     Provenance,
     label_findings,
     licences,
     provenance,
-    read,
     splits,
     summary,
 )
@@ -135,15 +135,16 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
             "dataset", settings, recordings, seed=settings.seed, libraries=("pyarrow", "pillow")
         )
         total = sum(count_images(path) for path in recordings)
-        sources = {path: label_source(path, settings.labels) for path in recordings}
-        beside = _beside(sources)
+        held = {path: Contents(path, topics.LABELS, topics.CALIBRATION) for path in recordings}
+        sources = {path: label_source(held[path], settings.labels) for path in recordings}
+        beside = _beside(held, sources)
         split_of = _splits(recordings, made, settings)
-        _warn_of_lenses(recordings)
+        _warn_of_lenses(held.values())
         tally = Tally()
         twins = Twins()
         images = write_dataset(
             partial,
-            twins.seen(_rows(sources, split_of, tally, total, settings)),
+            twins.seen(_rows(held, sources, split_of, tally, total, settings)),
             png=settings.png,
             parquet=settings.parquet,
             shard_images=settings.shard_images,
@@ -156,7 +157,7 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
             {why: count for why, count in tally.left_out().items() if count},
             {path.name: source for path, source in sources.items()},
             beside,
-            {path.name: found for path in recordings if (found := label_findings(path))},
+            {path.name: found for path in recordings if (found := label_findings(held[path]))},
             licences(recordings),
             twins.count,
         )
@@ -169,9 +170,9 @@ def _has_masks(recording: Path) -> bool:
     return any(topics.names(topics.MASKS, topic) for topic in summary(recording).topics)
 
 
-def _beside(sources: Mapping[Path, str]) -> dict[str, list[str]]:
+def _beside(held: Mapping[Path, Contents], sources: Mapping[Path, str]) -> dict[str, list[str]]:
     """Sources that are not used, by recording, which is said where one might be meant."""
-    found = {path.name: sorted(sources_of(path) - {used}) for path, used in sources.items()}
+    found = {path.name: sorted(sources_of(held[path]) - {used}) for path, used in sources.items()}
     for path, used in sources.items():
         if {"truth", "estimate"} <= {*found[path.name], used}:
             other = "estimate" if used == "truth" else "truth"
@@ -197,13 +198,13 @@ def _splits(
     }
 
 
-def _warn_of_lenses(recordings: Sequence[Path]) -> None:
+def _warn_of_lenses(held: Iterable[Contents]) -> None:
     """Say so if the cameras differ: from the size of a drone alone its depth is not known then."""
     focal_px = []
-    for path in recordings:
-        for topic in summary(path).topics:
+    for one in held:
+        for topic in one.topics:
             if topics.names(topics.CALIBRATION, topic):
-                first = (one.message.K for one in islice(read(path, topic), 1))
+                first = (stamped.message.K for stamped in islice(one.messages(topic), 1))
                 focal_px += [k[0] for k in first if len(k) == 9 and k[0] > 0]
     if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
         say(
@@ -247,6 +248,7 @@ def _shown_by(recording: Input) -> Iterator[str]:
 
 
 def _rows(
+    held: Mapping[Path, Contents],
     sources: dict[Path, str],
     split_of: dict[Path, SplitOf],
     tally: Tally,
@@ -257,7 +259,7 @@ def _rows(
     rows = (
         (path, row)
         for path, source in sources.items()
-        for row in rows_of(path, source, split_of[path], tally, **how)
+        for row in rows_of(held[path], source, split_of[path], tally, **how)
     )
     size_px: tuple[int, int] | None = None
     for path, kept in track(rows, "Writing images", total):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.output import refuse_existing
-from dmrl.recording import Summary, Timed, provenance, rewrite, summary
+from dmrl.recording import Contents, Timed, provenance, rewrite
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -21,17 +21,19 @@ try:
     from dmrl.estimation.gate import GATE_M
     from dmrl.estimation.pair import Pair
     from dmrl.estimation.swarm import estimate_swarm
-    from dmrl.labelling.camera import camera_given, camera_of, image_times
+    from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.labels import SOURCE, Look, Positions
-    from dmrl.labelling.logs import Logs, read_logs
+    from dmrl.labelling.logs import SENSED, Logs, read_logs
     from dmrl.labelling.report import PairReport, doubts, pair_report
-    from dmrl.labelling.sight import read_sight
+    from dmrl.labelling.sight import SEEN, read_sight
     from dmrl.labelling.sighted import sighted
     from dmrl.labelling.write import label_messages, position_messages
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl label") from e
 
 POSITION_HZ = 20.0
+BESIDE = (topics.LABELS, topics.CALIBRATION, topics.TRUTH)
+"""What labels are made with, beside what positions are estimated from."""
 PAIRS_AT_ONCE = 15
 """Pairs that are filtered side by side: more are no faster, and need more memory."""
 
@@ -113,27 +115,23 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
         If ``out`` exists.
     """
     refuse_existing(out)
-    held = summary(recording)
-    logs = _logs(recording, held, settings)
-    cameras = {
-        robot: camera_given(recording, held, robot, path) for robot, path in settings.camera.items()
-    }
+    held = Contents(recording, *SENSED, *BESIDE, *(SEEN if settings.detections else ()))
+    logs = _logs(held, settings)
+    cameras = {robot: camera_given(held, robot, path) for robot, path in settings.camera.items()}
     look = Look(settings.attitude_std_rad, not settings.undistorted, cameras)
     estimates = _estimates(logs.pairs, settings)
-    images = {robot: image_times(recording, held, robot) for robot in logs.robots}
+    images = {robot: held.times(topics.camera_image(robot)) for robot in logs.robots}
     exposures = {robot: look.exposures_ns(robot, times) for robot, times in images.items()}
     positions = {
         pair: _positions(logs.start_ns, _oriented(logs.pairs, pair), estimate, exposures[pair[0]])
         for pair, estimate in estimates.items()
     }
     if settings.detections:
-        _correct(recording, held, positions, look, settings.pixel_std_px)
-    reports = [
-        pair_report(recording, held, pair, positions[pair], estimates[pair]) for pair in positions
-    ]
+        _correct(held, positions, look, settings.pixel_std_px)
+    reports = [pair_report(held, pair, positions[pair], estimates[pair]) for pair in positions]
     filming = [robot for robot, times in images.items() if len(times)]
     made = {
-        robot: list(label_messages(recording, held, logs, robot, _of(positions, robot), look))
+        robot: list(label_messages(held, logs, robot, _of(positions, robot), look))
         for robot in filming
     }
     fresh = [position_messages(*pair, found) for pair, found in positions.items()]
@@ -148,14 +146,14 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     return Result(reports, _count(made.values()), warnings)
 
 
-def _logs(recording: Path, held: Summary, settings: Settings) -> Logs:
+def _logs(held: Contents, settings: Settings) -> Logs:
     """Logs of all pairs, if there is a pair, and a robot for every camera file."""
-    logs = read_logs(recording, held, settings.range_offset_m)
+    logs = read_logs(held, settings.range_offset_m)
     if not logs.pairs:
         why = "; ".join(logs.warnings) or "there are no ranges"
-        raise RecordingError(f"{recording}: no pair can be estimated: {why}. Try: dmrl info")
+        raise RecordingError(f"{held.path}: no pair can be estimated: {why}. Try: dmrl info")
     if unknown := set(settings.camera) - set(logs.robots):
-        raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(logs.robots)}")
+        raise SettingError(f"--camera.{min(unknown)}: {held.path} has {', '.join(logs.robots)}")
     return logs
 
 
@@ -164,7 +162,7 @@ def _of(positions: Mapping[Names, Positions], robot: str) -> dict[str, Positions
     return {peer: found for (one, peer), found in positions.items() if one == robot}
 
 
-def _blind(held: Summary, filming: Iterable[str], cameras: Collection[str]) -> list[str]:
+def _blind(held: Contents, filming: Iterable[str], cameras: Collection[str]) -> list[str]:
     """Warnings for robots whose images get no labels, as their camera is not known."""
     return [
         f"{robot}: no {topics.calibration(robot)}; its images get no labels. Give one: "
@@ -180,20 +178,18 @@ def _count(made: Iterable[Iterable[Timed]]) -> int:
     return sum(peer.source == SOURCE for peer in peers)
 
 
-def _correct(
-    recording: Path, held: Summary, positions: dict[Names, Positions], look: Look, std_px: float
-) -> None:
+def _correct(held: Contents, positions: dict[Names, Positions], look: Look, std_px: float) -> None:
     """Put into the positions what their observers' cameras detected."""
     robots = topics.robots(list(held.topics), topics.DETECTIONS)
     if not robots:
-        raise MissingTopic(topics.detections("*"), held.topics, recording)
+        raise MissingTopic(topics.detections("*"), held.topics, held.path)
     for robot in robots:
-        camera = look.cameras.get(robot) or camera_of(recording, held, robot)
+        camera = look.cameras.get(robot) or camera_of(held, robot)
         if camera is None:
-            raise MissingTopic(topics.calibration(robot), held.topics, recording)
+            raise MissingTopic(topics.calibration(robot), held.topics, held.path)
         if not look.distorted:
             camera = replace(camera, distortion=())
-        sight = read_sight(recording, held, robot, camera, None)
+        sight = read_sight(held, robot, camera, None)
         for pair in (pair for pair in positions if pair[0] == robot):
             positions[pair], used = sighted(sight, positions[pair], std_px)
             say(f"{' -> '.join(pair)}: {used} detections in {len(sight.time_ns)} images counted")

@@ -13,7 +13,7 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.recording import Summary, Timed, provenance, rewrite, summary
+from dmrl.recording import Contents, Timed, provenance, rewrite, summary
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -22,7 +22,7 @@ try:
     from dmrl.estimation.tracker import Track, Tracker, Tuning
     from dmrl.evaluation.tracks import CAMERAS_METADATA
     from dmrl.labelling.camera import camera_given, camera_of
-    from dmrl.labelling.sight import Sight, read_sight
+    from dmrl.labelling.sight import SEEN, Sight, read_sight
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 
@@ -108,17 +108,14 @@ def run(recording: Path, out: Path, settings: Settings) -> list[RobotReport]:
         If ``out`` exists.
     """
     refuse_existing(out)
-    held = summary(recording)
-    robots = topics.robots(list(held.topics), topics.DETECTIONS)
+    robots = topics.robots(list(summary(recording).topics), topics.DETECTIONS)
     if not robots:
-        raise MissingTopic(topics.detections("*"), held.topics, recording)
+        raise MissingTopic(topics.detections("*"), summary(recording).topics, recording)
     if unknown := set(settings.camera) - set(robots):
         raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(robots)}")
-    cameras = {robot: _camera(recording, held, robot, settings) for robot in robots}
-    followed = {
-        robot: _follow(recording, held, robot, camera, settings)
-        for robot, camera in cameras.items()
-    }
+    held = Contents(recording, *SEEN)
+    cameras = {robot: _camera(held, robot, settings) for robot in robots}
+    followed = {robot: _follow(held, robot, camera, settings) for robot, camera in cameras.items()}
     replaced = [topic for topic in held.topics if topics.names(topics.TRACKS, topic)]
     inputs = [recording, *settings.camera.values()]
     made = provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
@@ -128,23 +125,21 @@ def run(recording: Path, out: Path, settings: Settings) -> list[RobotReport]:
     return [report for _, report in followed.values()]
 
 
-def _camera(recording: Path, held: Summary, robot: str, settings: Settings) -> Camera:
+def _camera(held: Contents, robot: str, settings: Settings) -> Camera:
     given = settings.camera.get(robot)
-    camera = (
-        camera_given(recording, held, robot, given) if given else camera_of(recording, held, robot)
-    )
+    camera = camera_given(held, robot, given) if given else camera_of(held, robot)
     if camera is None:
-        raise MissingTopic(topics.calibration(robot), held.topics, recording)
+        raise MissingTopic(topics.calibration(robot), held.topics, held.path)
     return replace(camera, distortion=()) if settings.undistorted else camera
 
 
 def _follow(
-    recording: Path, held: Summary, robot: str, camera: Camera, settings: Settings
+    held: Contents, robot: str, camera: Camera, settings: Settings
 ) -> tuple[list[Timed], RobotReport]:
     """Tracks messages of one robot, one per image, and what they hold."""
-    sight = read_sight(recording, held, robot, camera, settings.threshold)
+    sight = read_sight(held, robot, camera, settings.threshold)
     for warning in sight.warnings:
-        say(f"{recording}: {warning}")
+        say(f"{held.path}: {warning}")
     tracker, identity = Tracker(sight.camera, settings.tuning), Identity()
     made: list[Timed] = []
     seen: dict[int, str] = {}

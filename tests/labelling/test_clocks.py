@@ -19,7 +19,7 @@ from dmrl.labelling.clocks import (
     ranging,
 )
 from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Contents, Provenance, RecordingWriter
 
 TIME_S = np.arange(0, 30, 0.05)
 LATE_S = 0.13
@@ -60,7 +60,7 @@ def mocap(path: Path, only: str, tf: bool = False) -> Any:
             own = dict(zip(names, [*angles[k, :2], rate], strict=True))
             sink.write(own_ns, topics.attitude("cf1"), message("Attitude")(**own))
             sink.write(own_ns, topics.height("cf1"), message("Height")(height_m=place["z"]))
-    return mocap_clocks(path, summary(path))
+    return mocap_clocks(Contents(path))
 
 
 @pytest.mark.parametrize("only", ["roll", "pitch", "yaw rate", "height"])
@@ -86,9 +86,9 @@ def test_ranges_both_ways_set_the_second_robots_clock(tmp_path: Path) -> None:
             heard = message("UwbRange")(range_m=3 + away[k] + rng.normal(0, 0.01))
             sink.write(round(stamp_s * 1e9), topics.uwb_range(*link), heard)
             sink.write(round(moment * 1e9), topics.uwb_range("cf1", "cf3"), heard)
-    held = summary(path)
+    held = Contents(path)
     assert ranging(held) == {("cf1", "cf2"), ("cf2", "cf1"), ("cf1", "cf3")}
-    found = range_clocks(path, held)
+    found = range_clocks(held)
     assert found.keys() == {("cf1", "cf2")}
     assert found["cf1", "cf2"].offset_s == pytest.approx(-LATE_S, abs=0.03)
     assert found["cf1", "cf2"].by == "ranges"
@@ -113,11 +113,11 @@ def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> 
         for k, moment in enumerate(own_s.tolist()):
             turn = {"yaw_rate_radps": rate[k]} if axis == "yaw rate" else {"pitch_rad": own[k]}
             sink.write(round(moment * 1e9), topics.attitude("cf1"), message("Attitude")(**turn))
-    found = camera_clock(path, summary(path), "cf1", {})
+    found = camera_clock(Contents(path), "cf1", {})
     assert found is not None
     assert found.by == axis
     assert found.offset_s == pytest.approx(-LATE_S, abs=0.02)
-    assert camera_clock(path, summary(path), "cf2", {}) is None
+    assert camera_clock(Contents(path), "cf2", {}) is None
 
 
 def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:

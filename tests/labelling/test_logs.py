@@ -11,7 +11,7 @@ from dmrl import topics
 from dmrl.estimation.pair import RATE_HZ
 from dmrl.labelling.logs import LEAST_RANGES, Logs, RobotLog, read_logs
 from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Contents, Provenance, RecordingWriter
 
 START_NS = 7_000_000_000
 Write = Callable[[float, str, Any], None]
@@ -39,7 +39,7 @@ def logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> 
     with RecordingWriter(path, Provenance("test")) as sink:
         for part in parts:
             part(lambda t, topic, m: sink.write(START_NS + round(t * 1e9), topic, m))
-    return read_logs(path, summary(path), offset_m)
+    return read_logs(Contents(path), offset_m)
 
 
 def test_a_pair_stands_on_one_grid_with_the_ranges_of_both(tmp_path: Path) -> None:
@@ -179,5 +179,5 @@ def test_samples_that_are_no_numbers_and_clocks_that_go_back_are_said(tmp_path: 
         )
         flight(late)
         ranges(late)
-    back = read_logs(tmp_path / "b.mcap", summary(tmp_path / "b.mcap")).warnings
+    back = read_logs(Contents(tmp_path / "b.mcap")).warnings
     assert "/cf1/attitude: its clock goes back 1 times; samples overlap there" in back

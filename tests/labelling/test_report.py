@@ -12,7 +12,7 @@ from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.report import PairReport, pair_report
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Contents, Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
 STATUS = [STATUS_OK, STATUS_OK, STATUS_AMBIGUOUS, STATUS_UNCONVERGED, STATUS_OK]
@@ -45,7 +45,7 @@ def flight(path: Path, truth_s: list[float]) -> Path:
 
 
 def report(path: Path) -> PairReport:
-    return pair_report(path, summary(path), ("cf1", "cf2"), found(), estimate())
+    return pair_report(Contents(path), ("cf1", "cf2"), found(), estimate())
 
 
 def test_a_report_says_how_sure_and_how_right(tmp_path: Path) -> None:

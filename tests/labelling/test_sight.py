@@ -13,7 +13,7 @@ from dmrl.errors import MissingTopic, RecordingError
 from dmrl.geometry.frames import AIDECK
 from dmrl.labelling.sight import LONGEST_GAP_S, UNSAID, Sight, camera_flight, read_sight
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Contents, Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
 Row = tuple[float, str, str, dict[str, Any]]
@@ -56,8 +56,7 @@ def sight_of(
     path: Path, rows: Sequence[Row], threshold: float | None = None, **camera: Any
 ) -> Sight:
     recorded(path, rows)
-    held = summary(path)
-    return read_sight(path, held, "cf1", replace(AIDECK, **camera), threshold)
+    return read_sight(Contents(path), "cf1", replace(AIDECK, **camera), threshold)
 
 
 def test_detections_are_given_to_their_image(tmp_path: Path) -> None:
@@ -136,7 +135,7 @@ def test_what_a_camera_is_calibrated_with(tmp_path: Path) -> None:
     rows += [(1.0, topics.position("cf1", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
     rows += [(1.0, topics.position("cf2", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
     path = recorded(tmp_path / "a.mcap", rows)
-    flight = camera_flight(path, summary(path), "cf1", None, topics.POSITION)
+    flight = camera_flight(Contents(path), "cf1", None, topics.POSITION)
     assert flight.image_s.tolist() == [1.0, 2.0, 3.0]
     assert flight.image.tolist() == [0, 0, 2]
     assert flight.uv.tolist() == [[10, 5], [20, 10], [30, 15]]
@@ -148,4 +147,4 @@ def test_what_a_camera_is_calibrated_with(tmp_path: Path) -> None:
     assert path_of.covariance[0].diagonal().tolist() == [0.04, 0.05, 0.06]
     assert path_of.covariance[1].tolist() == UNSAID.tolist()
     with pytest.raises(MissingTopic):
-        camera_flight(path, summary(path), "cf1", None, topics.TRUTH)
+        camera_flight(Contents(path), "cf1", None, topics.TRUTH)

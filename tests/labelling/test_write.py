@@ -14,7 +14,7 @@ from dmrl.labelling.labels import NEAREST_M, Look, Positions
 from dmrl.labelling.logs import Logs, RobotLog
 from dmrl.labelling.write import label_messages, position_messages
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Contents, Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
 START_NS = 5 * SECOND_NS
@@ -55,7 +55,7 @@ def at(time_s: Sequence[float], status: int = STATUS_OK) -> Positions:
 
 def written(path: Path, found: dict[str, Positions], camera: Camera, known: Logs) -> list[Any]:
     look = Look(0.01, cameras={"cf1": camera})
-    return list(label_messages(path, summary(path), known, "cf1", found, look))
+    return list(label_messages(Contents(path), known, "cf1", found, look))
 
 
 def test_a_position_message_says_all_of_it() -> None:
@@ -110,5 +110,5 @@ def test_who_flies_without_a_position_may_be_in_any_image_that_has_one(tmp_path:
 
 def test_without_any_calibration_there_are_no_labels(tmp_path: Path) -> None:
     path = flight(tmp_path / "a.mcap", [2.0])
-    found = label_messages(path, summary(path), logs(), "cf1", {"cf2": at([2.0])}, Look(0.01))
+    found = label_messages(Contents(path), logs(), "cf1", {"cf2": at([2.0])}, Look(0.01))
     assert list(found) == []

@@ -8,7 +8,7 @@ from dmrl import topics
 from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.labelling.camera import camera_of
-from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary, trim
+from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw, summary, trim
 from dmrl.recording.inputs import sha256_of_file
 from dmrl.stages import evaluate, fly, track
 from dmrl.stages.track import Settings
@@ -62,7 +62,7 @@ def test_tracks_are_judged_with_the_camera_that_made_them(
         for one in read(detected):
             seen = one.topic in (topics.detections("cf1"), topics.camera_image("cf1"))
             sink.write(one.time_ns + seen * 200_000_000, one.topic, one.message)
-    camera = camera_of(detected, summary(detected), "cf1")
+    camera = camera_of(Contents(detected), "cf1")
     assert camera is not None
     path.write_text(write_camera(replace(camera, delay_s=0.2)))
     track.run(late, out, Settings(camera={"cf1": path}))

@@ -14,6 +14,7 @@ from dmrl.errors import DmrlError, RecordingError, SettingError
 from dmrl.evaluation import detections
 from dmrl.geometry.frames import Array
 from dmrl.learn.matching import errors
+from dmrl.recording import Contents
 from dmrl.terminal.progress import say
 from dmrl.viewer import entities, layouts, plots
 from dmrl.viewer.entities import Colour
@@ -87,7 +88,7 @@ def _models(selection: Selection, wanted: str | None) -> tuple[str, list[Path]]:
 def _judged(path: Path, robot: str, selection: Selection) -> Judged | None:
     """How far off a model was; None, and a line, if nothing can judge it."""
     try:
-        source = label_source(path, "best")
+        source = label_source(Contents(path, topics.LABELS), "best")
         pairs = detections.join([path], source)
     except DmrlError as e:
         say(f"no errors of {path.stem}: {e}")
