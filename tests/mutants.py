@@ -3,8 +3,12 @@
     make mutants ARGS="geometry labelling --count 30 --seed 1"
 
 Draws changes by a seed, each kind as often as the others, makes one at a time in a copy of the
-tree, and runs the room's tests until one fails: those of the module first, then the other files
-that run the changed line. What no test noticed is printed; ``--out`` keeps all.
+tree, and runs the room's tests that run the changed line until one fails: those of the module
+first, then the quickest. What no test noticed is printed; ``--out`` keeps all.
+
+    make mutants ARGS="--named"
+
+makes the changes of ``mutants.toml``, which people thought of, each against the tests named there.
 """
 
 import argparse
@@ -17,7 +21,9 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -25,13 +31,14 @@ from typing import NoReturn
 
 import pytest
 from coverage import Coverage, CoverageData
-from mutations import REPOSITORY, Mutant, drawn
+from mutations import REPOSITORY, Mutant, drawn, named, room_of
 
 ROOMS = ("geometry", "estimation", "labelling", "learn", "recording", "formats", "deploy")
 BESIDE = ("viewer", "schemas", "recipes")
 """Folders at the top that are imported as parts of dmrl."""
 HEAVY = ("scipy.stats", "scipy.optimize", "pyarrow.compute", "PIL.Image")
 HEAVY += ("filterpy.kalman", "mcap.writer", "cv2", "torch", "tensorboard", "onnx", "onnxruntime")
+HEAVY += ("hypothesis.strategies", "hypothesis.extra.numpy")
 """What tests import and changes do not touch: imported once, for the tests of every change."""
 LEAST_S = 120.0
 """Tests that run for longer than this, and than ten times what they should, do not end."""
@@ -53,13 +60,16 @@ class Copy:
         data = REPOSITORY.parent / "shared" / "data"
         self.env = {"DMRL_DATA": os.environ.get("DMRL_DATA", str(data)), "OMP_NUM_THREADS": "1"}
         self.env |= {"PYTHONPATH": str(folder), "TMPDIR": str(folder / "tmp")}
-        (folder / "tmp").mkdir()
+        (self.folder / "tmp").mkdir()
+        self.quietly = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:anyio"]
+        self.quietly += ["--basetemp", str(folder / "tmp" / "pytest")]
+        self.quietly += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
 
     def pytest(self, tests: list[str], limit_s: float) -> int | None:
         """Exit status of pytest up to its first failure; None where it did not end."""
         child = os.fork()
         if child == 0:
-            self._become_pytest(["-x", "-q", "-p", "no:cacheprovider", *tests])
+            self._become_pytest(["-x", *self.quietly, *tests])
         until = time.monotonic() + limit_s
         while (ended := os.waitpid(child, os.WNOHANG))[0] == 0 and time.monotonic() < until:
             time.sleep(0.05)
@@ -76,29 +86,34 @@ class Copy:
         os.chdir(self.folder)
         os.environ.update(self.env)
         sys.path[:0] = [str(self.folder)]
+        sys.dont_write_bytecode = False  # else all is compiled again for every change
         log = os.open("pytest.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         for stream in (1, 2):
             os.dup2(log, stream)
         status = 1
-        with suppress(BaseException):
+        try:
             status = int(pytest.main(words))
+        except BaseException:
+            traceback.print_exc()
         sys.stdout.flush()
         os._exit(status)
 
-    def lines(self, room: str) -> CoverageData:
-        """Which files of a room's tests run which lines of it. All of them pass."""
+    def lines(self, room: str) -> tuple[CoverageData, dict[str, float]]:
+        """Which tests of a room run which lines of it, and how long each takes. All pass."""
         data = self.folder / f"{room}.coverage"
         command = [sys.executable, "-m", "coverage", "run", f"--data-file={data}"]
-        command += [f"--source={self.folder / 'dmrl' / room}", "-m", "pytest", "-x", "-q"]
-        command += ["-p", "no:cacheprovider", "-p", "mutants", f"tests/{room}"]
+        command += [f"--source={self.folder / 'dmrl' / room}", "-m", "pytest", "-x"]
+        command += [*self.quietly, "-p", "mutants", f"tests/{room}"]
         path = os.pathsep.join([str(self.folder), str(self.folder / "tests")])
-        env = {**os.environ, **self.env, "PYTHONPATH": path}
+        took = self.folder / f"{room}.json"
+        env = {**os.environ, **self.env, "PYTHONPATH": path, "MUTANTS_TOOK": str(took)}
+        env.pop("PYTHONDONTWRITEBYTECODE", None)
         done = subprocess.run(command, cwd=self.folder, env=env, capture_output=True, text=True)
         if done.returncode:
             sys.exit(f"{done.stdout}{done.stderr}tests/{room} fail as they are")
         found = CoverageData(str(data))
         found.read()
-        return found
+        return found, json.loads(took.read_text())
 
     def survives(self, mutant: Mutant, tests: list[str], limit_s: float) -> bool:
         """Whether the tests pass with a change."""
@@ -113,24 +128,40 @@ class Copy:
             path.write_bytes(source)
 
 
+TOOK: dict[str, float] = {}
+
+
 def pytest_runtest_logstart(nodeid: str) -> None:
-    """As a plug-in of pytest: lines that run from here on are of this test's file."""
+    """As a plug-in of pytest: lines that run from here on are of this test."""
     running = Coverage.current()
     if running is not None:
-        running.switch_context(nodeid.partition("::")[0])
+        running.switch_context(nodeid)
 
 
-def tests_of(mutant: Mutant, room: str, lines: CoverageData, folder: Path) -> list[str]:
-    """Files of tests that may notice: the module's own first."""
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """How long a test took, with what it stands on."""
+    TOOK[report.nodeid] = TOOK.get(report.nodeid, 0.0) + report.duration
+
+
+def pytest_sessionfinish() -> None:
+    """Written where it is asked for."""
+    if "MUTANTS_TOOK" in os.environ:
+        Path(os.environ["MUTANTS_TOOK"]).write_text(json.dumps(TOOK))
+
+
+def tests_of(
+    mutant: Mutant, lines: CoverageData, took: Mapping[str, float], folder: Path
+) -> list[str]:
+    """Tests that may notice: the module's own first, then the quickest."""
     measured = {Path(name).resolve(): name for name in lines.measured_files()}
     name = measured.get((folder / mutant.path).resolve())
     by_line = lines.contexts_by_lineno(name) if name else {}
     rows = range(mutant.line, mutant.line + mutant.before.count("\n") + 1)
-    files = {file for row in rows for file in by_line.get(row, ())}
-    if "" in files:  # runs when the module is imported
-        files = {str(p.relative_to(REPOSITORY)) for p in _tests(room)}
-    own = f"test_{Path(mutant.path).stem}.py"
-    return sorted(files, key=lambda file: (Path(file).name != own, file))
+    found = {test for row in rows for test in by_line.get(row, ())}
+    if "" in found:  # runs when the module is imported
+        found = set(took)
+    own = f"/test_{Path(mutant.path).stem}.py::"
+    return sorted(found & took.keys(), key=lambda test: (own not in test, took[test], test))
 
 
 def _tests(room: str) -> list[Path]:
@@ -140,25 +171,44 @@ def _tests(room: str) -> list[Path]:
 def measured(copy: Copy, room: str, mutants: list[Mutant]) -> list[dict[str, object]]:
     """Each change, and whether it was noticed; those that were not are printed."""
     began = time.monotonic()
-    lines = copy.lines(room)
+    lines, took = copy.lines(room)
     limit_s = max(LEAST_S, 10 * (time.monotonic() - began))
     if copy.pytest([str(_tests(room)[0].relative_to(REPOSITORY))], limit_s):
         sys.exit((copy.folder / "pytest.log").read_text() + "no test passes after a fork")
     rows = []
     for mutant in mutants:
-        tests = tests_of(mutant, room, lines, copy.folder)
-        survived = not tests or copy.survives(mutant, tests, limit_s)
-        rows.append({"room": room, "survived": survived, "tests": tests, **asdict(mutant)})
-        if survived:
-            print(f"{mutant.path}:{mutant.line}: {mutant.kind}, {len(tests)} files of tests run it")
-            print(f"  - {' '.join(mutant.before.split())}\n  + {mutant.after}", flush=True)
+        tests = tests_of(mutant, lines, took, copy.folder)
+        rows.append(_row(mutant, tests, not tests or copy.survives(mutant, tests, limit_s)))
     return rows
+
+
+def by_hand(copy: Copy, rooms: tuple[str, ...]) -> list[dict[str, object]]:
+    """The same of the changes made by hand."""
+    changes = named(rooms)
+    for tests in sorted({tests for _, tests in changes}):
+        if copy.pytest(list(tests), LEAST_S):
+            sys.exit((copy.folder / "pytest.log").read_text() + f"{tests} fail as they are")
+    return [_row(m, tests, copy.survives(m, list(tests), LEAST_S)) for m, tests in changes]
+
+
+def _row(mutant: Mutant, tests: Sequence[str], survived: bool) -> dict[str, object]:
+    if survived:
+        print(f"{mutant.path}:{mutant.line}: {mutant.kind}, {len(tests)} tests run it")
+        print(f"  - {' '.join(mutant.before.split())}\n  + {mutant.after}", flush=True)
+    room = room_of(mutant.path) or "top"
+    return {"room": room, "survived": survived, "tests": list(tests), **asdict(mutant)}
+
+
+def _keep(out: Path | None, seed: int, rows: list[dict[str, object]]) -> None:
+    if out:
+        out.write_text(json.dumps({"seed": seed, "mutants": rows}, indent=1))
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("rooms", nargs="*", default=ROOMS, help=f"of {', '.join(ROOMS)}")
+    parser.add_argument("rooms", nargs="*", help=f"of {', '.join(ROOMS)}; without any, all")
+    parser.add_argument("--named", action="store_true", help="the changes of mutants.toml")
     parser.add_argument("--count", type=int, default=30, help="changes of each room")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--without", action="append", default=[], help="a module to leave alone")
@@ -175,14 +225,16 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         copy = Copy(Path(folder).resolve())
-        for room in given.rooms:
+        if given.named:
+            rows = by_hand(copy, tuple(given.rooms))
+        for room in () if given.named else given.rooms or ROOMS:
             chosen = drawn(room, given.count, given.seed, tuple(given.without))
             if alive is not None:
                 chosen = [m for m in chosen if (m.path, m.before, m.after) in alive]
             rows += measured(copy, room, chosen)
-            if given.out:
-                given.out.write_text(json.dumps({"seed": given.seed, "mutants": rows}, indent=1))
-    for room in given.rooms:
+            _keep(given.out, given.seed, rows)
+    _keep(given.out, given.seed, rows)
+    for room in dict.fromkeys(row["room"] for row in rows):
         count = Counter(row["survived"] for row in rows if row["room"] == room)
         share = count[False] / max(count.total(), 1)
         print(f"{room}: {count[False]} of {count.total()} noticed, {share:.0%}")

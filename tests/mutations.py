@@ -2,6 +2,7 @@
 
 import ast
 import random
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 from copy import deepcopy
@@ -9,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[1]
+NAMED = Path(__file__).with_name("mutants.toml")
+"""Changes that people made by hand: what an outsider would break."""
 
 OTHER: dict[type, tuple[type, ...]] = {
     **{ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.GtE)},
@@ -156,3 +159,30 @@ def drawn(room: str, count: int, seed: int, without: tuple[str, ...]) -> list[Mu
     while len(chosen) < count and any(by_kind.values()):
         chosen += [by_kind[kind].pop() for kind in sorted(by_kind) if by_kind[kind]]
     return chosen[:count]
+
+
+def named(rooms: tuple[str, ...] = ()) -> list[tuple[Mutant, tuple[str, ...]]]:
+    """The changes made by hand, each with the tests that should notice; of some rooms or all.
+
+    Raises
+    ------
+    ValueError
+        If what a change replaces does not stand in its file, or stands there twice.
+    """
+    found = []
+    for where, changes in tomllib.loads(NAMED.read_text()).items():
+        room = room_of(where)
+        tests = changes.pop("tests", [f"tests/{room}/test_{Path(where).stem}.py"])
+        source = (REPOSITORY / where).read_bytes()
+        for what, (before, after) in changes.items() if room in rooms or not rooms else ():
+            if source.count(before.encode()) != 1:
+                raise ValueError(f"{where}: {what}: {before!r} stands there not once")
+            start = source.index(before.encode())
+            end, line = start + len(before.encode()), source[:start].count(b"\n") + 1
+            found.append((Mutant(where, line, what, start, end, before, after), tuple(tests)))
+    return found
+
+
+def room_of(path: str) -> str:
+    """The folder of `dmrl/` that a file is in; empty for one at the top."""
+    return path.split("/")[1] if path.count("/") > 1 else ""
