@@ -9,6 +9,7 @@ from mcap.writer import Writer
 from dmrl.images.codec import encode_png
 from dmrl.messages import message, schema_bytes
 from dmrl.recording import Provenance, RecordingWriter, check
+from dmrl.recording.check import say_findings
 
 PNG = encode_png(np.zeros((224, 320, 3), np.uint8))
 Write = Callable[[int, str, Any], None]
@@ -241,3 +242,38 @@ def test_a_bias_is_told_by_its_standard_error(tmp_path: Path) -> None:
     few = [(9.0, 9.0)] * 19
     assert record(tmp_path / "d.mcap", lambda w: off_by(w, few)) == []
     assert len(record(tmp_path / "e.mcap", lambda w: off_by(w, [(9.0, 9.0)] * 20))) == 1
+
+
+def test_what_was_just_written_is_looked_at_without_its_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        sink.write(0, "/cf1/camera/image", image(b"no image"))
+        for topic in ("/cf1/height", "/cf1/velocity", "/cf1/attitude"):
+            kind = message(topic.rpartition("/")[2].title())
+            for second in (*range(12), 99):
+                sink.write(second * 10**9, topic, kind())
+    say_findings(path)
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 3
+    assert all("1 gaps, the longest 88.000 s" in line for line in said[:2])
+    assert said[-1] == f"1 more: dmrl check {path}"
+
+
+def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> None:
+    def fill(write: Write, left_px: float, right_px: float) -> None:
+        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        for k in range(40):
+            box = [left_px, 50, right_px, 70]
+            peer = message("PeerLabel")(u_px=100, v_px=60, depth_m=1, source="hand", box_px=box)
+            write(k * 10**9, "/cf1/camera/image", image())
+            write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[peer]))
+
+    for k, (left_px, right_px, found) in enumerate(
+        [(1.5, 100, 1), (1, 100, 0), (100, 318.5, 1), (100, 319, 0)]
+    ):
+        assert (
+            len(record(tmp_path / f"{k}.mcap", lambda w, a=left_px, b=right_px: fill(w, a, b)))
+            == found
+        )

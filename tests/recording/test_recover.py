@@ -1,0 +1,94 @@
+"""What recover says of what it could not bring back."""
+
+from math import sin
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap.writer import Writer
+
+from dmrl.errors import RecordingError
+from dmrl.messages import message, schema_bytes
+from dmrl.recording import Provenance, RecordingWriter, read_raw, recover
+
+TOPICS = ("/cf1/height", "/cf2/height")
+
+
+def chunks(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    return found.chunk_indexes
+
+
+@pytest.fixture
+def broken(tmp_path: Path) -> tuple[Path, int]:
+    """Three chunks, the middle one damaged, and how many messages that one had."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(2700):
+            if k in (900, 1800):
+                sink.flush()
+            height = message("Height")(height_m=sin(k))
+            sink.write(k, TOPICS[k % 3 == 0], height)
+    middle = chunks(path)[1]
+    data = bytearray(path.read_bytes())
+    data[middle.chunk_start_offset + middle.chunk_length // 2] ^= 255
+    path.write_bytes(data)
+    return path, 900
+
+
+def test_what_a_damaged_chunk_had_is_said_by_topic(
+    broken: tuple[Path, int], tmp_path: Path
+) -> None:
+    path, lost = broken
+    found = recover(path, tmp_path / "b.mcap")
+    assert found.missing == {TOPICS[0]: lost * 2 // 3, TOPICS[1]: lost // 3}
+    assert (found.messages, found.damaged_chunks, found.lost_bytes) == (1800, 1, 0)
+    assert (found.counted, found.doubtful, found.whole) == (True, False, False)
+
+
+def test_a_file_that_is_cut_says_only_what_its_indexes_say(
+    broken: tuple[Path, int], tmp_path: Path
+) -> None:
+    path, lost = broken
+    last = chunks(path)[2]
+    cut = last.chunk_start_offset + 1000
+    path.write_bytes(path.read_bytes()[:cut])
+    found = recover(path, tmp_path / "b.mcap")
+    assert found.messages == 900
+    assert sum(found.missing.values()) == lost  # not those of the last chunk: nobody knows
+    assert (found.counted, found.lost_bytes, found.whole) == (False, 1000, False)
+
+
+def test_metadata_that_fail_their_sum_are_kept_and_doubted(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        sink.write(0, TOPICS[0], message("Height")())
+        sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
+    path.write_bytes(path.read_bytes().replace(b"[[0, 10]]", b"[[0, 90]]"))
+    found = recover(path, tmp_path / "b.mcap")
+    assert (found.doubtful, found.whole, found.missing) == (True, False, {})
+
+
+def test_messages_beyond_2262_are_left_out_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        for log_ns, publish_ns in ((1, 2), (2**63, 3), (4, 2**63), (2**63 - 2, 2**63 - 2)):
+            writer.add_message(channel, log_ns, b"", publish_ns)
+        writer.finish()
+    found = recover(path, tmp_path / "b.mcap")
+    assert (found.messages, found.timeless, found.whole) == (2, 2, False)
+    assert [raw.time_ns for raw in read_raw(tmp_path / "b.mcap")] == [1, 2**63 - 2]
+
+
+def test_magic_bytes_alone_are_a_recording_that_holds_nothing(tmp_path: Path) -> None:
+    for content, words in ((b"\x89MCAP0\r\n", "holds no whole chunk"), (b"\x89MC", "not begin")):
+        (tmp_path / "a.mcap").write_bytes(content)
+        with pytest.raises(RecordingError, match=words):
+            recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
