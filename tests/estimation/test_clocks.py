@@ -132,7 +132,7 @@ def test_any_clocks_chain_and_undo(one: Clock, two: Clock) -> None:
     np.testing.assert_allclose(one.inverse().corrected(one.corrected(TIMES_S)), TIMES_S, atol=1e-8)
 
 
-@settings(max_examples=12, deadline=None, phases=[Phase.generate])
+@settings(max_examples=12, phases=[Phase.generate])
 @given(st.floats(-50, 50), st.floats(-20e-6, 20e-6), st.floats(0.1, 5), st.integers(0, 99))
 def test_any_offset_and_drift_come_back(
     offset_s: float, drift: float, scale: float, seed: int

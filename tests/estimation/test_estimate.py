@@ -142,3 +142,20 @@ def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() 
     assert xy.tolist() == [[0.5, 1.0], [1.0, 2.0]]
     assert covariance[0].tolist() == (2 * np.eye(2)).tolist()
     assert status.tolist() == [room.OK, room.UNCONVERGED]
+
+
+def test_between_two_statuses_the_worse_counts_and_turned_covariances_are_those_of_draws() -> None:
+    spread = np.array([[0.02, 0.01, 0.003], [0.01, 0.03, -0.002], [0.003, -0.002, 0.01]])
+    state = np.array([[1.0, 0.5, 0.4], [1.0, 0.5, 0.4]])
+    status = np.array([room.OK, room.AMBIGUOUS], np.int8)
+    constants = np.arange(11.0)
+    estimate = Estimate(np.arange(2.0), state, np.stack([spread] * 2), status, constants, Noise())
+    assert estimate.at(np.array([0.0, 0.5, 1.0, 1.5]))[2].tolist() == [room.AMBIGUOUS] * 4
+    back = swapped(estimate)
+    # Own and peer change places, and what a clock is late by the other is early by.
+    assert back.constants.tolist() == [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, -10]
+    drawn = np.random.default_rng(0).multivariate_normal(state[0], 1e-4 * spread, 100_000)
+    seen = np.cov(from_peer(drawn).T) * 1e4
+    assert back.covariance[0] == pytest.approx(seen, abs=3e-4)
+    # A peer 1 m ahead that faces left sees the observer 1 m to its left.
+    assert from_peer(np.array([[1.0, 0.0, np.pi / 2]]))[0] == pytest.approx([0, 1, -np.pi / 2])

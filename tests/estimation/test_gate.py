@@ -53,3 +53,24 @@ def test_where_most_of_a_flight_is_open_all_of_it_is() -> None:
     mostly = spread(0.3, 0.3, 0.02, 0.02, 0.02)
     assert (statuses_of(near, mostly, 0.3) != AMBIGUOUS).all()
     assert (statuses_of(near, mostly, 0.3)[2:] == OK).all()
+
+
+def test_the_positions_of_a_flight_are_worth_what_is_stated() -> None:
+    """Of those that are OK 4.5 % are expected to be bad, and none by more than 12 %."""
+    std_m = np.linspace(0.02, 0.2, 400)
+    far = np.tile([4.0, 0.0, 0.0], (400, 1))
+    bad = probability_beyond(spread(*std_m)[:, :2, :2], 0.3)
+    ok = statuses_of(far, spread(*std_m), 0.3) == OK
+    assert bad[ok].max() <= 0.12 < bad[~ok].min()
+    worse = np.linspace(0.11, 0.14, 400)  # 2 to 10 % each, so that the mean decides
+    ok = statuses_of(far, spread(*worse), 0.3) == OK
+    bad = probability_beyond(spread(*worse)[:, :2, :2], 0.3)
+    assert bad[ok].mean() <= 0.045 < np.append(bad[ok], bad[~ok].min()).mean()
+
+
+def test_a_bearing_is_open_by_its_worst_direction_over_the_distance() -> None:
+    along = np.diag([0.5**2, 0.02**2, 0.01])
+    for distance_m, open_ in ((1.4, True), (1.5, False)):  # 0.5 m over 1.43 m is 0.35 rad
+        at = np.tile([distance_m, 0.0, 0.0], (5, 1))
+        covariance = np.stack([along, *[np.eye(3) * 1e-4] * 4])
+        assert (statuses_of(at, covariance, 0.3)[0] == AMBIGUOUS) == open_

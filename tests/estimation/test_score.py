@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.score import DEFINITIONS, Figures, Judged, figures, overall
+from dmrl.estimation.score import (
+    DEFINITIONS,
+    Figures,
+    Judged,
+    figures,
+    inside_truth,
+    overall,
+)
 from dmrl.geometry.frames import Array
 
 
@@ -81,3 +88,11 @@ def test_over_all_pairs_every_sample_counts_once() -> None:
 
 def test_every_figure_is_defined() -> None:
     assert set(DEFINITIONS) == set(Figures.__dataclass_fields__) - {"samples"}
+
+
+def test_truth_reaches_as_far_as_it_is_dense() -> None:
+    true_ns = np.array([0, 200, 450, 701, 1000]) * 1_000_000  # gaps of 0.2, 0.25, 0.251, 0.299 s
+    at_ns = np.array([-1, 0, 100, 200, 300, 450, 500, 701, 900, 1000, 1001]) * 1_000_000
+    near = [False, True, True, True, True, True, False, True, False, True, False]
+    assert inside_truth(at_ns, true_ns).tolist() == near
+    assert not inside_truth(at_ns, true_ns[:0]).any()

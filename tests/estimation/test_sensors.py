@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from dmrl.estimation.sensors import frozen, track, wild
 
@@ -37,3 +38,30 @@ def test_fast_flight_and_single_outliers_do_not_run_away() -> None:
     speed = 2.5 + noisy()[:, 0]
     speed[::50] = 20.0
     assert not wild(speed, 3.0).any()
+
+
+def test_each_sensor_stands_in_its_place_and_any_ones_silence_is_a_gap() -> None:
+    forward = noisy() * 0.01 + [1.0, -0.5]
+    turn = np.full((len(GRID_S), 1), 0.3)
+    high = np.ones((len(GRID_S), 1))
+    every = (GRID_S, turn), (GRID_S, forward), (GRID_S, high)
+    found = track(*every, GRID_S)
+    assert found.vx_mps.mean() == pytest.approx(1.0, abs=0.01)
+    assert found.vy_mps.mean() == pytest.approx(-0.5, abs=0.01)
+    assert (found.yaw_rate_radps.mean(), found.height_m.mean()) == pytest.approx((0.3, 1.0))
+    assert not found.gap.any()
+    heard = (GRID_S < 8) | (GRID_S > 9)
+    for silent, names in ((0, "gap"), (1, "gap"), (2, "height_gap")):
+        logs = [(s[heard], v[heard]) if k == silent else (s, v) for k, (s, v) in enumerate(every)]
+        found = track(*logs, GRID_S)
+        assert (getattr(found, names) == ~heard).mean() > 0.99
+        assert not (found.gap.any() and silent == 2)
+
+
+def test_a_robot_that_spins_is_lost_for_a_second_around() -> None:
+    turn, high = np.full((len(GRID_S), 1), 0.2), np.ones((len(GRID_S), 1))
+    turn[(GRID_S > 10) & (GRID_S < 11)] = 9.0
+    found = track((GRID_S, turn), (GRID_S, noisy()), (GRID_S, high), GRID_S)
+    assert GRID_S[found.gap].min() == pytest.approx(9.0, abs=0.12)
+    assert GRID_S[found.gap].max() == pytest.approx(12.0, abs=0.12)
+    assert not found.yaw_rate_radps[found.gap].any()

@@ -44,3 +44,32 @@ def test_wrong_keys_are_named(tmp_path: Path, old: str, new: str, message: str) 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"no calibration .*a\.toml\. Name a TOML file"):
         read_camera(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "good"),
+    [
+        ("fx_px", "-183.0", False),
+        ("cx_px", "-183.0", True),  # beside the image, as of a crop
+        ("cy_px", "inf", False),
+        ("delay_s", "-inf", False),
+        ("delay_s", "-0.1", True),
+        ("mount_rad", "[0.1, 0.2]", False),
+        ("mount_rad", "[0.1, 0.2, nan]", False),
+        ("mount_rad", "[0.1, 0.2, 0.3, 0.4]", False),
+        ("distortion", "[0.1, 0.2, 0.3, 0.4, 0.5]", True),
+        ("distortion", "[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]", False),
+        ("distortion", "[]", True),
+    ],
+)
+def test_numbers_that_no_camera_has_are_refused(
+    tmp_path: Path, key: str, value: str, good: bool
+) -> None:
+    path = tmp_path / "camera.toml"
+    lines = write_camera(AIDECK).splitlines()
+    path.write_text("\n".join(f"{key} = {value}" if key in line else line for line in lines))
+    if good:
+        read_camera(path)
+        return
+    with pytest.raises(SourceError, match=f"wrong keys {key}"):
+        read_camera(path)

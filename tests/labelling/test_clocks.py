@@ -13,6 +13,7 @@ from dmrl.labelling.clocks import (
     MOCAP_STEP_S,
     _increasing,
     _of_pose,
+    _surest,
     camera_clock,
     mocap_clocks,
     range_clocks,
@@ -130,7 +131,8 @@ def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:
 def test_poses_tell_what_a_robot_measures_of_itself() -> None:
     time_s = np.arange(0, 4, 0.025)
     (roll, _), (pitch, _), (yaw, yaw_rate), (x, vx), (y, vy) = (smooth(k, time_s) for k in range(5))
-    angles = np.column_stack([0.8 * roll, 0.9 * pitch, 4 * yaw])  # past half a turn
+    angles = np.column_stack([0.8 * roll, 0.9 * pitch, 8 * yaw])
+    assert np.abs(angles[:, 2]).max() > np.pi  # so that it wraps
     rows = np.column_stack([x, 2 * y, 1 + roll, quaternion_zyx(angles)])
     found = _of_pose(time_s, rows)
     assert found["roll"][1] == pytest.approx(0.8 * roll)
@@ -138,7 +140,7 @@ def test_poses_tell_what_a_robot_measures_of_itself() -> None:
     assert found["height"][1] == pytest.approx(1 + roll)
     middle = (time_s[1:] + time_s[:-1]) / 2
     assert (found["yaw rate"][0] == middle).all()
-    assert found["yaw rate"][1] == pytest.approx(np.interp(middle, time_s, 4 * yaw_rate), abs=0.05)
+    assert found["yaw rate"][1] == pytest.approx(np.interp(middle, time_s, 8 * yaw_rate), abs=0.1)
     speed = np.interp(middle, time_s, np.hypot(vx, 2 * vy))
     assert found["speed"][1] == pytest.approx(speed, abs=0.1)
 
@@ -148,3 +150,15 @@ def test_poses_that_are_too_near_to_each_other_are_left_out() -> None:
     time_s = np.array([0.0, 0.5, 1.0, 1.5]) * MOCAP_STEP_S
     assert _of_pose(time_s, rows)["height"][0].tolist() == [0.0, MOCAP_STEP_S]
     assert _of_pose(time_s[:2], rows[:2]) == {}
+
+
+def test_of_several_signals_the_one_with_least_doubt_counts() -> None:
+    rng = np.random.default_rng(0)
+    one, two = (smooth(k, TIME_S)[0] for k in (7, 8))
+    noisy = two + rng.normal(0, 0.2, len(two))
+    reference = {"vague": (TIME_S, two), "sharp": (TIME_S, one), "alone": (TIME_S, one)}
+    other = {"vague": (TIME_S + 0.1, noisy), "sharp": (TIME_S + LATE_S, one)}
+    found = _surest(reference, other)
+    assert found is not None
+    assert (found.by, found.offset_s) == ("sharp", pytest.approx(-LATE_S, abs=0.001))
+    assert _surest(reference, {}) is None

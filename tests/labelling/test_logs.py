@@ -50,6 +50,8 @@ def test_a_pair_stands_on_one_grid_with_the_ranges_of_both(tmp_path: Path) -> No
     assert len(pair.range_m) == 70
     assert (np.diff(pair.range_time_s) >= 0).all()
     assert (pair.range_m.min(), pair.range_m.max()) == pytest.approx((1.5, 1.89))
+    # Each range stands at its time, whichever robot measured it.
+    assert pair.range_m == pytest.approx(1.5 + (pair.range_time_s - 0.1) / 15)
     assert np.diff(pair.time_s) == pytest.approx(1 / RATE_HZ)
     middle = slice(20, -20)
     time_s = pair.time_s[middle]

@@ -70,3 +70,13 @@ def test_positions_that_are_not_ok_and_images_without_one_are_left_alone() -> No
     assert used == 20
     assert (after.xyz_m[:20] == mixed.xyz_m[:20]).all()
     assert np.abs(after.xyz_m[25:] - TRUE_M[25:])[:, 1].max() == pytest.approx(0, abs=0.1)
+
+
+def test_detections_are_turned_by_the_attitude_of_their_image() -> None:
+    steep = np.tile([0.25, -0.15], (COUNT, 1))
+    uv, depth_m, _ = pixels_from_horizontal(TRUE_M, *steep.T, CAMERA)
+    detections = np.column_stack([uv, depth_m, np.zeros(COUNT)])
+    tilted = replace(seen(), detections=detections, attitude_rad=steep)
+    after, used = sighted(tilted, known(np.array([0.0, 0.1, 0.0])), 3.0)
+    assert used == COUNT
+    assert np.abs(after.xyz_m - TRUE_M).max() < 0.02

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.recording import block as room
@@ -26,7 +26,6 @@ def block_of(rows: list[Row], gap: int = 3) -> Block:
     return Block(np.frombuffer(data, np.uint8), *columns, begin, end)
 
 
-@settings(max_examples=25)
 @given(ROWS, ROWS)
 def test_messages_stay_whole(one: list[Row], other: list[Row]) -> None:
     first, second = block_of(one), block_of(other, 1)

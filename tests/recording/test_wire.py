@@ -101,14 +101,14 @@ def rows(messages: list[Any]) -> list[dict[str, Any]]:
     return [{name: lists[name][k] for name in lists} for k in range(len(messages))]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12)
 @given(st.lists(contents(), min_size=1, max_size=5))
 def test_bulk_decoding_equals_protobufs_own(values: list[dict[str, Any]]) -> None:
     messages = [OUTER(**v) for v in values]
     assert rows(messages) == [plain(m) for m in messages]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=60))
 def test_random_bytes_raise_wire_error_or_decode(data: bytes) -> None:
     array = np.frombuffer(data, np.uint8)

@@ -1,0 +1,34 @@
+"""Clocks by single exchanges: offset, drift, and how well each is known."""
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.exchanges import POLLED_S, SAME_M, SAME_S, _line, _same_exchange
+
+
+def test_a_line_is_found_under_outliers_with_the_deviations_of_its_parts() -> None:
+    x = np.linspace(-100, 100, 2001)
+    off = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        y = 0.05 + 3e-4 * x + rng.normal(0, 0.02, len(x))
+        y[rng.random(len(x)) < 0.03] += 0.2
+        slope, middle, (slope_std, middle_std) = _line(x, y)
+        off.append(((slope - 3e-4) / slope_std, (middle - 0.05) / middle_std))
+    # The line's own: sigma / sqrt(n), and that over the spread of x.
+    assert middle_std == pytest.approx(0.02 / np.sqrt(len(x)), rel=0.4)
+    assert middle_std / slope_std == pytest.approx(x.std(), rel=0.05)
+    assert np.sqrt(np.mean(np.square(off), axis=0)[0]) == pytest.approx(1.0, abs=0.4)
+    assert POLLED_S < 0.02
+
+
+def test_what_both_logged_is_told_by_value_and_time() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    value = 1 + 0.01 * np.arange(100)
+    late = time_s + 0.05
+    late[[3, 40]] += [2 * SAME_S, 0.2]  # out of reach, and beside the others
+    seen = value.copy()
+    seen[[7, 8]] += [1.5 * SAME_M, 0.5 * SAME_M]
+    found, apart_s = _same_exchange(late, seen, time_s, value)
+    assert set(range(100)) - set(found.tolist()) == {3, 7, 40}
+    assert apart_s == pytest.approx(np.full(97, 0.05))

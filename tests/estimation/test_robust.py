@@ -1,0 +1,54 @@
+"""Losses that forgive: their weights are their slopes."""
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.linear import RANGE_ERROR, SIZE, Linear
+from dmrl.estimation.problem import GLOBALS, Noise
+from dmrl.estimation.robust import MOTION, PRIOR, cost_of, limits, weights_of
+
+NOISE = Noise(jump=0.7, cauchy_m=0.3, range_std_m=0.1)
+STEPS, RANGES = 3, 4
+
+
+def linear(residuals: np.ndarray) -> tuple[Linear, np.ndarray]:
+    """A flight of these residuals, one after the other: steps, ranges, the first, constants."""
+    steps = np.zeros((STEPS, SIZE, 2))
+    ranges = np.zeros((RANGES, 2))
+    end = STEPS * SIZE
+    steps[..., -1] = residuals[:end].reshape(STEPS, SIZE)
+    ranges[:, -1] = residuals[end : end + RANGES]
+    constants = residuals[end + RANGES + 1 :] * NOISE.prior_std()
+    return Linear(steps, ranges, float(residuals[end + RANGES])), constants
+
+
+def test_a_weight_times_its_residual_is_the_slope_of_the_cost() -> None:
+    count = STEPS * SIZE + RANGES + 1 + len(GLOBALS)
+    at = np.random.default_rng(0).normal(0, 3, count)
+    found, constants = linear(at)
+    weights = weights_of(found, NOISE, constants)
+    every = np.concatenate([weights.step.ravel(), weights.range, [weights.first], weights.prior])
+    for k, step in enumerate(1e-6 * np.eye(count)):
+        ahead, behind = (linear(at + sign * step) for sign in (1, -1))
+        slope = (cost_of(ahead[0], NOISE, ahead[1]) - cost_of(behind[0], NOISE, behind[1])) / 2e-6
+        assert slope == pytest.approx(every[k] * at[k], rel=1e-4, abs=1e-6)
+
+
+def test_a_residual_at_its_limit_counts_half_and_small_ones_in_full() -> None:
+    step, ranges = limits(NOISE)
+    assert step.tolist() == [MOTION] * RANGE_ERROR + [NOISE.jump**2]
+    assert ranges == pytest.approx(9.0)  # 0.3 m of 0.1 m
+    size = STEPS * SIZE
+    limit = np.concatenate([np.tile(step, STEPS), [ranges] * RANGES, [NOISE.jump**2], PRIOR])
+    for share, weight in ((1.0, 0.5), (0.01, 1 / 1.0001), (3.0, 0.1)):
+        weights = weights_of(*_at(share * np.sqrt(limit)))
+        assert weights.step == pytest.approx(np.full((STEPS, SIZE), weight))
+        assert weights.range == pytest.approx(np.full(RANGES, weight))
+        assert weights.first == pytest.approx(weight)
+        assert weights.prior == pytest.approx(np.full(len(GLOBALS), weight))
+    assert size == weights.step.size
+
+
+def _at(residuals: np.ndarray) -> tuple[Linear, Noise, np.ndarray]:
+    found, constants = linear(residuals)
+    return found, NOISE, constants
