@@ -9,6 +9,8 @@ LAYOUT := build/layout
 # Tests of a file stay together, with what they share.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist loadfile
 INSTALL := $(BIN)/pip install --constraint constraints.txt --editable
+# Tests start many processes. Without bytecode on disk each would compile every module again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

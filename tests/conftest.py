@@ -32,3 +32,14 @@ def blender() -> Path:
     if python is None:
         pytest.skip("Blender is not set up; run: dmrl render --setup")
     return python
+
+
+@pytest.fixture
+def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made and written where they belong, but without a stroke: that takes long."""
+    style = pytest.importorskip("dmrl.plots.style")
+
+    def savefig(_: object, path: Path, **__: object) -> None:
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(style.Figure, "savefig", savefig)

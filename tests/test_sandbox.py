@@ -213,6 +213,7 @@ def test_no_command_writes_elsewhere_for_a_hostile_recording(
         _run(box, capsys, *words)
 
 
+@pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize("split", ELSEWHERE)
 def test_a_split_of_a_recording_stays_in_the_dataset(
     split: str, box: Box, capsys: pytest.CaptureFixture[str]
@@ -234,6 +235,7 @@ def test_a_split_of_a_recording_stays_in_the_dataset(
     assert not any("keep" in path.name for path in box.out.rglob("*"))
 
 
+@pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize("split", ELSEWHERE)
 def test_a_split_of_a_label_table_stays_in_the_dataset(
     split: str, box: Box, capsys: pytest.CaptureFixture[str]
@@ -249,6 +251,7 @@ def test_a_split_of_a_label_table_stays_in_the_dataset(
         _run(box, capsys, "dataset", out, box.out / "set", "--split", "auto")
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_hostile_dataset_is_read_and_carded_where_it_is(
     box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -403,6 +406,7 @@ def _with_junk(path: Path, junk: str, calibration: dict[str, Any]) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize(
     ("junk", "calibration"),
     [
@@ -437,6 +441,7 @@ def test_messages_that_cannot_be_read_are_one_line(
         _run(box, capsys, *words)
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_an_input_that_is_changed_meanwhile_is_one_line(
     box: Box, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,7 +34,8 @@ class Clone:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        ignored = shutil.ignore_patterns("__pycache__", "pretrained")
+        # What Python has compiled comes along; what another process is writing does not.
+        ignored = shutil.ignore_patterns("*.pyc.*", "pretrained")
         shutil.copytree(ROOT / "dmrl", root / "dmrl", ignore=ignored)
         pretrained = "dmrl/learn/pretrained"
         (root / pretrained).mkdir()
@@ -65,7 +66,7 @@ class Clone:
 
     def python(self, *words: str) -> str:
         """What the copy's Python prints."""
-        environment = {**os.environ, "PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = {**os.environ, "PYTHONPATH": str(self.root)}
         done = subprocess.run(
             [sys.executable, *words],
             cwd=self.root.parent,

@@ -114,7 +114,7 @@ def test_writing_it_again_gives_the_same_bytes(built: Path, with_figures: None) 
 
 
 def test_a_card_can_be_written_elsewhere_and_the_one_before_stays(
-    built: Path, with_figures: None, tmp_path: Path
+    built: Path, with_figures: None, empty_figures: None, tmp_path: Path
 ) -> None:
     before = (built / "README.md").read_bytes()
     card = run_card(built, CardSettings(title="Elsewhere"), tmp_path / "card")

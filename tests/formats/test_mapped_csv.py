@@ -185,7 +185,12 @@ def test_units_that_cannot_be_are_doubted(table: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize(
-    "name", ["B7_oval_medium_rep3", "B8_star_fast_rep2", "B9_trefoil_fast_rep4"]
+    "name",
+    [
+        "B8_star_fast_rep2",
+        pytest.param("B7_oval_medium_rep3", marks=pytest.mark.slow),
+        pytest.param("B9_trefoil_fast_rep4", marks=pytest.mark.slow),
+    ],
 )
 def test_flights_of_nanobench_are_known_and_agree_with_vicon(
     name: str, data: Path, capsys: pytest.CaptureFixture[str]

@@ -81,17 +81,25 @@ def stopped(
     walk.close()  # type: ignore[attr-defined]
 
 
+@pytest.fixture(scope="module", params=[SETTINGS, EVERYTHING], ids=["published", "everything"])
+def whole(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[FitSettings, Path]:
+    """A training that nothing stopped: its settings and its folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    trained(dots(20), folder, request.param)
+    return request.param, folder
+
+
 @pytest.mark.parametrize("steps", [1, 5])
-@pytest.mark.parametrize("settings", [SETTINGS, EVERYTHING], ids=["published", "everything"])
 def test_a_resumed_training_ends_with_the_same_bytes(
-    examples: Examples, tmp_path: Path, steps: int, settings: FitSettings
+    examples: Examples, tmp_path: Path, steps: int, whole: tuple[FitSettings, Path]
 ) -> None:
-    trained(examples, tmp_path / "whole", settings)
+    settings, folder = whole
     stopped(examples, tmp_path / "resumed", 2, steps, settings)
     trained(examples, tmp_path / "resumed", settings, resume=True)
     for name in ("model.safetensors", "model.json"):
-        whole, resumed = (tmp_path / f / name for f in ("whole", "resumed"))
-        assert whole.read_bytes() == resumed.read_bytes()
+        assert (folder / name).read_bytes() == (tmp_path / "resumed" / name).read_bytes()
 
 
 def test_same_seed_same_bytes_and_another_seed_others(examples: Examples, tmp_path: Path) -> None:
@@ -134,9 +142,10 @@ def test_dmrl_nano_finds_the_dot_within_its_cell(tmp_path: Path) -> None:
 def test_the_kept_weights_are_the_mean_of_those_of_many_steps(
     examples: Examples, tmp_path: Path
 ) -> None:
-    _, last = trained(examples, tmp_path / "last", replace(EVERYTHING, ema_steps=0))
-    _, mean = trained(examples, tmp_path / "mean", EVERYTHING)
-    _, one = trained(examples, tmp_path / "one", replace(EVERYTHING, ema_steps=1))
+    settings = replace(EVERYTHING, epochs=2)
+    _, last = trained(examples, tmp_path / "last", replace(settings, ema_steps=0))
+    _, mean = trained(examples, tmp_path / "mean", settings)
+    _, one = trained(examples, tmp_path / "one", replace(settings, ema_steps=1))
     for a, b, c in zip(last.parameters(), mean.parameters(), one.parameters(), strict=True):
         assert not torch.equal(a, b)
         assert torch.isfinite(b).all()

@@ -111,6 +111,7 @@ def test_two_messages_of_one_image_count_together(
         assert figures(both, Settings(against="hand", draws=5))["median_px"] == 0
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_recordings_are_judged_together(
     write: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

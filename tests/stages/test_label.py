@@ -333,7 +333,14 @@ def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> N
     fly.run(
         flown,
         fly.Settings(
-            2, 20.0, "observer_static", "realistic", seed=1000, camera=True, camera_rate_hz=1.0
+            2,
+            20.0,
+            "observer_static",
+            "realistic",
+            seed=1000,
+            camera=True,
+            cameras_max=1,
+            camera_rate_hz=1.0,
         ),
     )
     out = tmp_path / "out.mcap"

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from dmrl.cli import app
+from dmrl.deploy import targets
 from dmrl.deploy.c import write_c
 from dmrl.deploy.integer import Conv, IntegerNetwork
 from dmrl.deploy.samples import save_samples
 from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.errors import DatasetError, ModelError, SettingError, ToolError
+from dmrl.stages import verify
 from dmrl.stages.verify import Settings, document, run
 
 from ..deploy.networks import random_network
@@ -80,7 +82,15 @@ def test_counting_instructions_gives_the_same_number_again(
     assert again["instructions"] == everything["instructions"]
 
 
+@pytest.fixture
+def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The C is compiled once and its cost not counted: the slow tests do all of that."""
+    monkeypatch.setattr(targets, "LEVELS", ("-O0",))
+    monkeypatch.setattr(verify, "cost", lambda *_: None)
+
+
 @needs_gcc
+@pytest.mark.usefixtures("one_level")
 def test_c_of_another_network_is_found_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,6 +103,7 @@ def test_c_of_another_network_is_found_out(
 
 
 @needs_gcc
+@pytest.mark.usefixtures("one_level")
 def test_a_proof_is_written_only_where_the_c_is_right(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "proof.json"
     run(folder, GCC, out)
