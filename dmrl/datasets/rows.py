@@ -8,8 +8,9 @@ truth.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -122,8 +123,10 @@ def label_source(held: Contents, wanted: str) -> str:
 
 def rows_of(
     held: Contents, source: str, split_of: SplitOf, tally: Tally, *, keep_all: bool, masks: bool
-) -> Iterator[tuple[str, Row] | None]:
+) -> Iterator[tuple[str, Callable[[], Row]] | None]:
     """Split and row of each image of a recording, in time order; None for one left out.
+
+    The row is made when it is called, in any thread: that decodes the image.
 
     Parameters
     ----------
@@ -159,8 +162,7 @@ def rows_of(
             tally.not_ok += 1
         else:
             tally.kept += 1
-            row = _row(held.path, image, [_peer(label) for label in mine])
-            yield split, replace(row, mask=_mask(held.path, row, covered)) if masks else row
+            yield split, partial(_row, held.path, image, mine, covered, masks=masks)
             continue
         yield None
 
@@ -259,7 +261,9 @@ def _peer(label: Any) -> dict[str, Any]:
     return {**peer, "box_px": list(label.box_px), "status": status_name(label.status)}
 
 
-def _row(path: Path, image: Stamped, peers: list[dict[str, Any]]) -> Row:
+def _row(
+    path: Path, image: Stamped, labels: list[Any], covered: Stamped | None, *, masks: bool
+) -> Row:
     what = f"{path}: the image of {image.topic} at {image.time_ns} ns"
     rgb = decode(image.message.data, what)
     height_px, width_px = rgb.shape[:2]
@@ -269,12 +273,13 @@ def _row(path: Path, image: Stamped, peers: list[dict[str, Any]]) -> Row:
             "Scale it: dmrl convert --from images --width-px 320 --height-px 224"
         )
     # A label as unsure as the image is wide says only that the peer may be there.
-    peers = [peer for peer in peers if peer["sigma_u_px"] < width_px]
+    peers = [peer for peer in map(_peer, labels) if peer["sigma_u_px"] < width_px]
     uv_depth = np.array([[p["u_px"], p["v_px"], p["depth_m"]] for p in peers]).reshape(-1, 3)
     ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & (uv_depth[:, 2] > 0)]
     shape = (height_px // STRIDE_PX, width_px // STRIDE_PX)
     grid = grid_label(ahead[:, :2], ahead[:, 2], shape=shape)
-    return Row(rgb, peers, grid, _robot(image), path.name, image.time_ns)
+    row = Row(rgb, peers, grid, _robot(image), path.name, image.time_ns)
+    return replace(row, mask=_mask(path, row, covered)) if masks else row
 
 
 def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
-from dmrl.pipeline.work import Answer
+from dmrl.pipeline.job import Answer, failed
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """A step has one core, however many run: so its sums, and its bytes, are always the same."""
@@ -28,11 +28,14 @@ class Crew:
     Parameters
     ----------
     workers
-        Steps at a time, at most.
+        Steps at a time, at most. None: as many as there are cores.
+    bars
+        Whether a single worker shows its own progress.
     """
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
+    def __init__(self, workers: int | None = None, *, bars: bool = True) -> None:
+        self.workers = workers = workers or cores()
+        self._bars = bars and workers == 1
         self._threads = ThreadPoolExecutor(workers)
         self._idle: list[_Process] = []
         self._all: list[_Process] = []
@@ -71,13 +74,13 @@ class Crew:
             if self._idle and not alone:
                 process = self._idle.pop()
         if process is None:
-            more = {} if alone else ONE_THREAD | (NO_BARS if self.workers > 1 else {})
+            more = {} if alone else ONE_THREAD | ({} if self._bars else NO_BARS)
             process = self._new(os.environ | more)
         answer = process.answer(job)
         with self._lock:
             if self._over:
                 return answer
-            if "sha256" in answer and not alone:
+            if not (failed(answer) or alone):
                 self._idle.append(process)  # one that failed may hold what it should not
                 return answer
             self._all.remove(process)
@@ -140,3 +143,8 @@ def _end(processes: list[_Process], *, in_order: bool) -> None:
             if stream is not None:
                 with suppress(BrokenPipeError):
                     stream.close()
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

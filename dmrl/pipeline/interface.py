@@ -27,6 +27,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from dmrl import plugins
 from dmrl.errors import RecipeError
+from dmrl.recording import Provenance
 
 ALONE = ("processes", "workers")
 """A stage with one of these settings keeps all cores busy by itself."""
@@ -66,6 +67,9 @@ class Interface:
         Whether it keeps all cores busy by itself.
     filled
         Makes a recipe's keys settings, where a key stands for several: a preset.
+    origin
+        Provenance of what ``run`` would write, given the same but ``out``. None: that of its
+        inputs and settings.
     """
 
     run: Callable[..., Any]
@@ -76,6 +80,7 @@ class Interface:
     resumes: bool = False
     alone: bool = False
     filled: Callable[[Keys], Keys] = dict
+    origin: Callable[..., Provenance] | None = None
 
     @property
     def keys(self) -> list[str]:
@@ -85,8 +90,15 @@ class Interface:
 
 
 @cache
-def interface_of(stage: str) -> Interface:
+def interface_of(stage: str, *, writes: bool = True) -> Interface:
     """What a stage takes.
+
+    Parameters
+    ----------
+    stage
+        Command name.
+    writes
+        Whether it must write something.
 
     Raises
     ------
@@ -97,7 +109,7 @@ def interface_of(stage: str) -> Interface:
     """
     module = _module(stage)
     run = getattr(module, "run", None)
-    if run is None or "out" not in inspect.signature(run).parameters:
+    if run is None or (writes and "out" not in inspect.signature(run).parameters):
         raise RecipeError(f"{stage} writes nothing, so it can be no step. Leave it out")
     hints = get_type_hints(run)
     roles, others = {}, {}
@@ -120,6 +132,7 @@ def interface_of(stage: str) -> Interface:
         resumes="resume" in hints,
         alone=any(name in names for name in ALONE),
         filled=getattr(module, "filled", dict),
+        origin=getattr(module, "origin", None),
     )
 
 

@@ -14,9 +14,9 @@ from dmrl.evaluation.report import Done
 from dmrl.output import note, partial_of
 from dmrl.pipeline.crew import Crew
 from dmrl.pipeline.interface import NO_CONTENT
+from dmrl.pipeline.job import Answer, job
 from dmrl.pipeline.memory import Memory, key_of
 from dmrl.pipeline.plan import UNFINISHED, Plan, Step, located, makers, mapped
-from dmrl.pipeline.work import Answer, job
 from dmrl.terminal.progress import say
 
 

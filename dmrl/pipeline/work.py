@@ -11,32 +11,35 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Iterator
+from dataclasses import asdict, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import DmrlError
+from dmrl.errors import DmrlError, OutputError
 from dmrl.pipeline.interface import Interface, interface_of
-from dmrl.recording.inputs import sha256_of_file, sha256_of_folder
-
-Answer = dict[str, str]
-
-
-def job(
-    stage: str, out: Path, inputs: dict[str, Any], settings: dict[str, Any], *, resume: bool
-) -> str:
-    """One line that `perform` understands."""
-    told = {"stage": stage, "out": out, "inputs": inputs, "settings": settings, "resume": resume}
-    return json.dumps(told, default=str)
+from dmrl.pipeline.job import Answer
+from dmrl.recording import Provenance, provenance
+from dmrl.recording.inputs import input_of, sha256_of_file, sha256_of_folder
 
 
 def perform(line: str) -> Answer:
-    """Run a step: the SHA-256 of its output, what a user can mend, or that dmrl has a fault."""
+    """Run a step: what came of it, what a user can mend, or that dmrl has a fault."""
     told = json.loads(line)
-    out = Path(told["out"])
+    out = Path(told["out"]) if told["out"] else None
     try:
-        takes = interface_of(told["stage"])
-        takes.run(**_arguments(told, takes), out=out)
+        takes = interface_of(told["stage"], writes=out is not None)
+        given = _arguments(told, takes)
+        if out is None:
+            return {"result": _plain(takes.run(**given))}
+        if told["keep"] and out.exists():
+            _require_same(out, told["stage"], takes, given)
+            return {"there": True}
+        result = takes.run(**given, out=out)
+        if told["keep"]:
+            return {"result": _plain(result)}
         return {"sha256": sha256_of_folder(out) if out.is_dir() else sha256_of_file(out)}
     except DmrlError as e:
         return {"error": str(e)}
@@ -58,6 +61,56 @@ def _arguments(told: dict[str, Any], takes: Interface) -> dict[str, Any]:
     if takes.resumes:
         found["resume"] = told["resume"]
     return found
+
+
+def _plain(result: Any) -> Any:
+    """What a stage gives back, as values of JSON."""
+
+    def plain(value: Any) -> Any:
+        return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
+
+    return json.loads(json.dumps(result, default=plain))
+
+
+def _require_same(out: Path, stage: str, takes: Interface, given: dict[str, Any]) -> None:
+    """Nothing, if an output was made of these inputs by these settings, as it says itself.
+
+    Raises
+    ------
+    OutputError
+        If not, or if it does not say.
+    RecordingError
+        If it is not whole.
+    """
+    made = input_of(out).provenance
+    wanted = (takes.origin or partial(_origin, stage, takes))(**given)
+    same = (
+        made is not None
+        and made.stage == wanted.stage
+        and {one.sha256 for one in wanted.inputs} <= {one.sha256 for one in made.inputs}
+        and wanted.settings.items() <= made.settings.items()
+    )
+    if not same:
+        raise OutputError(
+            f"{out} exists, and does not say that it was made of the same by the same settings. "
+            "Remove it, or name another folder"
+        )
+
+
+def _origin(stage: str, takes: Interface, **given: Any) -> Provenance:
+    """Provenance of what a stage would write, of everything that it is given to read."""
+    settings = given.get("settings")
+    values = [given[role] for role in takes.roles if role in given]
+    values += [getattr(settings, name) for name in takes.paths]
+    return provenance(stage, settings, [path for path in _paths(values) if path.exists()])
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from _paths(one)
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from dmrl.formats.counters import dejitter
 from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.messages import message
 from dmrl.output import refuse_existing
+from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import (
     Contents,
     RawMessage,
@@ -27,6 +28,7 @@ from dmrl.recording import (
     splits,
     summary,
 )
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -297,6 +299,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Set clocks by each other: from ranges of pairs, images, or motion capture.
@@ -304,12 +307,19 @@ def command(
     Parameters
     ----------
     recording
-        Recording of robots with clocks of their own, such as micro-SD logs.
+        Recording of robots with clocks of their own, such as micro-SD logs; or a folder of them.
     out
-        Recording to write: all of IN, on one clock. Must not exist.
+        Recording to write: all of IN, on one clock. Must not exist. For a folder: the folder of
+        what is made, under the same names.
+    workers
+        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
+        Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
+    if is_many(recording):
+        over_folder("align", recording, out, settings, workers=workers, as_json=as_json)
+        return
     clocks = run(recording, out, settings)
     if as_json:
         start_ns = summary(recording).start_ns

@@ -1,18 +1,48 @@
-"""``dmrl check``: whether a recording is what it should be."""
+"""``dmrl check``: whether recordings are what they should be."""
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from dmrl.errors import SettingError
+from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.folders import Task, all_recordings, end, is_many, outcomes, tasks_of, words_of
+from dmrl.pipeline.job import Answer, failed
+from dmrl.recording import Finding, summary
 from dmrl.recording import check as findings_of
-from dmrl.recording import summary
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.tables import print_json, print_line
 
 
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What a recording holds, and what is wrong with it."""
+
+    messages: int
+    topics: int
+    findings: list[Finding]
+
+
+def run(recording: Path) -> Checked:
+    """What is wrong with a recording.
+
+    Raises
+    ------
+    RecordingError
+        If it is not a complete recording.
+    """
+    findings = findings_of(recording)
+    held = summary(recording)
+    return Checked(held.count, len(held.topics), findings)
+
+
 def command(
-    recording: Path, /, *, as_json: Annotated[bool, Parameter(name="--json", negative=())] = False
+    *recordings: Annotated[Path, Parameter(name="IN")],
+    workers: Workers = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> int:
     """Check a recording: schemas, times, gaps, calibration, labels.
 
@@ -20,22 +50,82 @@ def command(
 
     Parameters
     ----------
-    recording
-        A recording.
+    recordings
+        A recording; or several, folders of them, or patterns in quotes: then one line for each.
+    workers
+        Recordings at a time, at most. Without it, as many as there are cores.
     as_json
         Print one JSON document instead of lines.
     """
-    findings = findings_of(recording)
-    errors = sum(f.level == "error" for f in findings)
+    if not recordings:
+        raise SettingError("check wants a recording, or a folder of them. Name one")
+    if len(recordings) > 1 or is_many(recordings[0]):
+        return _check_many(recordings, workers, as_json=as_json)
+    found = run(recordings[0])
+    errors = sum(f.level == "error" for f in found.findings)
     if as_json:
-        print_json({"recording": recording.name, "findings": [asdict(f) for f in findings]})
-    else:
-        for finding in findings:
-            where = f" {finding.topic}:" if finding.topic else ""
-            print_line(f"{finding.level}:{where} {finding.text}")
-        found = summary(recording)
-        print_line(
-            f"{recording}: {found.count} messages on {len(found.topics)} topics, "
-            f"{errors} errors, {len(findings) - errors} warnings"
-        )
+        told = [asdict(f) for f in found.findings]
+        print_json({"recording": recordings[0].name, "findings": told})
+        return 1 if errors else 0
+    for finding in found.findings:
+        where = f" {finding.topic}:" if finding.topic else ""
+        print_line(f"{finding.level}:{where} {finding.text}")
+    print_line(
+        f"{recordings[0]}: {found.messages} messages on {found.topics} topics, "
+        f"{errors} errors, {len(found.findings) - errors} warnings"
+    )
     return 1 if errors else 0
+
+
+def _check_many(named: Sequence[Path], workers: int | None, *, as_json: bool) -> int:
+    """Check recordings side by side; 1 if one of them has an error or cannot be read."""
+    found = {path: path for path in all_recordings(named)}
+    tasks = tasks_of("check", "recording", found, None)
+    done: list[tuple[Task, Answer]] = []
+    with Crew(workers, bars=False) as crew:
+        for task, answer in outcomes(tasks, crew, "Checking"):
+            done.append((task, answer))
+            if not (as_json or failed(answer)):
+                print_line(f"{task.source}: {_line(answer['result'])}")
+    documents = [_document(task, answer) for task, answer in done]
+    errors, warnings = (
+        sum(one["level"] == level for each in documents for one in each["findings"])
+        for level in ("error", "warning")
+    )
+    sound = sum(_is_sound(one) for one in documents)
+    if as_json:
+        totals = {"sound": sound, "errors": errors, "warnings": warnings}
+        print_json({"recordings": documents, **totals})
+    else:
+        print_line(
+            f"{len(documents)} recordings: {sound} without errors; {errors} errors, "
+            f"{warnings} warnings"
+        )
+    end(done)
+    return 0 if sound == len(documents) else 1
+
+
+def _is_sound(document: dict[str, Any]) -> bool:
+    wrong = any(one["level"] == "error" for one in document["findings"])
+    return not (wrong or "error" in document)
+
+
+def _line(found: dict[str, Any]) -> str:
+    """A recording in one line: how much it holds, and the worst of what is wrong with it."""
+    findings = found["findings"]
+    errors = sum(one["level"] == "error" for one in findings)
+    worst = ""
+    if findings:
+        where = f"{findings[0]['topic']}: " if findings[0]["topic"] else ""
+        worst = f"; {findings[0]['level']}: {where}{findings[0]['text']}"
+    return (
+        f"{found['messages']} messages on {found['topics']} topics, {errors} errors, "
+        f"{len(findings) - errors} warnings{worst}"
+    )
+
+
+def _document(task: Task, answer: Answer) -> dict[str, Any]:
+    named = {"recording": str(task.source)}
+    if failed(answer):
+        return {**named, "error": words_of(task, answer), "findings": []}
+    return {**named, **answer["result"]}

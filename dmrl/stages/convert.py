@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl.errors import SettingError
+from dmrl.errors import SettingError, SourceError
 from dmrl.export.ros2 import write_bag
 from dmrl.export.tables import write_tables
 from dmrl.formats.format import Content, Options
@@ -20,6 +20,7 @@ from dmrl.formats.known import format_of
 from dmrl.geometry.camera_file import camera_named
 from dmrl.messages import message
 from dmrl.output import refuse_existing
+from dmrl.pipeline.folders import over_folder, recordings_in
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,
@@ -29,7 +30,8 @@ from dmrl.recording import (
     provenance,
     say_findings,
 )
-from dmrl.terminal.progress import track
+from dmrl.terminal.arguments import Workers
+from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
@@ -173,6 +175,29 @@ def _names(text: str | None) -> dict[str, str]:
     return found
 
 
+def _sources(source: Path, settings: Settings) -> dict[Path, Path]:
+    """What a folder holds that can be converted, by what is made of it."""
+    if settings.to is not None:
+        return {name.with_suffix(""): path for name, path in recordings_in(source).items()}
+    found: dict[Path, Path] = {}
+    for path in sorted(source.iterdir()) if source.is_dir() else [source]:
+        try:
+            if path.name.startswith(".") or not format_of(path, settings.source_kind):
+                continue
+        except SourceError as e:
+            say(f"left out: {e}")
+            continue
+        name = Path(path.name if path.is_dir() else path.stem).with_suffix(".mcap")
+        if (twin := found.setdefault(name, path)) is not path:
+            raise SettingError(f"{twin} and {path} would both be {name}. Rename one")
+    if not found:
+        raise SourceError(
+            f"nothing in {source} is of a known kind. If it is one source, name one recording: "
+            "dmrl convert SOURCE OUT.mcap"
+        )
+    return found
+
+
 DEFAULTS = Settings()
 
 
@@ -182,6 +207,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Convert a foreign file or folder into a recording, or a recording into files.
@@ -189,12 +215,29 @@ def command(
     Parameters
     ----------
     source
-        A foreign file or folder: pictures, flight logs, dumps of a camera deck, ROS bags.
+        A foreign file or folder: pictures, flight logs, dumps of a camera deck, ROS bags. With a
+        folder as OUT, each thing in it is a source of its own.
     out
-        Recording to write; with --to, a folder. Must not exist.
+        Recording to write, NAME.mcap; with --to, a folder. Must not exist. Another name: the folder
+        of recordings, one for each thing in SOURCE.
+    workers
+        Of a folder: sources at a time, at most. Without it, as many as there are cores. Changes
+        no byte.
     as_json
         Print one JSON document in place of the table.
     """
+    if source.is_dir() and (settings.to is not None or out.suffix != ".mcap"):
+        over_folder(
+            "convert",
+            source,
+            out,
+            settings,
+            workers=workers,
+            as_json=as_json,
+            role="source",
+            found=_sources(source, settings),
+        )
+        return
     counts = run(source, out, settings)
     if as_json:
         print_json({"recording": str(out), "messages": counts})

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -26,7 +26,10 @@ from dmrl.datasets.splits import SplitOf, held_out, of_source
 from dmrl.datasets.twins import Twins
 from dmrl.datasets.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
+from dmrl.images.ahead import ahead
 from dmrl.output import partial_folder
+from dmrl.pipeline.crew import cores
+from dmrl.pipeline.folders import all_recordings
 from dmrl.recording import (
     Contents,
     Input,
@@ -37,6 +40,7 @@ from dmrl.recording import (
     splits,
     summary,
 )
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -105,7 +109,9 @@ class Result:
     tally: Tally
 
 
-def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
+def run(
+    recordings: Sequence[Path], out: Path, settings: Settings, *, workers: int | None = None
+) -> Result:
     """Images per split of the dataset written to ``out``.
 
     Parameters
@@ -116,6 +122,8 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
         Folder to write. Must not exist.
     settings
         See `Settings`.
+    workers
+        Threads that decode images. None: as many as there are cores. Changes no byte.
 
     Raises
     ------
@@ -144,7 +152,7 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> Result:
         twins = Twins()
         images = write_dataset(
             partial,
-            twins.seen(_rows(held, sources, split_of, tally, total, settings)),
+            twins.seen(_rows(held, sources, split_of, tally, total, settings, workers or cores())),
             png=settings.png,
             parquet=settings.parquet,
             shard_images=settings.shard_images,
@@ -254,6 +262,7 @@ def _rows(
     tally: Tally,
     total: int,
     settings: Settings,
+    workers: int,
 ) -> Iterator[tuple[str, Row]]:
     how = {"keep_all": settings.keep_all, "masks": settings.masks}
     rows = (
@@ -262,11 +271,18 @@ def _rows(
         for row in rows_of(held[path], source, split_of[path], tally, **how)
     )
     size_px: tuple[int, int] | None = None
-    for path, kept in track(rows, "Writing images", total):
+    for path, kept in track(ahead(_made, rows, workers), "Writing images", total):
         if kept is not None:
             size_px = size_px or kept[1].size_px
             one_size(path, kept[1], size_px)
             yield kept
+
+
+def _made(
+    planned: tuple[Path, tuple[str, Callable[[], Row]] | None],
+) -> tuple[Path, tuple[str, Row] | None]:
+    path, kept = planned
+    return path, None if kept is None else (kept[0], kept[1]())
 
 
 def _explain(
@@ -297,6 +313,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Build an Arrow dataset and its card from recordings.
@@ -304,13 +321,15 @@ def command(
     Parameters
     ----------
     recordings
-        Recordings with images and labels.
+        Recordings with images and labels, or folders of them.
     out
         Folder to write. Must not exist.
+    workers
+        Threads that decode images. Without it, as many as there are cores. Changes no byte.
     as_json
         Print one JSON document in place of the tables.
     """
-    result = run(recordings, out, settings)
+    result = run(all_recordings(recordings), out, settings, workers=workers)
     left_out = {why: count for why, count in result.tally.left_out().items() if count}
     if as_json:
         document = {"dataset": str(out), "images": result.images}

@@ -17,6 +17,7 @@ from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
 from dmrl.output import partial_folder, refuse_existing
+from dmrl.pipeline.folders import all_recordings
 from dmrl.recording import input_of, summary
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
@@ -321,14 +322,15 @@ def command(
     Parameters
     ----------
     recordings
-        Recordings with images, labels and detections, judged together; or one with true
-        positions and tracks or estimates.
+        Recordings with images, labels and detections, or folders of them, judged together; or
+        one with true positions and tracks or estimates.
     plots_to
         Folder to write plots to, and evaluation.json, positions.json or tracks.json. Must not
         exist.
     as_json
         Print one JSON document in place of the table.
     """
+    recordings = all_recordings(recordings)
     evaluation = run(recordings, plots_to, settings)
     if isinstance(evaluation, dict):
         if as_json:

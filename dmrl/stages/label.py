@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.output import refuse_existing
+from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -248,6 +250,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Find every robot's peers from ranges and odometry, and label the images with them.
@@ -255,12 +258,19 @@ def command(
     Parameters
     ----------
     recording
-        Recording with attitude, velocity, height and ranges.
+        Recording with attitude, velocity, height and ranges; or a folder of recordings.
     out
-        Recording to write: all of IN, positions of peers and labels. Must not exist.
+        Recording to write: all of IN, positions of peers and labels. Must not exist. For a
+        folder: the folder of what is made, under the same names.
+    workers
+        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
+        Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
+    if is_many(recording):
+        over_folder("label", recording, out, settings, workers=workers, as_json=as_json)
+        return
     result = run(recording, out, settings)
     for warning in result.warnings:
         say(f"{recording}: {warning}")

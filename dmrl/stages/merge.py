@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import SettingError
+from dmrl.pipeline.folders import all_recordings
 from dmrl.recording import merge, say_findings
 from dmrl.terminal.tables import print_line
 
@@ -20,17 +21,22 @@ def run(recordings: Sequence[Path], out: Path) -> int:
 
 def command(
     *recordings: Annotated[
-        Path, Parameter(name="IN... OUT", help="Two recordings or more, then the one to write.")
+        Path,
+        Parameter(
+            name="IN... OUT",
+            help="Two recordings or more, or a folder of them; then the one to write.",
+        ),
     ],
 ) -> None:
     """Merge recordings into one, by time.
 
     Of equal times, messages of the earlier named recording come first.
     """
-    if len(recordings) < 3:
+    *named, out = recordings or [Path()]
+    inputs = all_recordings(named)
+    if len(inputs) < 2:
         raise SettingError(
             "merge wants two recordings or more and OUT: dmrl merge A.mcap B.mcap OUT.mcap"
         )
-    *inputs, out = recordings
     count = run(inputs, out)
     print_line(f"{out}: {count} messages of {len(inputs)} recordings")

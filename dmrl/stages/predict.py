@@ -20,6 +20,7 @@ from dmrl.learn.decode import decode as find
 from dmrl.learn.pretrained import resolved
 from dmrl.learn.views import VIEWS, agreed, returned, shown
 from dmrl.messages import message
+from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import (
     Provenance,
     RawMessage,
@@ -31,6 +32,7 @@ from dmrl.recording import (
     summary,
 )
 from dmrl.recording.inputs import sha256_of_file
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -110,10 +112,7 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     OutputError
         If ``out`` exists.
     """
-    model = resolved(model)
-    detector = open_detector(model, settings.backend)
-    if settings.threshold is not None:
-        detector = replace(detector, threshold=settings.threshold)
+    detector = _detector(model, settings)
     held = summary(recording)
     if not topics.robots(list(held.topics)):
         raise MissingTopic(topics.camera_image("*"), held.topics, recording)
@@ -132,8 +131,21 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     return Result(images, believed)
 
 
+def origin(model: Path, recording: Path, settings: Settings) -> Provenance:
+    """Provenance of what `run` would write."""
+    return _provenance(model, recording, settings, _detector(model, settings))
+
+
+def _detector(model: Path, settings: Settings) -> Detector:
+    detector = open_detector(resolved(model), settings.backend)
+    if settings.threshold is not None:
+        detector = replace(detector, threshold=settings.threshold)
+    return detector
+
+
 def _provenance(model: Path, recording: Path, settings: Settings, detector: Detector) -> Provenance:
     libraries = LIBRARIES[settings.backend]
+    model = resolved(model)
     made = provenance("predict", settings, (model, recording), libraries=libraries)
     # It stands beside the weights, and in every message.
     made = replace(made, settings={**made.settings, "model_threshold": detector.threshold})
@@ -247,6 +259,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Run a network on every image of a recording.
@@ -257,12 +270,22 @@ def command(
         A run folder of dmrl train, a .safetensors, a Keras .h5, a quantised model, an export
         folder, or dmrl-nano, which ships with dmrl.
     recording
-        Recording with images.
+        Recording with images; or a folder of recordings.
     out
-        Recording to write: all of IN, and what was detected. Must not exist.
+        Recording to write: all of IN, and what was detected. Must not exist. For a folder: the
+        folder of what is made, under the same names.
+    workers
+        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
+        Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
+    if is_many(recording):
+        given = {"model": model}
+        over_folder(
+            "predict", recording, out, settings, workers=workers, as_json=as_json, inputs=given
+        )
+        return
     result = run(model, recording, out, settings)
     if as_json:
         print_json({"recording": str(out), **asdict(result)})

@@ -6,7 +6,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Recovery, recover
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.tables import print_json, print_line
 
 
@@ -20,6 +22,7 @@ def command(
     out: Path,
     /,
     *,
+    workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Bring back the messages of a recording that was cut short.
@@ -30,12 +33,19 @@ def command(
     Parameters
     ----------
     recording
-        A damaged recording, or the .partial file of a killed run.
+        A damaged recording, or the .partial file of a killed run; or a folder of recordings.
     out
-        Recording to write. Must not exist.
+        Recording to write. Must not exist. For a folder: the folder of what is made, under the
+        same names.
+    workers
+        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
+        Changes no byte.
     as_json
         Print one JSON document instead of a line.
     """
+    if is_many(recording):
+        over_folder("recover", recording, out, workers=workers, as_json=as_json)
+        return
     result = run(recording, out)
     if as_json:
         print_json(asdict(result))

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from dmrl import pipeline
 from dmrl.evaluation.report import report
+from dmrl.pipeline import run as pipeline
 
 
 def command(

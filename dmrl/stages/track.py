@@ -13,7 +13,9 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
+from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite, summary
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -181,6 +183,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Follow detected peers over time: 3D tracks with covariance.
@@ -188,12 +191,19 @@ def command(
     Parameters
     ----------
     recording
-        Recording with detections, calibration and attitude.
+        Recording with detections, calibration and attitude; or a folder of recordings.
     out
-        Recording to write: all of IN, and tracks. Must not exist.
+        Recording to write: all of IN, and tracks. Must not exist. For a folder: the folder of
+        what is made, under the same names.
+    workers
+        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
+        Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
+    if is_many(recording):
+        over_folder("track", recording, out, settings, workers=workers, as_json=as_json)
+        return
     reports = run(recording, out, settings)
     if as_json:
         print_json({"recording": str(out), "robots": [asdict(report) for report in reports]})

@@ -8,7 +8,9 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import SettingError
-from dmrl.recording import summary, trim
+from dmrl.pipeline.folders import is_many, over_folder
+from dmrl.recording import Provenance, provenance, summary, trim
+from dmrl.terminal.arguments import Workers
 from dmrl.terminal.tables import print_line
 
 
@@ -58,14 +60,25 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
     first, last = settings.from_s, settings.to_s
     if first is not None and last is not None and first >= last:
         raise SettingError(f"--from {first:g} is not before --to {last:g}. Exchange them")
+    low_ns, high_ns = _kept_ns(recording, settings)
+    return trim(recording, out, start_ns=low_ns, end_ns=high_ns, topics=settings.topic)
+
+
+def origin(recording: Path, settings: Settings) -> Provenance:
+    """Provenance of what `run` would write."""
+    low_ns, high_ns = _kept_ns(recording, settings)
+    kept = {"start_ns": low_ns, "end_ns": high_ns, "topics": list(settings.topic)}
+    return provenance("trim", kept, [recording])
+
+
+def _kept_ns(recording: Path, settings: Settings) -> tuple[int | None, int | None]:
+    """First log time that is kept, and the first that is not."""
     start_ns = summary(recording).start_ns
-    return trim(
-        recording,
-        out,
-        start_ns=None if first is None else start_ns + round(first * 1e9),
-        end_ns=None if last is None else start_ns + round(last * 1e9),
-        topics=settings.topic,
+    low, high = (
+        None if given is None else start_ns + round(given * 1e9)
+        for given in (settings.from_s, settings.to_s)
     )
+    return low, high
 
 
 DEFAULTS = Settings()
@@ -77,6 +90,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    workers: Workers = None,
 ) -> None:
     """Keep a stretch of a recording, or some of its topics.
 
@@ -85,8 +99,15 @@ def command(
     Parameters
     ----------
     recording
-        A recording.
+        A recording, or a folder of recordings.
     out
-        Recording to write. Must not exist.
+        Recording to write. Must not exist. For a folder: the folder of what is made, under the
+        same names.
+    workers
+        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
+        Changes no byte.
     """
+    if is_many(recording):
+        over_folder("trim", recording, out, settings, workers=workers)
+        return
     print_line(f"{out}: {run(recording, out, settings)} messages")

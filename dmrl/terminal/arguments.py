@@ -9,3 +9,5 @@ AsJson = Annotated[bool, Parameter(name="--json", negative=())]
 Seed = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 """Of everything drawn at random."""
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
+Workers = Annotated[int | None, Parameter(validator=validators.Number(gte=1))]
+"""How many processes work side by side."""

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import pipeline
 from dmrl.datasets import open_dataset
 from dmrl.formats.format import Options
 from dmrl.formats.known import FORMATS
+from dmrl.pipeline import run as pipeline
 from dmrl.stages import convert, export, predict
 
 from .conftest import Count, cases_of, ended

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl import card, pipeline
+from dmrl import card
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
+from dmrl.pipeline import run as pipeline
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 from dmrl.stages import convert, dataset, export, fly, label, merge, quantize, recover, sketch, trim
 from dmrl.stages import predict as predict_stage

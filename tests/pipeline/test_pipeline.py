@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from dmrl import pipeline
 from dmrl.errors import DmrlError, OutputError, RecipeError, SettingError
 from dmrl.evaluation.report import report
+from dmrl.pipeline import run as pipeline
 from dmrl.pipeline.crew import Crew
-from dmrl.pipeline.work import job
+from dmrl.pipeline.job import job
 
 SMALL = """
 kind = "pipeline"

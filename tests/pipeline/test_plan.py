@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
-from dmrl import pipeline, plugins, recipe
+from dmrl import plugins, recipe
 from dmrl.errors import RecipeError
-from dmrl.pipeline import Step
+from dmrl.pipeline import run as pipeline
 from dmrl.pipeline.interface import interface_of
+from dmrl.pipeline.plan import Step
 
 HEAD = 'kind = "pipeline"\n'
 SMALL = f"""{HEAD}

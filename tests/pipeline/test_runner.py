@@ -14,10 +14,10 @@ from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.report import Done
 from dmrl.output import partial_of
 from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.job import Answer
 from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import Plan, Step
 from dmrl.pipeline.runner import Runner
-from dmrl.pipeline.work import Answer
 from dmrl.recording.inputs import sha256_of_file
 
 A = Step("sketch", "a", settings={"seed": 1})

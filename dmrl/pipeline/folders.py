@@ -1,0 +1,296 @@
+"""One stage over many recordings: a folder in, a folder out.
+
+What is to be done is a plan: a list of tasks, each an input, an output and a line of JSON. Any
+process that has dmrl and sees the files can do one. An executor takes the lines: `Crew`, whose
+processes are on this machine.
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, fields
+from glob import has_magic
+from pathlib import Path
+from typing import Any, Protocol
+
+from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
+from dmrl.output import note
+from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.job import Answer, failed, job
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_json, print_table
+
+MOST_WORDS = 4
+"""Of a result in the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A stage on one input.
+
+    Parameters
+    ----------
+    source
+        What it is about.
+    out
+        What it writes; None: nothing.
+    line
+        As `dmrl.pipeline.work.perform` takes it.
+    """
+
+    source: Path
+    out: Path | None
+    line: str
+
+
+class Executor(Protocol):
+    """Who does tasks."""
+
+    def give(self, job: str, *, alone: bool) -> Future[Answer]:
+        """The answer to a job, once it is there."""
+
+
+def is_many(source: Path) -> bool:
+    """Whether a name is of many recordings: a folder, or a pattern that no file is called."""
+    return source.is_dir() or (has_magic(str(source)) and not source.exists())
+
+
+def recordings_in(source: Path, *, but: Path | None = None) -> dict[Path, Path]:
+    """Recordings by what they are called below a folder, or before a pattern's first sign.
+
+    Parameters
+    ----------
+    source
+        A folder, which is searched to its depths; a pattern such as ``2024-*/*.mcap``; or a
+        recording.
+    but
+        A folder that is left out: of the outputs.
+
+    Raises
+    ------
+    RecordingError
+        If there is none.
+    """
+    if source.is_dir():
+        base, found = source, _below(source, but)
+    elif is_many(source):
+        base, found = _before_signs(source), []
+        for path in sorted(base.glob(str(source.relative_to(base)))):
+            if any(part.startswith(".") for part in path.relative_to(base).parts):
+                continue
+            found += _below(path, but) if path.is_dir() else [path]
+    else:
+        return {Path(source.name): source}
+    if not found:
+        raise RecordingError(f"no recording (.mcap) in {source}. Name another folder")
+    return {path.relative_to(base): path for path in found}
+
+
+def all_recordings(named: Iterable[Path]) -> list[Path]:
+    """Recordings that are named, and all in the folders that are named.
+
+    Raises
+    ------
+    RecordingError
+        If a folder has none.
+    """
+    return [path for one in named for path in recordings_in(one).values()]
+
+
+def _below(folder: Path, but: Path | None) -> list[Path]:
+    found = []
+    for where, folders, names in os.walk(folder):
+        left_out = [n for n in folders if n.startswith(".") or _same(Path(where, n), but)]
+        folders[:] = sorted(set(folders) - set(left_out))
+        whole = (n for n in sorted(names) if n.endswith(".mcap") and not n.startswith("."))
+        found += [Path(where, name) for name in whole]
+    return found
+
+
+def _same(path: Path, other: Path | None) -> bool:
+    return other is not None and other.exists() and path.samefile(other)
+
+
+def _before_signs(pattern: Path) -> Path:
+    """The folder that all of a pattern's files lie below."""
+    return next(parent for parent in pattern.parents if not has_magic(str(parent)))
+
+
+def tasks_of(
+    stage: str,
+    role: str,
+    found: Mapping[Path, Path],
+    out: Path | None,
+    settings: Any = None,
+    inputs: Mapping[str, Path] | None = None,
+) -> list[Task]:
+    """A task for each input.
+
+    Parameters
+    ----------
+    stage
+        Command name.
+    role
+        The argument of its ``run`` that takes one of them.
+    found
+        Inputs by the names of their outputs.
+    out
+        Folder of the outputs. None: it writes nothing.
+    settings
+        Its settings; None: it has none.
+    inputs
+        What all of them read besides.
+    """
+    own = _differing(settings)
+    made = []
+    for name, source in found.items():
+        place = None if out is None else out / name
+        given = {role: source, **(inputs or {})}
+        made.append(Task(source, place, job(stage, place, given, own, keep=True)))
+    return made
+
+
+def _differing(settings: Any) -> dict[str, Any]:
+    """Settings that are not the default ones."""
+    if settings is None:
+        return {}
+    default = type(settings)()
+    pairs = ((f.name, getattr(settings, f.name), getattr(default, f.name)) for f in fields(default))
+    return {name: value for name, value, usual in pairs if value != usual}
+
+
+def outcomes(tasks: Sequence[Task], executor: Executor, what: str) -> Iterator[tuple[Task, Answer]]:
+    """Tasks in their order, each with its answer as soon as those before it are there.
+
+    The largest inputs are begun first, so that no one of them is waited for at the end.
+    """
+    by_size = sorted(range(len(tasks)), key=lambda k: _size(tasks[k].source), reverse=True)
+    answers = {k: executor.give(tasks[k].line, alone=False) for k in by_size}
+    for k in track(range(len(tasks)), what):
+        answer = answers.pop(k).result()
+        place = tasks[k].out
+        if place is not None and not failed(answer):
+            note(place)
+        yield tasks[k], answer
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0  # what it is about says so itself
+
+
+def over_folder(
+    stage: str,
+    source: Path,
+    out: Path,
+    settings: Any = None,
+    *,
+    workers: int | None,
+    as_json: bool = False,
+    role: str = "recording",
+    inputs: Mapping[str, Path] | None = None,
+    found: Mapping[Path, Path] | None = None,
+) -> None:
+    """Run a stage on every recording of a folder, and print what came of each.
+
+    Parameters
+    ----------
+    stage, role, settings, inputs
+        See `tasks_of`.
+    source
+        A folder of recordings, or a pattern.
+    out
+        Folder of the outputs, made if it is not there. They have the names of their inputs; those
+        that are there, made of the same inputs by the same settings, are left as they are.
+    workers
+        Processes, at most. None: as many as there are cores.
+    as_json
+        Print one JSON document in place of the table.
+    found
+        Inputs by the names of their outputs; without it, the recordings in ``source``.
+
+    Raises
+    ------
+    DmrlError
+        If there is nothing to do, or some of it failed; then after everything else was done.
+    """
+    if _same(source, out):
+        raise SettingError(f"{out} is the folder that is read. Name another for what is made")
+    found = recordings_in(source, but=out) if found is None else found
+    tasks = tasks_of(stage, role, found, out, settings, inputs)
+    _make_folders(out, tasks)
+    with Crew(workers, bars=False) as crew:
+        done = list(outcomes(tasks, crew, f"dmrl {stage}"))
+    for task, answer in done:
+        for warning in _part(answer.get("result"), "warnings"):
+            say(f"{task.source}: {warning}")
+    if as_json:
+        print_json({"folder": str(out), "recordings": [_document(*one) for one in done]})
+    else:
+        rows = [(task.out, came_of(answer), _brief(answer.get("result"))) for task, answer in done]
+        print_table(str(out), ("recording", "", "holds"), rows)
+    end(done, "; the others are there. Run it again when these are mended")
+
+
+def _make_folders(out: Path, tasks: Iterable[Task]) -> None:
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out} is a file. Many recordings go into a folder: name one")
+    if not out.parent.is_dir():
+        raise OutputError(f"no folder {out.parent} to make {out.name} in. Try: mkdir -p {out}")
+    for folder in dict.fromkeys(task.out.parent for task in tasks if task.out):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            raise OutputError(f"cannot make {folder}: {e.strerror}. Choose another place") from e
+
+
+def came_of(answer: Answer) -> str:
+    """What came of a task, in a word."""
+    return "failed" if failed(answer) else "was there" if "there" in answer else "made"
+
+
+def words_of(task: Task, answer: Answer) -> str:
+    """What is to be said of a task that failed: its file, and why."""
+    if "fault" in answer:
+        return f"{task.source}: internal error, {answer['fault']}. Please report what it printed"
+    text = str(answer["error"])
+    return text if str(task.source) in text else f"{task.source}: {text}"
+
+
+def end(done: Sequence[tuple[Task, Answer]], then: str = "") -> None:
+    """Say what failed, a line each.
+
+    Raises
+    ------
+    DmrlError
+        If anything has.
+    """
+    bad = [(task, answer) for task, answer in done if failed(answer)]
+    for task, answer in bad:
+        say(f"failed: {words_of(task, answer)}")
+    if bad:
+        raise DmrlError(f"{len(bad)} of {len(done)} recordings failed{then}")
+
+
+def _document(task: Task, answer: Answer) -> dict[str, Any]:
+    told = {"recording": str(task.source), "out": str(task.out), "state": came_of(answer)}
+    if failed(answer):
+        return {**told, "error": words_of(task, answer)}
+    return told if "there" in answer else {**told, "result": answer["result"]}
+
+
+def _part(result: Any, name: str) -> list[str]:
+    return result.get(name, []) if isinstance(result, dict) else []
+
+
+def _brief(result: Any) -> str:
+    """Numbers of a result that stand by themselves; of counts by topic, their sum."""
+    if isinstance(result, int):
+        return f"{result} messages"
+    found = result.items() if isinstance(result, dict) else ()
+    numbers = {name: value for name, value in found if isinstance(value, int | float)}
+    if any(name.startswith("/") for name in numbers):
+        return f"{sum(numbers.values())} messages"
+    return ", ".join(f"{name} {value}" for name, value in list(numbers.items())[:MOST_WORDS])

@@ -1,0 +1,136 @@
+"""Pipelines: recipes of many steps. A step is run unless its output is there and up to date.
+
+An output is made again when a setting that matters, or the content of something that it is made
+of, has changed. Until the new one is whole the old one stays. See docs/pipelines.md.
+"""
+
+import errno
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from dmrl.errors import OutputError, SettingError
+from dmrl.evaluation.report import Done
+from dmrl.output import as_output_error, partial_of
+from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.memory import Memory
+from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located
+from dmrl.pipeline.runner import Runner
+from dmrl.terminal.progress import say
+
+__all__ = ["Done", "Plan", "Step", "load", "run"]
+
+
+def run(
+    name: str | Path, out: Path, data: Path | None = None, *, workers: int | None = None
+) -> list[Done]:
+    """Run the steps of a pipeline recipe whose outputs are not there, or not up to date.
+
+    Parameters
+    ----------
+    name
+        Path of a recipe, or the name of a shipped one.
+    out
+        Folder for all outputs; made if it is not there.
+    data
+        Folder that ``{data}`` in the recipe stands for.
+    workers
+        Steps that run at a time, at most. None: as many as there are cores. The bytes are the
+        same with any number.
+
+    Returns
+    -------
+    list
+        What became of every step, in the order of the recipe.
+
+    Raises
+    ------
+    RecipeError
+        If the recipe is wrong; before anything is done.
+    SettingError
+        If the recipe needs ``data`` and has none, or something in it is missing.
+    OutputError
+        If ``out`` cannot be used.
+    DmrlError
+        What a stage says against its step.
+    """
+    plan = load(name)
+    _check_data(name, plan, data)
+    with _owned(out) as folder:
+        memory = Memory.of(folder / STATE_FILE)
+        memory.save()
+        _keep_recipe(folder, plan)
+        with Crew(workers) as crew:
+            done = Runner(plan, folder, data, memory, crew).run()
+        memory.forget_what_is_gone()
+        memory.save()
+        with suppress(OSError):
+            (folder / UNFINISHED).rmdir()
+    if skipped := sum(one.skipped for one in done):
+        say(f"{skipped} of {len(done)} steps were up to date")
+    return done
+
+
+def _check_data(name: str | Path, plan: Plan, data: Path | None) -> None:
+    """Refuse a recipe whose data is not there."""
+    if not plan.needs_data:
+        return
+    if data is None:
+        raise SettingError(f"{name} reads data that does not ship with dmrl. Say where: --data DIR")
+    if not data.is_dir():
+        raise SettingError(f"no folder {data}. Say where the data is: --data DIR")
+    names = dict.fromkeys(n for step in plan.steps for n in step.names if n.startswith(DATA))
+    missing = [path for n in names if not (path := located(n, set(), data, data)).exists()]
+    if missing:
+        more = f" and {len(missing) - 1} more that {name} reads" * (len(missing) > 1)
+        raise SettingError(f"no {missing[0]}{more}. Check --data {data}")
+
+
+@contextmanager
+def _owned(out: Path) -> Iterator[Path]:
+    """The folder of outputs, for this process alone."""
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out} is a file. Name a folder: --out DIR")
+    try:
+        known = (out / STATE_FILE).exists() or (out / UNFINISHED).exists()
+        if not known and out.exists() and any(out.iterdir()):
+            raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
+        (out / UNFINISHED).mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise OutputError(f"{out} is a file. Name a folder: --out DIR") from None
+    except OSError as e:
+        raise as_output_error(out, e) from e
+    if not (out / STATE_FILE).exists() and any(p.name != UNFINISHED for p in out.iterdir()):
+        with suppress(OSError):
+            (out / UNFINISHED).rmdir()
+        raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
+    held = os.open(out, os.O_RDONLY)
+    try:
+        _lock(held, out)
+        yield out
+    except OSError as e:
+        if e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+            raise as_output_error(out, e) from e
+        raise
+    finally:
+        os.close(held)
+
+
+def _lock(held: int, out: Path) -> None:
+    """Lock an open folder until it is closed, or this process dies."""
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise OutputError(f"another dmrl run is at work in {out}. Wait for it") from None
+    except OSError:
+        return  # a file system without locks
+
+
+def _keep_recipe(folder: Path, plan: Plan) -> None:
+    """Leave the recipe beside what it makes."""
+    kept = folder / RECIPE_FILE
+    partial = partial_of(kept)
+    partial.write_text(plan.text, encoding="utf-8")
+    partial.replace(kept)

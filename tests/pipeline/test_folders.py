@@ -1,0 +1,213 @@
+"""A folder in, a folder out: the same bytes with any number of processes, whatever fails."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import DmrlError, RecordingError
+from dmrl.images.codec import encode_png
+from dmrl.messages import message
+from dmrl.pipeline.folders import is_many, over_folder, recordings_in
+from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.stages import check, convert, trim
+from dmrl.topics import attitude
+
+KEPT = trim.Settings(to_s=1.5)
+
+
+def record(path: Path, messages: int = 20, roll_rad: float = 0.0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(messages):
+            one = message("Attitude")(roll_rad=roll_rad + k)
+            sink.write(1_000_000_000 + k * 100_000_000, attitude("cf1"), one)
+    return path
+
+
+@pytest.fixture
+def flights(tmp_path: Path) -> Path:
+    """Four recordings, two of them with one name."""
+    folder = tmp_path / "flights"
+    for k, name in enumerate(("a", "b", "monday/a", "monday/c")):
+        record(folder / f"{name}.mcap", roll_rad=k)
+    (folder / "notes.txt").write_text("windy")
+    (folder / ".hidden").mkdir()
+    record(folder / ".hidden" / "d.mcap")
+    return folder
+
+
+def bytes_in(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def trimmed(source: Path, out: Path, workers: int = 2, how: trim.Settings = KEPT) -> None:
+    over_folder("trim", source, out, how, workers=workers)
+
+
+def test_every_recording_is_found_by_its_place_and_nothing_else(flights: Path) -> None:
+    names = ["a.mcap", "b.mcap", "monday/a.mcap", "monday/c.mcap"]
+    assert [str(name) for name in recordings_in(flights)] == names
+    assert [str(name) for name in recordings_in(flights / "*" / "*.mcap")] == names[2:]
+    assert [str(name) for name in recordings_in(flights / "mon*")] == names[2:]
+    assert list(recordings_in(flights / "a.mcap").values()) == [flights / "a.mcap"]
+    outs = flights / "outs"
+    record(outs / "a.mcap")
+    assert [str(name) for name in recordings_in(flights, but=outs)] == names
+
+
+def test_signs_in_the_name_of_a_file_are_no_pattern(tmp_path: Path) -> None:
+    assert not is_many(record(tmp_path / "a[1].mcap"))
+    assert is_many(tmp_path / "b[1].mcap")
+
+
+def test_the_bytes_are_those_of_one_at_a_time_with_any_number_of_workers(
+    flights: Path, tmp_path: Path
+) -> None:
+    trimmed(flights, tmp_path / "one", workers=1)
+    trimmed(flights, tmp_path / "two", workers=2)
+    made = bytes_in(tmp_path / "one")
+    assert list(made) == ["a.mcap", "b.mcap", "monday/a.mcap", "monday/c.mcap"]
+    assert made == bytes_in(tmp_path / "two")
+    trim.run(flights / "monday" / "a.mcap", tmp_path / "alone.mcap", KEPT)
+    assert (tmp_path / "alone.mcap").read_bytes() == made["monday/a.mcap"]
+
+
+def test_one_that_fails_stops_no_other_and_is_told_at_the_end(
+    flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (flights / "aa.mcap").write_bytes((flights / "a.mcap").read_bytes()[:200])
+    with pytest.raises(DmrlError, match=r"1 of 5 recordings failed"):
+        trimmed(flights, tmp_path / "out")
+    assert len(bytes_in(tmp_path / "out")) == 4
+    said = capfd.readouterr()
+    assert [line for line in said.err.splitlines() if line.startswith("failed: ")] == [
+        line for line in said.err.splitlines() if "aa.mcap" in line
+    ]
+
+
+def test_what_is_there_and_made_of_the_same_is_left_as_it_is(
+    flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    trimmed(flights, out)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.mcap")}
+    (out / "b.mcap").unlink()
+    trimmed(flights, out)
+    said = capfd.readouterr().out.splitlines()
+    assert [line.split()[1:3] for line in said if "/b.mcap" in line][-1] == ["made", "15"]
+    assert sum("was there" in line for line in said) == 3
+    after = {path: path.stat().st_mtime_ns for path in out.rglob("*.mcap")}
+    assert {path: after[path] for path in before if path.name != "b.mcap"} == {
+        path: when for path, when in before.items() if path.name != "b.mcap"
+    }
+
+
+@pytest.mark.parametrize("wrong", ["settings", "input", "torn"])
+def test_what_is_there_and_of_something_else_is_refused(
+    wrong: str, flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    trimmed(flights, out)
+    how = trim.Settings(to_s=1.0) if wrong == "settings" else KEPT
+    if wrong == "input":
+        (flights / "a.mcap").unlink()
+        record(flights / "a.mcap", roll_rad=9.0)
+    if wrong == "torn":
+        (out / "a.mcap").write_bytes((out / "a.mcap").read_bytes()[:-30])
+    before = bytes_in(out)
+    with pytest.raises(DmrlError, match=f"{4 if wrong == 'settings' else 1} of 4"):
+        trimmed(flights, out, how=how)
+    assert bytes_in(out) == before
+    assert str(out / "a.mcap") in capfd.readouterr().err
+
+
+def test_an_empty_folder_and_the_folder_itself_are_refused(flights: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RecordingError, match=r"no recording \(.mcap\) in"):
+        trimmed(tmp_path / "empty", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(DmrlError, match="is the folder that is read"):
+        trimmed(flights, flights)
+    with pytest.raises(DmrlError, match="is a file"):
+        trimmed(flights, flights / "a.mcap")
+
+
+def test_check_of_a_folder_is_a_line_each_and_one_for_all(
+    flights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert check.command(flights) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines[:-1]] == [
+        str(flights / name) for name in ("a.mcap", "b.mcap", "monday/a.mcap", "monday/c.mcap")
+    ]
+    assert lines[-1].startswith("4 recordings: 4 without errors; 0 errors, ")
+
+
+def test_check_of_many_with_a_bad_one_says_so_in_json_and_status(
+    flights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (flights / "b.mcap").write_bytes(b"no recording")
+    with pytest.raises(DmrlError, match="1 of 4 recordings failed"):
+        check.command(flights, as_json=True, workers=2)
+    told = json.loads(capsys.readouterr().out)
+    assert told["sound"] == 3
+    assert [("error" in one, one.get("messages")) for one in told["recordings"]] == [
+        *((False, 20), (True, None), (False, 20), (False, 20))
+    ]
+
+
+def test_sources_in_a_folder_become_recordings_of_their_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("one", "two"):
+        (tmp_path / "sources" / name).mkdir(parents=True)
+        png = encode_png(np.zeros((16, 16, 3), np.uint8))
+        (tmp_path / "sources" / name / "0.png").write_bytes(png)
+    (tmp_path / "sources" / "README").write_text("not a source")
+    convert.command(tmp_path / "sources", tmp_path / "out", workers=2)
+    made = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in made] == ["one.mcap", "two.mcap"]
+    assert all(summary(path).count == 1 for path in made)
+    assert "README" in capsys.readouterr().err
+
+
+def children(process: int) -> list[int]:
+    tasks = Path(f"/proc/{process}/task").iterdir()  # threads start them
+    return [int(number) for task in tasks for number in (task / "children").read_text().split()]
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes")
+def test_ctrl_c_ends_the_workers_and_leaves_nothing_half_written(tmp_path: Path) -> None:
+    png = encode_png(np.zeros((224, 320, 3), np.uint8))
+    for name in ("one", "two", "three"):
+        folder = tmp_path / "sources" / name
+        folder.mkdir(parents=True)
+        (folder / "0.png").write_bytes(png)
+        for k in range(1, 6000):
+            os.link(folder / "0.png", folder / f"{k}.png")
+    words = ["-m", "dmrl.cli", "convert", "sources", "out", "--workers", "2"]
+    running = subprocess.Popen(
+        [sys.executable, *words], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    )
+    while len(list((tmp_path / "out").glob("*.partial"))) < 2:
+        assert running.poll() is None
+        time.sleep(0.01)
+    workers = children(running.pid)
+    assert len(workers) == 2
+    running.send_signal(signal.SIGINT)
+    _, said = running.communicate()
+    assert running.returncode == 130
+    assert "Traceback" not in said and "stopped" in said
+    assert not [path for path in (tmp_path / "out").iterdir() if path.suffix == ".partial"]
+    assert not any(Path(f"/proc/{number}").exists() for number in workers)
