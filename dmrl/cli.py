@@ -4,6 +4,7 @@ A command's flags and help come from the function that the table names; errors a
 act on become one line and exit status 1.
 """
 
+import sys
 from difflib import get_close_matches
 from typing import NoReturn, get_origin
 
@@ -12,6 +13,7 @@ from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
 from dmrl.border.names import without_middle
+from dmrl.terminal import standins
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
@@ -81,7 +83,15 @@ def main() -> NoReturn:
     """Run the command; turn errors into one line and an exit status."""
     boundary.open_standard_streams()
     boundary.end_by_signals()
-    raise SystemExit(boundary.status_of(app))
+    name, *words = sys.argv[1:] or [""]
+    wants_help = name in COMMANDS and not set(app.help_flags).isdisjoint(words)
+    raise SystemExit(boundary.status_of((lambda: help_of(name)) if wants_help else app))
+
+
+def help_of(name: str) -> None:
+    """Print a command's help; load nothing that only its work needs."""
+    standins.install()
+    app.help_print([name])
 
 
 if __name__ == "__main__":

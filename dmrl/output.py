@@ -110,8 +110,9 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
     refuse_existing(path)
     partial = partial_of(path)
     with _refusals(path, partial):
-        held, kept = take_file(partial), keep_on_error
+        held, kept = None, keep_on_error
         try:
+            held = take_file(partial)  # in here, as Ctrl-C comes between any two lines
             _begin(path)
             yield partial
             sync(partial)
@@ -120,11 +121,12 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
             kept = True
             raise
         finally:
-            if not kept or is_held(path, held):
-                with suppress(OSError):  # it would hide the error that brought us here
-                    partial.unlink(missing_ok=True)
-            os.close(held)
-            _ended.append(path)
+            if held is not None:
+                if not kept or is_held(path, held):
+                    with suppress(OSError):  # it would hide the error that brought us here
+                        partial.unlink(missing_ok=True)
+                os.close(held)
+                _ended.append(path)
 
 
 @contextmanager

@@ -93,6 +93,53 @@ def test_help_of_every_command_fits_a_narrow_terminal(name: str) -> None:
     assert max(map(len, page.getvalue().splitlines())) <= 50
 
 
+@pytest.fixture(scope="module")
+def light() -> dict[str, tuple[str, list[str]]]:
+    """Every command's help as `main` prints it, and packages that were loaded for real so far."""
+    code = """
+import contextlib, io, json, sys
+from dmrl.cli import COMMANDS, main
+said = {}
+for name in COMMANDS:
+    sys.argv, page = ["dmrl", name, "--help"], io.StringIO()
+    with contextlib.redirect_stdout(page):
+        try: main()
+        except SystemExit as e: assert not e.code, name
+    files = {m for m, found in sys.modules.items() if getattr(found, "__file__", None)}
+    real = {m.partition(".")[0] for m in files}
+    said[name] = page.getvalue(), sorted(real - sys.stdlib_module_names)
+print(json.dumps(said))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return {name: (page, real) for name, (page, real) in json.loads(done.stdout).items()}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_a_command_loads_no_package_that_only_its_work_needs(
+    name: str, light: dict[str, tuple[str, list[str]]]
+) -> None:
+    _, real = light[name]
+    mine = {package for package in real if not package.startswith("_")}
+    assert mine <= {
+        "dmrl",
+        "cyclopts",
+        "rich",
+        "attr",
+        "attrs",
+        "docstring_parser",
+        "sphinxcontrib",
+    }
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_is_the_same_as_with_everything_loaded(
+    name: str, light: dict[str, tuple[str, list[str]]]
+) -> None:
+    page = io.StringIO()
+    app.help_print([name], console=Console(file=page, width=80))
+    assert light[name][0] == page.getvalue()
+
+
 HELP_OF_EACH = """
 import contextlib, io, json
 from dmrl.cli import COMMANDS, main

@@ -39,8 +39,12 @@ def take_file(partial: Path) -> int:
         except FileExistsError:
             _remove_left_over(partial)
             continue
-        if _locked_still(held, partial):
-            return held
+        try:
+            if _locked_still(held, partial):
+                return held
+        except KeyboardInterrupt:
+            partial.unlink(missing_ok=True)
+            raise
 
 
 def take_folder(partial: Path) -> int:

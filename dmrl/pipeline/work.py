@@ -125,7 +125,9 @@ def main() -> None:
         while True:
             print(json.dumps(perform(jobs.get())), file=answers, flush=True)
     except KeyboardInterrupt:
-        os._exit(130)
+        pass
+    # Not before the exception is gone, and with it the frames that hold what is half written.
+    os._exit(130)
 
 
 def _listen(jobs: "queue.SimpleQueue[str]") -> None:
