@@ -310,6 +310,22 @@ def test_a_disk_that_fails_to_sync_leaves_nothing(
         assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_that_cannot_be_opened_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.open
+
+    def refused(path: Any, flags: int, *rest: Any) -> int:
+        if str(path).endswith("set.partial") and (tmp_path / "set.partial").exists():
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return real(path, flags, *rest)
+
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(OutputError, match="cannot write"), partial_folder(tmp_path / "set"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_name_too_long_is_said_before_any_work(tmp_path: Path) -> None:
     for length in (248, 256, 5000):
         with pytest.raises(OutputError, match="Give one of 247 bytes"):

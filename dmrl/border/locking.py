@@ -58,6 +58,10 @@ def take_folder(partial: Path) -> int:
             continue  # finished by another process just now
         except NotADirectoryError:
             raise OutputError(f"{partial} is in the way, and no folder. Remove it") from None
+        except OSError:
+            with suppress(OSError):
+                partial.rmdir()  # if it is ours it is empty
+            raise
         if _locked_still(held, partial):
             return held
 

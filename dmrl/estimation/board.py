@@ -14,6 +14,8 @@ try:
 except ImportError as e:
     raise MissingExtra("cv2", "calibrate", "dmrl calibrate") from e
 
+cv2.setNumThreads(1)  # sums of several threads come in any order: the last digits would change
+
 LEAST_BOARDS = 5
 """Fewer views leave focal length and distortion to chance."""
 WINDOW = 0.45

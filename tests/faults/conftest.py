@@ -1,18 +1,14 @@
-"""What the tests of faults share: inputs, one command run to its end, and the table of counts."""
+"""What the tests of faults share: how many cases are tried, and the table of counts."""
 
-import io
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
-from dmrl.boundary import status_of
-
-from .works import Inputs, contents, prepare
+from .disk import Disk
 
 Count = Callable[..., None]
 ROW = "faults"
@@ -25,10 +21,12 @@ def cases_of(most: int) -> int:
     return max(1, round(SHARE * most))
 
 
-@pytest.fixture(scope="session")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
-    """Inputs of every stage; whole and unchanged at the end."""
-    return prepare(tmp_path_factory.mktemp("inputs"))
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
+    """A disk that fails, and a process that has loaded what is run on it."""
+    disk = Disk(tmp_path_factory.mktemp("disk"))
+    yield disk
+    disk.close()
 
 
 @pytest.fixture
@@ -41,24 +39,6 @@ def count(request: pytest.FixtureRequest) -> Count:
     return add
 
 
-def ended(work: Callable[[], object]) -> tuple[int, str]:
-    """Exit status and last words of a command; never a bug, never more than one line of error."""
-    said = io.StringIO()
-    with redirect_stderr(said), redirect_stdout(io.StringIO()):
-        status = status_of(work)
-    errors = [line for line in said.getvalue().splitlines() if line.startswith("dmrl: ")]
-    text = errors[-1] if errors else ""
-    assert "Traceback" not in said.getvalue(), said.getvalue()
-    assert "internal error" not in text, text
-    assert len(errors) == (1 if status else 0), said.getvalue()
-    return status, text
-
-
-def unchanged(inputs: Inputs, before: dict[str, bytes]) -> None:
-    """Nothing, if the inputs are what they were."""
-    assert contents(inputs.folder) == before
-
-
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """The table of counts."""
     rows: dict[str, Counter[str]] = {}
@@ -68,7 +48,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
                 rows.setdefault(value[0], Counter()).update(value[1])
     if not rows:
         return
-    columns = ("cases", "refused in one line", "right", "found again")
+    columns = ("cases", "refused in one line", "right", "found by a second run")
     terminalreporter.write_sep("-", "what was broken, how often, and what came of it")
     terminalreporter.write_line(f"| what | {' | '.join(columns)} |")
     terminalreporter.write_line(f"|---|{'--:|' * len(columns)}")

@@ -1,132 +1,212 @@
-"""A disk that fails, or a process that dies, at one operation.
+"""Commands run in children of one process that has everything loaded, on a disk that can fail.
 
-Python's own ways to the disk are replaced: what opens a file for writing, writes, syncs, links,
-renames, makes a folder. Libraries that write in C (Arrow's tables) go by it; the kernel's limit on
-the size of a file stops them too, see `small_files`.
+The process is started once with disk.c before all libraries, and forks for each command: a trial
+takes no longer than the command's own work. Processes that a command starts are on the same disk.
 """
 
+import ctypes
 import errno
-import io
+import json
+import mmap
 import os
 import resource
+import shutil
 import signal
-from collections.abc import Callable, Iterator
+import subprocess
+import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
-import pytest
-
-CALLS = ("fsync", "link", "mkdir", "rename", "replace", "open")
 REFUSALS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EFBIG, errno.EINTR)
 KILL = 0
 """In place of an errno: the process dies there."""
+TESTS = Path(__file__).parents[1]
+START = """
+import sys, types
+tests = types.ModuleType("tests")
+tests.__path__ = [sys.argv[1]]
+sys.modules["tests"] = tests
+from tests.faults.server import main
+main(sys.argv[2])
+"""
+
+
+class Orders(ctypes.Structure):
+    """As in disk.c."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        ("fail_at", ctypes.c_int64),
+        ("error", ctypes.c_int32),
+        ("stays", ctypes.c_int32),
+        ("folder", ctypes.c_char * 1024),
+        ("failed", ctypes.c_char * 1024),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What goes wrong, where.
+
+    Parameters
+    ----------
+    at
+        Number of the operation that fails, from 0.
+    error
+        What the system says, an errno; or `KILL`.
+    stays
+        Whether the disk fails from there on, or once.
+    """
+
+    at: int
+    error: int
+    stays: bool = False
+
+    def __str__(self) -> str:
+        name = errno.errorcode.get(self.error, "kill -9")
+        return f"operation {self.at}: {name}{', and from there on' if self.stays else ''}"
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How a command ended: exit status, or a signal's number below 0; its last line of error.
+
+    ``operations`` came to the disk, ``failed`` is the one that did not pass.
+    """
+
+    status: int
+    said: str
+    operations: int
+    failed: str
+    seconds: float
 
 
 class Disk:
-    """Fails the n-th operation below a folder.
+    """A disk below a folder, and a process that runs commands on it.
 
     Parameters
     ----------
     folder
-        Operations elsewhere go through.
-    fail_at
-        Number of the one that fails, from 0. None: all go through and are counted.
-    error
-        What the system says, an errno; or `KILL`.
+        Operations elsewhere go through. For a log, and what is compiled.
     """
 
-    def __init__(self, folder: Path, fail_at: int | None = None, error: int = KILL) -> None:
-        self.folder, self.fail_at, self.error = folder, fail_at, error
-        self.count = 0
-        self.failed = ""
-        self._patch = pytest.MonkeyPatch()
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        library = folder / "disk.so"
+        compiler = shutil.which("cc") or shutil.which("gcc") or "cc"
+        source = Path(__file__).with_name("disk.c")
+        line = [compiler, "-O1", "-shared", "-fPIC", "-o", str(library), str(source), "-ldl"]
+        subprocess.run(line, check=True)
+        orders = folder / "orders"
+        orders.write_bytes(bytes(ctypes.sizeof(Orders)))
+        with orders.open("r+b") as stream:
+            self._map = mmap.mmap(stream.fileno(), 0)
+        self.orders = Orders.from_buffer(self._map)
+        self.orders.fail_at = -1
+        told = {"LD_PRELOAD": str(library), "DMRL_TEST_DISK": str(orders), "OMP_NUM_THREADS": "1"}
+        told |= {"CUDA_VISIBLE_DEVICES": "", "TERM": "dumb"}
+        self.log = (folder / "log").open("wb")
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", START, str(TESTS), str(folder)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self.log,
+            env=os.environ | told,
+        )
 
-    def step(self, what: str, name: object) -> None:
-        """One operation: it fails if it is its turn."""
-        self.count += 1
-        if self.count - 1 != self.fail_at:
-            return
-        if self.error == KILL:
-            os.kill(os.getpid(), signal.SIGKILL)
-        self.failed = f"{what} {name}: {errno.errorcode[self.error]}"
-        raise OSError(self.error, os.strerror(self.error), str(name))
-
-    def mine(self, file: object) -> Path | None:
-        """The file, if it lies in the folder."""
-        try:
-            if isinstance(file, int):
-                path = Path(f"/proc/self/fd/{file}").readlink()
-            else:
-                path = Path(os.fsdecode(file))  # type: ignore[arg-type]
-        except (OSError, TypeError):
-            return None
-        return path if path.is_relative_to(self.folder) else None
-
-    def __enter__(self) -> Self:
-        for name in CALLS:
-            self._patch.setattr(os, name, self._counted(name, getattr(os, name)))
-        real_open = io.open
-        disk = self
-
-        class FileIO(io.FileIO):
-            def __init__(self, file: Any, mode: str = "r", *rest: Any, **named: Any) -> None:
-                writes = mode.strip("bt") != "r" and disk.mine(file) is not None
-                if writes:
-                    disk.step("open", file)
-                super().__init__(file, mode, *rest, **named)
-                self.watched = writes
-
-            def write(self, data: Any) -> int:
-                if self.watched:
-                    disk.step("write", self.name)
-                return super().write(data)
-
-        def opened(
-            file: Any, mode: str = "r", buffering: int = -1, *rest: Any, **named: Any
-        ) -> Any:
-            if mode.strip("bt") == "r" or disk.mine(file) is None:
-                return real_open(file, mode, buffering, *rest, **named)
-            raw = FileIO(file, mode.replace("b", "").replace("t", ""), named.get("closefd", True))
-            both = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
-            if "b" in mode:
-                return both
-            text = {k: named[k] for k in ("encoding", "errors", "newline") if k in named}
-            text |= dict(zip(("encoding", "errors", "newline"), rest, strict=False))
-            return io.TextIOWrapper(both, **text)
-
-        self._patch.setattr(io, "FileIO", FileIO)
-        self._patch.setattr(io, "open", opened)
-        self._patch.setattr("builtins.open", opened)
-        return self
-
-    def _counted(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
-        def call(path: Any, *rest: Any, **named: Any) -> Any:
-            reads = name == "open" and not (rest and rest[0] & (os.O_WRONLY | os.O_RDWR))
-            if not reads and self.mine(path) is not None:
-                self.step(name, path)
-            return real(path, *rest, **named)
-
-        return call
-
-    def __exit__(
+    def run(
         self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._patch.undo()
+        work: str,
+        folder: Path,
+        out: str,
+        fault: Fault | None = None,
+        *,
+        kill_s: float | None = None,
+        most_bytes: int | None = None,
+    ) -> Ending:
+        """Run a work of `works.WORKS` in a process of its own.
+
+        Parameters
+        ----------
+        work
+            Its name.
+        folder
+            The disk that fails; the output goes there.
+        out
+            Name of the output.
+        fault
+            What goes wrong. None: nothing.
+        kill_s
+            Kill it after so many seconds.
+        most_bytes
+            The kernel lets no file grow beyond.
+
+        Raises
+        ------
+        AssertionError
+            If it ended with a traceback, with more than a line of error, or not at all.
+        """
+        given = {"work": work, "out": str(folder / out), "most_bytes": most_bytes}
+        self.orders.count, self.orders.failed = 0, b""
+        self.orders.fail_at = -1 if fault is None else fault.at
+        self.orders.error = 0 if fault is None else fault.error
+        self.orders.stays = fault is not None and fault.stays
+        self.orders.folder = os.fsencode(folder) + b"/"
+        answer = self.ask("server:run_work", kill_s=kill_s, **given)
+        self.orders.folder, self.orders.fail_at = b"", -1
+        failed = os.fsdecode(self.orders.failed).replace(str(folder), "")
+        assert "fault" not in answer, f"{work}, {fault}: {failed}: {answer['fault']}"
+        status, said = answer["value"] or (-signal.SIGKILL, "")
+        return Ending(status, said, self.orders.count, failed, answer["seconds"])
+
+    def prepare(self, work: str, folder: Path, out: str) -> None:
+        """Make what has to be there before a work."""
+        self.call("server:prepare_work", work=work, out=str(folder / out))
+
+    def call(self, call: str, **given: Any) -> Any:
+        """What a function gives that does not fail.
+
+        Raises
+        ------
+        AssertionError
+            If it did, or did not end.
+        """
+        answer = self.ask(call, **given)
+        assert "fault" not in answer, answer["fault"]
+        return answer["value"]
+
+    def ask(self, call: str, *, kill_s: float | None = None, **given: Any) -> dict[str, Any]:
+        """What a function of these tests gives, ``module:name``, in a child of the process."""
+        told = {"call": call, "kill_s": kill_s, "given": given}
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(json.dumps(told).encode() + b"\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        assert line, f"the process has died, see {self.log.name}"
+        answer: dict[str, Any] = json.loads(line)
+        self.rss_kb: int = answer["rss_kb"]
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.wait()
+        self._process.stdout.close()
+        self.log.close()
 
 
 @contextmanager
-def small_files(size: int) -> Iterator[None]:
-    """The kernel lets no file of this process grow beyond ``size`` bytes: EFBIG, C or not."""
+def small_files(size: int | None) -> Iterator[None]:
+    """The kernel lets no file of this process grow beyond ``size`` bytes: EFBIG."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    told = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    if size is not None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, told)

@@ -1,23 +1,56 @@
-"""Every stage that writes, on inputs so small that it can be broken hundreds of times."""
+"""Every command that writes, on inputs so small that it can be broken hundreds of times."""
 
+import pickle
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
 import numpy as np
+import pytest
 
-from dmrl import card
+from dmrl.cli import app
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.pipeline import run as pipeline
+from dmrl.output import partial_of
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
-from dmrl.stages import convert, dataset, export, fly, label, merge, quantize, recover, sketch, trim
-from dmrl.stages import predict as predict_stage
-from dmrl.stages import train as train_stage
-from dmrl.topics import attitude, camera_image, labels
+from dmrl.topics import attitude, camera_image, labels, uwb_range
+
+from ..stages.detector import with_detections
 
 STEP_NS = 100_000_000
+TIMED = {"tensorboard", "pipeline.json", "unfinished"}
+"""Names of what tells when something was made, and differs each time; of what is not done."""
+STAND_INS = {
+    "render": (
+        ("dmrl.rendering.renderer:", "Pool", "Painters"),
+        ("dmrl.rendering.renderer:", "shipped_lights", "sky"),
+        ("dmrl.stages.render:", "ensure", "no_python"),
+    ),
+    "run": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
+    "evaluate": (("matplotlib.figure:Figure", "draw", "blank"),),
+    "dataset": (("dmrl.card:", "plots", "nothing"),),
+    "card": (("dmrl.card:", "plots", "nothing"),),
+    "quantize": (("dmrl.stages.quantize:", "plots", "nothing"),),
+}
+"""By command: where, what, and the name in stand_ins.py of what takes its place."""
+SHORT = """
+kind = "train"
+architecture = "locanet"
+epochs = 1
+batch_size = 4
+validation_share = 0.0
+"""
+SCENE = """
+kind = "render"
+images = 2
+robots_max = 2
+empty_share = 0.0
+workers = 1
+seed = 3
+"""
 PIPELINE = """
 kind = "pipeline"
 [[step]]
@@ -29,9 +62,10 @@ stage = "convert"
 source = "pictures"
 out = "pictures.mcap"
 [[step]]
-stage = "dataset"
-recordings = ["pictures.mcap"]
-out = "set"
+stage = "trim"
+recording = "pictures.mcap"
+to_s = 0.5
+out = "short.mcap"
 """
 
 
@@ -62,13 +96,34 @@ class Inputs:
     @property
     def pictures(self) -> Path:
         """Three sketches."""
-        return self.made("pictures", lambda path: sketch.run(path, sketch.Settings(images=3)))
+        return self.made("pictures", lambda path: cli("sketch", path, "--images", 3))
 
     @property
     def flight(self) -> Path:
         """Eight seconds of two robots."""
-        settings = fly.Settings(duration_s=8.0, seed=1)
-        return self.made("flight.mcap", lambda path: fly.run(path, settings))
+        flags = "--duration-s", 8, "--seed", 1
+        return self.made("flight.mcap", lambda path: cli("fly", "fly_in_view", path, *flags))
+
+    @property
+    def seen(self) -> Path:
+        """The same with detections."""
+        return self.made("seen.mcap", lambda path: with_detections(self.flight, path))
+
+    @property
+    def pair(self) -> Path:
+        """Half a minute of two robots' ranges; the clock of one is ahead."""
+        return self.made("pair.mcap", _pair)
+
+    @property
+    def boards(self) -> Path:
+        """Pictures of a chessboard."""
+        return self.made("boards", _boards)
+
+    @property
+    def camera(self) -> Path:
+        """A camera file."""
+        flags = "--board", "7x5"
+        return self.made("camera.toml", lambda path: cli("calibrate", self.boards, path, *flags))
 
     @property
     def chain(self) -> Path:
@@ -76,37 +131,112 @@ class Inputs:
         return self.made("chain.toml", lambda path: path.write_text(PIPELINE))
 
     @property
+    def short(self) -> Path:
+        """A training of one epoch."""
+        return self.made("short.toml", lambda path: path.write_text(SHORT))
+
+    @property
+    def scene(self) -> Path:
+        """Two renders."""
+        return self.made("scene.toml", lambda path: path.write_text(SCENE))
+
+    @property
     def set(self) -> Path:
         """The dataset of ``dots``."""
-        return self.made("set", lambda path: dataset.run([self.dots], path, dataset.Settings()))
+        return self.made("set", lambda path: cli("dataset", self.dots, path))
 
     @property
     def model(self) -> Path:
         """A network of one epoch."""
-        return self.made("model", lambda path: _train(self, path))
+        return self.made("model", lambda path: cli("train", self.set, path, *self.training))
+
+    @property
+    def training(self) -> tuple[object, ...]:
+        """Flags of that training."""
+        return "--recipe", self.short, "--device", "cpu"
+
+    @property
+    def found(self) -> Path:
+        """``dots`` with its detections."""
+        return self.made("found.mcap", lambda path: cli("predict", self.model, self.dots, path))
 
     @property
     def int8(self) -> Path:
         """Its int8 form."""
-        settings = quantize.Settings()
-        return self.made("int8", lambda path: quantize.run(self.model, self.set, path, settings))
+        return self.made("int8", lambda path: cli("quantize", self.model, self.set, path))
+
+    @property
+    def proof(self) -> Path:
+        """What `dmrl verify` found in it."""
+        return self.made("proof", lambda path: _tried(self, path))
+
+    @property
+    def c(self) -> Path:
+        """Its C."""
+        return self.made("c", lambda path: cli("export", self.int8, path))
+
+
+Run = Callable[[Inputs, Path], object]
 
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """A stage, and the name of its output. A slow one is broken less often."""
+    """A command that writes.
+
+    Parameters
+    ----------
+    name
+        Its row.
+    run
+        Writes to a path.
+    out
+        Name of what it writes.
+    keeps
+        What it had done stays unfinished after an error.
+    command
+        Which one it is, if its name does not begin so.
+    before
+        What has to be there.
+    slow
+        Takes so long that it is broken less often.
+    same
+        Whether it writes the same bytes each time; else they are as many.
+    pieces
+        Whether its output is a folder whose parts stand by themselves.
+    """
 
     name: str
-    run: Callable[[Inputs, Path], object]
+    run: Run
     out: str
+    keeps: bool = False
+    command: str = ""
+    before: Run | None = None
     slow: bool = False
+    same: bool = True
+    pieces: bool = False
+
+    @property
+    def of(self) -> str:
+        """The command."""
+        return self.command or self.name.split()[0]
 
 
-def prepare(folder: Path) -> Inputs:
-    """The inputs of all works."""
-    card.plots = None  # figures take longer than all the rest
-    quantize.plots = None
-    return Inputs(folder)
+def cli(*words: object) -> None:
+    """A command line.
+
+    Raises
+    ------
+    SystemExit
+        With its exit status, unless that is 0.
+    """
+    for place, name, other in STAND_INS.get(str(words[0]), ()):
+        stand_in = getattr(import_module(".stand_ins", __package__), other)
+        setattr(resolve_name(place), name, stand_in)
+    try:
+        app([str(word) for word in words])
+    except SystemExit as e:
+        if e.code:
+            raise
 
 
 def _dots(path: Path) -> None:
@@ -134,46 +264,93 @@ def _dots(path: Path) -> None:
                 sink.flush()
 
 
-def _tables(inputs: Inputs, out: Path) -> object:
-    return convert.run(inputs.flight, out, convert.Settings(to="csv"))
+def _pair(path: Path) -> None:
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.03, 0.05, 700))
+    measured = 3 + 0.5 * np.sin(time) + 0.4 * np.sin(1.7 * time) + rng.normal(0, 0.05, len(time))
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for at_s, value in zip(time.tolist(), measured.tolist(), strict=True):
+            ranged = message("UwbRange")(range_m=value)
+            sink.write(round(at_s * 1e9), uwb_range("cf1", "cf2"), ranged)
+            sink.write(round((at_s + 0.08) * 1e9), uwb_range("cf2", "cf1"), ranged)
 
 
-def _predict(inputs: Inputs, out: Path) -> object:
-    return predict_stage.run(inputs.model, inputs.dots, out, predict_stage.Settings())
+def _boards(folder: Path) -> None:
+    boards = import_module("..estimation.boards", __package__)
+    rng = np.random.default_rng(0)
+    folder.mkdir()
+    for k in range(7):
+        grey = boards.picture(*boards.pose(rng))
+        (folder / f"{k}.png").write_bytes(encode_png(np.repeat(grey[..., None], 3, axis=2)))
 
 
-def _train(inputs: Inputs, out: Path) -> object:
-    settings = train_stage.Settings(epochs=1, batch_size=4, device="cpu", validation_share=0.0)
-    return train_stage.run(inputs.set, out, settings)
+def _train(i: Inputs, out: Path) -> None:
+    more = ("--resume",) if partial_of(out).is_dir() else ()
+    cli("train", i.set, out, *i.training, *more)
+
+
+def _render(i: Inputs, out: Path) -> None:
+    more = ("--resume",) if partial_of(out).is_file() else ()
+    cli("render", i.scene, out, *more)
+
+
+def _copied(i: Inputs, out: Path) -> None:
+    shutil.copytree(i.set, out)
+
+
+def _card(i: Inputs, out: Path) -> None:
+    cli("card", out, "--title", "Another")
+
+
+def _tried(i: Inputs, out: Path) -> None:
+    verify = import_module("dmrl.stages.verify")
+    settings = verify.Settings(images=1, noise=1, targets=("gcc",))
+    out.write_bytes(pickle.dumps(verify.run(i.c, settings)))
+
+
+def _verify(i: Inputs, out: Path) -> None:
+    """As a step of a pipeline, once gcc has had its say: the command writes nothing."""
+    verify, tried = import_module("dmrl.stages.verify"), pickle.loads(i.proof.read_bytes())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verify, "_tried", lambda *_: tried)
+        verify.run(i.c, verify.Settings(), out)
 
 
 WORKS = (
-    Work("sketch", lambda i, out: sketch.run(out, sketch.Settings(images=2)), "pictures", True),
-    Work("convert", lambda i, out: convert.run(i.pictures, out, convert.Settings()), "a.mcap"),
-    Work("convert to csv", _tables, "tables", True),
-    Work("trim", lambda i, out: trim.run(i.dots, out, trim.Settings(to_s=0.9)), "a.mcap"),
-    Work("merge", lambda i, out: merge.run([i.dots, i.flight], out), "a.mcap"),
-    Work("recover", lambda i, out: recover.run(i.cut, out), "a.mcap"),
-    Work("fly", lambda i, out: fly.run(out, fly.Settings(duration_s=1.0, seed=1)), "a.mcap", True),
-    Work("label", lambda i, out: label.run(i.flight, out, label.Settings()), "a.mcap", True),
-    Work("dataset", lambda i, out: dataset.run([i.dots], out, dataset.Settings()), "set", True),
+    Work("sketch", lambda i, out: cli("sketch", out, "--images", 2), "pictures"),
+    Work("convert", lambda i, out: cli("convert", i.pictures, out), "a.mcap"),
+    Work("convert to csv", lambda i, out: cli("convert", i.flight, out, "--to", "csv"), "tables"),
+    Work("convert to ros2", lambda i, out: cli("convert", i.dots, out, "--to", "ros2"), "bag"),
+    Work("trim", lambda i, out: cli("trim", i.dots, out, "--to-s", 0.9), "a.mcap"),
+    Work("merge", lambda i, out: cli("merge", i.dots, i.seen, out), "a.mcap"),
+    Work("recover", lambda i, out: cli("recover", i.cut, out), "a.mcap"),
+    Work("fly", lambda i, out: cli("fly", "fly_in_view", out, "--duration-s", 1, "--seed", 1), "a.mcap"),
+    Work("label", lambda i, out: cli("label", i.flight, out), "a.mcap", slow=True),
+    Work("align", lambda i, out: cli("align", i.pair, out), "a.mcap"),
+    Work("track", lambda i, out: cli("track", i.seen, out), "a.mcap"),
     Work(
-        "dataset to parquet",
-        lambda i, out: dataset.run([i.dots], out, dataset.Settings(parquet=True)),
-        "set",
-        True,
+        "calibrate",
+        lambda i, out: cli("calibrate", i.boards, out, "--board", "7x5"),
+        "camera.toml",
     ),
-    Work("predict", _predict, "a.mcap", True),
-    Work("train", _train, "model", True),
-    Work(
-        "quantize",
-        lambda i, out: quantize.run(i.model, i.set, out, quantize.Settings()),
-        "int8",
-        True,
-    ),
-    Work("export", lambda i, out: export.run(i.int8, out, export.Settings()), "c", True),
-    Work("run", lambda i, out: pipeline.run(i.chain, out), "chain", True),
+    Work("dataset", lambda i, out: cli("dataset", i.dots, out), "set"),
+    Work("dataset to parquet", lambda i, out: cli("dataset", i.dots, out, "--parquet"), "set"),
+    Work("card", _card, "set", before=_copied, pieces=True),
+    Work("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
+    Work("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots", slow=True),
+    Work("train", _train, "model", keeps=True),
+    Work("quantize", lambda i, out: cli("quantize", i.model, i.set, out), "int8", slow=True),
+    Work("export", lambda i, out: cli("export", i.int8, out), "c"),
+    Work("verify", _verify, "proof.json", slow=True),
+    Work("render", _render, "a.mcap", keeps=True),
+    Work("view", lambda i, out: cli("view", i.dots, "--save", out), "a.rrd", same=False),
+    Work("run", lambda i, out: cli("run", i.chain, "--out", out), "chain", pieces=True),
 )
+
+
+def work_named(name: str) -> Work:
+    """The work of that name."""
+    return next(work for work in WORKS if work.name == name)
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -183,7 +360,7 @@ def contents(path: Path) -> dict[str, bytes]:
     return {
         str(inner.relative_to(path)): inner.read_bytes()
         for inner in sorted(path.rglob("*"))
-        if inner.is_file() and "tensorboard" not in inner.parts
+        if inner.is_file() and not TIMED & {*inner.parts}
     }
 
 

@@ -1,0 +1,20 @@
+"""How a command may end."""
+
+import io
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+
+from dmrl.boundary import status_of
+
+
+def ended(work: Callable[[], object]) -> tuple[int, str]:
+    """Exit status and last words of a command; never a bug, never more than one line of error."""
+    said = io.StringIO()
+    with redirect_stderr(said), redirect_stdout(io.StringIO()):
+        status = status_of(work)
+    errors = [line for line in said.getvalue().splitlines() if line.startswith("dmrl: ")]
+    text = errors[-1] if errors else ""
+    assert "Traceback" not in said.getvalue(), said.getvalue()
+    assert "internal error" not in text, text
+    assert len(errors) == (1 if status else 0), said.getvalue()
+    return status, text
