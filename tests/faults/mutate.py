@@ -1,10 +1,9 @@
 """Damage: bytes flipped, overwritten, cut, doubled, inserted, or made extreme."""
 
-import struct
-import zlib
-
 import numpy as np
 from mcap.opcode import Opcode
+
+from . import parts
 
 EXTREMES = (b"\0" * 4, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\xff" * 8)
 
@@ -34,30 +33,118 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def mutated_within(data: bytes, rng: np.random.Generator) -> bytes:
-    """A recording with one record's content damaged, its length and the summary's CRC made good.
-
-    What no checksum refuses has to be met by the code behind it.
-    """
-    at, records = 8, []
-    while at + 9 <= len(data) - 8:
-        opcode, length = struct.unpack_from("<BQ", data, at)
-        if at + 9 + length > len(data) - 8:
-            break
-        records.append((opcode, data[at + 9 : at + 9 + length]))
-        at += 9 + length
+    """A recording with one record changed, also within a chunk; all sums and places made good."""
+    records, starts = parts.taken_apart(data, len(parts.MAGIC), len(data) - len(parts.MAGIC))
     if not records:
         return mutated(data, rng)
-    chosen = int(rng.integers(len(records)))
-    opcode, body = records[chosen]
-    records[chosen] = opcode, mutated(body, rng)
-    out = bytearray(data[:8])
-    start = 0
-    for code, content in records:
-        if code == Opcode.FOOTER and len(content) == 20 and start:
-            _, offsets, _ = struct.unpack("<QQI", content)
-            head = struct.pack("<BQQQ", code, 20, start, offsets)
-            content = head[9:] + struct.pack("<I", zlib.crc32(head, zlib.crc32(out[start:])))
-        out += struct.pack("<BQ", code, len(content)) + content
-        if code == Opcode.DATA_END:
-            start = len(out)
-    return bytes(out) + data[-8:]
+    sums, moved = parts.sums_of(records), dict[int, int]()
+    placed = list(zip(records, starts, strict=True))
+    chosen = _chosen(records, rng)
+    (opcode, body), place = placed[chosen]
+    inner = parts.chunk_parts(body) if opcode == Opcode.CHUNK and rng.random() < 0.8 else None
+    if inner is not None:
+        kind, unpacked = inner
+        changed, moved = _within_chunk(unpacked, rng)
+        if rng.random() < 0.1:
+            kind = ("zstd", "lz4", "")[int(rng.integers(3))]
+        placed[chosen] = (opcode, parts.chunk_of(body, kind, changed)), place
+    else:
+        placed[chosen : chosen + 1] = _changed(placed[chosen], rng)
+    return parts.put_together(placed, moved, sums)
+
+
+def _chosen(records: list[parts.Record], rng: np.random.Generator) -> int:
+    """One of them, every second time one with messages in it."""
+    full = [k for k, (opcode, _) in enumerate(records) if opcode in (Opcode.CHUNK, Opcode.MESSAGE)]
+    return int(rng.choice(full)) if full and rng.random() < 0.5 else int(rng.integers(len(records)))
+
+
+def _changed(
+    placed: tuple[parts.Record, int], rng: np.random.Generator
+) -> list[tuple[parts.Record, int]]:
+    """A record changed, doubled or dropped."""
+    (opcode, body), place = placed
+    kind = rng.random()
+    if kind < 0.08:
+        return []
+    if kind < 0.16:
+        return [placed, ((opcode, body), -1)]
+    if kind < 0.2:
+        return [((int(rng.integers(0x11)), body), place)]
+    if opcode == Opcode.MESSAGE and len(body) > 22 and rng.random() < 0.7:
+        return [((opcode, body[:22] + mutated_message(body[22:], rng)), place)]
+    return [((opcode, mutated(body, rng)), place)]
+
+
+def _within_chunk(data: bytes, rng: np.random.Generator) -> tuple[bytes, dict[int, int]]:
+    """The records of a chunk with one changed; old and new places."""
+    records, starts = parts.taken_apart(data)
+    if not records:
+        return mutated(data, rng), {}
+    placed = list(zip(records, starts, strict=True))
+    chosen = int(rng.integers(len(placed)))
+    placed[chosen : chosen + 1] = _changed(placed[chosen], rng)
+    out, moved = bytearray(), {}
+    for record, place in placed:
+        moved[place] = len(out)
+        out += parts.written(record)
+    moved.pop(-1, None)
+    return bytes(out), moved
+
+
+def mutated_message(data: bytes, rng: np.random.Generator) -> bytes:
+    """A protobuf message with one field changed, doubled, dropped, or of another kind."""
+    fields = _fields(data)
+    if not fields or rng.random() < 0.3:
+        return mutated(data, rng)
+    start, at, end = fields[int(rng.integers(len(fields)))]
+    key, value = data[start:at], data[at:end]
+    kind = int(rng.integers(6))
+    if kind == 0:
+        new = b""
+    elif kind == 1:
+        new = (key + value) * 2
+    elif kind == 2:
+        new = bytes([int(rng.integers(128))]) + value
+    elif kind == 3:
+        new = key + EXTREMES[int(rng.integers(len(EXTREMES)))][: max(1, len(value))]
+    elif kind == 4 and key[0] & 7 == 2:
+        inner = mutated_message(value[1:], rng) if len(value) > 1 else b"\0"
+        new = key + _varint(len(inner)) + inner
+    else:
+        new = key + _varint(int(rng.integers(1 << 62)) * 2 + 1)
+    return data[:start] + new + data[end:]
+
+
+def _fields(data: bytes) -> list[tuple[int, int, int]]:
+    """Start, value and end of every field, as far as they can be told apart."""
+    found, at = [], 0
+    while at < len(data):
+        start, kind = at, data[at] & 7
+        at = value = _after_varint(data, at)
+        if kind == 0:
+            at = _after_varint(data, at)
+        elif kind == 2 and at < len(data) and data[at] < 128:
+            at += 1 + data[at]
+        elif kind in (1, 5):
+            at += 8 if kind == 1 else 4
+        else:
+            break
+        if at > len(data):
+            break
+        found.append((start, value, at))
+    return found
+
+
+def _after_varint(data: bytes, at: int) -> int:
+    while at < len(data) and data[at] >= 128:
+        at += 1
+    return at + 1
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value >= 128:
+        out.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*out, value])

@@ -126,5 +126,3 @@ def _work(jobs: int, answers: int) -> NoReturn:
     except BaseException:
         traceback.print_exc()
     os._exit(1)
-
-

@@ -20,6 +20,7 @@ from dmrl.topics import attitude, camera_image, labels, uwb_range
 
 from ..stages.detector import with_detections
 
+RECORD_S = 2.5
 STEP_NS = 100_000_000
 TIMED = {"tensorboard", "pipeline.json", "unfinished"}
 """Names of what tells when something was made, and differs each time; of what is not done."""
@@ -316,6 +317,15 @@ def _verify(i: Inputs, out: Path) -> None:
         verify.run(i.c, verify.Settings(), out)
 
 
+def _record(i: Inputs, out: Path) -> None:
+    """Two robots for a second, and the robots themselves."""
+    fake_drone = import_module("dmrl.stages.fake_drone")
+    uris = ("udp://127.0.0.1:0",) * 2
+    with fake_drone.fleet(i.flight, uris, (), fake_drone.Settings()) as fleet:
+        named = [f"--robot={d.robot}=udp://127.0.0.1:{d.port}" for d in fleet.drones]
+        cli("record", out, *named, "--duration-s", RECORD_S)
+
+
 WORKS = (
     Work("sketch", lambda i, out: cli("sketch", out, "--images", 2), "pictures"),
     Work("convert", lambda i, out: cli("convert", i.pictures, out), "a.mcap"),
@@ -324,7 +334,11 @@ WORKS = (
     Work("trim", lambda i, out: cli("trim", i.dots, out, "--to-s", 0.9), "a.mcap"),
     Work("merge", lambda i, out: cli("merge", i.dots, i.seen, out), "a.mcap"),
     Work("recover", lambda i, out: cli("recover", i.cut, out), "a.mcap"),
-    Work("fly", lambda i, out: cli("fly", "fly_in_view", out, "--duration-s", 1, "--seed", 1), "a.mcap"),
+    Work(
+        "fly",
+        lambda i, out: cli("fly", "fly_in_view", out, "--duration-s", 1, "--seed", 1),
+        "a.mcap",
+    ),
     Work("label", lambda i, out: cli("label", i.flight, out), "a.mcap", slow=True),
     Work("align", lambda i, out: cli("align", i.pair, out), "a.mcap"),
     Work("track", lambda i, out: cli("track", i.seen, out), "a.mcap"),
@@ -348,9 +362,13 @@ WORKS = (
 )
 
 
+RECORD = Work("record", _record, "a.mcap", keeps=True, same=False)
+"""Apart from the others: it writes what comes in, and that is never the same."""
+
+
 def work_named(name: str) -> Work:
     """The work of that name."""
-    return next(work for work in WORKS if work.name == name)
+    return next(work for work in (*WORKS, RECORD) if work.name == name)
 
 
 def contents(path: Path) -> dict[str, bytes]:
