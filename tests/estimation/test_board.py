@@ -37,6 +37,14 @@ def normalised(camera: Camera, made: Intrinsics) -> Array:
     return np.asarray(errors / (*made.focal_std_px, *made.centre_std_px))
 
 
+def test_the_same_boards_give_the_same_digits_each_time() -> None:
+    rng = np.random.default_rng(0)
+    seen = [corners_of(*pose(rng)) for _ in range(8)]
+    views = [(at + rng.normal(0, 0.1, at.shape)).astype(np.float32) for at in seen]
+    made = [intrinsics(views, (COLUMNS, ROWS), (320, 224)) for _ in range(50)]
+    assert len({one.camera for one in made}) == 1
+
+
 def test_a_drawn_board_gives_the_camera_that_drew_it() -> None:
     pairs = shown(AIDECK, np.random.default_rng(0), 10)
     assert len(pairs) >= 8

@@ -14,7 +14,7 @@ from .disk import KILL, REFUSALS, Disk, Ending, Fault
 from .works import RECORD, WORKS, Work, clear, contents
 
 SLOW = [pytest.param(work, id=work.name, marks=pytest.mark.slow) for work in WORKS]
-QUICK = [pytest.param(work, id=work.name) for work in WORKS if work.name in ("trim", "recover")]
+QUICK = [pytest.param(work, id=work.name) for work in WORKS if work.name == "trim"]
 KILLS = 50
 SIZES = 8
 STAYING = (errno.ENOSPC, errno.EIO, errno.EROFS)
@@ -142,6 +142,7 @@ def test_every_command_that_writes_is_broken() -> None:
     assert broken == COMMANDS.keys() - WRITES_NOTHING - IS_A_RUN
 
 
+@pytest.mark.slow
 def test_what_a_library_writes_in_c_comes_to_the_disk(disk: Disk, folder: Path) -> None:
     """Arrow opens and writes the tables of a dataset without Python."""
     broken = Broken(next(work for work in WORKS if work.name == "dataset"), disk, folder)

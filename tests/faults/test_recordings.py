@@ -236,7 +236,7 @@ def nothing_is_lost(path: Path, sound: Held | None) -> bool:
 
 
 def test_mutated_recordings_are_read_or_refused(tmp_path: Path, count: Count) -> None:
-    hunt(tmp_path, 100, 1, count)
+    hunt(tmp_path, 60, 1, count)
 
 
 @pytest.mark.slow
