@@ -40,6 +40,7 @@ COMMANDS = {
     "verify": "Prove that the C of an export computes the int8 network, bit for bit.",
     "view": "Show recordings in rerun, or save what it would show.",
     "doctor": "Say what is installed, what it is for, and how to get what is missing.",
+    "report": "Show what a folder comes to, as one HTML page that needs nothing else.",
     "info": "Show what a recording holds and where it comes from.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",
     "recover": "Bring back the messages of a recording that was cut short.",

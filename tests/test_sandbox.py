@@ -371,6 +371,7 @@ def test_every_command_takes_damaged_inputs_as_errors(
         "predict": ("predict", "IN", "IN", "OUT.mcap"),
         "quantize": ("quantize", "IN", "IN", "OUT"),
         "view": ("view", "IN", "--save", "OUT.rrd"),
+        "report": ("report", "IN", "OUT.html"),
         "evaluate": ("evaluate", "IN"),
         "info": ("info", "IN"),
         "check": ("check", "IN"),

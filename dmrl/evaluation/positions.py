@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -117,24 +117,68 @@ def judge(recording: Path) -> list[Pair]:
     return pairs
 
 
-def _judge(held: Contents, robot: str, peer: str) -> Pair:
-    estimate = held.table(topics.position(robot, peer))
-    true = held.table(topics.truth(robot, peer))
+class Paths(NamedTuple):
+    """Estimates of one robot about one peer that there is truth for.
+
+    ``time_ns`` (N,) log times, ``estimate_m`` and ``true_m`` (N, 2) in the robot's horizontal
+    frame, ``covariance`` (N, 2, 2) square metres, ``kept`` (N,) whether the estimator believes it,
+    ``started_ns`` the first log time of all its estimates.
+    """
+
+    time_ns: Array
+    estimate_m: Array
+    true_m: Array
+    covariance: Array
+    kept: NDArray[np.bool_]
+    started_ns: float
+
+
+def paths(recording: Path) -> dict[tuple[str, str], Paths]:
+    """Of every pair with estimates and truth, where the peer was and was estimated to be.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+    """
+    known = set(_pairs(recording, topics.TRUTH))
+    estimated = [pair for pair in _pairs(recording, topics.POSITION) if pair in known]
+    held = Contents(recording, topics.POSITION, topics.TRUTH)
+    return {pair: _matched(*_tables(held, *pair)) for pair in estimated}
+
+
+def _tables(held: Contents, robot: str, peer: str) -> tuple[pa.Table, pa.Table]:
+    return held.table(topics.position(robot, peer)), held.table(topics.truth(robot, peer))
+
+
+def _matched(estimate: pa.Table, true: pa.Table) -> Paths:
     time_ns, true_ns = _column(estimate, "log_time"), _column(true, "log_time")
     near = inside_truth(time_ns.astype(np.int64), true_ns.astype(np.int64))
-    truth = np.stack(
-        [np.interp(time_ns[near], true_ns, _column(true, axis)) for axis in "xy"], axis=1
+    return Paths(
+        time_ns[near],
+        np.stack([_column(estimate, axis)[near] for axis in "xy"], axis=1),
+        np.stack([np.interp(time_ns[near], true_ns, _column(true, axis)) for axis in "xy"], axis=1),
+        _covariance(estimate)[near],
+        _column(estimate, "status")[near] == STATUS_OK,
+        float(time_ns[0]) if len(time_ns) else 0.0,
     )
-    position = np.stack([_column(estimate, axis)[near] for axis in "xy"], axis=1)
+
+
+def _judge(held: Contents, robot: str, peer: str) -> Pair:
+    estimate, true = _tables(held, robot, peer)
+    found = _matched(estimate, true)
     judged = Judged(
-        time_s=(time_ns[near] - time_ns[0]) * 1e-9 if len(time_ns) else np.zeros(0),
-        error_m=position - truth,
-        covariance=_covariance(estimate)[near],
-        distance_m=np.linalg.norm(truth, axis=1),
-        kept=_column(estimate, "status")[near] == STATUS_OK,
+        time_s=(found.time_ns - found.started_ns) * 1e-9,
+        error_m=found.estimate_m - found.true_m,
+        covariance=found.covariance,
+        distance_m=np.linalg.norm(found.true_m, axis=1),
+        kept=found.kept,
     )
-    covered = inside_truth(true_ns.astype(np.int64), time_ns.astype(np.int64))
-    return Pair(robot, peer, judged, int((~near).sum()), len(covered), int(covered.sum()))
+    time_ns, true_ns = (_column(table, "log_time").astype(np.int64) for table in (estimate, true))
+    covered = inside_truth(true_ns, time_ns)
+    return Pair(
+        robot, peer, judged, len(time_ns) - len(found.kept), len(covered), int(covered.sum())
+    )
 
 
 def _column(table: pa.Table, name: str) -> Array:

@@ -154,6 +154,57 @@ def _band(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """What a threshold would cost, and whether confidence is a probability.
+
+    Parameters
+    ----------
+    confidence, precision, recall
+        (K,) of all detections at or above that confidence, surest first.
+    bin_confidence, bin_right, bin_count
+        (10,) mean confidence, share of detections that are right, and how many there are, in
+        tenths of the confidence; NaN where there is none.
+    """
+
+    confidence: Array
+    precision: Array
+    recall: Array
+    bin_confidence: Array
+    bin_right: Array
+    bin_count: Index
+
+
+def curves(scored: Scored, most: int = 200) -> Curves:
+    """Precision over recall, and reliability, of detections that are right within 16 px.
+
+    Parameters
+    ----------
+    scored
+        Matched labels and detections.
+    most
+        Points of the curve at most, evenly over the detections.
+    """
+    confidence = scored.detections.confidence
+    order = np.argsort(-confidence, kind="stable")
+    right = (scored.right_16_px >= 0)[order]
+    found = np.cumsum(right)
+    # Detections of equal confidence are taken or left together.
+    last = np.flatnonzero(np.diff(confidence[order], append=-1.0))
+    last = last[np.unique(np.linspace(0, len(last) - 1, min(most, len(last))).round().astype(int))]
+    place = np.clip((confidence[order] * 10).astype(int), 0, 9)
+    count = np.bincount(place, minlength=10)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Curves(
+            confidence[order][last],
+            found[last] / (last + 1.0),
+            found[last] / np.float64(len(scored.labels)),
+            np.bincount(place, confidence[order], minlength=10) / count,
+            np.bincount(place, right, minlength=10) / count,
+            count,
+        )
+
+
 def resamples(scored: Scored, draws: int, seed: int) -> Iterator[Array]:
     """Blocks of (b, images) weights: how often each image was drawn, ``draws`` rows in all."""
     rng = np.random.default_rng(seed)

@@ -22,7 +22,7 @@ KEYS = ("kind", "each", "defaults", "step")
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
-RESERVED = (RECIPE_FILE, STATE_FILE, UNFINISHED)
+RESERVED = (RECIPE_FILE, STATE_FILE, UNFINISHED, "report.html")
 MOST_BYTES = 200
 """Of an output's name: what is unfinished has a longer one."""
 

@@ -92,7 +92,7 @@ def input_of(path: Path) -> Input:
     if path.suffix == ".mcap" and path.is_file():
         expect_unchanged(path)
     digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
-    return Input(path.resolve().name, digest, _own_provenance(path))
+    return Input(path.resolve().name, digest, provenance_of(path))
 
 
 def sha256_of_file(path: Path) -> str:
@@ -116,7 +116,14 @@ def sha256_of_folder(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _own_provenance(path: Path) -> Provenance | None:
+def provenance_of(path: Path) -> Provenance | None:
+    """How a recording, or an output folder, was made; None: it does not say.
+
+    Raises
+    ------
+    RecordingError
+        If what it says is damaged.
+    """
     if path.suffix == ".mcap" and path.is_file():
         return summary(path).provenance
     file = path / FILE_NAME

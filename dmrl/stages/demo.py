@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.evaluation.report import report
+from dmrl.page import write
 from dmrl.pipeline import run as pipeline
 
 
@@ -18,7 +19,8 @@ def command(
 
     Draws pictures of small drones, converts them to a recording, builds a dataset, trains
     the published network on it, lets it look at pictures it has not seen, judges it against
-    the truth and shows it. The steps are those of the recipe demo: dmrl run demo.
+    the truth and shows it; report.html shows it all on one page. The steps are those of the
+    recipe demo: dmrl run demo.
 
     Parameters
     ----------
@@ -28,3 +30,9 @@ def command(
         Print one JSON document in place of the table.
     """
     report(pipeline.run("demo", out), as_json=as_json)
+    page = write(out)
+    if not as_json:
+        print(f"""{page}: open it in a browser. Now try:
+  dmrl view {out}/predictions.mcap       # the same in rerun, image by image
+  dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap
+  dmrl predict dmrl-nano YOUR.mcap found.mcap   # the network that ships, on your own images""")

@@ -15,7 +15,7 @@ from dmrl import topics
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
-from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, score
+from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, curves, score
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.pipeline.folders import all_recordings
 from dmrl.recording import input_of, summary
@@ -212,6 +212,7 @@ def document(
         "bootstrap": {"draws": settings.draws, "seed": settings.seed},
         "overall": overall,
         "bands": bands,
+        "curves": _curves(evaluation.scored),
         "definitions": DEFINITIONS,
     }
 
@@ -228,6 +229,11 @@ def _band(band: BandFigures) -> dict[str, Any]:
             for name, figure in band.figures.items()
         },
     }
+
+
+def _curves(scored: Scored) -> dict[str, list[float | None]]:
+    found = asdict(curves(scored))
+    return {name: [_finite(value) for value in values.tolist()] for name, values in found.items()}
 
 
 def _finite(value: float) -> float | None:

@@ -7,6 +7,7 @@ from cyclopts import Parameter, validators
 
 from dmrl.evaluation.report import report
 from dmrl.pipeline import run as pipeline
+from dmrl.terminal.tables import print_line
 
 
 def command(
@@ -35,3 +36,5 @@ def command(
     """
     folder = Path(Path(recipe).stem) if out is None else out
     report(pipeline.run(recipe, folder, data, workers=workers), as_json=as_json)
+    if not as_json:
+        print_line(f"On one page: dmrl report {folder}")

@@ -13,6 +13,7 @@ from dmrl.learn.metrics import (
     BandFigures,
     average_precision,
     by_band,
+    curves,
     score,
     weighted_quantile,
 )
@@ -40,6 +41,33 @@ def test_a_perfect_detector_has_perfect_figures() -> None:
     assert got["median_px"] == got["p95_px"] == got["rmse_px"] == got["bias_u_px"] == 0
     assert got["within_8_px"] == got["f1"] == got["ap_8_px"] == got["ap_16_px"] == 1
     assert got["depth_mae_m"] == pytest.approx(0.1)
+
+
+def test_curves_of_four_detections_by_hand() -> None:
+    labels, _ = scene(3)
+    at = np.full(4, 100.0)
+    at[2] = 200.0  # the third is beside every label
+    confidence = np.array([0.95, 0.85, 0.85, 0.15])
+    depth = np.ones(4)
+    found = Points(np.array([0, 1, 1, 2]), at, np.full(4, 50.0), depth, confidence)
+    got = curves(score(3, labels, found))
+    # Equal confidences are one point of the curve.
+    assert got.confidence.tolist() == [0.95, 0.85, 0.15]
+    assert got.precision == pytest.approx([1, 2 / 3, 3 / 4])
+    assert got.recall == pytest.approx([1 / 3, 2 / 3, 1])
+    assert got.bin_count.tolist() == [0, 1, 0, 0, 0, 0, 0, 0, 2, 1]
+    assert got.bin_right[[1, 8, 9]].tolist() == [1, 0.5, 1]
+    assert got.bin_confidence[[1, 8, 9]] == pytest.approx([0.15, 0.85, 0.95])
+    assert np.isnan(got.bin_right[0])
+
+
+def test_curves_without_detections_or_labels_are_empty() -> None:
+    labels, found = scene(3)
+    none = found.select(found.image > 9)
+    assert curves(score(3, labels, none)).recall.size == 0
+    assert np.isnan(curves(score(3, none, found)).recall).all()
+    many = curves(score(3, *scene(3)), most=1)
+    assert many.recall.tolist() == [1.0]
 
 
 def test_figures_of_a_known_offset() -> None:

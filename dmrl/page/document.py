@@ -1,0 +1,150 @@
+"""One HTML file: nothing is fetched, nothing is run, names from files cannot become markup."""
+
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from dmrl.border.names import one_line
+from dmrl.errors import DmrlError
+from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
+
+MARK = "<!-- written by dmrl report -->"
+"""Stands in every page: one that has it may be written again."""
+MOST_BYTES = 9_000_000
+"""Of a page, pictures and all."""
+PLAIN_BYTES, WIDEST_PX = 250_000, 1400
+STYLE = """
+:root { color-scheme: light dark; --ink: #1b1f24; --paper: #ffffff; --line: #d0d7de;
+  --soft: #57606a; --card: #f6f8fa; --link: #0969da }
+@media (prefers-color-scheme: dark) { :root { --ink: #e6edf3; --paper: #0d1117; --line: #30363d;
+  --soft: #9198a1; --card: #161b22; --link: #4493f8 } }
+* { box-sizing: border-box }
+body { margin: 0 auto; max-width: 72rem; padding: 1rem; color: var(--ink); background: var(--paper);
+  font: 16px/1.5 system-ui, sans-serif }
+h1 { font-size: 1.6rem; margin: .5rem 0 } h2 { font-size: 1.25rem; margin: 2rem 0 .5rem;
+  border-bottom: 1px solid var(--line) } h3 { font-size: 1rem; margin: 1.2rem 0 .4rem }
+p, figcaption { color: var(--soft) } p.big { color: var(--ink); font-size: 1.1rem }
+nav a { margin-right: 1rem; display: inline-block; color: var(--link) }
+.wide { overflow-x: auto } table { border-collapse: collapse; font-size: .9rem }
+th, td { text-align: left; padding: .25rem .7rem .25rem 0; border-bottom: 1px solid var(--line);
+  vertical-align: top } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums }
+.row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0; flex: 1 1 24rem;
+  min-width: 0; max-width: min(100%, 35rem) } figure.full { flex-basis: 100%; max-width: 100% }
+figure svg { width: 100%; height: auto; max-height: 34rem }
+figure img { max-width: 100%; height: auto; background: #fff; border-radius: 4px }
+code { background: var(--card); padding: .1rem .3rem; border-radius: 4px; font-size: .85rem;
+  overflow-wrap: anywhere }
+"""
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+def text(value: object) -> str:
+    """Words of anything as HTML: one line, no markup."""
+    if value is None:
+        return ""
+    return escape(f"{value:.4g}" if isinstance(value, float) else one_line(str(value)))
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table; columns of numbers, or of texts that begin as one, are set flush right."""
+    body = [[text(cell) for cell in row] for row in rows]
+    number = [
+        bool(body) and all(row[k][:1].lstrip("-").isdigit() or not row[k] for row in body)
+        for k in range(len(columns))
+    ]
+    kind = ["n" if n else "" for n in number]
+
+    def line(tag: str, cells: Sequence[str]) -> str:
+        parts = (f'<{tag} class="{k}">{c}</{tag}>' for c, k in zip(cells, kind, strict=True))
+        return f"<tr>{''.join(parts)}</tr>"
+
+    head = line("th", [text(column) for column in columns])
+    return (
+        f'<div class="wide"><table>{head}{"".join(line("td", row) for row in body)}</table></div>'
+    )
+
+
+def chart(svg: str, caption: str, *, least_rem: int = 0) -> str:
+    """A chart of dmrl's own drawing, with words below; ``least_rem`` wide at least, to scroll."""
+    words = f"<figcaption>{text(caption)}</figcaption>"
+    if not least_rem:
+        return f"<figure>{svg}{words}</figure>"
+    wide = f'<div class="wide"><div style="min-width: {least_rem}rem">{svg}</div></div>'
+    return f'<figure class="full">{wide}{words}</figure>'
+
+
+def row(figures: Iterable[str]) -> str:
+    """Figures beside each other, or below where there is no room."""
+    return f'<div class="row">{"".join(figures)}</div>'
+
+
+@dataclass(slots=True)
+class Pictures:
+    """Pictures that go into a page, as long as there is room.
+
+    Parameters
+    ----------
+    room
+        Bytes of the page that are left.
+    """
+
+    room: int = MOST_BYTES
+
+    def figure(self, path: Path, caption: str, *, full: bool = False) -> str:
+        """A picture with words below; large ones are made smaller."""
+        try:
+            data, kind = _small(path)
+        except (DmrlError, OSError) as e:
+            return f"<p>{text(path.name)}: {text(e)}</p>"
+        words = b64encode(data).decode()
+        if len(words) > self.room:
+            return f"<p>{text(path.name)}: no room left in this page; look at the file</p>"
+        self.room -= len(words)
+        where = f"data:image/{kind};base64,{words}"
+        image = f'<img src="{where}" alt="{text(caption)}" loading="lazy">'
+        chosen = ' class="full"' if full else ""
+        return f"<figure{chosen}>{image}<figcaption>{text(caption)}</figcaption></figure>"
+
+
+def _small(path: Path) -> tuple[bytes, str]:
+    """A picture's bytes and kind, a JPEG where it was large."""
+    data = path.read_bytes()
+    if len(data) <= PLAIN_BYTES and data.startswith(b"\x89PNG"):
+        return data, "png"
+    rgb = decode(data, path)
+    height, width = rgb.shape[:2]
+    if width > WIDEST_PX:
+        to = (WIDEST_PX, max(1, round(height * WIDEST_PX / width)))
+        rgb = crop_and_scale(rgb, (0, 0, width, height), *to)
+    return encode_jpeg(rgb, 85), "jpeg"
+
+
+def html(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> str:
+    """The page.
+
+    Parameters
+    ----------
+    title
+        Its name.
+    lead
+        What it comes to, in a sentence.
+    sections
+        (words of the heading, HTML); those without content are left out.
+    """
+    shown = [(words, body) for words, body in sections if body]
+    links = "".join(f'<a href="#s{k}">{text(words)}</a>' for k, (words, _) in enumerate(shown))
+    parts = "".join(
+        f'<section id="s{k}"><h2>{text(words)}</h2>{body}</section>'
+        for k, (words, body) in enumerate(shown)
+    )
+    return (
+        f'<!doctype html>\n{MARK}\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{text(title)}</title><style>{STYLE}</style></head><body>"
+        f'<h1>{text(title)}</h1><p class="big">{text(lead)}</p><nav>{links}</nav>{parts}'
+        "</body></html>\n"
+    )

@@ -1,0 +1,137 @@
+"""What stands in a folder: recordings, datasets, models, evaluations, pictures."""
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dmrl.border.documents import parse_json
+from dmrl.datasets import is_dataset
+from dmrl.errors import DmrlError, SettingError
+from dmrl.recording import Provenance, Summary, summary
+from dmrl.recording.inputs import provenance_of
+
+DOCUMENTS = {
+    "evaluation.json": "evaluations",
+    "positions.json": "positions",
+    "tracks.json": "tracks",
+    "quantisation.json": "int8",
+    "model.json": "models",
+}
+"""Names of files that say what an output folder is, and what it is here."""
+MOST_FILES, MOST_BYTES, DEEPEST = 20_000, 16 << 20, 6
+PICTURE_KINDS = (".png", ".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What stands in a folder, by its name in there.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    recordings
+        Whole recordings, and what they hold.
+    datasets
+        Their folders.
+    documents
+        Of each kind of `DOCUMENTS`: the document of an output.
+    pictures
+        Pictures that lie beside outputs rather than in one.
+    made
+        How each output was made, where it says so.
+    unread
+        What could not be read, and why.
+    """
+
+    folder: Path
+    recordings: dict[str, Summary] = field(default_factory=dict)
+    datasets: dict[str, Path] = field(default_factory=dict)
+    documents: dict[str, dict[str, Mapping[str, Any]]] = field(default_factory=dict)
+    pictures: list[Path] = field(default_factory=list)
+    made: dict[str, Provenance] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
+
+    def of(self, kind: str) -> dict[str, Mapping[str, Any]]:
+        """Documents of one kind."""
+        return self.documents.get(kind, {})
+
+
+def gather(folder: Path) -> Found:
+    """Everything in a folder that a page can tell of; links are not followed.
+
+    Raises
+    ------
+    SettingError
+        If it is no folder, or holds nothing of the kind.
+    """
+    if not folder.is_dir():
+        raise SettingError(f"{folder} is no folder. Name one with recordings, models, evaluations")
+    found = Found(folder)
+    for path in _files(folder):
+        try:
+            _take(found, path)
+        except (DmrlError, ValueError, OSError) as e:
+            found.unread[_name(found, path)] = str(e)
+    if not (found.recordings or found.datasets or found.documents):
+        raise SettingError(
+            f"{folder} holds no recording, dataset, model or evaluation. Try: dmrl demo"
+        )
+    return found
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Files below a folder, by name, but what is unfinished."""
+    seen = 0
+    for place, below, names in os.walk(folder):
+        inside = Path(place)
+        if len(inside.relative_to(folder).parts) >= DEEPEST:
+            below.clear()
+        below[:] = sorted(n for n in below if not n.endswith(".partial") and n != "unfinished")
+        for name in sorted(names):
+            seen += 1
+            path = inside / name
+            if seen <= MOST_FILES and not path.is_symlink():
+                yield path
+
+
+def _take(found: Found, path: Path) -> None:
+    if path.suffix == ".mcap":
+        held = summary(path)
+        name = _name(found, path)
+        found.recordings[name] = held
+        if held.provenance is not None:
+            found.made[name] = held.provenance
+    elif path.name in DOCUMENTS:
+        name = _name(found, path.parent)
+        found.documents.setdefault(DOCUMENTS[path.name], {})[name] = _document(path)
+        _remember(found, path.parent)
+    elif path.name in ("dataset_dict.json",) or path.suffix == ".parquet":
+        root = path.parent if path.suffix != ".parquet" else path.parent.parent
+        if is_dataset(root):
+            found.datasets[_name(found, root)] = root
+            _remember(found, root)
+    elif path.suffix.lower() in PICTURE_KINDS and path.parent == found.folder:
+        found.pictures.append(path)
+
+
+def _remember(found: Found, output: Path) -> None:
+    """Keep how an output folder was made."""
+    made = provenance_of(output)
+    if made is not None:
+        found.made[_name(found, output)] = made
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{path.name} is larger than {MOST_BYTES >> 20} MB")
+    document = parse_json(path.read_text(encoding="utf-8"))
+    if not isinstance(document, dict):
+        raise ValueError(f"{path.name} is no table")
+    return document
+
+
+def _name(found: Found, path: Path) -> str:
+    return path.relative_to(found.folder).as_posix() if path != found.folder else path.name

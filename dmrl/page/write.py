@@ -1,0 +1,42 @@
+"""The page as a file, in the folder that it tells of."""
+
+from pathlib import Path
+
+from dmrl.errors import OutputError
+from dmrl.output import partial_file, rewritten_file
+from dmrl.page.document import MARK
+from dmrl.page.gather import gather
+from dmrl.page.sections import page
+
+NAME = "report.html"
+
+
+def write(folder: Path, out: Path | None = None) -> Path:
+    """Write the page of a folder; a page that this has written before is written again.
+
+    Parameters
+    ----------
+    folder
+        With recordings, datasets, models or evaluations.
+    out
+        Page to write. None: report.html in the folder.
+
+    Raises
+    ------
+    SettingError
+        If the folder holds nothing of the kind.
+    MissingExtra
+        If matplotlib is not installed.
+    OutputError
+        If another file is in the way, or it cannot be written.
+    """
+    path = folder / NAME if out is None else out
+    if path.suffix != ".html":
+        raise OutputError(f"{path}: a report is a page. Call it {path.with_suffix('.html').name}")
+    again = path.is_file() and not path.is_symlink()
+    if again and not path.read_bytes()[:200].decode(errors="replace").count(MARK):
+        raise OutputError(f"{path} exists and is no report of dmrl's. Choose another name")
+    text = page(gather(folder))
+    with rewritten_file(path) if again else partial_file(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+    return path

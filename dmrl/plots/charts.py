@@ -1,0 +1,195 @@
+"""Charts for a page: SVG that is drawn in the page's own ink, light or dark."""
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.plots.style import STYLE, Figure, MaxNLocator, mpl
+
+Array = NDArray[np.float64]
+
+INK = "#010203"
+"""Stands for the page's ink, which SVG calls currentColor."""
+LINES = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#7f7f7f", "#b8a800")
+"""After Okabe and Ito; all are read on white and on black."""
+THEME = STYLE | {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.prop_cycle": f"cycler(color={LINES})",
+}
+SIZE_INCHES = (4.8, 3.6)
+
+
+@contextmanager
+def _chart(size: tuple[float, float] = SIZE_INCHES) -> Iterator[tuple[Figure, list[str]]]:
+    """A figure in the theme, and a list that gets its SVG at the end."""
+    made: list[str] = []
+    with mpl.rc_context(THEME):
+        figure = Figure(size, layout="constrained")
+        yield figure, made
+        stream = io.StringIO()
+        metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
+        figure.savefig(stream, format="svg", transparent=True, metadata=metadata)
+    svg = stream.getvalue()
+    svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
+    # The size is the page's to choose.
+    made.append(re.sub(r'(<svg[^>]*?) height="[^"]*"([^>]*?) width="[^"]*"', r"\1\2", svg, count=1))
+
+
+def _legend(axes: Any) -> None:
+    if len(axes.get_legend_handles_labels()[1]) > 1:
+        axes.legend(fontsize=8, frameon=False)
+
+
+def losses(histories: Mapping[str, Sequence[float]]) -> str:
+    """Loss over the epochs of a training, one line per model."""
+    with _chart() as (figure, made):
+        axes = figure.subplots()
+        for name, values in histories.items():
+            axes.plot(range(1, len(values) + 1), values, label=name)
+        axes.set(xlabel="epoch", ylabel="loss", yscale="log")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.grid(alpha=0.25)
+        _legend(axes)
+    return made[0]
+
+
+def by_distance(
+    figures: Mapping[str, Sequence[tuple[str, float, float, float]]], words: str
+) -> str:
+    """A figure with its interval for each range of distance, one colour per evaluation.
+
+    Parameters
+    ----------
+    figures
+        By evaluation: words of the range, value, and both ends of the interval.
+    words
+        Of the axis up.
+    """
+    with _chart() as (figure, made):
+        axes = figure.subplots()
+        ranges = list(dict.fromkeys(row[0] for rows in figures.values() for row in rows))
+        for k, (name, rows) in enumerate(figures.items()):
+            at = np.array([ranges.index(row[0]) for row in rows]) + 0.15 * (
+                k - (len(figures) - 1) / 2
+            )
+            value, low, high = np.array([row[1:] for row in rows], float).reshape(-1, 3).T
+            reach = np.maximum([value - low, high - value], 0.0)
+            axes.errorbar(at, value, reach, fmt="o", capsize=3, label=name)
+        axes.set(xticks=range(len(ranges)), xticklabels=ranges, ylabel=words, ylim=(0, None))
+        axes.set_xlabel("depth of the label, m; bars: 95 % intervals")
+        axes.grid(axis="y", alpha=0.25)
+        _legend(axes)
+    return made[0]
+
+
+def precision_recall(curves: Mapping[str, tuple[Array, Array]]) -> str:
+    """Precision over recall, one line per evaluation: (K,) recall and precision each."""
+    with _chart() as (figure, made):
+        axes = figure.subplots()
+        for name, (recall, precision) in curves.items():
+            axes.plot(recall, precision, label=name)
+        axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
+        axes.grid(alpha=0.25)
+        _legend(axes)
+    return made[0]
+
+
+def reliability(bins: Mapping[str, tuple[Array, Array, Array]]) -> str:
+    """Share of detections that are right over their confidence; honest is the diagonal.
+
+    Parameters
+    ----------
+    bins
+        By evaluation: (K,) mean confidence, share that is right, and number of detections.
+    """
+    with _chart() as (figure, made):
+        axes = figure.subplots()
+        axes.plot((0, 1), (0, 1), color=INK, linewidth=0.8, linestyle=":")
+        for k, (name, (confidence, right, count)) in enumerate(bins.items()):
+            colour = LINES[k % len(LINES)]
+            axes.plot(confidence, right, color=colour, label=name)
+            axes.scatter(confidence, right, 8 + 40 * count / max(count.max(), 1), color=colour)
+        axes.set(xlabel="confidence", ylabel="share that is right", xlim=(0, 1), ylim=(0, 1.02))
+        axes.grid(alpha=0.25)
+        _legend(axes)
+    return made[0]
+
+
+def positions(true_m: Array, estimate_m: Array, covariance: Array, kept: NDArray[np.bool_]) -> str:
+    """Where a peer was and was estimated to be, from above, with 95 % ellipses.
+
+    Parameters
+    ----------
+    true_m, estimate_m
+        (N, 2) x forward and y left of the observer, metres.
+    covariance
+        (N, 2, 2), square metres; an ellipse is drawn of some thirty.
+    kept
+        (N,) whether the estimator believes it.
+    """
+    with _chart((4.6, 4.4)) as (figure, made):
+        axes = figure.subplots()
+        for k in np.flatnonzero(kept)[:: max(1, int(kept.sum()) // 30)]:
+            axes.plot(*_turned(_ellipse(estimate_m[k], covariance[k])), color=LINES[0], alpha=0.35)
+        axes.plot(*_turned(estimate_m[kept]), ".", markersize=3, color=LINES[0], label="estimate")
+        axes.plot(*_turned(true_m), ".", markersize=1.5, color=LINES[1], label="ground truth")
+        axes.plot(0, 0, "^", color=INK, label="observer, looks up")
+        axes.set(xlabel="to the right, m", ylabel="forward, m", aspect="equal")
+        axes.grid(alpha=0.25)
+        axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return made[0]
+
+
+def _turned(xy_m: Array) -> tuple[Array, Array]:
+    """Forward is up, left is left."""
+    return -xy_m[..., 1], xy_m[..., 0]
+
+
+def _ellipse(centre_m: Array, covariance: Array, inside: float = 0.95) -> Array:
+    """(41, 2) points around what holds so much of a Gaussian."""
+    values, axes = np.linalg.eigh(covariance)
+    turn = np.linspace(0, 2 * np.pi, 41)
+    radii = np.sqrt(-2 * np.log(1 - inside) * np.maximum(values, 0.0))
+    circle = np.stack((np.cos(turn), np.sin(turn)), axis=-1)
+    return np.asarray(centre_m + (circle * radii) @ axes.T)
+
+
+def chain(columns: Sequence[Sequence[str]], arrows: Sequence[tuple[str, str]]) -> str:
+    """What was made from what: boxes in columns, from sources to results.
+
+    Parameters
+    ----------
+    columns
+        Words of the boxes, each once, from left to right.
+    arrows
+        (from, to), by words.
+    """
+    tallest = max(len(column) for column in columns)
+    with _chart((1.9 * len(columns), max(0.5 * tallest, 1.0))) as (figure, made):
+        axes = figure.subplots()
+        at = {
+            words: (x, (len(column) - 1) / 2 - y)
+            for x, column in enumerate(columns)
+            for y, words in enumerate(column)
+        }
+        for source, result in arrows:
+            (x0, y0), (x1, y1) = at[source], at[result]
+            arrow = {"arrowstyle": "->", "color": INK, "alpha": 0.5, "shrinkA": 0, "shrinkB": 0}
+            axes.annotate("", (x1 - 0.42, y1), (x0 + 0.42, y0), arrowprops=arrow)
+        box = {"boxstyle": "round", "facecolor": "none", "edgecolor": INK, "alpha": 0.6}
+        for words, (x, y) in at.items():
+            axes.text(x, y, words, ha="center", va="center", fontsize=8, bbox=box)
+        axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(-tallest / 2, tallest / 2))
+        axes.axis("off")
+    return made[0]

@@ -1,0 +1,134 @@
+"""The page of a folder shows what is there, needs nothing else, and survives odd documents."""
+
+import json
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.errors import OutputError, SettingError
+from dmrl.images.codec import encode_png
+from dmrl.page import gather, page, write
+
+Evaluation = Callable[..., dict[str, Any]]
+
+
+class _Seen(HTMLParser):
+    """Tags, the addresses in them, and the headings."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.places: list[str] = []
+        self.headings: list[str] = []
+        self._heading = False
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self._heading = tag == "h2"
+        named = ("src", "href", "xlink:href", "action", "data")
+        self.places += [value or "" for name, value in attrs if name in named]
+
+    def handle_data(self, data: str) -> None:
+        if self._heading:
+            self.headings.append(data)
+        self._heading = False
+
+
+def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None:
+    html = page(gather(outputs))
+    seen = _Seen(html)
+    wanted = ["Detections", "Positions", "Training", "Pictures", "Recordings"]
+    assert seen.headings == [*wanted, "Where it comes from"]
+    assert not seen.tags & {"script", "link", "iframe", "object", "embed", "form"}
+    assert all(place.startswith(("#", "data:image/")) for place in seen.places)
+    assert "url(" not in re.sub(r"url\(#", "", html) and "@import" not in html
+    assert "default-src 'none'" in html
+    assert html.count("<svg") >= 6 and html.count("data:image/png") == 2
+    assert "0.5 (0.5, 0.6)" in html and "24778" in html and "flight.mcap" in html
+    assert "seen from cf1; 95 % ellipses" in html
+
+
+def test_the_same_folder_gives_the_same_page(outputs: Path) -> None:
+    assert page(gather(outputs)) == page(gather(outputs))
+
+
+def test_names_and_documents_cannot_become_markup(outputs: Path, evaluation: Evaluation) -> None:
+    bad = "<script>alert(1)</script>"
+    document = evaluation(against=bad, split=bad, recording={"name": bad, "sha256": ""})
+    (outputs / "judged/evaluation.json").write_text(json.dumps(document))
+    about = json.loads((outputs / "model/model.json").read_text())
+    about["architecture"] = bad
+    (outputs / "model/model.json").write_text(json.dumps(about))
+    (outputs / "<img src=x>").mkdir()
+    (outputs / "<img src=x>/evaluation.json").write_text(json.dumps(document))
+    seen = _Seen(page(gather(outputs)))
+    assert "script" not in seen.tags and "x" not in seen.places
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"recording": None},
+        {"bands": [{}]},
+        {"curves": {"recall": "x"}},
+        {"overall": [1, 2]},
+        {"threshold": "high"},
+    ],
+)
+def test_the_rest_of_a_document_that_is_not_as_it_should_be_is_shown(
+    outputs: Path, evaluation: Evaluation, changes: dict[str, Any]
+) -> None:
+    (outputs / "judged/evaluation.json").write_text(json.dumps(evaluation(**changes)))
+    html = page(gather(outputs))
+    assert "judged" in html and "Training" in html and "Recordings" in html
+
+
+def test_a_document_that_is_none_is_named(outputs: Path) -> None:
+    (outputs / "judged/evaluation.json").write_text("{}")
+    assert "judged is not as dmrl writes it" in page(gather(outputs))
+    (outputs / "judged/evaluation.json").write_text("[1]")
+    assert "evaluation.json is no table" in page(gather(outputs))
+
+
+def test_damaged_recordings_and_pictures_are_named_and_the_rest_is_shown(outputs: Path) -> None:
+    (outputs / "cut.mcap").write_bytes((outputs / "flight.mcap").read_bytes()[:-20])
+    (outputs / "odd.png").write_bytes(b"\xff\xd8 no picture" * 30_000)
+    html = page(gather(outputs))
+    assert "cut.mcap" in html and "is cut short" in html and "Not read" in html
+    assert "odd.png" in html
+
+
+def test_large_pictures_are_made_smaller_and_the_page_stays_small(outputs: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (900, 1600, 3), np.uint8)
+    for k in range(12):
+        (outputs / f"large{k:02d}.png").write_bytes(encode_png(noise))
+    html = page(gather(outputs))
+    assert len(html) < 10_000_000
+    assert "data:image/jpeg" in html and "no room left in this page" in html
+
+
+def test_a_report_is_written_again_but_no_other_file(outputs: Path) -> None:
+    first = write(outputs)
+    assert first == outputs / "report.html"
+    before = first.read_bytes()
+    assert write(outputs).read_bytes() == before
+    other = outputs / "mine.html"
+    other.write_text("<p>mine</p>")
+    with pytest.raises(OutputError, match="no report of dmrl's"):
+        write(outputs, other)
+    with pytest.raises(OutputError, match=r"Call it page\.html"):
+        write(outputs, outputs / "page.pdf")
+    assert other.read_text() == "<p>mine</p>"
+
+
+def test_a_folder_with_nothing_to_tell_of_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="holds no recording"):
+        write(tmp_path)
+    with pytest.raises(SettingError, match="no folder"):
+        write(tmp_path / "none")
