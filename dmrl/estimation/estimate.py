@@ -18,13 +18,21 @@ from dmrl.estimation.gate import (
     statuses,
 )
 from dmrl.estimation.grading import noise_of, with_range_noise
-from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, mirrored, spread_of
+from dmrl.estimation.hypotheses import (
+    BESIDE,
+    KEPT,
+    START_STD,
+    candidates,
+    mirrored,
+    passed_by,
+    spread_of,
+)
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK, OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array, Mask, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
-from dmrl.estimation.stretches import mended
+from dmrl.estimation.stretches import joined, mended, stretches
 
 KEY_HZ = 10.0
 """Keyframes per second."""
@@ -40,6 +48,8 @@ STILL, ALIKE = 0.022, 0.04
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
+CHEAPER = 0.5
+"""A solution that costs so much less is another one, and its passes are tried again."""
 STEADY, REACH_M = 10, 0.5
 """A position is held against the medians of so many ranges before and after, and may be this
 much farther."""
@@ -135,6 +145,10 @@ def estimate_pairs(
         A position that is off by more than this is a bad one, metres.
     """
     problems = [problem(pair, KEY_HZ) for pair in pairs]
+    parts: list[list[tuple[Estimate, Estimate]]] = [[] for _ in pairs]
+    if method == "batch":
+        solve = partial(estimate_pairs, noise=noise, gate_m=gate_m)
+        parts = [solve(cut) if (cut := stretches(pair)) else [] for pair in pairs]
     out: dict[int, tuple[Estimate, Estimate]] = {}
     lengths = np.array([len(p.key_s) for p in problems], int)
     for length in np.unique(lengths):
@@ -146,10 +160,12 @@ def estimate_pairs(
             if method == "smoother":
                 made = _from_smoother(flight, noise or Noise(), *starts, covariances[:, mine])
             else:
-                made = _from_batch(flight, noise, *starts)
-            out[number] = _both(flight, made, gate_m)
-    solve = partial(estimate_pairs, method=method, noise=noise, gate_m=gate_m)
-    return [mended(pair, out[number], solve) for number, pair in enumerate(pairs)]
+                pieced = (
+                    [joined(flight, [here for here, _ in parts[number]])] if parts[number] else []
+                )
+                made = _from_batch(flight, noise, *starts, pieced)
+            out[number] = mended(_both(flight, made, gate_m), parts[number])
+    return [out[number] for number in range(len(pairs))]
 
 
 def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:
@@ -241,9 +257,11 @@ def _from_smoother(
     )
 
 
-def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Array) -> Estimate:
+def _from_batch(
+    flight: Problem, noise: Noise | None, score: Array, tracks: Array, pieced: list[Array]
+) -> Estimate:
     first = noise or Noise()
-    solutions = _solutions(flight, first, score, tracks.swapaxes(0, 1))
+    solutions = _solutions(flight, first, score, tracks.swapaxes(0, 1), pieced)
     best = solutions[0]
     costs, states = zip(*((s.cost, s.state[:, :3]) for s in solutions), strict=True)
     apart = spread_of(np.array(costs), np.stack(states))
@@ -259,8 +277,10 @@ def _from_batch(flight: Problem, noise: Noise | None, score: Array, tracks: Arra
     return Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)
 
 
-def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> list[Solution]:
-    """What the likely starts (S, K, 5) lead to, best first.
+def _solutions(
+    flight: Problem, noise: Noise, score: Array, tracks: Array, pieced: list[Array]
+) -> list[Solution]:
+    """What the likely starts (S, K, 5) lead to, and those joined of stretches (K, 6), best first.
 
     Even starts that look alike half-way may pass the peer on different sides: all are solved that
     are not hopeless, each until it comes to a solution that another one led to.
@@ -272,13 +292,27 @@ def _solutions(flight: Problem, noise: Noise, score: Array, tracks: Array) -> li
         if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
             begun.append(start)
             found.append(solve_batch(flight, noise, *_start(flight, start), found, ROUGH))
+    found += [solve_batch(flight, noise, start, known=found, tolerance=ROUGH) for start in pieced]
     best = min(found, key=lambda s: s.cost)
     # What stuck on its way may come free once all that is constant starts from zero again.
     found.append(solve_batch(flight, noise, best.state, known=found, tolerance=ROUGH))
     best = min(found, key=lambda s: s.cost)
     for start in mirrored(best.state, KEY_HZ):
         found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
-    return sorted(found, key=lambda s: s.cost)
+    return sorted(_passed_by(flight, noise, found), key=lambda s: s.cost)
+
+
+def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Solution]:
+    """Solutions, and what the best leads to with the peer past the observer on the other side."""
+    found, best, tried = [*found], None, 0
+    while best is None or min(s.cost for s in found) < best.cost - CHEAPER:
+        best = min(found, key=lambda s: s.cost)
+        for start in passed_by(best.state, KEY_HZ)[: BESIDE - tried]:
+            tried += 1
+            found.append(solve_batch(flight, noise, start, best.constants, found, ROUGH))
+            if found[-1].cost < best.cost - CHEAPER:
+                break
+    return found
 
 
 def _start(flight: Problem, track: Array) -> tuple[Array, Array]:

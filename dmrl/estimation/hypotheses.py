@@ -25,6 +25,10 @@ PASS_M = 0.35
 """Two passes nearer than this leave open on which side the peer was in between."""
 MIRRORED = 4
 """Stretches between passes that are tried on the other side, the shortest."""
+BESIDE_M, ROUND_M = 0.5, 0.4
+"""A pass nearer than this may have been on the other side; it begins and ends so much farther."""
+BESIDE = 6
+"""So often this is tried, the nearest passes first."""
 COST_UNIT = 4.0
 """Costs of solutions differ by this much for no good reason: the robust loss and the noise are
 not quite the sensors'. A solution that costs this much more counts 1 / e of the better one."""
@@ -146,5 +150,32 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
         aside = QUARTER @ way / max(float(np.hypot(*way)), 1e-6)
         copy = state.copy()
         copy[start:end, :2] -= 2 * np.outer(copy[start:end, :2] @ aside, aside)
+        out.append(copy)
+    return out
+
+
+def passed_by(state: Array, rate_hz: float) -> list[Array]:
+    """Copies of a solution, each with the peer going past the observer on the other side once.
+
+    Parameters
+    ----------
+    state
+        (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m).
+    rate_hz
+        Keyframes per second.
+    """
+    distance, second = np.hypot(*state[:, :2].T), round(rate_hz)
+    least = minimum_filter1d(distance, 2 * second + 1)
+    passes = np.flatnonzero((distance == least) & (distance < BESIDE_M))
+    out = []
+    for at in passes[np.argsort(distance[passes])].tolist():
+        farther = np.flatnonzero(distance > distance[at] + ROUND_M)
+        start = int(farther[farther < at].max(initial=-1)) + 1
+        end = int(farther[farther > at].min(initial=len(state)))
+        way = state[min(at + 2, len(state) - 1), :2] - state[max(at - 2, 0), :2]
+        aside = QUARTER @ way / max(float(np.hypot(*way)), 1e-6)
+        near = np.cos((distance[start:end] - distance[at]) / ROUND_M * np.pi / 2)
+        copy = state.copy()
+        copy[start:end, :2] -= np.outer(2 * near * (copy[start:end, :2] @ aside), aside)
         out.append(copy)
     return out

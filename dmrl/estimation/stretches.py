@@ -1,26 +1,31 @@
-"""A flight whose ranges were silent for long, stretch by stretch.
+"""A flight in which ranges or odometry were silent for long, stretch by stretch.
 
-Through a silence of half a minute dead reckoning is off by a metre, and what comes after may fit
-a wrong side of the observer as well as the right one. So every stretch with ranges is solved by
-itself too. Where a stretch alone is sure and the whole flight contradicts it, the stretch counts.
+Through a silence dead reckoning is off by a metre, and what comes after may fit a wrong side of the
+observer as well as the right one. So every stretch between silences is solved by itself too, and
+they are joined to a start of the whole flight's solve. Where a stretch alone is sure all the same
+and the whole flight contradicts it, the stretch counts.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import chi2
 
+from dmrl.estimation.confidence import path_of
 from dmrl.estimation.gate import OK
-from dmrl.estimation.pair import Mask, Pair, Track
+from dmrl.estimation.motion import rotation
+from dmrl.estimation.pair import Array, Mask, Pair, Track
+from dmrl.estimation.problem import Problem
 
 if TYPE_CHECKING:
     from dmrl.estimation.estimate import Estimate
 
-SILENCE_S = 5.0
-"""Ranges that are silent for so long part a flight."""
-LEAST_S = 10.0
+SILENCE_S = 3.0
+"""Ranges or odometry that are silent for so long part a flight."""
+LEAST_S, LEAST_RANGES = 10.0, 20
 """Shorter stretches tell nothing by themselves."""
 INSIDE, CONTRADICTED = 0.99, 0.2
 """A solution is not believed where more than this share of another's sure positions lie outside
@@ -48,38 +53,83 @@ def contradicts(whole: "Estimate", sure: "Estimate") -> bool:
 
 
 def stretches(pair: Pair) -> list[Pair]:
-    """The parts of a flight between long silences of its ranges; none where there is no such one.
+    """The parts of a flight between long silences; none where there is no such silence.
 
     Parameters
     ----------
     pair
         What both measured.
     """
-    edges = np.flatnonzero(np.diff(pair.range_time_s) > SILENCE_S)
-    if not len(edges):
+    heard_s = np.concatenate([pair.time_s[:1], pair.range_time_s, pair.time_s[-1:]])
+    after = np.searchsorted(heard_s[1:-1], pair.time_s) + 1
+    silent = heard_s[after] - heard_s[after - 1] > SILENCE_S
+    edges = np.diff(np.concatenate([[False], pair.own.gap | pair.peer.gap, [False]]).astype(int))
+    for start, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        if (end - start) * pair.dt_s > SILENCE_S:
+            silent[start:end] = True
+    if not silent.any():
         return []
-    starts = np.concatenate([[pair.time_s[0]], pair.range_time_s[edges + 1]])
-    ends = np.concatenate([pair.range_time_s[edges], [pair.time_s[-1]]])
-    return [_cut(pair, a, b) for a, b in zip(starts, ends, strict=True) if b - a >= LEAST_S]
+    ends = np.flatnonzero(np.diff(np.concatenate([[True], silent, [True]]).astype(int)))
+    parts = [(pair.time_s[a], pair.time_s[b - 1]) for a, b in ends.reshape(-1, 2)]
+    made = [_cut(pair, a, b) for a, b in parts if b - a >= LEAST_S]
+    return [part for part in made if len(part.range_m) >= LEAST_RANGES]
+
+
+def joined(flight: Problem, parts: "Sequence[Estimate]") -> Array:
+    """(K, 6) states of a flight that stretches of it say, by dead reckoning in between.
+
+    Parameters
+    ----------
+    flight
+        The whole flight.
+    parts
+        Solutions of one stretch or more, in order of time.
+    """
+    key_s, (heading, place), (turned, way) = flight.key_s, path_of(flight.own), path_of(flight.peer)
+    ways = []
+    for part in parts:
+        at = np.flatnonzero((key_s >= part.time_s[0]) & (key_s <= part.time_s[-1]))
+        columns = (*part.state[:, :2].T, np.unwrap(part.state[:, 2]))
+        known = np.column_stack([np.interp(key_s[at], part.time_s, c) for c in columns])
+        seen = _apply(rotation(heading[at]), known[:, :2]) + place[at]
+        # Before and after it, the peer goes on as its log says, from either end.
+        near = np.clip(np.arange(len(key_s)), at[0], at[-1]) - at[0]
+        turn = (heading[at] + known[:, 2] - turned[at])[near]
+        there = seen[near] + _apply(rotation(turn), way - way[at][near])
+        ways.append((at[0], at[-1], np.column_stack([there, turn + turned - heading])))
+    state = ways[0][2]
+    for (_, last, _), (first, _, track) in pairwise(ways):
+        track[:, 2] += 2 * np.pi * np.round((state[first, 2] - track[first, 2]) / (2 * np.pi))
+        share = np.clip((np.arange(len(key_s)) - last) / (first - last), 0.0, 1.0)[:, None]
+        state = (1 - share) * state + share * track
+    xy = _apply(rotation(-heading), state[:, :2] - place)
+    return np.column_stack([xy, state[:, 2], np.zeros((len(key_s), 2)), _errors(key_s, parts)])
+
+
+def _errors(key_s: Array, parts: "Sequence[Estimate]") -> Array:
+    """(K,) by how much ranges were too long, as the stretches found; 0 between them."""
+    out = np.zeros(len(key_s))
+    for part in parts:
+        at = (key_s >= part.time_s[0]) & (key_s <= part.time_s[-1])
+        if part.range_error_m is not None:
+            out[at] = np.interp(key_s[at], part.time_s, part.range_error_m)
+    return out
 
 
 def mended(
-    pair: Pair,
-    both: "tuple[Estimate, Estimate]",
-    solve: "Callable[[list[Pair]], list[tuple[Estimate, Estimate]]]",
+    both: "tuple[Estimate, Estimate]", parts: "Sequence[tuple[Estimate, Estimate]]"
 ) -> "tuple[Estimate, Estimate]":
     """Both directions of a pair, with the stretches that are surer alone.
 
     Parameters
     ----------
-    pair, both
-        What was measured, and the solution of the whole flight.
-    solve
-        How pairs are solved.
+    both
+        The solution of the whole flight.
+    parts
+        Those of its stretches.
     """
     here, there = both
-    parts = stretches(pair)
-    for own, peer in solve(parts) if parts else ():
+    for own, peer in parts:
         if contradicts(here, own) or contradicts(there, peer):
             here, there = _with(here, own), _with(there, peer)
     return here, there
@@ -114,3 +164,7 @@ def _cut_track(track: Track, at: Mask) -> Track:
     vx, vy, yaw_rate, height = (signal[at] for signal in track.values())
     silent = None if track.height_gap is None else track.height_gap[at]
     return Track(vx, vy, yaw_rate, height, track.gap[at], silent)
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.hypotheses import COST_UNIT, mirrored, spread_of
+from dmrl.estimation.hypotheses import COST_UNIT, mirrored, passed_by, spread_of
 
 HERE = np.zeros((4, 3))
 THERE = np.tile([1.0, 0.0, 0.0], (4, 1))
@@ -45,3 +45,25 @@ def test_between_two_close_passes_the_peer_is_put_on_the_other_side() -> None:
 def test_without_close_passes_nothing_is_mirrored() -> None:
     far = np.tile([2.0, 0.0, 0.0, 0.0, 0.0], (200, 1))
     assert mirrored(far, 10.0) == []
+
+
+def test_a_pass_is_tried_on_the_other_side_and_the_rest_of_the_flight_stays() -> None:
+    time_s = np.arange(0, 20, 0.1)
+    state = np.zeros((len(time_s), 6))
+    state[:, 0], state[:, 1] = 0.5 * (time_s - 10), 0.2  # straight past, 0.2 m to the left
+    (copy,) = passed_by(state, 10.0)
+    nearest = int(np.argmin(np.abs(time_s - 10)))
+    assert copy[nearest, :2] == pytest.approx([0.0, -0.2], abs=1e-9)
+    moved = time_s[(copy != state).any(axis=1)]
+    assert 8.5 < moved.min() < 9.5 and 10.5 < moved.max() < 11.5
+    assert np.abs(np.diff(copy[:, 1])).max() < 0.1  # a way that can be flown
+
+
+def test_the_nearest_pass_is_tried_first_and_a_far_one_not_at_all() -> None:
+    time_s = np.arange(0, 30, 0.1)
+    state = np.zeros((len(time_s), 6))
+    state[:, 0], state[:, 1] = 2 * np.cos(np.pi * time_s / 10), np.interp(time_s, [0, 30], [0.6, 0])
+    copies = passed_by(state, 10.0)  # passes at 5, 15 and 25 s, 0.5, 0.3 and 0.1 m off
+    changed = [float(time_s[(copy != state).any(axis=1)].mean()) for copy in copies]
+    assert [round(at / 5) * 5 for at in changed][:2] == [25, 15]
+    assert passed_by(np.tile([2.0, 0.0, 0.0, 0.0, 0.0, 0.0], (200, 1)), 10.0) == []

@@ -5,10 +5,10 @@ import numpy as np
 from dmrl.estimation.estimate import Estimate
 from dmrl.estimation.gate import OK, UNCONVERGED
 from dmrl.estimation.pair import Pair
-from dmrl.estimation.problem import GLOBALS, Noise
-from dmrl.estimation.stretches import contradicts, mended, stretches
+from dmrl.estimation.problem import GLOBALS, Noise, problem
+from dmrl.estimation.stretches import contradicts, joined, mended, stretches
 
-from .flights import flown, pair_of
+from .flights import flown, pair_of, truth_at
 
 
 def silent(pair: Pair, start_s: float, end_s: float) -> Pair:
@@ -36,16 +36,40 @@ def test_long_silences_of_the_ranges_part_a_flight() -> None:
     assert len(stretches(silent(pair, 5.0, 20.0))) == 1  # five seconds tell nothing
 
 
+def test_silent_odometry_parts_a_flight_too() -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 60.0))
+    gap = (pair.time_s > 20.0) & (pair.time_s < 25.0)
+    early, late = stretches(replace(pair, peer=replace(pair.peer, gap=gap)))
+    assert early.time_s[-1] <= 20.1 and late.time_s[0] >= 24.9
+    short = (pair.time_s > 20.0) & (pair.time_s < 22.0)
+    assert stretches(replace(pair, peer=replace(pair.peer, gap=short))) == []
+
+
+def test_stretches_are_joined_by_dead_reckoning() -> None:
+    flight = flown("in_view", "ideal", 1000, 60.0)
+    pair = pair_of(flight)
+    whole, cut = problem(pair), silent(pair, 20.0, 40.0)
+    yaw = [flight.truth[name].yaw_at(whole.key_s) for name in ("cf1", "cf2")]
+    truth = np.column_stack([truth_at(flight, whole.key_s), yaw[1] - yaw[0]])
+    parts = []
+    for number, part in enumerate(stretches(cut)):
+        at = (whole.key_s >= part.time_s[0]) & (whole.key_s <= part.time_s[-1])
+        turned = truth[at] + [0.0, 0.0, 2 * np.pi * number]  # which turn of the circle is nobody's
+        parts.append(replace(standing(whole.key_s[at], 0.0), state=turned))
+    state = joined(whole, parts)
+    assert np.abs(state[:, :2] - truth[:, :2]).max() < 0.02
+    assert np.abs(np.sin(state[:, 2] - truth[:, 2])).max() < 0.02
+    assert np.abs(np.diff(state[:, 2])).max() < 0.5
+
+
 def test_a_stretch_that_is_sure_counts_against_the_whole_flight() -> None:
     pair = silent(pair_of(flown("in_view", "calibrated", 1000, 60.0)), 20.0, 40.0)
     key_s = np.arange(0.0, 60.0, 0.1) + pair.time_s[0]
     whole = standing(key_s, 1.0)
-
-    def solve(parts: list[Pair]) -> list[tuple[Estimate, Estimate]]:
-        late = standing(parts[1].time_s, -1.0)
-        return [(standing(parts[0].time_s, 1.0),) * 2, (late, late)]
-
-    here, there = mended(pair, (whole, whole), solve)
+    early, late = (
+        standing(part.time_s, x) for part, x in zip(stretches(pair), (1.0, -1.0), strict=True)
+    )
+    here, there = mended((whole, whole), [(early, early), (late, late)])
     after = key_s > 40.5
     assert (here.state[after, 0] == -1.0).all() and (here.state[key_s < 39.0, 0] == 1.0).all()
     assert (there.state[after, 0] == -1.0).all()
