@@ -3,6 +3,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy.stats import chi2
 
 from dmrl.estimation.identity import Identity
@@ -267,3 +268,42 @@ def test_a_track_moves_against_the_observer() -> None:
     # Ahead by 2 + 0.25 - 0.4 and left by 0.3 - 0.1; after a quarter turn left that is right.
     assert track.position_m == pytest.approx([0.2, -1.85, -0.05])
     assert track.velocity_mps == pytest.approx([0.0, -0.5, -0.2])
+
+
+def test_a_depth_s_own_deviation_counts_by_its_share_of_the_depth() -> None:
+    view = View(np.zeros((3, 2)), np.array([2.0, 4.0, 1.0]), 0.0, 0.0, np.array([0.3, 0.3, 0.0]))
+    noise = Tracker(AIDECK, TUNING)._of_depth(view)
+    assert np.sqrt(noise[:, 2, 2]) == pytest.approx([0.15, 0.075, TUNING.depth_std_ratio])
+    assert noise[:, :2].max() == noise[:, 2, :2].max() == 0.0
+
+
+def test_a_new_track_is_as_unsure_as_detections_that_are_drawn() -> None:
+    tracker, rng, count = Tracker(AIDECK, replace(TUNING, pixel_std_px=2.0)), default_rng(0), 4_000
+    true, tilt = np.array([[1.6, 0.3, -0.2]]), np.array([0.1, -0.05])
+    uv, depth_m, _ = pixels_from_horizontal(true, tilt[:1], tilt[1:], AIDECK)
+    tracker.step(STILL, View(uv, depth_m, *tilt.tolist()))
+    (track,) = tracker.tracks
+    bias = rng.normal(0, TUNING.depth_bias_ratio, count)
+    white = rng.normal(0, TUNING.depth_std_ratio, count)
+    pixels = uv + rng.normal(0, 2.0, (count, 2))
+    roll, pitch = (tilt[:, None] + rng.normal(0, TUNING.attitude_std_rad, (2, count))).tolist()
+    drawn = horizontal_from_pixels(
+        pixels, depth_m * (1 - bias - white), np.array(roll), np.array(pitch), AIDECK
+    )
+    seen = np.cov(np.column_stack([drawn, bias]).T)
+    told = track.filter.P[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])]
+    assert told == pytest.approx(seen, rel=0.15, abs=1e-3)
+    assert np.diag(track.filter.P)[3:6] == pytest.approx(TUNING.speed_std_mps**2)
+
+
+def test_the_gate_lets_its_share_of_a_peer_s_own_detections_through() -> None:
+    tracker, rng = Tracker(AIDECK, replace(TUNING, gate=0.9)), default_rng(1)
+    spread = np.array([[16.0, 3.0, 0.1], [3.0, 9.0, 0.0], [0.1, 0.0, 0.02]])
+    off = rng.multivariate_normal(np.zeros(3), spread, 5000)
+    gain = tracker._likelihood(off, np.tile(spread, (5000, 1, 1)))
+    assert np.isfinite(gain).mean() == pytest.approx(0.9, abs=0.015)
+    # At its middle: how much likelier a detection is from a track than a false alarm.
+    best = tracker._likelihood(np.zeros((1, 3)), spread[None])
+    alarms = TUNING.false_per_image / (AIDECK.width_px * AIDECK.height_px * np.log(20))
+    wanted = TUNING.detection_share / alarms / np.sqrt(np.linalg.det(2 * np.pi * spread))
+    assert best == pytest.approx(np.log(wanted))
