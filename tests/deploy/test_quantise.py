@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dmrl.deploy import reference
 from dmrl.deploy.backends import Float, integer
 from dmrl.deploy.equalise import equalise
-from dmrl.deploy.graph import FloatConv, Graph, outputs_of, tensors_of, to_input
+from dmrl.deploy.graph import FloatConv, Graph, grey_of, outputs_of, tensors_of, to_input
 from dmrl.deploy.integer import Conv
 from dmrl.deploy.layers import layer_figures
 from dmrl.deploy.quantise import About, _fixed_point, quantise
@@ -146,3 +147,29 @@ def test_a_factor_is_31_bits_and_a_shift(factor: float) -> None:
 def test_a_factor_just_below_a_power_of_two_is_carried_to_it(power: int) -> None:
     (multiplier,), (shift,) = _fixed_point(np.array([np.nextafter(2.0**power, 0)]))
     assert (multiplier, shift) == (2**30, 30 - power)
+
+
+def test_the_largest_value_that_was_seen_has_the_last_level() -> None:
+    """Unsigned tensors use all of 0 to 255, signed ones -127 to 127."""
+    rng = np.random.default_rng(2)
+    first = small().layers[0]
+    assert isinstance(first, FloatConv)
+    second = FloatConv("second", (1,), rng.normal(0, 0.5, (4, 4, 1, 1)), np.zeros(4))
+    head = FloatConv("head", (2,), rng.normal(0, 0.5, (2, 4, 1, 1)), np.array([0.1, -2.0]))
+    graph = Graph((first, second, head), ((3, 0), (3, 1)))
+    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
+    tensors = [list(reference.tensors_of(network, image)) for image in NOISE]
+    unsigned, signed = (np.stack([t[k] for t in tensors]) for k in (1, 2))
+    assert (unsigned.min(), unsigned.max()) == (0, pytest.approx(255, abs=2))
+    assert np.abs(signed).max() == pytest.approx(127, abs=2)
+    assert signed.min() < 0
+
+
+def test_ranges_are_those_of_all_images_and_grey_networks_see_grey() -> None:
+    together, alone = (calibrate(small(), batches) for batches in ([NOISE[:1], NOISE[1:]], [NOISE]))
+    for one, other in ((together.low, alone.low), (together.high, alone.high)):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert (together.images, together.height_px, together.width_px) == (3, 16, 24)
+    grey = calibrate(small().grey(), [NOISE])
+    assert grey.high[0].tolist() == [float(to_input(grey_of(NOISE)).max())]

@@ -10,7 +10,7 @@ from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import FloatConv, Graph, tensors_of, to_input
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
-from dmrl.deploy.rounding import LARGEST, moments_of, rounded
+from dmrl.deploy.rounding import LARGEST, _rounded, moments_of, rounded
 
 from .graphs import random_graph
 
@@ -82,3 +82,10 @@ def test_random_networks_lose_less_than_by_nearest_weights() -> None:
         ]
         gained_db.append(10 * np.log10(lost[0] / lost[1]))
     assert np.median(gained_db) > 0.5
+
+
+def test_weights_stay_within_seven_bits_and_a_sign() -> None:
+    wanted = np.array([[-127.4, -127.4, -140.0, 200.0, 3.0]])
+    together = np.full((5, 5), 0.9) + 0.1 * np.eye(5)  # what one lost, the next makes good
+    levels = _rounded(wanted, together)
+    assert np.abs(levels[:, :-1]).max() == LARGEST == 127

@@ -8,7 +8,7 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats import mapped_csv
-from dmrl.formats.column_map import read_map
+from dmrl.formats.column_map import QUANTITIES, read_map
 from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
 from dmrl.formats.log_block import euler_zyx
@@ -222,3 +222,16 @@ def test_flights_of_nanobench_are_known_and_agree_with_vicon(
     assert np.median(np.linalg.norm(world - true, axis=1)) < 0.12
     assert min(np.corrcoef(world[:, k], true[:, k])[0, 1] for k in (0, 1)) > 0.97
     assert np.ptp(place[:, 0]) > 1
+
+
+def test_units_are_what_they_are_called() -> None:
+    degree = np.pi / 180
+    for quantity, units in {
+        "yaw": {"rad": 1, "deg": degree},
+        "gyro_z": {"rad/s": 1, "deg/s": degree},
+        "height": {"m": 1, "cm": 0.01, "mm": 0.001},
+        "vx": {"m/s": 1, "cm/s": 0.01, "mm/s": 0.001},
+        "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1},
+        "qw": {"1": 1},
+    }.items():
+        assert QUANTITIES[quantity] == pytest.approx(units)

@@ -150,3 +150,14 @@ def test_images_without_robots_or_boxes_can_be_varied_too() -> None:
 def test_nothing_is_nothing() -> None:
     assert Augmentation().is_nothing
     assert not replace(Augmentation(), flip_share=0.1).is_nothing
+
+
+def test_every_epoch_varies_images_anew_and_noise_is_no_louder_than_asked_for() -> None:
+    grey = Examples(
+        [np.full((1, 112, 160, 3), 128, np.uint8)], np.full((1, 1, len(FIELDS)), np.nan, np.float32)
+    )
+    maker = Augmenter(grey, Augmentation(noise=0.05), seed=0)
+    first, second = (maker.batch([0] * 8, epoch=epoch, index=0).images for epoch in (0, 1))
+    assert not torch.equal(first, second)
+    loud = first.float().sub(128).std(dim=(1, 2, 3)) / 255
+    assert 0.5 * 0.05 < loud.max() < 1.02 * 0.05  # anything up to what is asked for

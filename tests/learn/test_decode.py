@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -80,3 +81,22 @@ def test_depth_error_and_class_are_those_of_the_peak() -> None:
     silent = decode(confidence, np.full((1, 4, 9), 2.0), offset)
     assert not silent.sigma_depth_m.any()
     assert not silent.class_id.any()
+
+
+@pytest.mark.parametrize(("away_px", "count"), [(7.99, 1), (8.0, 2)])
+def test_detections_nearer_than_a_cell_are_one(away_px: float, count: int) -> None:
+    confidence, offset = np.zeros((1, 4, 9)), np.zeros((1, 2, 4, 9))
+    confidence[0, 1, [1, 3]] = 0.9, 0.8
+    offset[0, 0, 1, 3] = away_px / 8 - 2
+    assert decode(confidence, np.ones((1, 4, 9)), offset).count.tolist() == [count]
+
+
+@pytest.mark.parametrize(("least", "count"), [(0.3, 2), (0.31, 1), (0.0, 3), (-1.0, 3)])
+def test_peaks_below_the_least_confidence_are_dropped(least: float, count: int) -> None:
+    confidence = np.full((1, 1, 9), 0.01)
+    confidence[0, 0, [0, 4]] = 0.5, 0.3
+    confidence[0, 0, 6:] = 0.0, 0.2, 0.0
+    confidence[0, 0, 7] = 0.2 if least <= 0 else 0.0
+    confidence[0, 0, [1, 2, 3, 5]] = 0.0
+    found = decode(confidence, np.ones((1, 1, 9)), min_confidence=least)
+    assert found.count[0] == count

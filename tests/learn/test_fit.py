@@ -17,7 +17,7 @@ from dmrl.learn.fit import Training, device_of, learning_rate_at, new_network
 from dmrl.learn.model import Model, save_model
 from dmrl.learn.network import Network, build
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.step import losses
+from dmrl.learn.step import Average, losses, train_step
 from dmrl.learn.validate import best_threshold, scores
 
 PUBLISHED = recipe.load("locanet", "train", FitSettings)
@@ -331,3 +331,53 @@ def test_a_missing_cuda_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device_of("auto").type == "cpu"
     with pytest.raises(SettingError, match="no CUDA device here"):
         device_of("cuda")
+
+
+def test_a_mean_of_weights_follows_the_first_steps_and_forgets_slowly_later() -> None:
+    network = build("dmrl-nano")
+    mean = Average(network, 100)
+    expected = 0.0
+    for step in range(1, 300):
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.fill_(float(step))
+        mean.update(step)
+        share = min(1.0, max(1 / 100, 10 / (9 + step)))
+        expected += share * (step - expected)
+        if step in (1, 2, 50, 299):
+            for parameter in mean.network.parameters():
+                assert float(parameter.flatten()[0]) == pytest.approx(expected, rel=1e-4)
+    assert float(next(mean.network.parameters()).flatten()[0]) < 299 - 20
+
+
+def test_a_teacher_s_share_of_the_loss_is_the_one_that_is_asked_for(examples: Examples) -> None:
+    settings = replace(SETTINGS, architecture="dmrl-nano")
+    pupil, teacher = (build("dmrl-nano", seed=seed).eval() for seed in (1, 2))
+    batch = gathered(examples, [0, 1])
+    with torch.no_grad():
+        alone = losses(pupil, batch, settings)
+        none, half, all_ = (
+            losses(pupil, batch, replace(settings, distill_share=share), teacher)
+            for share in (0.0, 0.25, 1.0)
+        )
+    torch.testing.assert_close(none, alone)
+    assert not torch.allclose(all_, alone)
+    torch.testing.assert_close(half, 0.75 * none + 0.25 * all_)
+
+
+def test_gradients_of_one_step_are_gone_before_the_next(examples: Examples) -> None:
+    network = build("locanet").train()
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.0)
+    batch = gathered(examples, [0, 1])
+    sizes = []
+    for _ in range(2):
+        train_step(network, optimizer, batch, SETTINGS, 0.0)
+        sizes.append([float(p.grad.norm()) for p in network.parameters() if p.grad is not None])
+    assert sizes[1] == pytest.approx(sizes[0], rel=1e-3)
+
+
+def test_every_epoch_has_an_order_of_its_own(examples: Examples, tmp_path: Path) -> None:
+    training = Training(new_network(SETTINGS, examples), examples, SETTINGS, tmp_path)
+    seen = [torch.cat([b.images for b in training._batches(epoch)]) for epoch in (0, 0, 1)]
+    assert torch.equal(seen[0], seen[1])
+    assert not torch.equal(seen[0], seen[2])

@@ -136,3 +136,17 @@ def test_a_term_is_nothing_to_a_network_that_lacks_its_channels() -> None:
     )
     assert {name for name, part in parts.items() if not part} >= {"offset_loss", "class_loss"}
     assert parts["confidence_loss"] > 0
+
+
+def test_a_spread_below_a_hundredth_is_one() -> None:
+    one = torch.ones(1, 1, 1)
+    low, least = (spread_loss(x * one, 0 * one, one, one) for x in (-20.0, math.log(0.01)))
+    assert float(low) == float(least) == pytest.approx(math.log(0.01))
+
+
+@pytest.mark.parametrize("focus", [0.5, 1.0, 3.0])
+def test_the_focus_is_an_exponent(focus: float) -> None:
+    logit, label = torch.tensor([[[0.5]]]), torch.tensor([[[0.9]]])
+    wrong = abs(0.9 - 1 / (1 + math.exp(-0.5)))
+    plain = float(confidence_loss(logit, label, focus=0.0))
+    assert float(confidence_loss(logit, label, focus=focus)) == pytest.approx(plain * wrong**focus)

@@ -55,3 +55,12 @@ def test_a_step_of_muon_is_as_large_as_one_of_adam_and_downhill() -> None:
 def test_without_weight_decay_adam_is_the_papers() -> None:
     assert type(new_optimizer(build("locanet"), "adam", 0.0)) is torch.optim.Adam
     assert type(new_optimizer(build("locanet"), "adam", 0.1)) is torch.optim.AdamW
+
+
+@pytest.mark.parametrize("name", ["adam", "muon"])
+def test_only_kernels_decay(name: str) -> None:
+    network = build("dmrl-nano")
+    groups = new_optimizer(network, name, 0.01).param_groups  # type: ignore[arg-type]
+    decays = {id(p): group["weight_decay"] for group in groups for p in group["params"]}
+    for parameter in network.parameters():
+        assert decays[id(parameter)] == (0.01 if parameter.ndim > 1 else 0.0)

@@ -91,3 +91,20 @@ def test_a_teacher_is_learnt_where_it_sees_a_robot_and_where_it_doubts() -> None
     assert torch.nonzero(got.weight[0]).tolist() == [[3, 5]]
     assert got.depth_m[0, 3, 5] == pytest.approx(np.exp(0.5))
     assert got.offset[0, :, 3, 5].tolist() == pytest.approx([0.2, -0.1])
+
+
+def test_presence_is_a_gaussian_of_the_distance_in_cells() -> None:
+    got = targets(robots((100.0, 100.0, 1.0)), SHAPE, sigma_cells=0.7).confidence[0]
+    for row, col in ((12, 12), (12, 13), (11, 11), (13, 10)):
+        away = np.hypot(8 * (col + 0.5) - 100, 8 * (row + 0.5) - 100) / 8
+        assert got[row, col] == pytest.approx(np.exp(-0.5 * (away / 0.7) ** 2), rel=1e-5)
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_a_label_counts_by_the_square_of_its_sigma(times: float) -> None:
+    noisy = robots((100.0, 100.0, 2.0, 8 * times, 8 * times, 0.3))
+    exact = targets(noisy, SHAPE, sigma_cells=0.7)
+    got = targets(noisy, SHAPE, sigma_cells=0.7, label_noise="weight")
+    torch.testing.assert_close(got.offset_weight, exact.offset_weight / (1 + times**2))
+    # 0.3 m of 2 m is one and a half times what counts half.
+    torch.testing.assert_close(got.weight, exact.weight / (1 + 1.5**2))

@@ -12,7 +12,8 @@ from dmrl.formats import cpx
 from dmrl.formats.cpx import Image
 from dmrl.formats.cpx_pack import pack_image
 from dmrl.formats.cpx_packets import APP, GAP8, HOST, Packet, pack_packet
-from dmrl.live.camera import GARBAGE_BYTES, CameraClient, address
+from dmrl.formats.cpx_state import State
+from dmrl.live.camera import GARBAGE_BYTES, CameraClient, _Times, address
 from dmrl.live.clocks import HostTime
 from dmrl.live.feed import Feed, Received
 
@@ -132,3 +133,21 @@ def test_images_that_did_not_come_are_counted_by_their_numbers() -> None:
         before = camera._count(replace(RAW, frame_id=number), before)
     assert camera.health.lost == 3  # 256, 257 and 258
     assert before == 300
+
+
+def test_the_best_clock_that_a_camera_tells_counts_and_nothing_is_of_the_future() -> None:
+    known: dict[float, int] = {}
+    times = _Times(known.get)
+    # Its robot's clock was at 4 ms when the camera's was at 0; the picture is of 1 ms later.
+    robot = replace(RAW, time_us=1_000, state=State(robot_ms=4, received_us=0))
+    assert robot.robot_time_us == 5_000
+    assert times(robot, 10**9) == 10**9  # the robot's clock is not known yet: the camera's own
+    known[5.0] = 123_000_000
+    assert times(robot, 2 * 10**9) == 123_000_000
+    own = _Times(known.get)
+    first = own(replace(RAW, time_us=1_000_000), 5 * 10**9)
+    assert first == 5 * 10**9
+    # A second later by the camera; it came 0.4 s earlier than the first had let expect.
+    assert own(replace(RAW, time_us=2_000_000), 5_600_000_000) == 5_600_000_000
+    assert own(replace(RAW, time_us=2_100_000), 5_800_000_000) == 5_700_000_000
+    assert own(RAW, 7 * 10**9) == 7 * 10**9  # nothing told: when it came

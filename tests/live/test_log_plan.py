@@ -4,7 +4,7 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.live.fake_crazyflie import LOG_TYPES
-from dmrl.live.log_plan import BLOCK_BYTES, SIZES, Reading, number_of, plan
+from dmrl.live.log_plan import BLOCK_BYTES, BLOCKS_MAX, SIZES, Reading, number_of, plan
 
 TOC = {
     **{f"stateEstimate.{name}": "float" for name in ("roll", "pitch", "yaw", "vx", "vy", "z")},
@@ -90,3 +90,20 @@ def test_values_that_are_no_numbers_are_left_out() -> None:
 
 def test_robots_are_numbered_by_the_end_of_their_names() -> None:
     assert [number_of(name) for name in ("cf2", "drone10", "leader")] == [2, 10, None]
+
+
+def test_a_block_is_as_long_as_cflib_lets_it_be() -> None:
+    assert pytest.importorskip("cflib.crazyflie.log").LogConfig.MAX_LEN == BLOCK_BYTES
+    assert pytest.importorskip("cflib.crazyflie.log").Log.MAX_BLOCKS == BLOCKS_MAX
+
+
+def test_turning_about_the_vertical_is_found_at_any_tilt() -> None:
+    reading = Reading("cf1", plan(TOC, {}, 10))
+    for roll_deg, pitch_deg in ((20.0, 0.0), (0.0, 15.0), (-25.0, 10.0)):
+        # The log's pitch is nose up, and the body's rates are those of Ry(pitch) Rx(roll).
+        roll, pitch = math.radians(roll_deg), -math.radians(pitch_deg)
+        values = LEVEL | {"stateEstimate.roll": roll_deg, "stateEstimate.pitch": pitch_deg}
+        values |= {"gyro.y": 60 * math.cos(pitch) * math.sin(roll)}
+        values |= {"gyro.z": 60 * math.cos(pitch) * math.cos(roll)}
+        attitude, _ = reading.samples(5, values)
+        assert attitude.fields["yaw_rate_radps"] == pytest.approx(math.radians(60))

@@ -1,0 +1,35 @@
+"""Detections of a backend, and figures of them."""
+
+import numpy as np
+import pytest
+
+from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
+from dmrl.learn.matching import Points
+
+
+def outputs(*best: tuple[int, int]) -> dict[str, np.ndarray]:
+    """One sure cell in each image; the depth is e metres in all."""
+    logit = np.full((len(best), 4, 5), -4.0)
+    for k, cell in enumerate(best):
+        logit[k][cell] = 3.0
+    return {"confidence": logit, "log_depth": np.ones_like(logit), "depth": np.ones_like(logit)}
+
+
+def test_the_share_of_images_whose_best_cell_stays() -> None:
+    wanted, got = outputs((0, 1), (2, 3), (3, 4), (1, 1)), outputs((0, 1), (2, 4), (3, 4), (0, 1))
+    assert argmax_kept(wanted, got) == 0.5
+    assert argmax_kept(wanted, wanted) == 1.0
+
+
+def test_detections_are_judged_as_those_of_any_network() -> None:
+    found = points_of(outputs((0, 1), (2, 3)), 8)
+    sure = found.confidence > 0.5
+    assert found.image[sure].tolist() == [0, 1]
+    assert (found.u_px[sure].tolist(), found.v_px[sure].tolist()) == ([12, 28], [4, 20])
+    assert found.depth_m[sure] == pytest.approx(np.e)
+    ones = np.ones(2)
+    labels = Points(np.arange(2), np.array([12.0, 28.0]), np.array([4.0, 26.0]), 2 * ones, ones)
+    got = figures_of(2, labels, found, 0.5)
+    assert got["mean_px"] == pytest.approx(3.0)
+    assert got["precision"] == got["recall"] == 1.0
+    assert got["depth_mae_m"] == pytest.approx(np.e - 2)

@@ -1,0 +1,136 @@
+"""Promises of layers and heads, at their borders."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.deploy.integer import Head, IntegerNetwork
+from dmrl.deploy.integer_layers import Add, Conv, MaxPool
+from dmrl.errors import ModelError
+
+SHAPE = (3, 8, 10)
+
+
+def conv(outs: int = 2, kernel: int = 3, ins: int = 3, **more: Any) -> Conv:
+    """A convolution of ones."""
+    full = {
+        "weight": np.ones((outs, ins, kernel, kernel), np.int8),
+        "bias": np.zeros(outs, np.int32),
+        "multiplier": np.full(outs, 2**30, np.int32),
+        "shift": np.full(outs, 30, np.int32),
+    }
+    return Conv("conv", **{"source": 0, **full, **more})
+
+
+def sound(layer: Any, *shapes: tuple[int, int, int], signed: tuple[bool, ...] = (False,)) -> bool:
+    try:
+        layer.require_sound(shapes or (SHAPE,), signed)
+    except ModelError as e:
+        assert f"layer {layer.name}" in str(e)
+        return False
+    return True
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_sum_may_be_as_large_as_int32(signed: bool) -> None:
+    most = 27 * (128 if signed else 255)  # 27 weights of 1, of the largest input
+    for bias, good in ((2**31 - 1 - most, True), (2**31 - most, False)):
+        for sign in (1, -1):
+            layer = conv(bias=np.array([0, sign * bias], np.int32))
+            assert sound(layer, signed=(signed,)) == good
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "good"),
+    [
+        ("shift", 0, False),
+        ("shift", 1, True),
+        ("shift", 62, True),
+        ("shift", 63, False),
+        ("multiplier", 2**30 - 1, False),
+        ("multiplier", 2**31 - 1, True),
+    ],
+)
+def test_factors_are_of_31_bits_and_a_shift(field: str, value: int, good: bool) -> None:
+    assert sound(conv(**{field: np.array([value, 2**30 if field != "shift" else 9])})) == good
+
+
+def test_weights_fit_the_channels_they_read() -> None:
+    assert sound(conv(kernel=1))
+    assert not sound(conv(ins=2))
+    assert not sound(conv(weight=np.ones((2, 3, 2, 2), np.int8)))
+    assert not sound(conv(weight=np.ones((2, 3, 3, 1), np.int8)))
+    assert sound(conv(outs=3, ins=1, groups=3))
+    assert not sound(conv(outs=2, ins=1, groups=3))
+    assert not sound(conv(outs=4, ins=2, groups=2), (4, 8, 8))
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stride", "dilation", "padding"),
+    [(3, 1, 1, 1), (3, 2, 1, 1), (3, 1, 4, 4), (3, 2, 2, 0), (1, 1, 1, 0), (1, 2, 1, 0)],
+)
+def test_shapes_and_products_are_those_of_the_places_that_fit(
+    kernel: int, stride: int, dilation: int, padding: int
+) -> None:
+    layer = conv(kernel=kernel, stride=stride, dilation=dilation, padding=padding)
+
+    def places(side: int) -> int:
+        last = side + 2 * padding - dilation * (kernel - 1) - 1
+        return len([k for k in range(side + 2 * padding) if k % stride == 0 and k <= last])
+
+    wanted = (2, places(8), places(10))
+    assert layer.shape((SHAPE,)) == wanted
+    assert layer.macs((SHAPE,)) == np.prod(wanted) * 3 * kernel**2
+    assert MaxPool("pool", 0).shape(((4, 9, 6),)) == (4, 4, 3)
+
+
+def test_pools_keep_their_type_and_sums_are_of_one_shape() -> None:
+    assert sound(MaxPool("pool", 0, signed=True), signed=(True,))
+    assert not sound(MaxPool("pool", 0, signed=True))
+    both = (False, True)
+    assert not sound(Add("add", (0, 1), (2**20, 1), 20), SHAPE, (3, 8, 9), signed=both)
+    for multipliers, shift, good in (
+        ((2**20, 0), 1, True),
+        ((0, 2**21 - 1), 30, True),
+        ((2**20, 2**21), 20, False),
+        ((2**20 - 1, 5), 20, False),
+        ((-1, 2**20), 20, False),
+        ((2**20, 0), 0, False),
+        ((2**20, 0), 31, False),
+    ):
+        assert sound(Add("add", (0, 1), multipliers, shift), SHAPE, SHAPE, signed=both) == good
+
+
+def network(**more: Any) -> IntegerNetwork:
+    """One layer, and two heads on it; confidence rises by 257 a level."""
+    table = (np.arange(256) * 257).astype(np.int32)
+    heads = {"confidence": Head(1, 0, 0.1, 0, table), "depth": Head(1, 1, 0.1, 0, table)}
+    layers = (conv(signed=True, padding=1, pad_value=128),)
+    fields = {"layers": layers, "threshold": 0.5, **heads, **more}
+    return IntegerNetwork("a", "b", 3, 8, 10, 8, **fields)
+
+
+def test_the_threshold_is_the_first_level_that_reaches_it() -> None:
+    believed = 0.5 * 65535
+    q = network().threshold_q
+    assert network().confidence.table[q + 128] >= believed > network().confidence.table[q + 127]
+    assert network(threshold=0.0).threshold_q == -128
+    assert network(threshold=1.0).threshold_q == 127
+    low = replace(network().confidence, table=np.zeros(256, np.int32))
+    assert network(confidence=low).threshold_q == 128
+
+
+def test_heads_are_signed_tensors_of_the_grid_that_nobody_reads() -> None:
+    network()
+    unsigned = (conv(padding=1, pad_value=128),)
+    read = (*network().layers, conv(ins=2, kernel=1, signed=True, source=1))
+    small = (*network().layers, conv(ins=2, stride=2, signed=True, source=1))
+    other = Head(2, 1, 0.1, 0, network().depth.table)
+    for change in ({"layers": unsigned}, {"layers": read}, {"layers": small, "depth": other}):
+        with pytest.raises(ModelError, match="is no signed tensor of the grid"):
+            network(**change)
+    late = (replace(network().layers[0], source=1),)
+    with pytest.raises(ModelError, match="layer conv reads tensors"):
+        network(layers=late)

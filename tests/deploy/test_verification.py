@@ -1,0 +1,98 @@
+"""What counts as proved: every grid, every detection, every build, and the stack."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.deploy import verification
+from dmrl.deploy.c.harness import Answer
+from dmrl.deploy.c.source import STACK_BYTES
+from dmrl.deploy.measure import CLUSTER_HZ, KERNEL_MACS, Cost, rates, state_bytes
+from dmrl.deploy.reference import Detection
+from dmrl.deploy.targets import Build, Target
+from dmrl.deploy.verification import BuildResult, TargetResult, expected, prove, same
+from dmrl.errors import ModelError
+
+from .networks import random_network
+
+FOUND = [Detection(16, 32, 1500, 40_000)]
+ANSWER = Answer(
+    {"confidence": np.eye(3, dtype=np.int8), "depth": np.eye(3, dtype=np.int8)}, FOUND, 0
+)
+
+
+def test_answers_are_the_same_in_every_grid_and_every_detection() -> None:
+    assert same(ANSWER, replace(ANSWER, stack_bytes=9))
+    for name in ("confidence", "depth"):
+        assert not same(ANSWER, replace(ANSWER, grids=ANSWER.grids | {name: 2 * np.eye(3)}))
+    assert not same(ANSWER, replace(ANSWER, detections=[]))
+    assert not same(ANSWER, replace(ANSWER, detections=[replace(FOUND[0], depth_mm=1501)]))
+
+
+def test_proved_is_what_was_tried_without_an_error_or_a_difference() -> None:
+    right, wrong = BuildResult("-O1", 3, 0, 0), BuildResult("-O2", 3, 2, 0)
+    assert TargetResult("gcc", [right]).proved
+    for result in (
+        TargetResult("gcc", [right, wrong]),
+        TargetResult("gcc", [right], error="no"),
+        TargetResult("gcc", [], skipped="no gcc"),
+    ):
+        assert not result.proved
+    assert TargetResult("gcc", [wrong, right, wrong]).mismatches == 4
+
+
+@pytest.mark.parametrize(
+    ("stack", "drop", "words"),
+    [
+        (STACK_BYTES, 0, ""),
+        (STACK_BYTES + 1, 0, f"uses {STACK_BYTES + 1} bytes of stack"),
+        (0, 1, "answered 1 of 2 images"),
+    ],
+)
+def test_a_build_answers_every_image_within_its_stack(
+    stack: int, drop: int, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    network = random_network(1)
+    images = list(
+        np.random.default_rng(0).integers(
+            0, 256, (2, network.height_px, network.width_px, network.channels), np.uint8
+        )
+    )
+    wanted = expected(network, images)
+    given = {
+        False: [replace(a, stack_bytes=stack) for a in wanted.of_images],
+        True: list(wanted.of_raws),
+    }
+    given[True][1] = replace(given[True][1], detections=FOUND)
+    monkeypatch.setattr(Build, "program", lambda build, *_: [build])
+    monkeypatch.setattr(verification, "run", lambda command, *_, **__: command[0].bayer)
+    kept = slice(drop, None)
+    monkeypatch.setattr(verification, "answers", lambda _, bayer: given[bayer][kept])
+    builds = Build("-O1", "cc", ()), Build("Bayer", "cc", (), bayer=True)
+    monkeypatch.setattr(Target, "skipped", "")
+    result = prove(network, tmp_path, Target("cc", builds), wanted)
+    assert words in result.error
+    assert bool(result.error) == bool(words)
+    if not words:
+        assert [(b.images, b.mismatches) for b in result.builds] == [(2, 0), (2, 1)]
+        assert result.builds[0].stack_bytes == stack
+
+
+def test_rates_are_images_a_second() -> None:
+    network = random_network(1)
+    both = rates(network, Cost(1, 2, round(CLUSTER_HZ / 25)))
+    assert [rate for rate, _ in both] == pytest.approx(
+        [25, CLUSTER_HZ * KERNEL_MACS / network.macs]
+    )
+    assert len(rates(network, Cost(1, 2, None))) == len(rates(network, None)) == 1
+
+
+def test_the_header_states_the_bytes_of_the_state(tmp_path: Path) -> None:
+    header = tmp_path / "random.h"
+    header.write_text("#define RANDOM_STATE_BYTES (1234 + 8)\n")
+    assert state_bytes(random_network(1), tmp_path) == 1234
+    header.write_text("nothing")
+    with pytest.raises(ModelError, match=r"random\.h is damaged"):
+        state_bytes(random_network(1), tmp_path)
