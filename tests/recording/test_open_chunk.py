@@ -1,0 +1,153 @@
+"""Chunks that are filled: one message at a time, or many, they hold the same."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dmrl.errors import RecordingError
+from dmrl.messages import message, schema_bytes
+from dmrl.recording import Provenance, RawMessage, RecordingWriter, read_raw
+from dmrl.recording import open_chunk as room
+from dmrl.recording.block import HEAD_BYTES, Block
+from dmrl.recording.blocks import blocks
+from dmrl.recording.channel import Channel
+from dmrl.recording.chunks import scanned
+from dmrl.recording.defined import Defined, _free
+from dmrl.recording.open_chunk import OpenChunk
+
+Row = tuple[int, int, int, bytes]
+ROWS: list[Row] = [(k % 3, 100 + k, 200 + k, bytes([k]) * (k % 5)) for k in range(12)]
+
+
+def records_of(rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
+    """Records one after another, and where each starts and the last ends."""
+    chunk = OpenChunk()
+    for row in rows:
+        chunk.add(*row)
+    return np.frombuffer(bytes(chunk.data), np.uint8), np.array([*chunk.starts, len(chunk.data)])
+
+
+@given(st.integers(0, 12), st.integers(0, 12), st.integers(0, 40))
+def test_many_at_once_are_the_same_as_one_by_one(alone: int, skipped: int, defined: int) -> None:
+    records, at = records_of(ROWS)
+    one, many = OpenChunk(), OpenChunk()
+    for chunk in (one, many):
+        chunk.define(b"\x03" + defined.to_bytes(8, "little") + bytes(defined))
+        for row in ROWS[:alone]:
+            chunk.add(*row)
+    for row in ROWS[skipped:]:
+        one.add(*row)
+    assert many.fill(records, at[skipped:]) == len(ROWS) - skipped
+    assert (one.data, one.starts) == (many.data, many.starts)
+    assert list(scanned(np.frombuffer(bytes(one.data), np.uint8)).rows()) == (
+        ROWS[:alone] + ROWS[skipped:]
+    )
+
+
+def test_a_chunk_takes_what_fits_and_is_full_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
+    records, at = records_of([(1, k, k, b"x") for k in range(5)])
+    each = HEAD_BYTES + 1
+    for room_bytes, count in ((3 * each - 1, 2), (3 * each, 3), (5 * each, 5), (99 * each, 5)):
+        monkeypatch.setattr(room, "CHUNK_BYTES", room_bytes)
+        chunk = OpenChunk()
+        first = chunk.fill(records, at)
+        # The one that no longer fits still goes in, and fills it.
+        assert (first, chunk.full) in ((count, False), (count + 1, True))
+        assert len(chunk.data) == first * each
+    monkeypatch.setattr(room, "CHUNK_BYTES", each)
+    chunk = OpenChunk()
+    chunk.add(1, 2, 3, b"x")
+    assert not chunk.full
+    chunk.define(b"y")
+    assert chunk.full
+
+
+def test_a_packed_chunk_says_where_its_messages_are_and_is_empty_then() -> None:
+    chunk = OpenChunk()
+    chunk.define(b"\x03" + (2).to_bytes(8, "little") + b"ab")
+    for row in ROWS:
+        chunk.add(*row)
+    data, starts = bytes(chunk.data), chunk.starts.tolist()
+    chunk.age = 3
+    packed = chunk.packed()
+    assert zstandard.ZstdDecompressor().decompress(packed.data) == data
+    assert (packed.size, packed.at.tolist()) == (len(data), starts)
+    assert packed.channel.tolist() == [row[0] for row in ROWS]
+    assert packed.time_ns.tolist() == [row[1] for row in ROWS]
+    assert (len(chunk.data), len(chunk.starts), chunk.age) == (0, 0, 0)
+
+
+def test_blocks_are_appended_as_messages_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(room, "CHUNK_BYTES", 400)  # some messages each
+    paths = [tmp_path / name for name in ("a.mcap", "b.mcap")]
+    with RecordingWriter(paths[0], Provenance("test")) as sink:
+        for k in range(100):
+            sink.write(k, "/cf1/height", message("Height")(height_m=k), publish_ns=k + 7)
+            if k % 9 == 0:
+                image = message("CompressedImage")(data=bytes([k]) * 90, format="png")
+                sink.write(k, "/cf1/camera/image", image)
+                sink.write(k, "/cf2/height", message("Height")(height_m=-k))
+    with RecordingWriter(paths[1], Provenance("test")) as sink:
+        for block, channels in blocks(paths[0]):
+            sink.append(block, channels)
+    one, other = (
+        sorted(read_raw(path), key=lambda raw: (raw.time_ns, raw.topic)) for path in paths
+    )
+    assert len(one) == 124
+    assert one == other
+
+
+@pytest.mark.parametrize("wrong", [(-5, 1), (1, -5)])
+def test_a_block_with_a_negative_time_is_refused_by_topic(
+    tmp_path: Path, wrong: tuple[int, int]
+) -> None:
+    channels = {k: Channel(f"/{k}", "dmrl.v1.Height", schema_bytes("Height")) for k in (1, 2)}
+    records, at = records_of([(1, 3, 3, b""), (2, 3, 3, b"")])
+    one, two = np.array([1, 2]), np.array([[3, 3], wrong])
+    block = Block(records, one, two[:, 0], two[:, 1], at[:-1] + HEAD_BYTES, at[1:])
+    with (
+        pytest.raises(RecordingError, match=r"on /2 is negative"),
+        RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink,
+    ):
+        sink.append(block, channels)
+
+
+def channel(topic: str, schema: str = "a", **more: str) -> Channel:
+    return Channel(topic, schema, schema.encode(), **more)
+
+
+def test_channels_are_numbered_once_and_copies_keep_their_numbers_where_free() -> None:
+    defined = Defined()
+    assert [defined.number(channel(t)) for t in ("/a", "/b", "/a")] == [1, 2, 1]
+    assert defined.channels[1].schema_id == defined.channels[2].schema_id == 1
+    kept, taken = channel("/c", "b"), channel("/d", "c")
+    records = {9: Defined(), 2: Defined()}
+    for number, one in ((9, kept), (2, taken)):
+        records[number].number(one)
+    theirs = {number: records[number].channels[1] for number in records}
+    theirs[9].schema_id = 40
+    defined.adopt({9: kept, 2: taken}, theirs)
+    assert (defined.number(kept), defined.number(taken)) == (9, 10)
+    assert defined.channels[9].schema_id == 40
+    assert defined.schemas[40].name == "b"
+    nameless = Channel("/e", "", b"", "")
+    assert defined.channels[defined.number(nameless)].schema_id == 0
+    assert defined.records(defined.number(nameless))[0] == b""
+    schema, own = defined.records(9)
+    assert b"b" in schema
+    assert b"/c" in own
+
+
+def test_numbers_that_run_out_are_filled_up() -> None:
+    assert [_free(taken) for taken in ({}, {1: 0}, {7: 0}, {65_534: 0})] == [1, 2, 8, 65_535]
+    assert _free({65_535: 0, 1: 0, 3: 0}) == 2
+
+
+def test_a_message_of_no_number_is_none() -> None:
+    assert RawMessage(1, 2, channel("/a"), b"x").topic == "/a"
