@@ -116,6 +116,8 @@ def _code(node: ast.AST) -> Iterator[ast.AST]:
         return  # of zip: says only that what is so is so
     yield node
     for name, value in ast.iter_fields(node):
+        if isinstance(node, ast.Call) and _is_left_open(node, name):
+            continue
         if name in ("annotation", "returns", "decorator_list", "pattern"):
             continue
         if name == "type" and isinstance(node, ast.ExceptHandler):
@@ -123,6 +125,11 @@ def _code(node: ast.AST) -> Iterator[ast.AST]:
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
                 yield from _code(child)
+
+
+def _is_left_open(node: ast.Call, field: str) -> bool:
+    """Whether these are the lengths of a reshape: any negative one is the one not given."""
+    return field == "args" and isinstance(node.func, ast.Attribute) and node.func.attr == "reshape"
 
 
 def mutants_of(path: Path) -> list[Mutant]:

@@ -55,7 +55,9 @@ class OpenChunk:
             (N + 1,) where each starts, and the end of the last.
         """
         room = CHUNK_BYTES - len(self.data)
-        count = min(int(np.searchsorted(at - at[0], room, side="right")), len(at) - 1)
+        fitting = int(np.searchsorted(at - at[0], room, side="right"))
+        # One at least: a chunk that definitions fill alone is only written with a message.
+        count = min(max(fitting, 1), len(at) - 1)
         self.starts.frombytes((at[:count] - at[0] + len(self.data)).tobytes())
         self.data += records[at[0] : at[count]].data
         return count

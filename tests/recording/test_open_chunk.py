@@ -81,10 +81,12 @@ def test_a_packed_chunk_says_where_its_messages_are_and_is_empty_then() -> None:
     assert (len(chunk.data), len(chunk.starts), chunk.age) == (0, 0, 0)
 
 
+@pytest.mark.parametrize("chunk_bytes", [400, 2000])
 def test_blocks_are_appended_as_messages_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
 ) -> None:
-    monkeypatch.setattr(room, "CHUNK_BYTES", 400)  # some messages each
+    # Some messages each; and less than what defines a topic, which once went on for ever.
+    monkeypatch.setattr(room, "CHUNK_BYTES", chunk_bytes)
     paths = [tmp_path / name for name in ("a.mcap", "b.mcap")]
     with RecordingWriter(paths[0], Provenance("test")) as sink:
         for k in range(100):
@@ -136,6 +138,10 @@ def test_channels_are_numbered_once_and_copies_keep_their_numbers_where_free() -
     assert (defined.number(kept), defined.number(taken)) == (9, 10)
     assert defined.channels[9].schema_id == 40
     assert defined.schemas[40].name == "b"
+    new = channel("/f", "d")
+    defined.adopt({12: new}, {12: theirs[2]})  # whose schema has a number that is taken
+    assert defined.schemas[defined.channels[12].schema_id].name == "d"
+    assert defined.schemas[1].name == "a"
     nameless = Channel("/e", "", b"", "")
     assert defined.channels[defined.number(nameless)].schema_id == 0
     assert defined.records(defined.number(nameless))[0] == b""
