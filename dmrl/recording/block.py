@@ -49,6 +49,14 @@ class Block:
             self.end[rows],
         )
 
+    def numbers(self) -> list[int]:
+        """Channels that there are messages of."""
+        return [int(number) for number in np.flatnonzero(np.bincount(self.channel))]
+
+    def of(self, channels: Collection[int]) -> "Block":
+        """The same bytes with only the messages of some channels."""
+        return self.take(np.isin(self.channel, list(channels)))
+
     def rows(self) -> Iterator[tuple[int, int, int, bytes]]:
         """Channel number, log time, publish time and payload of one message after the other."""
         view = self.data.data

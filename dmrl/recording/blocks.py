@@ -5,7 +5,6 @@ walked as NumPy arrays instead: one block holds the bytes of a chunk and, for ea
 in it, its times and where its payload starts and ends. Decoders work on whole blocks.
 """
 
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Set
@@ -28,6 +27,7 @@ from dmrl.recording.chunks import (
     scanned,
     unpacked,
 )
+from dmrl.recording.container import INDEX
 from dmrl.recording.index import mcap_summary, metadata_of
 from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.walk import channel_of, walked
@@ -166,7 +166,7 @@ def _times_in_indexes(
         for number, at in chunk.message_index_offsets.items():
             yield (
                 summary.channels[number].topic,
-                _index_entries(path, raw, at - first, number)[:, 0],
+                _entries(_index(path, raw, at - first, number))[:, 0],
             )
     if said and said[-1].get("indexes") != sums.text(crc):
         raise damaged(path, "its message indexes fail their CRC")
@@ -229,7 +229,7 @@ def chunks_between(
 def in_chunk(
     path: Path,
     stream: Bounded,
-    chunk: ChunkIndex,
+    said: ChunkIndex,
     channels: dict[int, Channel],
     known: Collection[int],
 ) -> Block:
@@ -239,7 +239,7 @@ def in_chunk(
     ----------
     path, stream
         The recording.
-    chunk
+    said
         What its summary says of the chunk.
     channels
         Those that are wanted.
@@ -251,30 +251,39 @@ def in_chunk(
     RecordingError
         If the chunk is not what its summary and its message indexes say.
     """
-    stream.seek(chunk.chunk_start_offset)
-    raw = stream.read(chunk.chunk_length + chunk.message_index_length)
-    record = _chunk_record(path, raw, chunk)
-    data = unpacked(path, record, chunk.chunk_start_offset)
-    if not chunk.message_index_offsets:
-        return _within(path, chunk, of_channels(scanned(data), channels, known))
-    parts = [np.empty((0, 2), np.int64)]
-    for number, at in chunk.message_index_offsets.items():
-        if number in channels:
-            parts.append(_index_entries(path, raw, at - chunk.chunk_start_offset, number))
-    entries = np.concatenate(parts)
+    return whole_chunk(path, stream, said, channels, known)[1]
+
+
+def whole_chunk(
+    path: Path,
+    stream: Bounded,
+    said: ChunkIndex,
+    channels: dict[int, Channel],
+    known: Collection[int],
+) -> tuple[Chunk, Block]:
+    """The same, with the chunk that they stand in, still compressed."""
+    at = said.chunk_start_offset
+    stream.seek(at)
+    raw = stream.read(said.chunk_length + said.message_index_length)
+    record = _chunk_record(path, raw, said)
+    data = unpacked(path, record, at)
+    if not said.message_index_offsets:
+        return record, _within(path, said, of_channels(scanned(data).block, channels, known))
+    places = {n: place - at for n, place in said.message_index_offsets.items() if n in channels}
+    entries = _entries(b"".join(_index(path, raw, at, n) for n, at in places.items()))
     entries = entries[np.argsort(entries[:, 1])]
     # Indexes carry no CRC of their own, so they are held against the records they point at.
     if entries.size and not 0 <= entries[0, 1] <= entries[-1, 1] <= len(data) - HEAD_BYTES:
-        raise damaged(path, f"index beyond the chunk at byte {chunk.chunk_start_offset}")
+        raise damaged(path, f"index beyond the chunk at byte {at}")
     block = messages_at(data, entries[:, 1])
     if not (
         (data[entries[:, 1]] == Opcode.MESSAGE).all()
         and np.array_equal(block.time_ns, entries[:, 0])
         and (block.end <= len(data)).all()
-        and set(np.unique(block.channel).tolist()) <= channels.keys()
+        and set(block.numbers()) <= channels.keys()
     ):
-        raise damaged(path, f"index of the chunk at byte {chunk.chunk_start_offset} is wrong")
-    return _within(path, chunk, block)
+        raise damaged(path, f"index of the chunk at byte {at} is wrong")
+    return record, _within(path, said, block)
 
 
 def _within(path: Path, chunk: ChunkIndex, block: Block) -> Block:
@@ -303,13 +312,20 @@ def _chunk_record(path: Path, raw: bytes, said: ChunkIndex) -> Chunk:
     return chunk
 
 
-def _index_entries(path: Path, raw: bytes, at: int, number: int) -> Ints:
-    """(N, 2) log time and offset of one channel's messages in a chunk."""
-    opcode, length, channel, size = struct.unpack_from("<BQHI", raw, at)
+def _index(path: Path, raw: bytes, at: int, number: int) -> bytes:
+    """Entries of one channel's message index that stands there."""
+    opcode, length, channel, size = INDEX.unpack_from(raw, at)
     if (opcode, length, channel) != (Opcode.MESSAGE_INDEX, size + 6, number) or size % 16:
         raise damaged(path, f"message index of channel {number} is wrong")
-    entries = np.frombuffer(raw, "<i8", size // 8, at + RECORD_HEADER + 6)
-    return entries.reshape(-1, 2).astype(np.int64)
+    entries = raw[at + INDEX.size : at + INDEX.size + size]
+    if len(entries) < size:
+        raise damaged(path, f"message index of channel {number} is cut")
+    return entries
+
+
+def _entries(raw: bytes) -> Ints:
+    """(N, 2) log times and offsets."""
+    return np.frombuffer(raw, "<i8").reshape(-1, 2).astype(np.int64)
 
 
 def _unindexed(

@@ -17,11 +17,11 @@ class Channel:
     schema_encoding: str = "protobuf"
     encoding: str = "protobuf"
     metadata: tuple[tuple[str, str], ...] = ()
+    pictured: bool = field(init=False, repr=False, compare=False)
+    """Whether its messages stand in chunks of pictures, apart from numbers."""
 
-    @property
-    def pictured(self) -> bool:
-        """Whether its messages stand in chunks of pictures, apart from numbers."""
-        return holds_pictures(self.schema_name)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pictured", holds_pictures(self.schema_name))
 
 
 @cache

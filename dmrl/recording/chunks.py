@@ -1,8 +1,8 @@
 """A chunk of a recording: unpacked within its budget, and the messages in it."""
 
-import struct
 import zlib
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -17,9 +17,10 @@ from mcap.records import Channel, Chunk, Message, Schema
 from dmrl.border import limits
 from dmrl.recording.block import HEAD_BYTES, Block, Bytes, Ints
 from dmrl.recording.container import laid_out
-from dmrl.recording.opening import damaged, too_large
+from dmrl.recording.opening import RECORD, damaged, too_large
 
 RECORD_HEADER = 1 + 8  # opcode, length
+MESSAGE = int(Opcode.MESSAGE)
 MESSAGE_HEADER = HEAD_BYTES - RECORD_HEADER  # channel id, sequence, log time, publish time
 
 
@@ -95,36 +96,64 @@ def set_heads(records: Bytes, at: Ints, number: Ints, time_ns: Ints, publish_ns:
     put(RECORD_HEADER + 14, "<u8", publish_ns)
 
 
-def headers(data: Bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of every record of a chunk.
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """A chunk, gone through record by record.
+
+    Parameters
+    ----------
+    data
+        Its records.
+    messages
+        Where those of messages start.
+    others
+        Opcode, start and end of the others.
+    """
+
+    data: Bytes
+    messages: list[int]
+    others: list[tuple[int, int, int]]
+
+    @property
+    def block(self) -> Block:
+        """Its messages."""
+        return messages_at(self.data, np.array(self.messages, np.int64))
+
+    def definitions(self) -> Iterator[Schema | Channel]:
+        """The schemas and channels that it defines."""
+        kinds: dict[int, type[Schema] | type[Channel]] = {
+            Opcode.SCHEMA: Schema,
+            Opcode.CHANNEL: Channel,
+        }
+        for opcode, at, end in self.others:
+            if opcode in kinds:
+                body = BytesIO(self.data[at + RECORD_HEADER : end].tobytes())
+                yield kinds[opcode].read(ReadDataStream(body))
+
+
+def scanned(data: Bytes) -> Scan:
+    """A chunk's records, found one after the other, without its message index.
 
     Raises
     ------
     McapError
-        If the last runs beyond the chunk.
+        If one runs beyond the chunk, or is too short.
     """
-    view, at = data.data, 0
-    while at < len(view):
-        if at + RECORD_HEADER > len(view):
+    view, at, size, unpack = data.data, 0, len(data), RECORD.unpack_from
+    scan = Scan(data, [], [])
+    while at < size:
+        if at + RECORD_HEADER > size:
             raise McapError("a chunk ends within a record")
-        opcode, size = struct.unpack_from("<BQ", view, at)
-        end = at + RECORD_HEADER + size
-        if end > len(view) or (opcode == Opcode.MESSAGE and size < MESSAGE_HEADER):
+        opcode, length = unpack(view, at)
+        end = at + RECORD_HEADER + length
+        if end > size or (opcode == MESSAGE and length < MESSAGE_HEADER):
             raise McapError("a record in a chunk has a wrong length")
-        yield opcode, at, end
+        if opcode == MESSAGE:
+            scan.messages.append(at)
+        else:
+            scan.others.append((opcode, at, end))
         at = end
-
-
-def scanned(data: Bytes) -> Block:
-    """All messages of a chunk, record by record, without its message index.
-
-    Raises
-    ------
-    McapError
-        If a record runs beyond the chunk.
-    """
-    starts = [at for opcode, at, _ in headers(data) if opcode == Opcode.MESSAGE]
-    return messages_at(data, np.array(starts, np.int64))
+    return scan
 
 
 def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) -> Block:
@@ -136,24 +165,12 @@ def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) 
         If a message is of no channel in ``known``, or its time is beyond the year 2262, where 64
         bits with a sign end.
     """
-    present = set(np.unique(block.channel).tolist())
+    present = set(block.numbers())
     if unknown := present - set(known):
         raise McapError(f"messages of channel {min(unknown)}, which is not defined")
     if len(block) and min(int(block.time_ns.min()), int(block.publish_ns.min())) < 0:
         raise McapError("a message has a time beyond the year 2262")
-    return block if present <= set(numbers) else block.take(np.isin(block.channel, list(numbers)))
-
-
-def definitions(data: Bytes) -> Iterator[Schema | Channel]:
-    """The schemas and channels that a chunk defines."""
-    kinds: dict[int, type[Schema] | type[Channel]] = {
-        Opcode.SCHEMA: Schema,
-        Opcode.CHANNEL: Channel,
-    }
-    for opcode, at, end in headers(data):
-        if opcode in kinds:
-            body = BytesIO(data[at + RECORD_HEADER : end].tobytes())
-            yield kinds[opcode].read(ReadDataStream(body))
+    return block if present <= set(numbers) else block.of(numbers)
 
 
 def loose(messages: list[Message]) -> Block:

@@ -1,15 +1,16 @@
 """Recordings out of recordings: merged by time, or trimmed."""
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
 
 from dmrl.errors import RecordingError
+from dmrl.recording.copying import Piece, Wanted, adopt, copy, pieces, put
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import Summary, summary
 from dmrl.recording.inputs import provenance, refuse_twice
-from dmrl.recording.reader import matching, read_raw, read_table
+from dmrl.recording.reader import log_times, matching
 from dmrl.recording.writer import RecordingWriter
 from dmrl.terminal.progress import say
 from dmrl.topics import CALIBRATION, names, row_of
@@ -18,9 +19,8 @@ from dmrl.topics import CALIBRATION, names, row_of
 def merge(paths: Sequence[Path], out: Path) -> int:
     """Write one recording with the messages of several, by log time; how many.
 
-    Messages are copied bit for bit; of equal times, those of the first recording come
-    first. Metadata and attachments of all are kept. Two that have the same robot's sensor are
-    mixed with a word.
+    Messages are copied bit for bit, chunk by chunk. Metadata and attachments of all are kept.
+    Two that have the same robot's sensor are mixed with a word.
 
     Raises
     ------
@@ -32,15 +32,19 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     refuse_twice(paths)
     for one, other in combinations(paths, 2):
         _warn_of_namesakes(one, other)
-    count = 0
+    wanted = [Wanted(frozenset(summary(path).topics)) for path in paths]
     with RecordingWriter(out, provenance("merge", inputs=paths)) as sink:
-        for path in paths:
+        for path, every in zip(paths, wanted, strict=True):
             copy_extras(summary(path), sink)
-        streams = [read_raw(path) for path in paths]
-        for raw in heapq.merge(*streams, key=lambda raw: raw.time_ns):
-            sink.write_raw(raw)
-            count += 1
-    return count
+            adopt(path, every.topics, sink)
+        streams = [_timed(path, every) for path, every in zip(paths, wanted, strict=True)]
+        by_time = heapq.merge(*streams, key=lambda item: item[0])
+        return sum(put(piece, every, sink) for _, piece, every in by_time)
+
+
+def _timed(path: Path, wanted: Wanted) -> Iterator[tuple[int, Piece, Wanted]]:
+    """Pieces of a recording, with their first times."""
+    return ((piece.start_ns, piece, wanted) for piece in pieces(path, wanted))
 
 
 def _warn_of_namesakes(one: Path, other: Path) -> None:
@@ -77,8 +81,8 @@ def _sources(held: Summary) -> set[str]:
 
 def _span(path: Path, topic: str) -> tuple[int, int]:
     """First and last log time of a topic, nanoseconds."""
-    times = read_table(path, topic, fields=())["log_time"]
-    return (times[0].as_py(), times[-1].as_py()) if len(times) else (0, 0)
+    times = log_times(path, [topic])[topic]
+    return (int(times[0]), int(times[-1])) if len(times) else (0, 0)
 
 
 def trim(
@@ -111,19 +115,13 @@ def trim(
     """
     found = summary(path)
     wanted = matching(path, topics) if topics else frozenset(found.topics)
-    latched = {t for t in wanted if names(CALIBRATION, t) is not None}
+    latched = frozenset(t for t in wanted if names(CALIBRATION, t) is not None)
     settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
-    count = 0
+    low = found.start_ns if start_ns is None else start_ns
+    high = found.end_ns + 1 if end_ns is None else end_ns
     with RecordingWriter(out, provenance("trim", settings, [path])) as sink:
         copy_extras(found, sink)
-        low = found.start_ns if start_ns is None else start_ns
-        high = found.end_ns + 1 if end_ns is None else end_ns
-        for raw in read_raw(path, *sorted(wanted)):
-            if low <= raw.time_ns < high:
-                count += 1
-            elif raw.topic not in latched:
-                continue
-            sink.write_raw(raw)
+        count = copy(path, Wanted(wanted, low, high, latched), sink)
         if not count:
             raise RecordingError(
                 f"{path} has no message in that stretch; it lasts "

@@ -100,4 +100,4 @@ def _chosen(
 
 
 def _topics(held: Sequence[Block], channels: Mapping[int, Channel]) -> set[str]:
-    return {channels[n].topic for block in held for n in np.unique(block.channel).tolist()}
+    return {channels[n].topic for block in held for n in block.numbers()}

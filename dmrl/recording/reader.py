@@ -266,7 +266,7 @@ def by_topic(
 
 def apart(block: Block, channels: Mapping[int, Channel]) -> dict[str, Block]:
     """The messages of a block by topic, in the order they have in it."""
-    topics = sorted({channels[number].topic for number in np.unique(block.channel).tolist()})
+    topics = sorted({channels[number].topic for number in block.numbers()})
     place = np.full(max(channels, default=0) + 1, -1, np.int64)
     for number, channel in channels.items():
         if channel.topic in topics:
@@ -292,7 +292,7 @@ def decoded(
     RecordingError
         If they are of several types, or not what they should be.
     """
-    numbers = np.unique(block.channel).tolist()
+    numbers = block.numbers()
     own = [n for n, channel in channels.items() if channel.topic == topic]
     kinds = {descriptor_of(path, channels[number]) for number in numbers or own}
     return _decoded(path, topic, block, one_type(path, topic, kinds), fields)

@@ -1,14 +1,17 @@
 """Bringing back what a killed or damaged recording still holds."""
 
+import struct
 import zlib
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -17,7 +20,6 @@ from mcap.records import (
     Chunk,
     McapRecord,
     Message,
-    MessageIndex,
     Metadata,
     Schema,
 )
@@ -28,8 +30,11 @@ from dmrl.border import limits
 from dmrl.errors import RecordingError
 from dmrl.recording import sums
 from dmrl.recording.block import Block
-from dmrl.recording.channel import Channel, RawMessage
-from dmrl.recording.chunks import definitions, loose, scanned, unpacked
+from dmrl.recording.blocks import tally
+from dmrl.recording.channel import Channel
+from dmrl.recording.chunks import loose, scanned, unpacked
+from dmrl.recording.container import ENTRY_BYTES
+from dmrl.recording.copying import Piece, put
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import Summary
 from dmrl.recording.inputs import sha256_of_file
@@ -38,6 +43,8 @@ from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.section import places, stated
 from dmrl.recording.walk import channel_of
 from dmrl.recording.writer import RecordingWriter
+
+INDEX_HEAD = struct.Struct("<HI")  # of a message index: channel, bytes of entries
 
 
 @dataclass(slots=True)
@@ -78,6 +85,13 @@ class Recovery:
     whole: bool = False
 
 
+class _Indexed(NamedTuple):
+    """What a message index says of a chunk."""
+
+    channel: int
+    messages: int
+
+
 @dataclass(slots=True)
 class _Walk:
     """State while the records of a file are read one after the other."""
@@ -87,6 +101,7 @@ class _Walk:
     end: McapSummary  # what the end of the file says, as far as it is there
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
+    numbered: dict[int, McapChannel] = field(default_factory=dict)  # the same, as they stand
     metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     found: Counter[int] = field(default_factory=Counter)  # messages by channel number
@@ -130,17 +145,15 @@ def recover(path: Path, out: Path) -> Recovery:
             # A topic is defined in the chunk that has its first message. If that is damaged, all
             # later ones would be nameless.
             _define(walk, record)
-        messages = _messages(stream, walk)
+        pieces = _pieces(stream, walk)
         # Our provenance stands before the first message: it is known once that is reached.
-        first = next(messages, None)
+        first = next(pieces, None)
         if first is None:
             raise RecordingError(f"{path} holds no whole chunk: nothing to recover. Make it again")
         with RecordingWriter(out, _provenance(walk)) as sink:
-            sink.write_raw(first)
-            walk.recovery.messages = 1
-            for raw in messages:
-                sink.write_raw(raw)
-                walk.recovery.messages += 1
+            for piece in chain([first], pieces):
+                sink.adopt(walk.channels, walk.numbered)
+                walk.recovery.messages += put(piece, None, sink)
             copy_extras(Summary({}, 0, 0, walk.metadata, walk.attachments), sink)
     _account(walk)
     return walk.recovery
@@ -165,8 +178,8 @@ def _end(path: Path, stream: Bounded, start: int | None = None) -> McapSummary:
         return McapSummary()
 
 
-def _messages(stream: Bounded, walk: _Walk) -> Iterator[RawMessage]:
-    """Every message that can be read, in the order of the file."""
+def _pieces(stream: Bounded, walk: _Walk) -> Iterator[Piece]:
+    """Everything that can be read and whose topic is known, in the order of the file."""
     damaged = False  # the chunk whose message indexes follow
     for at, record in _records(stream, walk):
         if isinstance(record, Chunk):
@@ -174,12 +187,12 @@ def _messages(stream: Bounded, walk: _Walk) -> Iterator[RawMessage]:
             block = _unpacked(stream, walk, record, at)
             damaged = block is None
             if block is not None:
-                yield from _named(walk, block)
-        elif isinstance(record, MessageIndex):
+                yield from _named(walk, block, record)
+        elif isinstance(record, _Indexed):
             if damaged:
-                walk.skipped[record.channel_id] += len(record.records)
+                walk.skipped[record.channel] += record.messages
         elif isinstance(record, Message):
-            yield from _named(walk, loose([record]))
+            yield from _named(walk, loose([record]), None)
         else:
             _define(walk, record)
 
@@ -187,35 +200,34 @@ def _messages(stream: Bounded, walk: _Walk) -> Iterator[RawMessage]:
 def _unpacked(stream: Bounded, walk: _Walk, chunk: Chunk, at: int) -> Block | None:
     """The messages of a chunk, what it defines noted; None if it is damaged."""
     try:
-        data = unpacked(walk.path, chunk, at)
-        found = list(definitions(data))
-        block = scanned(data)
+        scan = scanned(unpacked(walk.path, chunk, at))
+        found = list(scan.definitions())
     except (RecordingError, *DAMAGE):
         walk.recovery.damaged_chunks += 1
         return None
-    walk.unpacked += len(data)
+    walk.unpacked += len(scan.data)
     if walk.unpacked > limits.unpacked_bytes(stream.size):
         raise too_large(walk.path, "it unpacks to more than its size explains")
     for record in found:
         _define(walk, record)
-    return block
+    return scan.block
 
 
-def _named(walk: _Walk, block: Block) -> Iterator[RawMessage]:
-    """The messages of a block whose topic is known."""
-    for number, time_ns, publish_ns, data in block.rows():
-        channel = walk.channels.get(number)
-        if channel is None:
-            walk.recovery.nameless += 1
-            continue
-        if time_ns < 0 or publish_ns < 0:
-            walk.recovery.timeless += 1
-            continue
-        walk.found[number] += 1
-        yield RawMessage(time_ns, publish_ns, channel, data)
+def _named(walk: _Walk, block: Block, chunk: Chunk | None) -> Iterator[Piece]:
+    """The messages of a block whose topic is known, and whose time can be; none, or a piece."""
+    named = np.isin(block.channel, list(walk.channels))
+    timed = (block.time_ns >= 0) & (block.publish_ns >= 0)
+    walk.recovery.nameless += int((~named).sum())
+    walk.recovery.timeless += int((named & ~timed).sum())
+    good = named & timed
+    if not good.all():
+        block, chunk = block.take(good), None
+    if len(block):
+        tally(walk.found, block)
+        yield Piece(block, walk.channels, chunk)
 
 
-def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord]]:
+def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord | _Indexed]]:
     """Where they start and whole records up to the footer, over what is damaged between."""
     known = sorted(start for start, _ in places(walk.end))
     at = len(MAGIC)
@@ -247,17 +259,19 @@ _KINDS: dict[int, type[Any]] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: McapChannel,
     Opcode.CHUNK: Chunk,
-    Opcode.MESSAGE_INDEX: MessageIndex,
     Opcode.ATTACHMENT: Attachment,
     Opcode.METADATA: Metadata,
 }
 
 
-def _parsed(opcode: int, body: bytes, walk: _Walk) -> McapRecord | None:
+def _parsed(opcode: int, body: bytes, walk: _Walk) -> McapRecord | _Indexed | None:
     """The record that these bytes are; None for one that is of no use here."""
     if opcode == Opcode.MESSAGE:
         message: Message = Message.read(ReadDataStream(BytesIO(body)), len(body))
         return message
+    if opcode == Opcode.MESSAGE_INDEX:
+        number, size = INDEX_HEAD.unpack_from(body)
+        return _Indexed(number, size // ENTRY_BYTES)
     if opcode not in _KINDS:
         return None
     record: McapRecord = _KINDS[opcode].read(ReadDataStream(BytesIO(body)))
@@ -277,6 +291,7 @@ def _define(walk: _Walk, record: McapRecord) -> None:
             walk.schemas[record.id] = record
         case McapChannel() if not record.schema_id or record.schema_id in walk.schemas:
             walk.channels[record.id] = channel_of(record.id, {record.id: record}, walk.schemas)
+            walk.numbered[record.id] = record
         case Metadata():
             walk.extras += 1
             walk.metadata.setdefault(record.name, []).append(dict(record.metadata))

@@ -5,12 +5,11 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from dmrl.recording.copying import Wanted, copy
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import Provenance
-from dmrl.recording.reader import read_raw
 from dmrl.recording.writer import RecordingWriter
-from dmrl.terminal.progress import track
 
 
 class Timed(NamedTuple):
@@ -30,7 +29,7 @@ def rewrite(
     fresh: Iterable[Iterable[Timed]],
     metadata: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
-    """Copy a recording bit for bit, but for some topics, with new messages among the rest.
+    """Copy a recording bit for bit, but for some topics, and add new messages.
 
     Parameters
     ----------
@@ -53,15 +52,12 @@ def rewrite(
         If ``out`` exists or cannot be written.
     """
     held = summary(recording)
-    kept = [topic for topic in held.topics if topic not in without]
-    total = sum(held.topics[topic].count for topic in kept)
-    streams: list[Iterable[Any]] = [track(read_raw(recording, *kept), "Writing", total), *fresh]
+    kept = frozenset(topic for topic in held.topics if topic not in without)
     with RecordingWriter(out, made) as sink:
         copy_extras(held, sink)
         for name, values in (metadata or {}).items():
             sink.add_metadata(name, values)
-        for item in heapq.merge(*streams, key=lambda m: m.time_ns):
-            if isinstance(item, Timed):
-                sink.write(*item)
-            else:
-                sink.write_raw(item)
+        copy(recording, Wanted(kept), sink)
+        sink.flush()  # what is new begins at the start again: it gets chunks of its own
+        for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
+            sink.write(*item)

@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader
 from dmrl.border import limits
 from dmrl.recording.block import Block
 from dmrl.recording.channel import Channel
-from dmrl.recording.chunks import definitions, loose, of_channels, scanned, unpacked
+from dmrl.recording.chunks import loose, of_channels, scanned, unpacked
 from dmrl.recording.opening import Bounded, too_large
 
 
@@ -63,10 +63,10 @@ def walked(path: Path, stream: Bounded) -> Walked:
             size += record.uncompressed_size
             if size > limits.unpacked_bytes(stream.size):
                 raise too_large(path, f"it unpacks to more than {size / 1e6:.0f} MB")
-            data = unpacked(path, record, stream.tell())
-            for definition in definitions(data):
+            scan = scanned(unpacked(path, record, stream.tell()))
+            for definition in scan.definitions():
                 _define(walk, schemas, definition)
-            walk.blocks.append(of_channels(scanned(data), walk.channels, walk.channels))
+            walk.blocks.append(of_channels(scan.block, walk.channels, walk.channels))
         elif isinstance(record, Message):
             messages.append(record)
         elif isinstance(record, Statistics):

@@ -3,6 +3,7 @@
 Pictures stand in chunks of their own, so that whoever reads numbers unpacks no picture.
 """
 
+import zlib
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,16 +13,17 @@ from typing import Any, Self
 import numpy as np
 from google.protobuf.descriptor import Descriptor
 from mcap.records import Channel as McapChannel
+from mcap.records import Chunk
 
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
 from dmrl.output import as_output_error, partial_file
-from dmrl.recording.block import Block
+from dmrl.recording.block import HEAD_BYTES, Block
 from dmrl.recording.channel import Channel, RawMessage
 from dmrl.recording.chunks import set_heads
-from dmrl.recording.container import Container
+from dmrl.recording.container import Container, Packed
 from dmrl.recording.defined import Defined
-from dmrl.recording.open_chunk import OpenChunk
+from dmrl.recording.open_chunk import CHUNK_BYTES, OpenChunk
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.topics import row_of
 
@@ -67,8 +69,6 @@ class RecordingWriter:
             raise OutputError(f"{path} is no name of a recording. Call it {path.name}{SUFFIX}")
         self._path = path
         self._defined = Defined()
-        self._begun: set[int] = set()  # channels whose records are in a chunk
-        self._begun_schemas: set[int] = {0}
         self._topics: dict[str, tuple[type, int, OpenChunk]] = {}
         self._numbers, self._pictures = OpenChunk(), OpenChunk()
         self._resources = ExitStack()
@@ -134,12 +134,12 @@ class RecordingWriter:
         self._defined.adopt(channels, records)
 
     def append(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        """Append many messages, bit for bit but for their heads.
+        """Append many messages, bit for bit.
 
         Parameters
         ----------
         block
-            The messages.
+            The messages, with the times that they are to have.
         channels
             By their numbers in it.
 
@@ -148,19 +148,16 @@ class RecordingWriter:
         RecordingError
             If a time is negative.
         """
-        present = np.unique(block.channel).tolist()
+        present = block.numbers()
         for pictured in (False, True):
             own = [number for number in present if channels[number].pictured == pictured]
             if own:
-                part = block if len(own) == len(present) else _of(block, own)
+                part = block if len(own) == len(present) else block.of(own)
                 self._append(part, {number: channels[number] for number in own})
 
     def _append(self, block: Block, channels: Mapping[int, Channel]) -> None:
         """Append messages that are all pictures, or none of them."""
-        if min(int(block.time_ns.min()), int(block.publish_ns.min())) < 0:
-            worst = int(np.argmin(np.minimum(block.time_ns, block.publish_ns)))
-            topic = channels[int(block.channel[worst])].topic
-            raise self._negative(int(block.time_ns[worst]), topic)
+        self._refuse_negative(block, channels)
         numbers = np.zeros(max(channels) + 1, np.int64)
         for number, channel in channels.items():
             numbers[number], chunk = self._begin(channel)
@@ -170,6 +167,49 @@ class RecordingWriter:
             at = at[chunk.fill(records, at) :]
             if chunk.full:
                 self._close(chunk)
+
+    def append_chunk(self, chunk: Chunk, block: Block, channels: Mapping[int, Channel]) -> bool:
+        """Append a chunk as it is, still compressed, if it can stand in this recording.
+
+        Parameters
+        ----------
+        chunk
+            A chunk that passed its CRC.
+        block
+            All of its messages, in the order of the chunk.
+        channels
+            By their numbers in it.
+
+        Returns
+        -------
+        bool
+            False: it mixes pictures and numbers, is small, or channels have other numbers here.
+            Nothing was written then.
+
+        Raises
+        ------
+        RecordingError
+            If a time is negative.
+        """
+        pictured = {channels[number].pictured for number in block.numbers()}
+        small = chunk.uncompressed_size < CHUNK_BYTES // 4
+        if len(pictured) != 1 or small or not self._defined.begin_in(block, channels):
+            return False
+        self._refuse_negative(block, channels)
+        before = self._pictures if pictured.pop() else self._numbers
+        self._close(before)  # what came before it stands before it
+        crc = chunk.uncompressed_crc or zlib.crc32(block.data.data)
+        places = block.channel, block.time_ns, block.start - HEAD_BYTES
+        packed = Packed(chunk.compression, chunk.data, chunk.uncompressed_size, crc, *places)
+        self._put(packed, before)
+        return True
+
+    def _refuse_negative(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        earliest = np.minimum(block.time_ns, block.publish_ns)
+        if earliest.min() < 0:
+            worst = int(np.argmin(earliest))
+            topic = channels[int(block.channel[worst])].topic
+            raise self._negative(int(block.time_ns[worst]), topic)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Append named strings, such as the source's own split."""
@@ -188,25 +228,21 @@ class RecordingWriter:
         """Number of a channel, defined before its first message, and the chunk it goes to."""
         number = self._defined.number(channel)
         chunk = self._pictures if channel.pictured else self._numbers
-        if number not in self._begun:
-            schema, own = self._defined.records(number)
-            schema_id = self._defined.channels[number].schema_id
-            if schema_id not in self._begun_schemas:
-                self._begun_schemas.add(schema_id)
-                chunk.define(schema)
-            chunk.define(own)
-            self._begun.add(number)
+        chunk.define(self._defined.begin(number))
         return number, chunk
 
     def _close(self, chunk: OpenChunk) -> None:
-        """Write a chunk that holds messages, and the other one if it is old."""
-        if not chunk.starts:
-            return
-        other = self._pictures if chunk is self._numbers else self._numbers
+        """Write a chunk, if it holds messages."""
+        if chunk.starts:
+            self._put(chunk.packed(), chunk)
+
+    def _put(self, packed: Packed, chunk: OpenChunk) -> None:
+        """Write what was in a chunk, and the other one if it is old."""
         try:
-            self._file.add_chunk(chunk.packed())
+            self._file.add_chunk(packed)
         except OSError as e:
             raise as_output_error(self._path, e) from e
+        other = self._pictures if chunk is self._numbers else self._numbers
         other.age += bool(other.starts)
         if other.age >= OLDEST:
             self._close(other)
@@ -231,7 +267,7 @@ class RecordingWriter:
             return
         try:
             self.flush()
-            self._file.finish(self._defined.schemas.values(), self._defined.channels.values())
+            self._file.finish(*self._defined.all_begun())
         except (OSError, OutputError) as e:
             self._abandon(e)
             raise (e if isinstance(e, OutputError) else as_output_error(self._path, e)) from e
@@ -251,7 +287,3 @@ def channel_for(topic: str, kind: Descriptor) -> Channel:
     if row is not None and not row.carries(schema_name):
         raise RecordingError(f"{topic} carries {row.message}, not {schema_name}. Use its own topic")
     return Channel(topic, schema_name, schema_bytes(kind))
-
-
-def _of(block: Block, numbers: list[int]) -> Block:
-    return block.take(np.isin(block.channel, numbers))

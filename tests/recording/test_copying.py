@@ -1,0 +1,229 @@
+"""Copies by the chunk: what goes over as it is, what as slices, and what is refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap.writer import CompressionType, Writer
+
+from dmrl.errors import RecordingError
+from dmrl.messages import message, schema_bytes
+from dmrl.recording import (
+    Provenance,
+    RecordingWriter,
+    Timed,
+    blocks,
+    merge,
+    read_raw,
+    recover,
+    rewrite,
+    summary,
+    trim,
+)
+
+MADE = Provenance("test")
+MOMENTS = 6000
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Attitude and height of two robots, a picture of 3 kB now and then."""
+    path = tmp_path_factory.mktemp("copying") / "flight.mcap"
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, MADE) as sink:
+        sink.write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320))
+        for k in range(MOMENTS):
+            for robot in ("cf1", "cf2"):
+                turn = message("Attitude")(roll_rad=rng.normal(), pitch_rad=rng.normal())
+                sink.write(k, f"/{robot}/attitude", turn, publish_ns=k + 3)
+                sink.write(k, f"/{robot}/height", message("Height")(height_m=rng.normal()))
+            if k % 10 == 0:
+                picture = message("CompressedImage")(data=rng.bytes(3000), format="jpeg")
+                sink.write(k, "/cf1/camera/image", picture)
+        sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
+    return path
+
+
+def chunks(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    return found.chunk_indexes
+
+
+def packed(path: Path) -> list[bytes]:
+    """The records of all chunks, without their message indexes."""
+    data = path.read_bytes()
+    found = sorted(chunks(path), key=lambda c: c.chunk_start_offset)
+    return [data[c.chunk_start_offset : c.chunk_start_offset + c.chunk_length] for c in found]
+
+
+def unchanged(before: Path, after: Path, topics: list[str]) -> None:
+    """Messages of these topics are the same, by dmrl's reader and by mcap's."""
+    for topic in topics:
+        assert list(read_raw(after, topic)) == list(read_raw(before, topic))
+    with after.open("rb") as stream:
+        theirs = make_reader(stream, validate_crcs=True).iter_messages(topics)
+        got = [(c.topic, m.log_time, m.publish_time, m.data) for _, c, m in theirs]
+    ours = [(r.topic, r.time_ns, r.publish_ns, r.data) for r in read_raw(before, *topics)]
+    assert sorted(got) == sorted(ours)
+
+
+def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[int] = []
+    unpacked = blocks.unpacked
+    monkeypatch.setattr(
+        blocks, "unpacked", lambda p, c, at: opened.append(at) or unpacked(p, c, at)
+    )
+    fresh = [Timed(k * 100, "/cf1/labels", message("PeerLabels")()) for k in range(20)]
+    out = tmp_path / "out.mcap"
+    rewrite(flight, out, MADE, without=(), fresh=[fresh])
+    assert len(opened) == len(set(opened)) == len(chunks(flight)) > 8
+    assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 2
+    unchanged(flight, out, list(summary(flight).topics))
+    assert [r for r in read_raw(out) if r.topic != "/cf1/labels"] == list(read_raw(flight))
+    assert [raw.time_ns for raw in read_raw(out, "/cf1/labels")] == [m.time_ns for m in fresh]
+
+
+def test_what_is_left_out_leaves_the_rest_bit_for_bit(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    rewrite(flight, out, MADE, without=["/cf2/attitude"], fresh=())
+    kept = [topic for topic in summary(flight).topics if topic != "/cf2/attitude"]
+    assert list(summary(out).topics) == kept
+    unchanged(flight, out, kept)
+
+
+def test_a_stretch_is_trimmed_out_of_its_chunks(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert trim(flight, out, start_ns=1000, end_ns=5000) == 4000 * 4 + 400
+    ours = [r for r in read_raw(flight) if 1000 <= r.time_ns < 5000]
+    assert list(read_raw(out))[1:] == ours
+    assert len(set(packed(flight)) & set(packed(out))) >= 4
+
+
+def test_parts_are_merged_to_what_they_were(flight: Path, tmp_path: Path) -> None:
+    parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    trim(flight, parts[0], topics=["/cf1/*", "/cf1/camera/*"])
+    trim(flight, parts[1], topics=["/cf2/*"])
+    out = tmp_path / "out.mcap"
+    assert merge(parts, out) == summary(flight).count
+    unchanged(flight, out, list(summary(flight).topics))
+    again = tmp_path / "again.mcap"
+    merge(parts, again)
+    assert again.read_bytes() == out.read_bytes()
+
+
+def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path) -> None:
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
+    last = max(c.chunk_start_offset for c in chunks(flight))
+    cut.write_bytes(flight.read_bytes()[:last])
+    result = recover(cut, out)
+    assert result.messages == summary(out).count > MOMENTS
+    assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 3
+
+
+def foreign(path: Path, fill: Callable[[Writer, int], None], **options: Any) -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        fill(writer, schema)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_chunks_of_other_writers_are_copied_in_their_compression(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    rng = np.random.default_rng(0)
+
+    def fill(writer: Writer, schema: int) -> None:
+        image = schema_bytes("CompressedImage")
+        pictures = writer.register_channel(
+            "/cam",
+            "protobuf",
+            writer.register_schema("foxglove.CompressedImage", "protobuf", image),
+        )
+        heights = writer.register_channel("/cf1/height", "protobuf", schema)
+        for k in range(30_000):
+            writer.add_message(heights, k, message("Height")(height_m=k).SerializeToString(), k)
+        for k in range(40):  # a chunk of both, then of pictures alone
+            data = message("CompressedImage")(data=rng.bytes(20_000)).SerializeToString()
+            writer.add_message(pictures, k, data, k)
+
+    path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=200_000)
+    out = tmp_path / "out.mcap"
+    rewrite(path, out, MADE, without=(), fresh=())
+    unchanged(path, out, ["/cf1/height", "/cam"])
+    assert len(set(packed(path)) & set(packed(out))) >= 6
+    numbers = {n for n, c in _channels(out).items() if c != "/cam"}
+    assert all(len({n in numbers for n in c.message_index_offsets}) == 1 for c in chunks(out))
+
+
+def _channels(path: Path) -> dict[int, str]:
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    return {number: channel.topic for number, channel in found.channels.items()}
+
+
+def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied_as_it_is(tmp_path: Path) -> None:
+    def fill(writer: Writer, schema: int) -> None:
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        for k in range(20_000):
+            writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
+
+    path = foreign(tmp_path / "a.mcap", fill, compression=CompressionType.NONE, enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"/cf1/height")
+    data[at : at + 11] = b"/cf9/height"  # the summary, which counts, says otherwise
+    path.write_bytes(data)
+    out = tmp_path / "out.mcap"
+    rewrite(path, out, MADE, without=(), fresh=())
+    assert b"/cf9/height" not in out.read_bytes()
+    unchanged(path, out, ["/cf1/height"])
+
+
+def test_what_is_copied_is_checked(flight: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "a.mcap"
+    for chunk in chunks(flight)[2], chunks(flight)[-1]:
+        data = bytearray(flight.read_bytes())
+        data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+        damaged.write_bytes(data)
+        with pytest.raises(RecordingError, match="damaged"):
+            rewrite(damaged, tmp_path / "out.mcap", MADE, without=(), fresh=())
+        with pytest.raises(RecordingError, match="damaged"):
+            merge([damaged, flight], tmp_path / "out.mcap")
+        assert not (tmp_path / "out.mcap").exists()
+
+
+def test_small_chunks_of_a_live_recording_are_put_together(tmp_path: Path) -> None:
+    path, out = tmp_path / "live.mcap", tmp_path / "out.mcap"
+    with RecordingWriter(path, MADE) as sink:
+        for k in range(500):
+            sink.write(k, "/cf1/height", message("Height")(height_m=k))
+            if k % 10 == 9:
+                sink.flush()
+    assert len(chunks(path)) == 50
+    rewrite(path, out, MADE, without=(), fresh=())
+    assert len(chunks(out)) == 1
+    unchanged(path, out, ["/cf1/height"])
+
+
+def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
+    def fill(writer: Writer, schema: int) -> None:
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        for k in range(300):
+            writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
+
+    path = foreign(tmp_path / "a.mcap", fill, use_chunking=False)
+    out = tmp_path / "out.mcap"
+    rewrite(path, out, MADE, without=(), fresh=())
+    assert list(read_raw(out)) == list(read_raw(path))
