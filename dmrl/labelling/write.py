@@ -14,20 +14,25 @@ from dmrl.labelling.camera import camera_of
 from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
 from dmrl.labelling.logs import Logs
 from dmrl.messages import message
-from dmrl.recording import Contents, Timed
+from dmrl.recording import Contents, Series, Timed
 from dmrl.recording.sources import looked_at
 
 Times = NDArray[np.int64]
 
 
-def position_messages(observer: str, peer: str, found: Positions) -> Iterator[Timed]:
-    """PeerPosition messages of one pair, in time order."""
-    topic, frame = topics.position(observer, peer), f"{observer}/horizontal"
-    rows = zip(found.time_ns, found.xyz_m, found.covariance, found.status, strict=True)
-    for time_ns, (x, y, z), covariance, status in rows:
-        fields = {"frame_id": frame, "x": x, "y": y, "z": z, "status": int(status)}
-        made = message("PeerPosition")(covariance=covariance.ravel().tolist(), **fields)
-        yield Timed(int(time_ns), topic, made)
+def position_series(observer: str, peer: str, found: Positions) -> Series:
+    """PeerPosition messages of one pair."""
+    x, y, z = found.xyz_m.T
+    fields = {
+        "frame_id": f"{observer}/horizontal",
+        "x": x,
+        "y": y,
+        "z": z,
+        "covariance": found.covariance.reshape(-1, 9),
+        "status": found.status,
+    }
+    topic = topics.position(observer, peer)
+    return Series(topic, message("PeerPosition"), found.time_ns, fields)
 
 
 def label_messages(

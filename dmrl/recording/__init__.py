@@ -27,7 +27,7 @@ from dmrl.recording.reader import (
 )
 from dmrl.recording.recover import Recovery, recover
 from dmrl.recording.resume import Interrupted, interrupted
-from dmrl.recording.rewrite import Timed, rewrite
+from dmrl.recording.rewrite import Series, Timed, retime, rewrite
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "RawMessage",
     "RecordingWriter",
     "Recovery",
+    "Series",
     "Stamped",
     "Summary",
     "Timed",
@@ -65,6 +66,7 @@ __all__ = [
     "read_raw",
     "read_table",
     "recover",
+    "retime",
     "rewrite",
     "say_findings",
     "splits",

@@ -51,11 +51,18 @@ class Block:
 
     def numbers(self) -> list[int]:
         """Channels that there are messages of."""
-        return [int(number) for number in np.flatnonzero(np.bincount(self.channel))]
+        found: list[int] = np.flatnonzero(np.bincount(self.channel)).tolist()
+        return found
 
     def of(self, channels: Collection[int]) -> "Block":
         """The same bytes with only the messages of some channels."""
-        return self.take(np.isin(self.channel, list(channels)))
+        return self.take(self.among(channels))
+
+    def among(self, channels: Collection[int]) -> NDArray[np.bool_]:
+        """(N,) which messages are of some channels."""
+        chosen = np.zeros(max(max(channels, default=0), int(self.channel.max(initial=0))) + 1, bool)
+        chosen[list(channels)] = True
+        return np.asarray(chosen[self.channel])
 
     def rows(self) -> Iterator[tuple[int, int, int, bytes]]:
         """Channel number, log time, publish time and payload of one message after the other."""
@@ -94,7 +101,7 @@ class Block:
             return self
         if not last:
             return self.take(np.argsort(self.time_ns, kind="stable"))
-        return self.take(np.lexsort((np.isin(self.channel, list(last)), self.time_ns)))
+        return self.take(np.lexsort((self.among(last), self.time_ns)))
 
 
 def concatenate(first: Block | None, second: Block) -> Block:

@@ -82,10 +82,25 @@ def messages_at(data: Bytes, at_record: Ints) -> Block:
     )
 
 
-def set_heads(records: Bytes, at: Ints, number: Ints, time_ns: Ints, publish_ns: Ints) -> None:
-    """Write channel number and times into message records that start at these offsets."""
+def set_heads(
+    records: Bytes, at: Ints, number: Ints, time_ns: Ints, publish_ns: Ints, *, fresh: bool = False
+) -> None:
+    """Write channel number and times into message records.
 
-    def put(offset: int, dtype: str, values: Ints) -> None:
+    Parameters
+    ----------
+    records
+        One after another.
+    at
+        (N + 1,) where each starts, and the end of the last.
+    number, time_ns, publish_ns
+        (N,) what to write.
+    fresh
+        Nothing stands there yet: write the rest of the head as well.
+    """
+    at, size = at[:-1], np.diff(at)
+
+    def put(offset: int, dtype: str, values: Ints | int) -> None:
         # A view with a stride of one byte writes unaligned integers in one go.
         size = np.dtype(dtype).itemsize
         view = np.ndarray((max(len(records) - size + 1, 0),), dtype, records.data, 0, (1,))
@@ -94,6 +109,9 @@ def set_heads(records: Bytes, at: Ints, number: Ints, time_ns: Ints, publish_ns:
     put(RECORD_HEADER, "<u2", number)
     put(RECORD_HEADER + 6, "<u8", time_ns)
     put(RECORD_HEADER + 14, "<u8", publish_ns)
+    if fresh:
+        put(0, "<u1", MESSAGE)
+        put(1, "<u8", size - RECORD_HEADER)
 
 
 @dataclass(frozen=True, slots=True)

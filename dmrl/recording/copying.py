@@ -76,12 +76,14 @@ class Wanted:
 
     def rows(self, piece: Piece) -> NDArray[np.bool_]:
         """(N,) which messages of a piece."""
-        block, topics = piece.block, {n: c.topic for n, c in piece.channels.items()}
-        known = np.zeros((2, max(topics, default=0) + 1), np.bool_)
-        known[0, [n for n, topic in topics.items() if topic in self.topics]] = True
-        known[1, [n for n, topic in topics.items() if topic in self.always]] = True
-        mine, ever = known[:, block.channel]
-        return np.asarray((mine & self.of_time(block)) | ever)
+        block, present = piece.block, piece.block.numbers()
+        topics = {number: piece.channels[number].topic for number in present}
+        of_time = self.of_time(block)
+        if of_time.all() and self.topics.issuperset(topics.values()):
+            return of_time
+        mine = block.among([n for n, topic in topics.items() if topic in self.topics])
+        ever = block.among([n for n, topic in topics.items() if topic in self.always])
+        return np.asarray((mine & of_time) | ever)
 
 
 def copy(path: Path, wanted: Wanted, sink: RecordingWriter) -> int:
@@ -105,7 +107,7 @@ def adopt(path: Path, topics: Collection[str], sink: RecordingWriter) -> None:
         if summary is not None:
             channels = _channels(summary)
             kept = {n: channel for n, channel in channels.items() if channel.topic in topics}
-            sink.adopt(kept, summary.channels)
+            sink.chunks.adopt(kept, summary.channels)
 
 
 def put(piece: Piece, wanted: Wanted | None, sink: RecordingWriter) -> int:
@@ -117,10 +119,10 @@ def put(piece: Piece, wanted: Wanted | None, sink: RecordingWriter) -> int:
         count = int((rows & wanted.of_time(block)).sum())
         if not rows.all():
             block, piece = block.take(rows), replace(piece, chunk=None)
-    if piece.chunk is not None and sink.append_chunk(piece.chunk, block, piece.channels):
+    if piece.chunk is not None and sink.chunks.append_chunk(piece.chunk, block, piece.channels):
         return count
     if len(block):
-        sink.append(block, piece.channels)
+        sink.chunks.append(block, piece.channels)
     return count
 
 

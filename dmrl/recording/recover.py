@@ -152,7 +152,7 @@ def recover(path: Path, out: Path) -> Recovery:
             raise RecordingError(f"{path} holds no whole chunk: nothing to recover. Make it again")
         with RecordingWriter(out, _provenance(walk)) as sink:
             for piece in chain([first], pieces):
-                sink.adopt(walk.channels, walk.numbered)
+                sink.chunks.adopt(walk.channels, walk.numbered)
                 walk.recovery.messages += put(piece, None, sink)
             copy_extras(Summary({}, 0, 0, walk.metadata, walk.attachments), sink)
     _account(walk)

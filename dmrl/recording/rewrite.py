@@ -1,11 +1,18 @@
 """A recording written again, with some topics in place of those it had."""
 
 import heapq
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dmrl.recording.copying import Wanted, copy
+import numpy as np
+
+from dmrl.recording.block import ROWS, Ints
+from dmrl.recording.channel import RawMessage
+from dmrl.recording.copying import EVER_NS, Wanted, adopt, copy, pieces, put
+from dmrl.recording.encode import Value
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import Provenance
@@ -20,13 +27,32 @@ class Timed(NamedTuple):
     message: Any
 
 
+class Series(NamedTuple):
+    """Messages of one topic as columns; see `RecordingWriter.write_columns`. Times increase."""
+
+    topic: str
+    kind: Any
+    time_ns: Ints
+    fields: Mapping[str, Value]
+
+    def between(self, first_ns: int, end_ns: int) -> "Series":
+        """Those of log times in [first_ns, end_ns)."""
+        rows = slice(*np.searchsorted(self.time_ns, (first_ns, end_ns)).tolist())
+        parts = {
+            name: value[rows] if isinstance(value, np.ndarray) else value
+            for name, value in self.fields.items()
+        }
+        return self._replace(time_ns=self.time_ns[rows], fields=parts)
+
+
 def rewrite(
     recording: Path,
     out: Path,
     made: Provenance,
     *,
     without: Collection[str],
-    fresh: Iterable[Iterable[Timed]],
+    fresh: Iterable[Iterable[Timed]] = (),
+    series: Sequence[Series] = (),
     metadata: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
     """Copy a recording bit for bit, but for some topics, and add new messages.
@@ -41,6 +67,8 @@ def rewrite(
         Topics that are left out.
     fresh
         Streams of new messages, each in time order.
+    series
+        New messages as columns.
     metadata
         Records to add, by name.
 
@@ -59,5 +87,62 @@ def rewrite(
             sink.add_metadata(name, values)
         copy(recording, Wanted(kept), sink)
         sink.flush()  # what is new begins at the start again: it gets chunks of its own
+        for part in _by_time(series):
+            sink.write_columns(*part)
         for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
             sink.write(*item)
+
+
+def _by_time(series: Sequence[Series]) -> Iterator[Series]:
+    """One stretch of time after another, so that whoever reads by time holds little."""
+    times = np.sort(np.concatenate([np.empty(0, np.int64), *(one.time_ns for one in series)]))
+    for first_ns, end_ns in pairwise([*times[::ROWS].tolist(), EVER_NS]):
+        for one in series:
+            yield one.between(first_ns, end_ns)
+
+
+def retime(
+    recording: Path,
+    sink: RecordingWriter,
+    corrected: Callable[[str, Ints], Ints],
+    each: Mapping[str, Callable[[RawMessage], RawMessage]],
+) -> None:
+    """Copy all messages of a recording, with other times.
+
+    Parameters
+    ----------
+    recording, sink
+        Recording to read and recording to write.
+    corrected
+        Topic and (N,) log times to what is added to them, and to publish times, nanoseconds.
+    each
+        By topic: what becomes of every message, for those that hold their time inside.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read.
+    OutputError
+        If the other cannot be written.
+    """
+    every = Wanted(frozenset(summary(recording).topics))
+    adopt(recording, every.topics, sink)
+    for piece in pieces(recording, every):
+        block, topics = piece.block, {n: piece.channels[n].topic for n in piece.block.numbers()}
+        alone = [number for number, topic in topics.items() if topic in each]
+        later = np.zeros(len(block), np.int64)
+        for number in topics.keys() - alone:
+            rows = block.channel == number
+            later[rows] = corrected(topics[number], block.time_ns[rows])
+        if not alone and not later.any():
+            put(piece, every, sink)
+            continue
+        shifted = replace(
+            block,
+            time_ns=block.time_ns + later,
+            publish_ns=np.maximum(block.publish_ns + later, 0),
+        )
+        sink.chunks.append(shifted.take(~block.among(alone)), piece.channels)
+        for number, time_ns, publish_ns, data in block.of(alone).rows():
+            raw = RawMessage(time_ns, publish_ns, piece.channels[number], data)
+            sink.write_raw(each[raw.topic](raw))

@@ -3,34 +3,28 @@
 Pictures stand in chunks of their own, so that whoever reads numbers unpacks no picture.
 """
 
-import zlib
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
 from google.protobuf.descriptor import Descriptor
-from mcap.records import Channel as McapChannel
-from mcap.records import Chunk
 
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
 from dmrl.output import as_output_error, partial_file
-from dmrl.recording.block import HEAD_BYTES, Block
+from dmrl.recording.assembly import Assembly
+from dmrl.recording.block import HEAD_BYTES, Ints
 from dmrl.recording.channel import Channel, RawMessage
-from dmrl.recording.chunks import set_heads
-from dmrl.recording.container import Container, Packed
-from dmrl.recording.defined import Defined
-from dmrl.recording.open_chunk import CHUNK_BYTES, OpenChunk
+from dmrl.recording.container import Container
+from dmrl.recording.encode import Value, encode
+from dmrl.recording.open_chunk import OpenChunk
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.topics import row_of
 
 SUFFIX = ".mcap"
 RECIPE_NAME = "recipe.toml"
-OLDEST = 16
-"""A chunk is written, full or not, once so many of the other kind were written after its start."""
 
 
 class RecordingWriter:
@@ -68,14 +62,13 @@ class RecordingWriter:
         if SUFFIX not in path.suffixes:  # a resumed one is out.mcap.kept for a while
             raise OutputError(f"{path} is no name of a recording. Call it {path.name}{SUFFIX}")
         self._path = path
-        self._defined = Defined()
         self._topics: dict[str, tuple[type, int, OpenChunk]] = {}
-        self._numbers, self._pictures = OpenChunk(), OpenChunk()
         self._resources = ExitStack()
         partial = self._resources.enter_context(partial_file(path, keep_on_error=keep_on_error))
         try:
             self._file = Container(partial, f"dmrl {provenance.dmrl_version}")
             self._resources.callback(self._file.close)
+            self.chunks = Assembly(path, self._file)
             self._file.add_metadata(METADATA_NAME, provenance.to_metadata())
             text = provenance.to_recipe() if recipe is None else recipe
             self.add_attachment(RECIPE_NAME, "application/toml", text.encode())
@@ -110,106 +103,55 @@ class RecordingWriter:
         known = self._topics.get(topic)
         if known is None or known[0] is not type(message):
             channel = channel_for(topic, message.DESCRIPTOR)
-            known = type(message), *self._begin(channel)
+            known = type(message), *self.chunks.begin(channel)
             self._topics[topic] = known
         _, number, chunk = known
+        times_ns = time_ns, time_ns if publish_ns is None else publish_ns
+        self.chunks.add(number, chunk, times_ns, message.SerializeToString(), topic)
+
+    def write_columns(
+        self,
+        topic: str,
+        kind: Any,
+        time_ns: Ints,
+        fields: Mapping[str, Value],
+        *,
+        publish_ns: Ints | None = None,
+    ) -> None:
+        """Append many messages of one topic, from columns: a tenth of the time of `write`.
+
+        Parameters
+        ----------
+        topic
+            Topic, as in ``topics.py``.
+        kind
+            The class of their type: ``message("Attitude")``.
+        time_ns
+            (N,) log times, nanoseconds.
+        fields
+            By name: (N,) values, (N, K) for a repeated field, one value for all, or the fields of
+            a sub-message. Those that are missing have their default.
+        publish_ns
+            (N,) when they were received, nanoseconds. None: the log times.
+
+        Raises
+        ------
+        RecordingError
+            If the topic is dmrl's and carries another message type, or a time is negative.
+        KeyError, TypeError, ValueError
+            If a column is none of the type's.
+        """
+        if not len(time_ns):
+            return
+        channel = channel_for(topic, kind.DESCRIPTOR)
+        records, at = encode(kind.DESCRIPTOR, fields, len(time_ns), HEAD_BYTES)
         publish_ns = time_ns if publish_ns is None else publish_ns
-        if time_ns < 0 or publish_ns < 0:
-            raise self._negative(time_ns, topic)
-        chunk.add(number, time_ns, publish_ns, message.SerializeToString())
-        if chunk.full:
-            self._close(chunk)
+        self.chunks.add_records(channel, records, at, time_ns, publish_ns)
 
     def write_raw(self, raw: RawMessage) -> None:
         """Append a message of another recording, bit for bit."""
-        if raw.time_ns < 0 or raw.publish_ns < 0:
-            raise self._negative(raw.time_ns, raw.topic)
-        number, chunk = self._begin(raw.channel)
-        chunk.add(number, raw.time_ns, raw.publish_ns, raw.data)
-        if chunk.full:
-            self._close(chunk)
-
-    def adopt(self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]) -> None:
-        """Number channels of a recording that is copied as they are there; see `Defined`."""
-        self._defined.adopt(channels, records)
-
-    def append(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        """Append many messages, bit for bit.
-
-        Parameters
-        ----------
-        block
-            The messages, with the times that they are to have.
-        channels
-            By their numbers in it.
-
-        Raises
-        ------
-        RecordingError
-            If a time is negative.
-        """
-        present = block.numbers()
-        for pictured in (False, True):
-            own = [number for number in present if channels[number].pictured == pictured]
-            if own:
-                part = block if len(own) == len(present) else block.of(own)
-                self._append(part, {number: channels[number] for number in own})
-
-    def _append(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        """Append messages that are all pictures, or none of them."""
-        self._refuse_negative(block, channels)
-        numbers = np.zeros(max(channels) + 1, np.int64)
-        for number, channel in channels.items():
-            numbers[number], chunk = self._begin(channel)
-        records, at = block.records()
-        set_heads(records, at[:-1], numbers[block.channel], block.time_ns, block.publish_ns)
-        while len(at) > 1:
-            at = at[chunk.fill(records, at) :]
-            if chunk.full:
-                self._close(chunk)
-
-    def append_chunk(self, chunk: Chunk, block: Block, channels: Mapping[int, Channel]) -> bool:
-        """Append a chunk as it is, still compressed, if it can stand in this recording.
-
-        Parameters
-        ----------
-        chunk
-            A chunk that passed its CRC.
-        block
-            All of its messages, in the order of the chunk.
-        channels
-            By their numbers in it.
-
-        Returns
-        -------
-        bool
-            False: it mixes pictures and numbers, is small, or channels have other numbers here.
-            Nothing was written then.
-
-        Raises
-        ------
-        RecordingError
-            If a time is negative.
-        """
-        pictured = {channels[number].pictured for number in block.numbers()}
-        small = chunk.uncompressed_size < CHUNK_BYTES // 4
-        if len(pictured) != 1 or small or not self._defined.begin_in(block, channels):
-            return False
-        self._refuse_negative(block, channels)
-        before = self._pictures if pictured.pop() else self._numbers
-        self._close(before)  # what came before it stands before it
-        crc = chunk.uncompressed_crc or zlib.crc32(block.data.data)
-        places = block.channel, block.time_ns, block.start - HEAD_BYTES
-        packed = Packed(chunk.compression, chunk.data, chunk.uncompressed_size, crc, *places)
-        self._put(packed, before)
-        return True
-
-    def _refuse_negative(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        earliest = np.minimum(block.time_ns, block.publish_ns)
-        if earliest.min() < 0:
-            worst = int(np.argmin(earliest))
-            topic = channels[int(block.channel[worst])].topic
-            raise self._negative(int(block.time_ns[worst]), topic)
+        number, chunk = self.chunks.begin(raw.channel)
+        self.chunks.add(number, chunk, (raw.time_ns, raw.publish_ns), raw.data, raw.topic)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Append named strings, such as the source's own split."""
@@ -221,37 +163,7 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Close the open chunks, so that a killed process keeps them."""
-        for chunk in (self._numbers, self._pictures):
-            self._close(chunk)
-
-    def _begin(self, channel: Channel) -> tuple[int, OpenChunk]:
-        """Number of a channel, defined before its first message, and the chunk it goes to."""
-        number = self._defined.number(channel)
-        chunk = self._pictures if channel.pictured else self._numbers
-        chunk.define(self._defined.begin(number))
-        return number, chunk
-
-    def _close(self, chunk: OpenChunk) -> None:
-        """Write a chunk, if it holds messages."""
-        if chunk.starts:
-            self._put(chunk.packed(), chunk)
-
-    def _put(self, packed: Packed, chunk: OpenChunk) -> None:
-        """Write what was in a chunk, and the other one if it is old."""
-        try:
-            self._file.add_chunk(packed)
-        except OSError as e:
-            raise as_output_error(self._path, e) from e
-        other = self._pictures if chunk is self._numbers else self._numbers
-        other.age += bool(other.starts)
-        if other.age >= OLDEST:
-            self._close(other)
-
-    def _negative(self, time_ns: int, topic: str) -> RecordingError:
-        return RecordingError(
-            f"{self._path}: time {time_ns} ns on {topic} is negative, which MCAP cannot hold. "
-            "Shift the recording's times"
-        )
+        self.chunks.flush()
 
     def _abandon(self, error: BaseException) -> None:
         self._resources.__exit__(type(error), error, error.__traceback__)
@@ -266,11 +178,10 @@ class RecordingWriter:
             self._resources.__exit__(kind, error, traceback)
             return
         try:
-            self.flush()
-            self._file.finish(*self._defined.all_begun())
-        except (OSError, OutputError) as e:
+            self.chunks.finish()
+        except OutputError as e:
             self._abandon(e)
-            raise (e if isinstance(e, OutputError) else as_output_error(self._path, e)) from e
+            raise
         self._resources.close()
 
 

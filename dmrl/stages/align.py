@@ -6,40 +6,40 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from cyclopts import Parameter
+from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.estimation.clocks import Clock, connected
 from dmrl.formats.counters import dejitter
 from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
-from dmrl.messages import message
+from dmrl.labelling.corrected import MOCAP, Corrected
 from dmrl.output import refuse_existing
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import (
     Contents,
-    RawMessage,
     RecordingWriter,
     copy_extras,
-    parsed,
     provenance,
-    read_raw,
     read_table,
     splits,
     summary,
 )
 from dmrl.terminal.arguments import Workers
-from dmrl.terminal.progress import say, track
+from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
 METADATA = "dmrl.clocks"
-MOCAP = "mocap"
-"""Stands where a robot's name does."""
 ALL = "*"
 """Stands for all of a recording, where all of it had to be moved."""
 TELLING = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE, topics.TRUE_POSE)
 """What clocks are told by, beside images and transforms."""
-STAMPED = ("CompressedImage", "CameraCalibration", "PoseInFrame")
+LIBRARIES = ("numpy",)
+
+
+Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,32 +101,19 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
         clocks = _robots(held, settings)
     if settings.cameras:
         clocks |= _cameras(held, clocks, steady)
-    later_ns = max(0, -_earliest_ns(held, clocks, steady))
+    corrected = Corrected(held, dict(clocks), steady)
+    later_ns = max(0, -corrected.earliest_ns())
     if later_ns:
         say(f"{recording}: all times are moved by {later_ns / 1e9:.9g} s, as one would be before 0")
         clocks[ALL] = Clock(later_ns * 1e-9, by="no time before 0")
-    _write(held, out, clocks, steady, later_ns, settings)
+    with RecordingWriter(
+        out, provenance("align", settings, [recording], libraries=LIBRARIES)
+    ) as sink:
+        copy_extras(held.summary, sink)
+        told = {robot: json.dumps(_told(c, held.start_ns)) for robot, c in clocks.items()}
+        sink.add_metadata(METADATA, told)
+        replace(corrected, later_ns=later_ns).write(sink)
     return clocks
-
-
-def _earliest_ns(
-    held: Contents,
-    clocks: Mapping[str, Clock],
-    steady: Mapping[str, Mapping[int, int]],
-) -> int:
-    """The first time of all messages, corrected: every robot's own first one counts."""
-    found = []
-    for topic in held.topics:
-        if topic == topics.TRANSFORMS:  # whose they are stands inside
-            raws = list(read_raw(held.path, topic))
-            found += [raw.time_ns + _correction_ns(raw, raw.time_ns, clocks, held) for raw in raws]
-            continue
-        times = held.times(topic)
-        if len(times):
-            first = int(min(steady.get(topic, {}).values(), default=times.min()))
-            clock = _clock_of(topic, topic.split("/")[1] if topic.count("/") > 1 else "", clocks)
-            found.append(first + (_shift_ns(first, clock, held.start_ns) if clock else 0))
-    return min(found, default=0)
 
 
 def _robots(held: Contents, settings: Settings) -> dict[str, Clock]:
@@ -208,27 +195,6 @@ def _steady(held: Contents) -> dict[str, dict[int, int]]:
     return found
 
 
-def _write(
-    held: Contents,
-    out: Path,
-    clocks: dict[str, Clock],
-    steady: dict[str, dict[int, int]],
-    later_ns: int,
-    settings: Settings,
-) -> None:
-    made = provenance("align", settings, [held.path], libraries=("numpy",))
-    copied = track(read_raw(held.path), "Writing", held.summary.count)
-    with RecordingWriter(out, made) as sink:
-        copy_extras(held.summary, sink)
-        told = {robot: json.dumps(_told(c, held.start_ns)) for robot, c in clocks.items()}
-        sink.add_metadata(METADATA, told)
-        for raw in copied:
-            even_ns = steady.get(raw.topic, {}).get(raw.time_ns, raw.time_ns)
-            shift_ns = later_ns + _correction_ns(raw, even_ns, clocks, held)
-            times_ns = even_ns + shift_ns, max(raw.publish_ns + shift_ns, 0)
-            sink.write_raw(_at(raw, *times_ns, held.path))
-
-
 def _told(clock: Clock, start_ns: int) -> dict[str, float | str]:
     return {
         "offset_s": clock.offset_s,
@@ -239,55 +205,6 @@ def _told(clock: Clock, start_ns: int) -> dict[str, float | str]:
         "correlation": clock.correlation,
         "by": clock.by,
     }
-
-
-def _at(raw: RawMessage, time_ns: int, publish_ns: int, recording: Path) -> RawMessage:
-    data = raw.data if time_ns == raw.time_ns else _stamped(raw, time_ns, recording)
-    return replace(raw, time_ns=time_ns, publish_ns=publish_ns, data=data)
-
-
-def _shift_ns(time_ns: int, clock: Clock, start_ns: int) -> int:
-    """What a time lacks on the reference's clock. As a float it is exact enough: times are not."""
-    elapsed_s = (time_ns - start_ns) * 1e-9
-    return round((clock.offset_s + clock.drift * (elapsed_s - clock.at_s)) * 1e9)
-
-
-def _correction_ns(
-    raw: RawMessage,
-    time_ns: int,
-    clocks: Mapping[str, Clock],
-    held: Contents,
-) -> int:
-    clock = _clock_of(raw.topic, _robot(raw, held.path), clocks)
-    return _shift_ns(time_ns, clock, held.start_ns) if clock else 0
-
-
-def _clock_of(topic: str, robot: str, clocks: Mapping[str, Clock]) -> Clock | None:
-    """What corrects a message's times: its robot's clock, its camera's, or motion capture's."""
-    if topic.startswith(f"/{robot}/camera/") and f"{robot}/camera" in clocks:
-        return clocks[f"{robot}/camera"]
-    if MOCAP in clocks and (topic == topics.TRANSFORMS or topic.endswith("/truth")):
-        return clocks[MOCAP]
-    return clocks.get(robot)
-
-
-def _robot(raw: RawMessage, recording: Path) -> str:
-    """Whose message it is; of transforms, whose the first frame is."""
-    if raw.topic != topics.TRANSFORMS:
-        return raw.topic.split("/")[1] if raw.topic.count("/") > 1 else ""
-    frames = parsed(raw, message("FrameTransforms"), recording).transforms
-    return str(frames[0].child_frame_id.split("/")[0]) if frames else ""
-
-
-def _stamped(raw: RawMessage, time_ns: int, recording: Path) -> bytes:
-    """The message with its own time set as well, where it has one."""
-    name = raw.schema_name.removeprefix("foxglove.")
-    if name not in (*STAMPED, "FrameTransforms"):
-        return raw.data
-    decoded = parsed(raw, message(name), recording)
-    for part in decoded.transforms if name == "FrameTransforms" else [decoded]:
-        part.timestamp.seconds, part.timestamp.nanos = divmod(time_ns, 1_000_000_000)
-    return bytes(decoded.SerializeToString())
 
 
 DEFAULTS = Settings()

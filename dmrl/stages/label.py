@@ -29,7 +29,7 @@ try:
     from dmrl.labelling.report import PairReport, doubts, pair_report
     from dmrl.labelling.sight import SEEN, read_sight
     from dmrl.labelling.sighted import sighted
-    from dmrl.labelling.write import label_messages, position_messages
+    from dmrl.labelling.write import label_messages, position_series
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl label") from e
 
@@ -136,13 +136,12 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
         robot: list(label_messages(held, logs, robot, _of(positions, robot), look))
         for robot in filming
     }
-    fresh = [position_messages(*pair, found) for pair, found in positions.items()]
-    fresh += [iter(messages) for messages in made.values()]
+    series = [position_series(*pair, found) for pair, found in positions.items()]
     replaced = [topics.labels(robot) for robot in filming]
     replaced += [topic for topic in held.topics if topics.names(topics.POSITION, topic)]
     inputs = [recording, *settings.camera.values()]
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
-    rewrite(recording, out, origin, without=replaced, fresh=fresh)
+    rewrite(recording, out, origin, without=replaced, fresh=made.values(), series=series)
     warnings = [*logs.warnings, *_blind(held, filming, cameras)]
     warnings += [line for pair in logs.pairs for line in doubts(pair, estimates[pair])]
     return Result(reports, _count(made.values()), warnings)

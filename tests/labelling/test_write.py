@@ -12,9 +12,9 @@ from dmrl import topics
 from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
 from dmrl.labelling.labels import NEAREST_M, Look, Positions
 from dmrl.labelling.logs import Logs, RobotLog
-from dmrl.labelling.write import label_messages, position_messages
+from dmrl.labelling.write import label_messages, position_series
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
-from dmrl.recording import Contents, Provenance, RecordingWriter
+from dmrl.recording import Contents, Provenance, RecordingWriter, read
 
 SECOND_NS = 1_000_000_000
 START_NS = 5 * SECOND_NS
@@ -58,9 +58,13 @@ def written(path: Path, found: dict[str, Positions], camera: Camera, known: Logs
     return list(label_messages(Contents(path), known, "cf1", found, look))
 
 
-def test_a_position_message_says_all_of_it() -> None:
+def test_a_position_message_says_all_of_it(tmp_path: Path) -> None:
     found = at([1.0, 2.0], STATUS_UNCONVERGED)
-    first, second = position_messages("cf1", "cf2", found)
+    series = position_series("cf1", "cf2", found)
+    assert series.topic == "/cf1/peer/cf2/position"
+    with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
+        sink.write_columns(*series)
+    first, second = read(tmp_path / "a.mcap")
     assert (first.time_ns, first.topic) == (START_NS + SECOND_NS, "/cf1/peer/cf2/position")
     said = second.message
     assert (said.x, said.y, said.z) == pytest.approx((2.0, 0.2, 0.1))

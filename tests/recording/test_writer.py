@@ -105,7 +105,7 @@ with RecordingWriter(Path(sys.argv[1]), Provenance("test")) as sink:
         sink.write(k, "/cf1/height", message("Height")(height_m=k * 0.1))
         k += 1
         if k % 1000 == 0:
-            print(k, len(sink._numbers.data), flush=True)
+            print(k, len(sink.chunks._numbers.data), flush=True)
 """
 
 
