@@ -1,0 +1,134 @@
+"""Every command goes over a recording once: chunks that are unpacked, over chunks in the file."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from dmrl import card, topics
+from dmrl.messages import message
+from dmrl.recording import (
+    RecordingWriter,
+    blocks,
+    check,
+    merge,
+    open_chunk,
+    provenance,
+    summary,
+    trim,
+)
+from dmrl.recording.copying import Wanted, copy
+from dmrl.stages import dataset, evaluate, fly, label, track
+
+Passes = Callable[[Path], float]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two robots for half a minute, pictures of one, and what a network found in them."""
+    folder = tmp_path_factory.mktemp("passes")
+    flown, out = folder / "flown.mcap", folder / "flight.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(open_chunk, "CHUNK_BYTES", 16 * 1024)  # many chunks of a short flight
+        fly.run(
+            flown,
+            fly.Settings(2, 30.0, seed=1001, camera=True, cameras_max=1, camera_rate_hz=4.0),
+        )
+        with RecordingWriter(out, provenance("test", inputs=[flown])) as sink:
+            copy(flown, Wanted(frozenset(summary(flown).topics)), sink)
+            rng = np.random.default_rng(0)
+            for time_ns in _times(flown, "/cf1/camera/image"):
+                found = {"u_px": rng.uniform(0, 320), "v_px": 100.0, "depth_m": 1.0}
+                seen = [{**found, "confidence": 0.9}]
+                made = message("Detections")(detections=seen, threshold=0.5)
+                sink.write(time_ns, topics.detections("cf1"), made)
+    return out
+
+
+def _times(path: Path, topic: str) -> list[int]:
+    with path.open("rb") as stream:
+        return [m.log_time for _, _, m in make_reader(stream).iter_messages([topic])]
+
+
+def _chunks(path: Path) -> int:
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    return len(found.chunk_indexes)
+
+
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
+    """How often a recording was gone over since the last call."""
+    opened: Counter[str] = Counter()
+    unpacked = blocks.unpacked
+
+    def counted(path: Path, *rest: object) -> object:
+        opened[path.name] += 1
+        return unpacked(path, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(blocks, "unpacked", counted)
+    monkeypatch.setattr(card, "plots", None)
+
+    def count(path: Path) -> float:
+        found = opened[path.name] / _chunks(path)
+        opened.clear()
+        return found
+
+    return count
+
+
+def test_a_check_is_one_pass(flight: Path, passes: Passes) -> None:
+    assert _chunks(flight) > 40
+    check(flight)
+    assert passes(flight) == 1.0
+
+
+def test_a_trim_is_less_than_one_pass(flight: Path, passes: Passes, tmp_path: Path) -> None:
+    trim(flight, tmp_path / "a.mcap", end_ns=summary(flight).start_ns + 10**10)
+    assert 0.2 < passes(flight) < 0.5
+    trim(flight, tmp_path / "b.mcap", topics=["/cf2/*"])
+    assert passes(flight) <= 1.0
+
+
+def test_a_merge_is_one_pass_over_each(flight: Path, passes: Passes, tmp_path: Path) -> None:
+    parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    middle_ns = summary(flight).start_ns + 15 * 10**9
+    trim(flight, parts[0], end_ns=middle_ns)
+    trim(flight, parts[1], start_ns=middle_ns)
+    passes(flight)
+    merge(parts, tmp_path / "out.mcap")
+    assert passes(parts[0]) == 1.0
+    merge(parts, tmp_path / "again.mcap")
+    assert passes(parts[1]) == 1.0
+
+
+def test_a_dataset_is_one_pass(flight: Path, passes: Passes, tmp_path: Path) -> None:
+    dataset.run([flight], tmp_path / "out", dataset.Settings())
+    assert passes(flight) <= 1.0
+
+
+def test_evaluating_is_one_pass(flight: Path, passes: Passes) -> None:
+    evaluate.run([flight], None, evaluate.Settings(draws=2))
+    assert passes(flight) <= 1.0
+
+
+def test_labelling_is_two_passes_one_of_them_the_copy(
+    flight: Path, passes: Passes, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.mcap"
+    label.run(flight, out, label.Settings(gate_m=0.5))
+    assert passes(flight) <= 2.0
+    evaluate.run([out], None, evaluate.Settings("positions"))
+    assert passes(out) <= 1.0
+
+
+def test_tracking_is_two_passes(flight: Path, passes: Passes, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    track.run(flight, out, track.Settings())
+    assert passes(flight) <= 2.0
+    evaluate.run([out], None, evaluate.Settings("tracks"))
+    assert passes(out) <= 1.0
