@@ -169,9 +169,9 @@ class Container:
         said.attachment_count = len(self._attachments)
         said.channel_message_counts = dict(sorted(self._counts.items()))
         start, body, offsets = self._at, b"", b""
-        groups = (schemas, channels, [said], self._chunks, self._attachments, self._metadata)
-        for group in groups:
-            records = b"".join(map(_chunk_index if group is self._chunks else laid_out, group))
+        chunks = b"".join(_chunk_index(chunk) for chunk in self._chunks)
+        before = laid_out(*schemas), laid_out(*channels), laid_out(said)
+        for records in (*before, chunks, laid_out(*self._attachments), laid_out(*self._metadata)):
             if records:
                 at = start + len(body)
                 offsets += laid_out(SummaryOffset(records[0], at, len(records)))

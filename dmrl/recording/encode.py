@@ -93,7 +93,7 @@ def _field(field: FieldDescriptor, value: Value, count: int) -> Cells:
     array = np.asarray(value)
     if field.is_repeated:
         body = _repeated(field, array, count)
-        return _delimited(field, body, body.there.any(axis=1))
+        return _delimited(field, body, np.asarray(body.there.any(axis=1)))
     body, zero = _scalar(field, np.broadcast_to(array, count))
     cells = _side_by_side([_constant(_tag(field, _wire(field)), count), body], count)
     return cells._replace(there=cells.there & ~zero[:, None])
@@ -105,7 +105,7 @@ def _scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, 
         values = np.ascontiguousarray(array, dtype=FIXED[field.type])
         data = values.view(np.uint8).reshape(len(values), -1)
         # As protobuf: -0.0 is no default.
-        return Cells(data, np.ones(data.shape, bool)), ~data.any(axis=1)
+        return Cells(data, np.ones(data.shape, bool)), ~np.asarray(data.any(axis=1))
     if field.type not in VARINTS or field.type in (F.TYPE_SINT32, F.TYPE_SINT64):
         raise TypeError(f"{field.full_name} has a type that is not written from columns")
     values = array.astype(VARINTS[field.type]).astype(np.int64).view(np.uint64)
