@@ -15,7 +15,7 @@ from mcap.records import Chunk, Message
 from dmrl.border import limits
 from dmrl.errors import RecordingError
 from dmrl.recording.block import Block
-from dmrl.recording.chunks import headers, loose, messages_at, of_channels, scanned, unpacked
+from dmrl.recording.chunks import loose, messages_at, of_channels, scanned, unpacked
 
 PATH = Path("a.mcap")
 ROWS = [(7, 30, 31, b"ab"), (300, 2**40, 2**50, b""), (7, 5, 6, b"xyz")]
@@ -34,14 +34,14 @@ def bytes_of(data: bytes) -> np.ndarray:
 
 
 def block(rows: list[tuple[int, int, int, bytes]] = ROWS) -> Block:
-    return scanned(bytes_of(b"".join(message_record(*row) for row in rows)))
+    return scanned(bytes_of(b"".join(message_record(*row) for row in rows))).block
 
 
 def test_messages_among_other_records_are_found_at_any_byte() -> None:
     for junk in range(4):
         parts = [record(Opcode.SCHEMA, bytes(junk)) + message_record(*row) for row in ROWS]
-        assert list(scanned(bytes_of(b"".join(parts))).rows()) == ROWS
-    assert len(scanned(bytes_of(b""))) == 0
+        assert list(scanned(bytes_of(b"".join(parts))).block.rows()) == ROWS
+    assert len(scanned(bytes_of(b"")).block) == 0
     assert len(messages_at(bytes_of(b"abc"), np.zeros(0, np.int64))) == 0
 
 
@@ -51,18 +51,17 @@ def test_loose_messages_are_a_block() -> None:
 
 
 def test_records_fill_a_chunk_to_its_last_byte() -> None:
-    whole = message_record(1, 2, 3, b"data")
-    assert list(headers(bytes_of(whole * 2))) == [
-        (Opcode.MESSAGE, 0, len(whole)),
-        (Opcode.MESSAGE, len(whole), 2 * len(whole)),
-    ]
+    whole, other = message_record(1, 2, 3, b"data"), record(Opcode.SCHEMA, b"abc")
+    scan = scanned(bytes_of(whole + other + whole))
+    assert scan.messages == [0, len(whole + other)]
+    assert scan.others == [(Opcode.SCHEMA, len(whole), len(whole + other))]
     for lost in range(1, len(whole)):
         with pytest.raises(McapError):
-            list(headers(bytes_of(whole + whole[:-lost])))
+            scanned(bytes_of(whole + whole[:-lost]))
     short = record(Opcode.MESSAGE, bytes(21))  # a message's own header takes 22
     with pytest.raises(McapError, match="wrong length"):
-        list(headers(bytes_of(short)))
-    assert len(list(headers(bytes_of(record(Opcode.MESSAGE, bytes(22)))))) == 1
+        scanned(bytes_of(short))
+    assert scanned(bytes_of(record(Opcode.MESSAGE, bytes(22)))).messages == [0]
 
 
 def test_only_the_channels_that_are_asked_for() -> None:
