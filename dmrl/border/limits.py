@@ -11,8 +11,14 @@ UNPACKED_BYTES = 128 * MB
 """What a chunk of a recording may unpack to; dmrl's own hold 256 KiB and a message."""
 
 UNPACKED_TIMES = 100
-"""A recording may unpack to `UNPACKED_BYTES`, and this many times its own size. The most that
-dmrl's own topics reach is about 20; pictures reach 1."""
+"""A recording, or an archive of arrays, may unpack to `UNPACKED_BYTES`, and this many times its
+own size. The most that dmrl's own topics reach is about 20; pictures reach 1."""
+
+MEMORY_BYTES = 500 * MB
+"""What a library may take to read a file as a whole (see `dmrl.border.memory`)."""
+
+MEMORY_TIMES = 10
+"""It may take `MEMORY_BYTES`, and this many times the file's own size."""
 
 TOPICS = 2_000
 """Channels of a recording, and schemas."""
@@ -25,6 +31,9 @@ PIXELS = 64 * MB
 
 DECODED_PIXELS = 1_000 * MB
 """Of a picture, each of its scans counted: a progressive JPEG of a few kB can have thousands."""
+
+PEERS = 1_000
+"""Labels of one image of a dataset."""
 
 DEPTH = 200
 """Of JSON and TOML: how many tables and lists stand in each other."""
@@ -46,5 +55,10 @@ ANCESTORS = 64
 
 
 def unpacked_bytes(size: int) -> int:
-    """What a recording of ``size`` bytes may unpack to."""
+    """What a recording, or an archive of arrays, of ``size`` bytes may unpack to."""
     return UNPACKED_BYTES + UNPACKED_TIMES * size
+
+
+def memory_bytes(size: int) -> int:
+    """What a library may take to read a file of ``size`` bytes as a whole."""
+    return MEMORY_BYTES + MEMORY_TIMES * size

@@ -62,6 +62,7 @@ def write_card(
     splits = {name: dataset.split(name) for name in dataset.splits}
     made = _provenance(folder)
     old, readme = folder / "README.md", (into or folder) / "README.md"
+    yours = _yours(old)
     before = read_front(old)
     title = title or before.get("pretty_name") or made.settings.get("title") or _title(made)
     license_id = license_id or before.get("license") or made.settings.get("license", "unknown")
@@ -73,7 +74,7 @@ def write_card(
     text += [*sections.numbers(counts), *cautions(read_facts(folder), sigmas_of(splits))]
     text += [*figures, *sections.features(splits)]
     text += ["## Provenance", "", *sections.ancestry(made), "", YOURS]
-    written = "\n".join(text) + (_yours(old) or "\n")
+    written = "\n".join(text) + (yours or "\n")
     with rewritten_file(readme) as partial:
         partial.write_text(written, encoding="utf-8")
     return readme
@@ -81,7 +82,10 @@ def write_card(
 
 def _yours(readme: Path) -> str:
     """What a hand has written below the line of a card; empty where there is none."""
-    return readme.read_text(encoding="utf-8").partition(YOURS)[2] if readme.is_file() else ""
+    try:
+        return readme.read_text(encoding="utf-8").partition(YOURS)[2] if readme.is_file() else ""
+    except UnicodeDecodeError as e:
+        raise DatasetError(f"{readme} is not UTF-8 ({e}). Save it as UTF-8, or remove it") from None
 
 
 def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> list[str]:

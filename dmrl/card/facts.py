@@ -2,11 +2,12 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.names import markdown
+from dmrl.border.documents import parse_json
+from dmrl.border.names import code, markdown
 from dmrl.errors import DatasetError
 
 FILE = "facts.json"
@@ -45,6 +46,9 @@ class Facts:
         (folder / FILE).write_text(text + "\n", encoding="utf-8")
 
 
+_NOTHING = Facts()
+
+
 def read_facts(folder: Path) -> Facts | None:
     """Facts of a dataset; None for one that was made before they were kept.
 
@@ -57,8 +61,15 @@ def read_facts(folder: Path) -> Facts | None:
     if not path.is_file():
         return None
     try:
-        return Facts(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as e:
+        facts = Facts(**parse_json(path.read_text(encoding="utf-8")))
+        for part in fields(Facts):
+            if not isinstance(getattr(facts, part.name), type(getattr(_NOTHING, part.name))):
+                raise ValueError(f"{part.name} is of another kind")
+        if facts.beside.keys() - facts.used.keys():
+            raise ValueError("labels beside none that are used")
+        list(_told(facts))
+        return facts
+    except (OSError, ValueError, TypeError, AttributeError) as e:
         raise DatasetError(f"{path} cannot be read ({e}). Make the dataset again") from None
 
 
@@ -76,7 +87,7 @@ def cautions(facts: Facts | None, sigmas: Mapping[str, Any]) -> Iterator[str]:
     for source, (known, total, u_px, v_px, depth_m) in sorted(sigmas.items()):
         spread = f"median {u_px:.1f} px in u, {v_px:.1f} px in v, {depth_m:.2f} m in depth"
         told = f"{known} of {total} have a sigma, {spread}" if known else "none has a sigma"
-        yield f"- How sure labels of `{markdown(source)}` are: {told}."
+        yield f"- How sure labels of {code(source)} are: {told}."
     if facts is not None:
         yield from _told(facts)
     yield ""
@@ -84,16 +95,18 @@ def cautions(facts: Facts | None, sigmas: Mapping[str, Any]) -> Iterator[str]:
 
 def _told(facts: Facts) -> Iterator[str]:
     for name, others in sorted(facts.beside.items()):
-        used, more = markdown(facts.used[name]), ", ".join(f"`{markdown(o)}`" for o in others)
-        yield f"- `{markdown(name)}`: labels of `{used}` are used; there were labels of {more} too."
+        used, more = code(facts.used[name]), ", ".join(map(code, others))
+        yield f"- {code(name)}: labels of {used} are used; there were labels of {more} too."
     for name, findings in sorted(facts.findings.items()):
-        yield from (f"- `{markdown(name)}`: {markdown(finding)}." for finding in findings)
+        yield from (f"- {code(name)}: {markdown(finding)}." for finding in findings)
     if not facts.findings:
         yield "- `dmrl check` finds no bias in the labels, as far as they have boxes to tell."
-    reasons = [f"{count} images {why}" for why, count in facts.left_out.items() if count]
+    reasons = [
+        f"{count:d} images {markdown(why)}" for why, count in facts.left_out.items() if count
+    ]
     yield f"- Left out: {'; '.join(reasons) or 'no image'}."
     yield f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train."
     for name, licence in sorted(facts.licences.items()):
-        yield f"- Licence beside `{markdown(name)}`: {markdown(licence)}."
+        yield f"- Licence beside {code(name)}: {markdown(licence)}."
     if not facts.licences:
         yield "- No licence was found beside what the recordings were made from."

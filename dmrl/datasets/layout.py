@@ -23,6 +23,7 @@ from dmrl.geometry.frames import STRIDE_PX
 
 PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"
+NAMES = (PIXELS, IMAGE, MASKS, "peers", CONFIDENCE, DEPTH, "robot", "source", "log_time", "split")
 
 PEER = pa.struct(
     [

@@ -4,17 +4,19 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from dmrl.border import limits
 from dmrl.border.documents import parse_json
 from dmrl.border.names import inside, split_name
 from dmrl.datasets import layout
+from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.images.codec import decode
@@ -97,9 +99,17 @@ class Split:
         return mine.reshape(len(chunk), *self.image_shape, -1)
 
     def _decoded(self, chunk: pa.Array) -> NDArray[np.uint8]:
-        out = np.empty((len(chunk), *self.image_shape, 3), np.uint8)
+        shape = (len(chunk), *self.image_shape, 3)
+        if prod(shape) > limits.unpacked_bytes(chunk.nbytes):
+            raise DatasetError(f"images of split {self.name} unpack to too much. Make it again")
+        out = np.empty(shape, np.uint8)
         for image, data in zip(out, chunk.field("bytes"), strict=True):
-            image[:] = decode(data.as_py(), f"an image of split {self.name}")
+            rgb = decode(data.as_py(), f"an image of split {self.name}")
+            if rgb.shape != image.shape:
+                raise DatasetError(
+                    f"an image of split {self.name} has another size than its labels. Make it again"
+                )
+            image[:] = rgb
         return out
 
     def _grid(self, name: str) -> NDArray[np.float32]:
@@ -139,7 +149,12 @@ class Dataset:
             present = ", ".join(self.splits)
             raise DatasetError(f"no split {name} in {self.path}. It has: {present}")
         shards = self._parquet_shards(name) if self.parquet else self._arrow_shards(name)
-        tables = [_open_shard(path, rows) for path, rows in shards]
+        tables = [open_shard(path, rows) for path, rows in shards]
+        for (path, _), table in zip(shards, tables, strict=True):
+            if table.schema != tables[0].schema:
+                raise DatasetError(f"{path} has other columns than {shards[0][0]}. Make it again")
+        if not sum(table.num_rows for table in tables):
+            raise DatasetError(f"split {name} of {self.path} has no images. Make it again")
         return Split(name, pa.concat_tables(tables))
 
     def _arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
@@ -150,6 +165,8 @@ class Dataset:
             info = (_read_json(about).get("splits") or {}).get(name, {})
             rows = info.get("shard_lengths") or [None] * len(files)
             named = list(zip(files, rows, strict=True))
+            if len(set(files)) < len(files):
+                raise ValueError("a shard is named twice")
         except (KeyError, TypeError, AttributeError, ValueError) as e:
             raise DatasetError(
                 f"{state} or {about} is not what it should be ({e}). Make the dataset again"
@@ -158,7 +175,7 @@ class Dataset:
 
     def _parquet_shards(self, name: str) -> list[tuple[Path, int | None]]:
         found = {index: count for split, index, count in _parquet_names(self.path) if split == name}
-        count = max(found.values())
+        count = max(found.values(), default=0)
         paths = [layout.shard_path(self.path, name, k, count, parquet=True) for k in range(count)]
         return [(path, None) for path in paths]
 
@@ -214,24 +231,3 @@ def _read_json(path: Path) -> Any:
         raise DatasetError(f"{path} is missing. Make the dataset again, or copy it whole") from None
     except ValueError as e:
         raise DatasetError(f"{path} is not JSON: {e}. Make the dataset again") from None
-
-
-def _open_shard(path: Path, rows: int | None) -> pa.Table:
-    again = "Make the dataset again, or copy it whole"
-    try:
-        if path.suffix == ".parquet":
-            table = pq.read_table(path)
-        else:
-            table = pa.ipc.open_stream(pa.memory_map(str(path))).read_all()
-    except FileNotFoundError:
-        raise DatasetError(f"shard {path} is missing. {again}") from None
-    except (pa.ArrowInvalid, OSError) as e:
-        why = " ".join(str(e).split())
-        raise DatasetError(f"shard {path} is cut short or damaged: {why}. {again}") from None
-    # A stream cut between two batches reads without an error.
-    if rows is not None and table.num_rows != rows:
-        found = f"{table.num_rows} of {rows} rows"
-        raise DatasetError(f"shard {path} is cut short: {found}. {again}")
-    if absent := sorted({layout.CONFIDENCE, layout.DEPTH} - set(table.schema.names)):
-        raise DatasetError(f"shard {path} has no column {absent[0]}. Make it with: dmrl dataset")
-    return table

@@ -20,13 +20,13 @@
 ``QUANTITIES`` lists what there is.
 """
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from dmrl.border.documents import parse_toml
 from dmrl.errors import SourceError
 
 ANGLE = {"rad": 1.0, "deg": 0.017453292519943295}
@@ -102,8 +102,8 @@ def read_map(path: Path) -> ColumnMap:
         If the file is not TOML, or describes no map: names every fault, in one line.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
+        values = parse_toml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as e:
         raise SourceError(f"{path} is no table of columns in TOML: {e}. Mend it") from None
     ranges = values.pop("range", {})
     ranges = ranges if isinstance(ranges, dict) else {"": ranges}

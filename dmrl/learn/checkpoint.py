@@ -91,6 +91,8 @@ def load_checkpoint(
         said = parse_json((folder / STATE_NAME).read_text(encoding="utf-8"))
         tensors = load_file(inside(folder, said.pop("tensors"), f"{folder}: the tensors"))
         state = State(**said)
+        if not isinstance(state.run, dict) or not isinstance(state.epochs_done, int):
+            raise ValueError("it tells no run")
     except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:
         raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
     _require_same(state.run, run, folder)
@@ -98,7 +100,10 @@ def load_checkpoint(
         start = f"{role}."
         mine = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
         set_weights(network, mine, folder)
-    _set_optimizer(optimizer, tensors)
+    try:
+        _set_optimizer(optimizer, tensors)
+    except (ValueError, LookupError, RuntimeError) as e:
+        raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
     return state
 
 

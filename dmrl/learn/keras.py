@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dmrl.border.memory import bounded
 from dmrl.errors import MissingExtra, ModelError
 from dmrl.learn.network import LocaNet
 
@@ -45,11 +46,13 @@ def read_h5(path: Path) -> dict[str, Tensor]:
     if h5py is None:
         raise MissingExtra("h5py", "keras", f"{path.name}")
     try:
-        with h5py.File(path, "r") as file:
-            group = file.get("model_weights", file)
+        with bounded(path.stat().st_size), h5py.File(path, "r") as file:
+            inner = file.get("model_weights", getlink=True)
+            group = file["model_weights"] if isinstance(inner, h5py.HardLink) else file
             return {name: _read(path, group, *where) for name, where in _places().items()}
-    except OSError as e:
-        raise ModelError(f"{path} cannot be read: {e}. Download it again") from None
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError, MemoryError) as e:
+        why = " ".join(str(e).split())
+        raise ModelError(f"{path} cannot be read: {why}. Download it again") from None
 
 
 def _places() -> dict[str, tuple[str, str]]:
@@ -66,16 +69,22 @@ def _places() -> dict[str, tuple[str, str]]:
 
 
 def _read(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
-    key = f"{layer}/{layer}/{variable}:0"
-    if not isinstance(group.get(key), h5py.Dataset):
+    found: h5py.Group | h5py.Dataset | None = group
+    for part in (layer, layer, f"{variable}:0"):
+        # A soft or external link may lead anywhere, also into files that are not the stranger's.
+        own = isinstance(found, h5py.Group) and isinstance(
+            found.get(part, getlink=True), h5py.HardLink
+        )
+        found = found[part] if own else None
+    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
         raise ModelError(f"{path} has no {layer}/{variable}. Give weights of locanet")
-    wanted, shape = _keras_shape(layer, variable), group[key].shape
+    wanted, shape = _keras_shape(layer, variable), found.shape
     if shape != wanted:
         raise ModelError(
             f"{path}: {layer}/{variable} has shape {shape}, locanet needs {wanted}. "
             "Give weights of locanet"
         )
-    values = np.asarray(group[key], dtype=np.float32)
+    values = np.asarray(found, dtype=np.float32)
     if values.ndim == 4:
         values = values.transpose(3, 2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(values))

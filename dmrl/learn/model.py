@@ -160,6 +160,8 @@ def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> 
         verb = "lacks" if odd[0] in wanted else "has an unknown"
         raise ModelError(f"{where} {verb} tensor {odd[0]}. Give weights of this architecture")
     for name, value in weights.items():
+        if value.dtype not in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
+            raise ModelError(f"{where}: {name} holds {value.dtype}. Give weights in float32")
         if value.shape != wanted[name].shape:
             raise ModelError(
                 f"{where}: {name} has shape {tuple(value.shape)}, the network needs "

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import __version__
+from dmrl.border.documents import parse_json
 from dmrl.errors import OutputError
 from dmrl.output import partial_of
 from dmrl.recording.inputs import sha256_of_file, sha256_of_folder
@@ -48,7 +49,7 @@ class Memory:
             If the file is damaged.
         """
         try:
-            kept = json.loads(file.read_text(encoding="utf-8"))
+            kept = parse_json(file.read_text(encoding="utf-8"))
             return cls(file, dict(kept["begun"]), dict(kept["done"]), dict(kept["hashes"]))
         except FileNotFoundError:
             return cls(file)

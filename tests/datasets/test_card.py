@@ -255,3 +255,43 @@ def test_a_broken_provenance_is_one_line(built: Path) -> None:
     (built / "provenance.json").write_text("[]")
     with pytest.raises(DatasetError, match=r"provenance.json cannot be read .* again$"):
         write_card(built)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        "[]",
+        '{"left_out": "x"}',
+        '{"left_out": {"x": "y"}}',
+        '{"beside": {"a": ["b"]}}',
+        '{"beside": {"a": 3}, "used": {"a": "b"}}',
+        '{"licences": {"a": 3}}',
+        '{"findings": {"a": [3]}}',
+        '{"other": 1}',
+    ],
+)
+def test_facts_that_are_none_are_one_line(built: Path, text: str) -> None:
+    (built / "facts.json").write_text(text)
+    with pytest.raises(DatasetError, match=r"facts.json cannot be read"):
+        write_card(built)
+
+
+def test_facts_cannot_leave_their_line(built: Path) -> None:
+    bad = "a`<img src=x>`b\n# heading"
+    facts = {
+        "left_out": {bad: 1},
+        "used": {bad: bad},
+        "beside": {bad: [bad]},
+        "licences": {bad: bad},
+    }
+    (built / "facts.json").write_text(json.dumps(facts))
+    text = write_card(built).read_text()
+    assert "\n# heading" not in text
+    assert re.search(r"(?<!\\)<img", re.sub(r"(`+)[^`].*?(?<!`)\1(?!`)", "", text)) is None
+
+
+def test_a_card_that_is_no_text_is_one_line(built: Path) -> None:
+    (built / "README.md").write_bytes(b"\xff\xfe")
+    with pytest.raises(DatasetError, match="not UTF-8"):
+        write_card(built)

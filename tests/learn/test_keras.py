@@ -108,3 +108,26 @@ def test_published_weights_load(data: Path, name: str) -> None:
     model = load_model(data / "locanet-weights" / name)
     assert model.architecture == "locanet"
     assert model.name == name
+
+
+@pytest.mark.parametrize("kind", ["soft", "external", "raw file", "virtual"])
+def test_weights_that_stand_elsewhere_are_not_followed(tmp_path: Path, kind: str) -> None:
+    """A file of a stranger must not bring in what stands in other files of ours."""
+    ours, key = write(tmp_path / "ours.h5", variables()), "conv2d_4/conv2d_4/bias:0"
+    path = write(tmp_path / "w.h5", {k: v for k, v in variables().items() if k != key})
+    (tmp_path / "secret.bin").write_bytes(np.ones(2, np.float32).tobytes())
+    with h5py.File(path, "a") as file:
+        at = f"model_weights/{key}"
+        if kind == "soft":
+            file[at] = h5py.SoftLink("/model_weights/conv2d/conv2d/kernel:0")
+        elif kind == "external":
+            file[at] = h5py.ExternalLink(str(ours), at)
+        elif kind == "raw file":
+            place = [(str(tmp_path / "secret.bin"), 0, 8)]
+            file.create_dataset(at, (2,), np.float32, external=place)
+        else:
+            layout = h5py.VirtualLayout((2,), np.float32)
+            layout[:] = h5py.VirtualSource(str(ours), at, (2,))
+            file.create_virtual_dataset(at, layout)
+    with pytest.raises(ModelError, match=r"has no conv2d_4/bias"):
+        read_h5(path)

@@ -198,3 +198,13 @@ def test_a_wrong_description_is_named(run: Path, key: str, value: str, text: str
 def test_images_that_do_not_divide_into_cells_are_refused(run: Path) -> None:
     with pytest.raises(SettingError, match="324 x 244 px do not divide into cells of 8 px"):
         load_model(run).grids(np.zeros((1, 244, 324, 3), np.uint8))
+
+
+@pytest.mark.parametrize("kind", [torch.int64, torch.bool, torch.complex64, torch.float8_e4m3fn])
+def test_weights_of_another_kind_than_numbers_with_a_point_are_refused(
+    run: Path, kind: torch.dtype
+) -> None:
+    tensors = load_file(run / "model.safetensors")
+    save_file({k: v.to(kind) for k, v in tensors.items()}, run / "model.safetensors")
+    with pytest.raises(ModelError, match=r"holds torch\.\w+. Give weights in float32"):
+        load_model(run)

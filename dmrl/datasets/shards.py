@@ -1,0 +1,104 @@
+"""Shards of a dataset, opened and held against the layout before anything looks at their values.
+
+Arrow's own reader believes a file: an offset beyond a buffer is read all the same. So every
+shard is validated, and what is not laid out as `dmrl.datasets.layout` says is refused.
+"""
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from dmrl.border import limits
+from dmrl.border.memory import bounded
+from dmrl.datasets import layout
+from dmrl.errors import DatasetError
+from dmrl.geometry.frames import STRIDE_PX
+
+AGAIN = "Make the dataset again, or copy it whole"
+
+
+def open_shard(path: Path, rows: int | None) -> pa.Table:
+    """The columns of the layout in a shard; memory-mapped for Arrow.
+
+    Parameters
+    ----------
+    path
+        An Arrow stream, or a ``.parquet`` file.
+    rows
+        How many it has; None: not known.
+
+    Raises
+    ------
+    DatasetError
+        If it is missing, damaged, asks for more memory than its size explains, or is not laid out
+        as a dataset.
+    """
+    try:
+        with bounded(path.stat().st_size):
+            table = _mapped(path)
+            table.validate(full=True)
+    except FileNotFoundError:
+        raise DatasetError(f"shard {path} is missing. {AGAIN}") from None
+    except MemoryError:
+        raise DatasetError(
+            f"shard {path} unpacks to much more than its size explains. {AGAIN}"
+        ) from None
+    except (pa.ArrowException, OSError, ValueError) as e:
+        why = " ".join(str(e).split())
+        raise DatasetError(f"shard {path} is cut short or damaged: {why}. {AGAIN}") from None
+    # A stream cut between two batches reads without an error.
+    if rows is not None and table.num_rows != rows:
+        found = f"{table.num_rows} of {rows} rows"
+        raise DatasetError(f"shard {path} is cut short: {found}. {AGAIN}")
+    if wrong := _not_laid_out(table):
+        raise DatasetError(f"shard {path} {wrong}. Make it with: dmrl dataset")
+    return table.select([name for name in table.schema.names if name in layout.NAMES])
+
+
+def _mapped(path: Path) -> pa.Table:
+    if path.suffix == ".parquet":
+        return pq.ParquetFile(path, memory_map=True).read()
+    return pa.ipc.open_stream(pa.memory_map(str(path))).read_all()
+
+
+def _not_laid_out(table: pa.Table) -> str:
+    """What of a table is not as the layout has it; empty: nothing."""
+    names = table.schema.names
+    if len(set(names)) < len(names):
+        return "has a column twice"
+    for name in (layout.CONFIDENCE, layout.DEPTH, "peers", "source"):
+        if name not in names:
+            return f"has no column {name}"
+    if not {layout.PIXELS, layout.IMAGE} & set(names):
+        return f"has no column {layout.PIXELS}"
+    grid = table.schema.field(layout.CONFIDENCE).type
+    if not (pa.types.is_fixed_size_list(grid) and pa.types.is_fixed_size_list(grid.value_type)):
+        return f"has no grid in its column {layout.CONFIDENCE}"
+    rows, cols = grid.list_size, grid.value_type.list_size
+    if not 0 < rows * cols <= limits.PIXELS // STRIDE_PX**2:
+        return f"has grids of {cols} x {rows}"
+    size = (rows * STRIDE_PX, cols * STRIDE_PX)
+    for wanted in (
+        *layout.schema(*size, masks=layout.MASKS in names),
+        layout.schema(*size, png=True).field(layout.IMAGE),
+    ):
+        if wanted.name in names and table.schema.field(wanted.name).type != wanted.type:
+            return f"has a column {wanted.name} of another type"
+        if wanted.name in names and any(map(_has_nulls, table[wanted.name].chunks)):
+            return f"has a column {wanted.name} with values missing"
+    if (pc.max(pc.utf8_length(table["source"])).as_py() or 0) > limits.NAME_CHARACTERS:
+        return "has a source with a very long name"
+    most = pc.max(pc.list_value_length(table["peers"])).as_py() or 0
+    return f"has an image with {most} peers" if most > limits.PEERS else ""
+
+
+def _has_nulls(values: pa.Array) -> bool:
+    """Whether a value is missing, or one in it. A picture needs no path."""
+    if values.null_count:
+        return True
+    if pa.types.is_struct(values.type):
+        return any(_has_nulls(values.field(f.name)) for f in values.type if f.name != "path")
+    nested = pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type)
+    return nested and _has_nulls(values.flatten())

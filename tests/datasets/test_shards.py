@@ -1,0 +1,165 @@
+"""Shards of strangers: what is not laid out as a dataset is refused before it is looked at."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from dmrl.datasets import open_dataset
+from dmrl.datasets.layout import schema
+from dmrl.datasets.shards import open_shard
+from dmrl.errors import DatasetError
+from dmrl.stages.dataset import Settings, run
+
+from .conftest import HEIGHT_PX, WIDTH_PX, Record, peer
+
+SHARD = "train/data-00000-of-00001.arrow"
+
+
+@pytest.fixture
+def shard(record: Record, tmp_path: Path) -> Path:
+    run([record(peers=[[peer()] * k for k in (1, 2, 3, 1)])], tmp_path / "set", Settings())
+    return tmp_path / "set" / SHARD
+
+
+def rewritten(path: Path, table: pa.Table, compression: str | None = None, times: int = 1) -> None:
+    """The shard with another table in it, ``times`` over."""
+    options = pa.ipc.IpcWriteOptions(compression=compression)
+    with pa.ipc.new_stream(str(path), table.schema, options=options) as sink:
+        for _ in range(times):
+            sink.write_table(table)
+
+
+def table_of(path: Path) -> pa.Table:
+    with path.open("rb") as stream:
+        return pa.ipc.open_stream(stream.read()).read_all()
+
+
+@pytest.mark.parametrize("column", ["peers", "robot", "source", "split"])
+@pytest.mark.parametrize("offset", [2_000_000_000, -2_000_000_000])
+def test_an_offset_beyond_its_buffer_is_refused(shard: Path, column: str, offset: int) -> None:
+    data = bytearray(shard.read_bytes())
+    offsets = table_of(shard)[column].chunk(0).buffers()[1].to_pybytes()[:20]
+    at = data.rfind(offsets)
+    data[at + 4 : at + 20] = struct.pack("<i", offset) * 4
+    shard.write_bytes(data)
+    with pytest.raises(DatasetError, match="is cut short or damaged"):
+        open_shard(shard, None)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_compressed_shard_is_read(shard: Path, compression: str) -> None:
+    sound = table_of(shard)
+    rewritten(shard, sound, compression)
+    assert open_shard(shard, 4).equals(sound)
+
+
+def test_a_shard_that_unpacks_to_much_is_refused(shard: Path) -> None:
+    many = pa.concat_tables([table_of(shard).slice(0, 1)] * 5_000).combine_chunks()
+    rewritten(shard, many, "zstd", times=20)
+    assert shard.stat().st_size < 5_000_000
+    with pytest.raises(DatasetError, match="unpacks to much more than its size explains"):
+        open_shard(shard, None)
+
+
+def test_a_parquet_file_that_repeats_one_row_without_end_is_refused(
+    shard: Path, tmp_path: Path
+) -> None:
+    rows = pa.concat_tables([table_of(shard).slice(0, 1)] * 20_000).combine_chunks()
+    path = tmp_path / "train.parquet"
+    with pq.ParquetWriter(path, rows.schema, compression="zstd") as sink:
+        for _ in range(10):
+            sink.write_table(rows)
+    assert path.stat().st_size < 5_000_000
+    with pytest.raises(DatasetError, match="unpacks to much more than its size explains"):
+        open_shard(path, None)
+
+
+def _replaced(name: str, of: Callable[[pa.Table], Any]) -> Callable[[pa.Table], pa.Table]:
+    def change(table: pa.Table) -> pa.Table:
+        return table.set_column(table.schema.get_field_index(name), name, of(table))
+
+    return change
+
+
+def _a_peer_missing(table: pa.Table) -> pa.Array:
+    peers = table["peers"].to_pylist()
+    peers[1][0] = None
+    return pa.array(peers, table["peers"].type)
+
+
+def _many_peers(table: pa.Table) -> pa.Array:
+    return pa.array([table["peers"][0].as_py() * 1001] * 4, table["peers"].type)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda t: t.drop_columns("peers"), "no column peers"),
+        (lambda t: t.drop_columns("pixels"), "no column pixels"),
+        (lambda t: t.append_column("depth", t["depth"]), "a column twice"),
+        (_replaced("depth", lambda t: pa.array([1.0] * 4)), "depth of another type"),
+        (_replaced("confidence", lambda t: pa.array(["x"] * 4)), "no grid"),
+        (_replaced("source", lambda t: pa.array([1] * 4)), "source of another type"),
+        (_replaced("pixels", lambda t: pa.array([b"x"] * 4)), "pixels of another type"),
+        (_replaced("source", lambda t: pa.array([None] * 4, pa.string())), "values missing"),
+        (_replaced("peers", _a_peer_missing), "peers with values missing"),
+        (_replaced("peers", _many_peers), "an image with 1001 peers"),
+        (_replaced("source", lambda t: pa.array(["x" * 2000] * 4)), "a very long name"),
+        (
+            _replaced(
+                "confidence",
+                lambda t: pa.array([[[]]] * 4, pa.list_(pa.list_(pa.float32(), 0), 1)),
+            ),
+            "grids of 0 x 1",
+        ),
+    ],
+)
+def test_what_is_not_laid_out_as_a_dataset_is_refused(
+    shard: Path, change: Callable[[pa.Table], pa.Table], complaint: str
+) -> None:
+    rewritten(shard, change(table_of(shard)))
+    with pytest.raises(DatasetError, match=complaint):
+        open_shard(shard, None)
+
+
+def test_columns_that_dmrl_does_not_know_are_left_alone(shard: Path) -> None:
+    table = table_of(shard)
+    nested: Any = pa.array([[[["x"]]]] * 4)
+    rewritten(shard, table.append_column("mine", nested))
+    assert open_shard(shard, 4).equals(table)
+
+
+def test_a_split_without_images_and_a_shard_named_twice_are_refused(shard: Path) -> None:
+    rewritten(shard, schema(HEIGHT_PX, WIDTH_PX).empty_table())
+    state, folder = shard.parent / "state.json", shard.parents[1]
+    (shard.parent / "dataset_info.json").write_text("{}")
+    with pytest.raises(DatasetError, match="has no images"):
+        open_dataset(folder).split("train")
+    name = f'{{"filename": "{shard.name}"}}'
+    state.write_text(f'{{"_data_files": [{name}, {name}]}}')
+    with pytest.raises(DatasetError, match="named twice"):
+        open_dataset(folder).split("train")
+    state.write_text('{"_data_files": []}')
+    with pytest.raises(DatasetError, match="has no images"):
+        open_dataset(folder).split("train")
+
+
+def test_pictures_of_another_size_than_their_labels_are_refused(
+    record: Record, tmp_path: Path
+) -> None:
+    run([record()], tmp_path / "set", Settings(split="none", png=True))
+    path = tmp_path / "set" / SHARD
+    table = table_of(path)
+    wide = schema(HEIGHT_PX, 2 * WIDTH_PX, png=True)
+    grid = [[[0.0] * (2 * WIDTH_PX // 8)] * (HEIGHT_PX // 8)] * 6
+    for name in ("confidence", "depth"):
+        column = pa.array(grid, wide.field(name).type)
+        table = table.set_column(table.schema.get_field_index(name), name, column)
+    rewritten(path, table)
+    with pytest.raises(DatasetError, match="another size than its labels"):
+        _ = open_dataset(tmp_path / "set").split("train").pixels
