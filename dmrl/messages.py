@@ -19,6 +19,9 @@ from google.protobuf.descriptor_pb2 import (
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
+from dmrl.border import limits
+from dmrl.errors import SourceError
+
 PACKAGES = ("dmrl.v1", "foxglove")
 
 
@@ -84,10 +87,22 @@ class LogType:
         Of the event or block.
     variables
         Names and types, the latter in the letters of ``struct``: ``b B h H i I q e f d``.
+
+    Raises
+    ------
+    SourceError
+        If there are more variables than a log may have.
     """
 
     name: str
     variables: tuple[tuple[str, str], ...]
+
+    def __post_init__(self) -> None:
+        if len(self.variables) > limits.VARIABLES:
+            raise SourceError(
+                f"the log of {self.name[:40]} has {len(self.variables)} variables, more than "
+                f"{limits.VARIABLES}. Leave some out"
+            )
 
     @property
     def fields(self) -> tuple[str, ...]:

@@ -76,7 +76,7 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
     with path.open("rb") as stream:
         with zipfile.ZipFile(stream) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size > limits.unpacked_bytes(path.stat().st_size):
+        if size > limits.archive_bytes(path.stat().st_size):
             raise ValueError(f"it unpacks to {size / 1e6:.0f} MB")
         stream.seek(0)
         try:

@@ -11,8 +11,8 @@ UNPACKED_BYTES = 128 * MB
 """What a chunk of a recording may unpack to; dmrl's own hold 256 KiB and a message."""
 
 UNPACKED_TIMES = 100
-"""A recording, or an archive of arrays, may unpack to `UNPACKED_BYTES`, and this many times its
-own size. The most that dmrl's own topics reach is about 20; pictures reach 1."""
+"""A recording may unpack to `UNPACKED_BYTES`, and this many times its own size. The most that
+dmrl's own topics reach is about 20; pictures reach 1."""
 
 MEMORY_BYTES = 500 * MB
 """What a library may take to read a file as a whole (see `dmrl.border.memory`)."""
@@ -25,6 +25,16 @@ TOPICS = 2_000
 
 NAME_CHARACTERS = 1_000
 """Of a topic or a message type."""
+
+LARGE_PIXELS = 2 * MB
+"""Of a picture that counts: all large ones that a process decodes may have `DECODED_PIXELS`, and
+`UNPACKED_TIMES` as many as they have bytes. Cameras reach about 3; only blank pictures are over."""
+
+HEADER_BYTES = 65_536
+"""Of a PPM, comments among them."""
+
+VARIABLES = 1_000
+"""Of an event of a log, and columns of a table that is one."""
 
 PIXELS = 64 * MB
 """Of a picture: 8,000 x 8,000. With its copies in other orders that is 0.7 GB."""
@@ -55,8 +65,13 @@ ANCESTORS = 64
 
 
 def unpacked_bytes(size: int) -> int:
-    """What a recording, or an archive of arrays, of ``size`` bytes may unpack to."""
+    """What a recording of ``size`` bytes may unpack to."""
     return UNPACKED_BYTES + UNPACKED_TIMES * size
+
+
+def archive_bytes(size: int) -> int:
+    """What an archive of arrays of ``size`` bytes may unpack to; all of it is in memory."""
+    return UNPACKED_BYTES + MEMORY_TIMES * size
 
 
 def memory_bytes(size: int) -> int:

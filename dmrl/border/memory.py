@@ -1,4 +1,4 @@
-"""Memory that a foreign file may take while a library reads it, held by the system itself.
+"""What a foreign file may take while a library reads it, held by the system itself.
 
 Sizes that a file states can be false, and libraries believe them. Where dmrl does not unpack by
 its own hands, the system refuses what goes beyond the budget.
@@ -6,8 +6,7 @@ its own hands, the system refuses what goes beyond the budget.
 
 import re
 import resource
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from dmrl.border import limits
@@ -15,32 +14,51 @@ from dmrl.border import limits
 _HELD = re.compile(r"VmData:\s*(\d+) kB")
 
 
-@contextmanager
-def bounded(size: int) -> Iterator[None]:
-    """While the block lasts, this process gets no more memory than ``size`` bytes explain.
+class Bounded:
+    """Blocks in which this process gets no more memory than ``size`` bytes of a file explain.
 
-    Mapped files do not count. Holds for all threads, so for blocks that parse and end. Without
-    effect where the system does not tell what a process holds (macOS).
+    Mapped files do not count. Nor can a file be written that is larger, as by a library that
+    unpacks into the temporary folder. All threads are held, so blocks should only parse. Where the
+    system does not tell what a process holds (macOS) memory is not bounded.
+
+    Parameters
+    ----------
+    size
+        Of the file, bytes.
 
     Raises
     ------
-    MemoryError
+    MemoryError, OSError
         From the block, or what the library in it makes of it.
     """
-    found = None
-    with suppress(OSError):
-        found = _HELD.search(Path("/proc/self/status").read_text(encoding="ascii"))
-    if found is None:
-        yield
-        return
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    most = 1024 * int(found[1]) + limits.memory_bytes(size)
-    try:
-        resource.setrlimit(resource.RLIMIT_DATA, (_least(most, *before), before[1]))
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+    def __init__(self, size: int) -> None:
+        most = limits.memory_bytes(size)
+        self._bounds = {resource.RLIMIT_FSIZE: most}
+        with suppress(OSError):
+            if found := _HELD.search(Path("/proc/self/status").read_text(encoding="ascii")):
+                self._bounds[resource.RLIMIT_DATA] = most + 1024 * int(found[1])
+        self._before = {kind: resource.getrlimit(kind) for kind in self._bounds}
+
+    def __enter__(self) -> None:
+        for kind, most in self._bounds.items():
+            soft, hard = self._before[kind]
+            known = [b for b in (soft, hard, most) if b != resource.RLIM_INFINITY]
+            resource.setrlimit(kind, (min(known), hard))
+
+    def __exit__(self, *_: object) -> None:
+        for kind, before in self._before.items():
+            resource.setrlimit(kind, before)
 
 
-def _least(*bounds: int) -> int:
-    return min(b for b in bounds if b != resource.RLIM_INFINITY)
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of the files in a folder and its folders.
+
+    Raises
+    ------
+    OSError
+        If it is not there.
+    """
+    if not path.is_dir():
+        return path.stat().st_size
+    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from dmrl.border import limits
-from dmrl.border.memory import bounded
+from dmrl.border.memory import Bounded
 from dmrl.datasets import layout
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
@@ -36,7 +36,7 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
         as a dataset.
     """
     try:
-        with bounded(path.stat().st_size):
+        with Bounded(path.stat().st_size):
             table = _mapped(path)
             table.validate(full=True)
     except FileNotFoundError:

@@ -92,7 +92,10 @@ def read_block(path: Path) -> Block:
     except (OSError, UnicodeDecodeError) as e:
         raise SourceError(f"{path} cannot be read as text: {e}. Name another file") from None
     lines = text.splitlines()
-    names = next(csv.reader(lines[:1]), [])
+    try:
+        names = next(csv.reader(lines[:1]), [])
+    except csv.Error as e:
+        raise SourceError(f"{path}:1: {e}. Name another file") from None
     if names[:1] != [TIME] or len(set(names)) < len(names) or not all(names):
         raise SourceError(f"{path}:1: not {TIME} and names of variables. Name another file")
     rows = [_row(line, len(names)) for line in lines[1:]]

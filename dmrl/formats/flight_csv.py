@@ -138,10 +138,13 @@ def read_log(path: Path) -> Log:
     names = _header(path)
     if missing := [name for name in REQUIRED if name not in names]:
         raise SourceError(f"{path} has no column {', '.join(missing)}. Add it, in SI units")
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.reader(stream)
-        next(reader)
-        rows = [(reader.line_num, row) for row in reader if row]
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream)
+            next(reader)
+            rows = [(reader.line_num, row) for row in reader if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as e:
+        raise SourceError(f"{path} cannot be read as CSV: {e}. Save it as CSV in UTF-8") from None
     lines = [line for line, _ in rows]
     values = [_numbers(path, line, row, len(names)) for line, row in rows]
     if len(rows) < 2:

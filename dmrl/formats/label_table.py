@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TextIO
 
+from dmrl.border import limits
 from dmrl.border.names import split_name
 from dmrl.errors import SourceError
 
@@ -105,6 +106,11 @@ def read_labels(path: Path, files: Collection[str]) -> dict[str, list[LabelRow]]
                 others = found.setdefault(row.file, [])
                 _check_agrees(f"{path}:{reader.line_num}", row, others)
                 others.append(row)
+                if len(others) > limits.PEERS:
+                    raise SourceError(
+                        f"{path}:{reader.line_num}: {row.file} has more than {limits.PEERS} rows. "
+                        "Delete some"
+                    )
     except FileNotFoundError:
         raise SourceError(f"no label file {path}. Name another with --labels") from None
     except (OSError, UnicodeDecodeError, csv.Error) as e:

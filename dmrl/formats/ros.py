@@ -13,14 +13,19 @@ Times are those of the headers. Where they are empty, the time at which the bag 
 stands for it, with a line that says so; that time is the publish time of every message.
 """
 
+import errno
 import re
+import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from dmrl import topics
+from dmrl.border.memory import Bounded, size_of
 from dmrl.errors import DmrlError, MissingExtra, SourceError
 from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.ros_messages import HANDLERS, OWN, Placed, own
@@ -32,6 +37,7 @@ NO_PICTURES = (topics.MASKS, topics.DEPTHS)
 """Images that are no pictures of a camera: of a render that was exported."""
 CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
 PAIR = re.compile(r"/(?P<robot>[^/]+)/(?:range/)?(?P<peer>[^/]+)(?:/(?:distance|range|uwb))?$")
+ODD_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
 # Parts of a topic that say what it is, not whose.
 GENERIC = re.compile(
     r"odom\w*|odometry|pose\w*|imu\w*|data|raw|twist|velocity|image\w*|color|colour|camera\w*|rgb|"
@@ -160,6 +166,25 @@ def _topics(source: Path) -> list[tuple[str, str, int]]:
     return [(topic, kind, count) for (topic, kind), count in found.items()]
 
 
+def _refuse_programs(source: Path) -> None:
+    """Nothing, if the SQLite files of a bag hold tables alone: a view computes what it likes.
+
+    Raises
+    ------
+    SourceError
+        If one holds anything else.
+    """
+    for path in sorted(source.glob("*.db3")) if source.is_dir() else [source]:
+        with path.open("rb") as stream:
+            if not stream.read(16).startswith(b"SQLite format 3"):
+                continue
+        where = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(where, uri=True)) as database:
+            for kind, text in database.execute("SELECT type, sql FROM sqlite_master"):
+                if kind not in ("table", "index") or ODD_TABLE.search(text or ""):
+                    raise SourceError(f"{path} holds more than tables. Record the bag again")
+
+
 def _guarded(source: Path, of: Any) -> Iterator[Any]:
     """What ``of(reader)`` gives, with any error of rosbags as one line.
 
@@ -167,11 +192,26 @@ def _guarded(source: Path, of: Any) -> Iterator[Any]:
     bags, so there is no list of errors to name here.
     """
     try:
-        with _reader(source) as reader:
-            yield from of(reader)
+        bound = Bounded(size_of(source))
+        reader = _reader(source)
+        _refuse_programs(source)
+        with bound:
+            reader.open()
+        with closing(reader):
+            found = of(reader)
+            while True:
+                with bound:
+                    one = next(found, None)
+                if one is None:
+                    return
+                yield one
     except DmrlError:
         raise
     except Exception as e:
+        if isinstance(e, MemoryError) or getattr(e, "errno", None) == errno.EFBIG:
+            raise SourceError(
+                f"{source} unpacks to much more than its size explains. Record the bag again"
+            ) from e
         why = " ".join(str(e).split())[:200] or type(e).__name__
         raise SourceError(f"{source} cannot be read as a ROS bag: {why}. Restore it") from e
 

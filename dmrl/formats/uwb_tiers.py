@@ -41,8 +41,10 @@ BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
 )
-POSE = re.compile(r"optitrack_turtle(\d+)_pose_np")
-RANGE = re.compile(r"uwb_range_(\d+)_(\d+)_np")
+POSE = re.compile(r"optitrack_turtle(\d{1,3})_pose_np")
+RANGE = re.compile(r"uwb_range_(\d{1,3})_(\d{1,3})_np")
+ROBOTS = 64
+"""More would be told of too many pairs."""
 
 
 def recognises(source: Path) -> bool:
@@ -95,10 +97,16 @@ def content(source: Path, _options: Options | None = None) -> Content:
 
 def _arrays(source: Path) -> dict[str, Array]:
     try:
-        return {name: np.asarray(values, float) for name, values in load_npz(source).items()}
+        found = {n: np.asarray(v, float) for n, v in load_npz(source).items() if v.itemsize >= 4}
     except BROKEN as e:
         why = " ".join(str(e).split())
         raise SourceError(f"{source} cannot be read: {why}. Fetch it again") from e
+    ranges = [values for name, values in found.items() if RANGE.fullmatch(name)]
+    if not all(v.ndim for v in found.values()) or any(v.ndim != 1 for v in ranges):
+        raise SourceError(f"{source} has arrays of other shapes than it should. Fetch it again")
+    if sum(bool(POSE.fullmatch(name)) for name in found) > ROBOTS:
+        raise SourceError(f"{source} has more than {ROBOTS} robots. Fetch it again")
+    return found
 
 
 def _pose(arrays: dict[str, Array], number: str) -> tuple[Array, Array, Array]:

@@ -4,6 +4,7 @@ Arrays are (height, width, 3), uint8, RGB. EXIF orientation is not applied: a ca
 calibration belongs to the pixels as they were stored.
 """
 
+import re
 import struct
 import warnings
 from io import BytesIO
@@ -23,10 +24,17 @@ FORMATS = ("PNG", "JPEG", "PPM", "BMP")
 BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
 
 
+_spent = 0
+"""Pixels of large pictures that this process decoded, beyond what their bytes explain."""
+
+
 def _open(data: bytes, what: object) -> Image.Image:
     try:
+        if data[:1] == b"P" and not _has_header(data):
+            raise ValueError("a header without end")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
+            # Of many pixels: our own limit is stricter. Of strange metadata: nothing reads it.
+            warnings.simplefilter("ignore")
             return Image.open(BytesIO(data), formats=FORMATS)
     except Image.DecompressionBombError:
         raise _too_many(what) from None
@@ -35,6 +43,12 @@ def _open(data: bytes, what: object) -> Image.Image:
         raise SourceError(
             f"{what} is not a picture ({names}). Remove it or save it again"
         ) from None
+
+
+def _has_header(data: bytes) -> bool:
+    """Whether the sizes of a PPM stand at its beginning: Pillow reads comments byte by byte."""
+    words = re.sub(rb"#[^\r\n]*[\r\n]", b" ", data[: limits.HEADER_BYTES]).split(None, 4)
+    return len(words) >= (3 if data[:2] in (b"P1", b"P4") else 4)
 
 
 def _too_many(what: object) -> SourceError:
@@ -49,6 +63,11 @@ def _decodable(image: Image.Image, data: bytes, what: object) -> None:
     scans = data.count(b"\xff\xda") if image.format == "JPEG" else 1
     if pixels > limits.PIXELS or pixels * scans > limits.DECODED_PIXELS:
         raise _too_many(what)
+    global _spent
+    if pixels > limits.LARGE_PIXELS:
+        _spent += max(0, pixels - limits.UNPACKED_TIMES * len(data))
+    if _spent > limits.DECODED_PIXELS:
+        raise SourceError(f"{what} and those before it are blank and very large. Scale them down")
 
 
 def decode(data: bytes, what: object = "the image") -> Rgb:
@@ -74,7 +93,9 @@ def decode(data: bytes, what: object = "the image") -> Rgb:
     with _open(data, what) as image:
         _decodable(image, data, what)
         try:
-            return np.asarray(image.convert("RGB"))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return np.asarray(image.convert("RGB"))
         except BROKEN as e:
             why = " ".join(str(e).split())
             raise SourceError(

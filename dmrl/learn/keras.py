@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dmrl.border.memory import bounded
+from dmrl.border.memory import Bounded
 from dmrl.errors import MissingExtra, ModelError
 from dmrl.learn.network import LocaNet
 
@@ -46,7 +46,7 @@ def read_h5(path: Path) -> dict[str, Tensor]:
     if h5py is None:
         raise MissingExtra("h5py", "keras", f"{path.name}")
     try:
-        with bounded(path.stat().st_size), h5py.File(path, "r") as file:
+        with Bounded(path.stat().st_size), h5py.File(path, "r") as file:
             inner = file.get("model_weights", getlink=True)
             group = file["model_weights"] if isinstance(inner, h5py.HardLink) else file
             return {name: _read(path, group, *where) for name, where in _places().items()}
@@ -75,7 +75,7 @@ def _read(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
         own = isinstance(found, h5py.Group) and isinstance(
             found.get(part, getlink=True), h5py.HardLink
         )
-        found = found[part] if own else None
+        found = found[part] if found is not None and own else None
     if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
         raise ModelError(f"{path} has no {layer}/{variable}. Give weights of locanet")
     wanted, shape = _keras_shape(layer, variable), found.shape

@@ -12,7 +12,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import RecipeError
+from dmrl.border.names import file_name
+from dmrl.errors import RecipeError, UnsafeName
 from dmrl.geometry.camera_file import KNOWN
 from dmrl.learn import pretrained
 from dmrl.pipeline.interface import Interface, interface_of
@@ -23,8 +24,6 @@ STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
 RESERVED = (RECIPE_FILE, STATE_FILE, UNFINISHED, "report.html")
-MOST_BYTES = 200
-"""Of an output's name: what is unfinished has a longer one."""
 
 Table = dict[str, Any]
 
@@ -248,8 +247,11 @@ def _name_faults(found: Sequence[tuple[int, Step]]) -> Iterator[str]:
 
 
 def _out_fault(name: str) -> str:
-    plain = name.isprintable() and not any(sign in name for sign in "/\\{}")
-    if not name or not plain or name.startswith(".") or len(name.encode()) > MOST_BYTES:
+    try:
+        file_name(name, "out")
+    except UnsafeName:
+        return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
+    if "{" in name or "}" in name:
         return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
     if name.casefold() in RESERVED or name.casefold().endswith(".partial"):
         return f"{name} is a name that dmrl uses itself. Choose another"

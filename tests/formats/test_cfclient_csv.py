@@ -145,3 +145,26 @@ def test_attitude_is_put_together_from_several_blocks(tmp_path: Path) -> None:
     first = samples(tmp_path)["/cf1/attitude"][0].fields
     assert (first["roll_rad"], first["pitch_rad"]) == pytest.approx(np.radians((10.5, -20.5)))
     assert first["yaw_rad"] == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("Timestamp," + "a" * 200_000 + "\n1,2\n", "field larger"),
+        ("Timestamp," + ",".join(f"a{k}" for k in range(1001)) + "\n", "has no rows"),
+    ],
+)
+def test_a_header_without_end_is_one_line(tmp_path: Path, text: str, complaint: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(SourceError, match=complaint):
+        cfclient_csv.content(path, Options())
+
+
+def test_a_log_of_very_many_variables_is_refused(tmp_path: Path) -> None:
+    """Their message type took a time that grew with the square of their number."""
+    path = tmp_path / "log.csv"
+    names = ",".join(f"a{k}" for k in range(1001))
+    path.write_text(f"Timestamp,{names}\n" + f"{'1,' * 1001}1\n" * 2)
+    with pytest.raises(SourceError, match="1001 variables, more than 1000"):
+        list(cfclient_csv.content(path, Options()).samples)

@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,3 +62,24 @@ def test_the_public_file_reads(data: Path) -> None:
     assert len(ranged) == 6
     assert "/turtle5/range/turtle1" in ranged
     assert max(s.time_ns for s in samples) == 150_700_000_000
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"uwb_range_1_2_np": np.zeros((9, 2)), "optitrack_turtle1_pose_np": np.zeros((9, 2))},
+        {"uwb_range_1_2_np": np.float64(1), "optitrack_turtle1_pose_np": np.zeros((9, 2))},
+        {f"optitrack_turtle{'1' * 5000}_pose_np": np.zeros((9, 2)), "uwb_range_1_2_np": np.ones(9)},
+        {
+            **{f"optitrack_turtle{k}_pose_np": np.zeros((9, 2)) for k in range(65)},
+            "uwb_range_1_2_np": np.ones(9),
+        },
+    ],
+)
+def test_arrays_of_strange_shapes_and_numbers_are_one_line(
+    tmp_path: Path, arrays: dict[str, Any]
+) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(SourceError):
+        uwb_tiers.content(path)

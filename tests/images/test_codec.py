@@ -116,3 +116,25 @@ def test_a_jpeg_of_endless_scans_is_refused() -> None:
 
 def test_a_large_photo_is_no_bomb() -> None:
     assert codec.decode(_png_of(6000, 4000)).shape == (4000, 6000, 3)
+
+
+def test_a_ppm_whose_header_does_not_end_is_refused() -> None:
+    for head in (
+        b"P6 #" + b"x" * 100_000 + b"\n2 2 255\n",
+        b"P6 " + b"#\n" * 50_000 + b"2 2 255\n",
+    ):
+        with pytest.raises(SourceError, match="not a picture"):
+            codec.decode(head + bytes(12))
+
+
+def test_large_blank_pictures_have_a_budget_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of them takes a second for each 7 kB."""
+    monkeypatch.setattr(codec, "_spent", 0)
+    monkeypatch.setattr(codec.limits, "DECODED_PIXELS", 4_000_000)
+    blank = codec.encode_png(np.zeros((1600, 2000), np.uint8))
+    for _ in range(2):
+        codec.decode(blank)
+    with pytest.raises(SourceError, match="blank and very large"):
+        codec.decode(blank)
+    small = codec.encode_png(np.zeros((224, 320), np.uint8))
+    assert codec.decode(small).shape == (224, 320, 3)
