@@ -64,10 +64,13 @@ def _decodable(image: Image.Image, data: bytes, what: object) -> None:
     if pixels > limits.PIXELS or pixels * scans > limits.DECODED_PIXELS:
         raise _too_many(what)
     global _spent
-    if pixels > limits.LARGE_PIXELS:
-        _spent += max(0, pixels - limits.UNPACKED_TIMES * len(data))
-    if _spent > limits.DECODED_PIXELS:
-        raise SourceError(f"{what} and those before it are blank and very large. Scale them down")
+    excess = max(0, pixels - limits.UNPACKED_TIMES * len(data))
+    if pixels > limits.LARGE_PIXELS and excess:
+        _spent += excess
+        if _spent > limits.DECODED_PIXELS:
+            raise SourceError(
+                f"{what} and those before it are blank and very large. Scale them down"
+            )
 
 
 def decode(data: bytes, what: object = "the image") -> Rgb:
