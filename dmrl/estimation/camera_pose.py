@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 
 from dmrl.errors import SettingError
 from dmrl.estimation.camera_views import (
+    FINER,
     Flight,
     Matched,
     Noise,
@@ -31,7 +32,7 @@ TRIED_S = np.arange(-5, 6) * 0.08
 """Delays that are tried: their images of a peer that crosses the view still overlap."""
 TRIED_IMAGES = 600
 """Images, of all peers and flights, that tell a good start from a bad one."""
-WIDE_PX, RADII_PX = 60.0, (60.0, 40.0, 25.0)
+WIDE_PX, RADII_PX = 60.0, (60.0, 60.0)
 """How far a detection may be from where its peer is expected: at first, and round by round."""
 WORST = 9.0
 """Squared residual, whitened, of a detection that is nobody's."""
@@ -43,6 +44,10 @@ SAME_S = 0.015
 """Delays so near to each other are one."""
 LIKELY = 4.0
 """Two delays are not told apart if their log-likelihoods differ by less: one in fifty."""
+ASIDE, LEAST_WORSE = (-4.0, -2.0, 2.0, 4.0), 0.1
+"""Standard errors aside at which the likelihood is asked how wide it is."""
+SAMPLED = 0.07
+"""Share of the time between two samples of attitude that no delay is better known than."""
 LEAST = 50
 """Fewest matched detections that are worth a calibration."""
 
@@ -59,7 +64,7 @@ class Calibration:
         (3,) standard errors of roll, pitch and yaw. Errors of positions last for seconds, and
         partly for a flight (`dmrl.estimation.mount`): a count of images would promise too much.
     delay_std_s
-        Of the delay.
+        Of the delay: at least a small share of a sample of attitude.
     matched
         How many detections were used.
     before_px, after_px
@@ -107,8 +112,7 @@ def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibr
     tries = _tries(views, camera, start, noise)
     if not tries:
         return None
-    refined = [_refined(views, camera, one, noise) for one in _apart(tries)]
-    ends = sorted((end for end in refined if end is not None), key=lambda end: end[0].cost)
+    ends = _ends(views, camera, tries, noise)
     if not ends:
         return None
     found, matched = ends[0]
@@ -117,7 +121,7 @@ def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibr
     return Calibration(
         mounted(camera, found.values),
         (float(spread[0]), float(spread[1]), float(spread[2])),
-        float(spread[3]),
+        _delay_std_s(views, camera, matched, found, noise),
         len(matched.time_s),
         median_px(views, camera, matched, start),
         median_px(views, camera, matched, found.values),
@@ -178,8 +182,26 @@ def _apart(tries: Sequence[_Try]) -> list[_Try]:
     return kept[:REFINED]
 
 
+def _ends(
+    views: Sequence[View], camera: Camera, tries: Sequence[_Try], noise: Noise
+) -> list[tuple[Mount, Matched]]:
+    """Where the best tries end, the likeliest first.
+
+    How far off single detections are is what is left of them at the likeliest end; all are then
+    solved, and held against each other, with that.
+    """
+    spread_px = float(np.hypot(noise.pixel_std_px, noise.attitude_std_rad * camera.fx_px))
+    refined = [_refined(views, camera, one, noise, spread_px) for one in _apart(tries)]
+    ends = sorted((end for end in refined if end is not None), key=lambda end: end[0].cost)
+    again = [
+        (solve(views, camera, matched, end.values, noise, ends[0][0].spread_px), matched)
+        for end, matched in ends
+    ]
+    return sorted(again, key=lambda end: end[0].cost)
+
+
 def _refined(
-    views: Sequence[View], camera: Camera, one: _Try, noise: Noise
+    views: Sequence[View], camera: Camera, one: _Try, noise: Noise, spread_px: float
 ) -> tuple[Mount, Matched] | None:
     """One start, matched again as it gets better; None where too few detections are near."""
     values, end = one.values, None
@@ -187,9 +209,28 @@ def _refined(
         matched = match(views, mounted(camera, values), radius_px, noise)
         if len(matched.time_s) < LEAST:
             return None
-        found = solve(views, camera, matched, values, noise)
+        found = solve(views, camera, matched, values, noise, spread_px)
         values, end = found.values, (found, matched)
     return end
+
+
+def _delay_std_s(
+    views: Sequence[View], camera: Camera, matched: Matched, found: Mount, noise: Noise
+) -> float:
+    """Standard error of the delay: by how much worse others explain the images.
+
+    At the best delay alone the likelihood may be sharper than it is wide: a short flight has a few
+    quick tilts, and each draws the delay to where it fits that one.
+    """
+    std_s = float(np.sqrt(found.covariance[3, 3]))
+    widest_s = std_s
+    for apart in ASIDE:
+        beside = found.values + np.array([0.0, 0.0, 0.0, apart * std_s])
+        cost = solve(views, camera, matched, beside, noise, found.spread_px, held=True).cost
+        worse = max(cost - found.cost, LEAST_WORSE)
+        widest_s = max(widest_s, abs(apart) * std_s / float(np.sqrt(2 * worse)))
+    sample_s = max(float(np.median(np.diff(flight.attitude_s))) for flight, _ in views)
+    return float(np.hypot(widest_s, SAMPLED * FINER * sample_s))
 
 
 def _refuse_alike(ends: Sequence[Mount]) -> None:

@@ -50,9 +50,9 @@ class Settings:
     threshold
         flight: least confidence of a detection, 0 to 1. Without it, the recording's.
     pixel_std_px
-        flight: error of a detection in u and in v.
+        flight: error of a detection in u and in v, to start with; the flight says how large it is.
     attitude_std_rad
-        flight: error of roll and pitch.
+        flight: error of roll and pitch. Half of it is taken to last for the flight.
     every
         board: take every so many images of a recording.
     """

@@ -87,3 +87,53 @@ def test_the_delay_does_not_hang_on_where_it_starts(delay_s: float) -> None:
     found = calibrate([seen], replace(AIDECK, delay_s=delay_s), Noise(3.0, 0.01))
     assert found is not None
     assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.008)
+
+
+def _tilting(time_s: np.ndarray) -> np.ndarray:
+    """(N, 2) roll and pitch of a drone that tilts at once, every 2.5 s, and comes back slowly."""
+    rng = np.random.default_rng(3)
+    tilt = np.zeros((len(time_s), 2))
+    for turned_s in np.arange(0.0, time_s[-1], 2.5):
+        since_s = time_s - turned_s
+        tilt += rng.normal(0, 0.12, 2) * np.where(since_s >= 0, np.exp(-since_s / 0.25), 0)[:, None]
+    return tilt
+
+
+def test_tilts_that_come_at_once_do_not_shift_the_delay() -> None:
+    rng = np.random.default_rng(11)
+    clean = flight(6, images=600)
+    log_s = np.arange(0.0, clean.image_s[-1] + 1, 0.01)
+    peer = clean.peers["cf2"]
+    taken_s = clean.image_s - TRUE.delay_s
+    roll, pitch = (np.interp(taken_s, log_s, angle) for angle in _tilting(log_s).T)
+    uv, _, _ = pixels_from_horizontal(peer.at(taken_s), roll, pitch, TRUE)
+    seen = np.flatnonzero(inside(uv, 320, 224))
+    uv = uv[seen] + rng.normal(0, 1.0, (len(seen), 2))
+    logged = _tilting(log_s) + rng.normal(0, 0.005, (len(log_s), 2))
+    shown = replace(clean, image=seen, uv=uv, attitude_s=log_s, attitude_rad=logged)
+    found = calibrate([shown], AIDECK, Noise(2.0, 0.005))
+    assert found is not None
+    assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.003)
+
+
+def test_a_path_that_is_far_off_for_seconds_does_not_turn_the_mount() -> None:
+    # Only what lay within 25 px was kept: of a path that is 30 px off to either side, one half.
+    clean = flight(8, images=900, outliers=0.0)
+    peer = clean.peers["cf2"]
+    off_m = np.zeros_like(peer.xyz_m)
+    off_m[:, 1] = 0.25 * np.sign(np.sin(2 * np.pi * peer.time_s / 25.0) - 0.6)
+    wide = np.broadcast_to(np.diag([0.02, 0.25, 0.02]) ** 2, peer.covariance.shape)
+    moved = PeerPath(peer.time_s, peer.xyz_m + off_m, wide)
+    found = calibrate([replace(clean, peers={"cf2": moved})], AIDECK, Noise(3.0, 0.005))
+    assert found is not None
+    assert found.matched > 850
+
+
+def test_how_far_single_detections_are_off_is_found() -> None:
+    sharp, blunt = (
+        calibrate([flight(9, images=600, outliers=0.0)], AIDECK, Noise(pixels, 0.005))
+        for pixels in (3.0, 9.0)
+    )
+    assert sharp is not None
+    assert blunt is not None
+    assert blunt.mount_std_rad == pytest.approx(sharp.mount_std_rad, rel=0.05)

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.geometry.frames import AIDECK, Camera, inside, pixels_from_horizontal
+from dmrl.geometry.frames import AIDECK, Array, Camera, inside, pixels_from_horizontal
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read_raw, read_table, summary
 
@@ -13,23 +14,27 @@ RATE_HZ = 10.0
 
 
 def with_detections(
-    flight: Path, out: Path, robot: str = "cf1", camera: Camera = AIDECK, seed: int = 0
+    flight: Path,
+    out: Path,
+    robot: str = "cf1",
+    camera: Camera = AIDECK,
+    seed: int = 0,
+    tilt: tuple[NDArray[np.int64], Array, Array] | None = None,
+    rate_hz: float = RATE_HZ,
 ) -> Path:
     """The flight with ``robot``'s detections; ``camera`` took the images, AIDECK is on record.
 
     Pixels are off by 3 px, depths by 15 % and, for a second or so, by another 8 %; one image in
-    six shows nobody; one in four has a false alarm.
+    six shows nobody; one in four has a false alarm. The camera tilts as ``tilt`` says, times,
+    roll and pitch; without it, as the log does.
     """
     rng = np.random.default_rng(seed)
     held = summary(flight)
     span_ns = held.start_ns, held.end_ns
-    times_ns = np.arange(span_ns[0] + 10**9, span_ns[1] - 10**9, round(1e9 / RATE_HZ))
+    times_ns = np.arange(span_ns[0] + 10**9, span_ns[1] - 10**9, round(1e9 / rate_hz))
     taken_ns = times_ns - round(camera.delay_s * 1e9)
-    attitude = read_table(flight, topics.attitude(robot))
-    at_ns = attitude["log_time"].to_numpy()
-    roll, pitch = (
-        np.interp(taken_ns, at_ns, attitude[f"{name}_rad"].to_numpy()) for name in ("roll", "pitch")
-    )
+    at_ns, *tilted = tilt or _logged(flight, robot)
+    roll, pitch = (np.interp(taken_ns, at_ns, angle) for angle in tilted)
     found: list[list[dict[str, float]]] = [[] for _ in times_ns]
     for topic in held.topics:
         link = topics.names(topics.TRUTH, topic)
@@ -62,6 +67,13 @@ def with_detections(
             made = message("Detections")(detections=entries, threshold=0.3)
             sink.write(time_ns, topics.detections(robot), made)
     return out
+
+
+def _logged(flight: Path, robot: str) -> tuple[NDArray[np.int64], Array, Array]:
+    table = read_table(flight, topics.attitude(robot))
+    columns = (table[name].to_numpy() for name in ("log_time", "roll_rad", "pitch_rad"))
+    times_ns, roll, pitch = columns
+    return times_ns, roll, pitch
 
 
 def _detection(u_px: float, v_px: float, depth_m: float, confidence: float) -> dict[str, float]:

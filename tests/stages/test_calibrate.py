@@ -6,8 +6,9 @@ import pytest
 from scipy.stats import chi2
 
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
-from dmrl.geometry.camera_file import read_camera
-from dmrl.geometry.frames import AIDECK
+from dmrl.flight import NOISE, Scenario, simulate
+from dmrl.geometry.camera_file import read_camera, write_camera
+from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read
@@ -18,6 +19,8 @@ from ..estimation.boards import picture, pose
 from .detector import with_detections
 
 CROOKED = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
+
+TILTED = replace(AIDECK, mount_rad=(0.0, float(np.radians(-2.86)), 0.0), delay_s=0.06)
 
 
 @pytest.fixture(scope="module")
@@ -166,24 +169,56 @@ def test_an_existing_output_is_refused(seen: Path, tmp_path: Path) -> None:
         calibrate.run([seen], out, Settings(against="truth"))
 
 
-def _normalised(seed: int, folder: Path) -> np.ndarray:
-    """(4,) errors over their sigmas: mount and delay from positions that were estimated."""
+def _seen(seed: int, folder: Path, camera: Camera) -> Path:
+    """A labelled flight with detections; the camera tilts as the robot did, not as its log says."""
     steps = [folder / f"{seed}-{name}.mcap" for name in ("flight", "labelled", "seen")]
     fly.run(steps[0], fly.Settings(2, 60.0, noise="calibrated", seed=seed))
     label.run(steps[0], steps[1], label.Settings())
-    with_detections(steps[1], steps[2], camera=CROOKED, seed=seed)
-    figures = calibrate.run([steps[2]], folder / f"{seed}.toml", Settings()).figures
-    true = [*np.degrees(CROOKED.mount_rad), 1e3 * CROOKED.delay_s]
+    true = simulate(Scenario(2, 60.0), NOISE["calibrated"], seed).truth["cf1"]
+    times_ns = fly.START_NS + np.rint(true.time_s * 1e9).astype(np.int64)
+    tilt = times_ns, true.roll, true.pitch
+    return with_detections(steps[1], steps[2], "cf1", camera, seed, tilt, rate_hz=9.73)
+
+
+def _normalised(sources: list[Path], out: Path, camera: Camera) -> np.ndarray:
+    """(4,) errors over their sigmas: mount and delay from positions that were estimated."""
+    figures = calibrate.run(sources, out, Settings()).figures
+    true = [*np.degrees(camera.mount_rad), 1e3 * camera.delay_s]
     found = np.array([*figures["mount_deg"], figures["delay_ms"]])
     return np.asarray((found - true) / [*figures["mount_std_deg"], figures["delay_std_ms"]])
 
 
 def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None:
-    assert np.abs(_normalised(4000, tmp_path)).max() < 3.5
+    seen = _seen(4000, tmp_path, CROOKED)
+    assert np.abs(_normalised([seen], tmp_path / "camera.toml", CROOKED)).max() < 3.5
 
 
 @pytest.mark.slow
 def test_sigmas_of_twenty_flights_hold(tmp_path: Path) -> None:
-    squares = np.array([_normalised(4100 + k, tmp_path) for k in range(20)]) ** 2
+    squares = np.array(
+        [
+            _normalised([_seen(4100 + k, tmp_path, CROOKED)], tmp_path / f"{k}.toml", CROOKED)
+            for k in range(20)
+        ]
+    )
     low, high = chi2.ppf((0.025, 0.975), squares.size) / squares.size
-    assert low < squares.mean() < high
+    assert low < (squares**2).mean() < high
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("three")
+    return [_seen(4200 + k, folder, TILTED) for k in range(3)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start_s", [0.0, 0.06, 0.2])
+def test_three_flights_give_pitch_and_delay_from_any_start(
+    three: list[Path], start_s: float, tmp_path: Path
+) -> None:
+    # Estimated positions left pitch off by half, and the delay where it started.
+    begin = tmp_path / "begin.toml"
+    begin.write_text(write_camera(replace(AIDECK, delay_s=start_s)), encoding="utf-8")
+    found = calibrate.run(three, tmp_path / "camera.toml", Settings(camera=begin)).camera
+    assert np.degrees(found.mount_rad[1]) == pytest.approx(-2.86, abs=0.8)
+    assert found.delay_s == pytest.approx(0.06, abs=0.004)
