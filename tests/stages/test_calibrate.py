@@ -194,6 +194,7 @@ def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_sigmas_of_twenty_flights_hold(tmp_path: Path) -> None:
     squares = np.array(
         [
@@ -212,6 +213,7 @@ def three(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("start_s", [0.0, 0.06, 0.2])
 def test_three_flights_give_pitch_and_delay_from_any_start(
     three: list[Path], start_s: float, tmp_path: Path
