@@ -88,9 +88,18 @@ class Writer:
                 f"{topic}: {len(columns[wrong[0]])} values of {wrong[0]} at {len(times)} times. "
                 "Give as many of each"
             )
-        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-        for time, row in zip(times.tolist(), rows, strict=True):
-            self.write(topic, time, dict(zip(columns, row, strict=True)))
+        if any(column.dtype.kind not in "biufUS" for column in columns.values()):
+            rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+            for time, row in zip(times.tolist(), rows, strict=True):
+                self.write(topic, time, dict(zip(columns, row, strict=True)))
+            return
+        kind, time_ns = _message_of(topic), np.rint(times * 1e9).astype(np.int64)
+        try:
+            self._sink.write_columns(topic, message(kind), time_ns, columns)
+        except (TypeError, ValueError) as e:
+            raise RecordingError(
+                f"{self.path}: {topic} carries {kind}: {e}. Mend its fields"
+            ) from e
 
     def image(
         self, robot: str, time_s: float, rgb: NDArray[np.uint8], *, quality: int | None = None

@@ -54,10 +54,9 @@ def encode(
 
     Raises
     ------
-    KeyError
-        If the type has no field of a name.
     TypeError, ValueError
-        If a column is not of the field's type, or not as long as ``count`` says.
+        If the type has no field of a name, or a column is not of its type, or not as long as
+        ``count`` says.
     """
     cells = _message(kind, fields, count)
     if head_bytes:
@@ -69,7 +68,7 @@ def encode(
 def _message(kind: Descriptor, fields: Mapping[str, Value], count: int) -> Cells:
     known = kind.fields_by_name
     if unknown := [name for name in fields if name not in known]:
-        raise KeyError(f"{kind.full_name} has no field {unknown[0]}")
+        raise ValueError(f"{kind.full_name} has no field {unknown[0]}")
     chosen = sorted((known[name] for name in fields), key=lambda field: int(field.number))
     return _side_by_side([_field(field, fields[field.name], count) for field in chosen], count)
 
@@ -91,6 +90,8 @@ def _field(field: FieldDescriptor, value: Value, count: int) -> Cells:
     if field.type in (F.TYPE_STRING, F.TYPE_BYTES):
         return _text(field, value, count)
     array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{field.full_name} takes numbers")
     if field.is_repeated:
         body = _repeated(field, array, count)
         return _delimited(field, body, np.asarray(body.there.any(axis=1)))
@@ -108,8 +109,12 @@ def _scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, 
         return Cells(data, np.ones(data.shape, bool)), ~np.asarray(data.any(axis=1))
     if field.type not in VARINTS or field.type in (F.TYPE_SINT32, F.TYPE_SINT64):
         raise TypeError(f"{field.full_name} has a type that is not written from columns")
-    values = array.astype(VARINTS[field.type]).astype(np.int64).view(np.uint64)
-    return _varint(values), values == 0
+    with np.errstate(invalid="ignore"):  # what is no number is refused
+        values = array.astype(VARINTS[field.type])
+    if not np.array_equal(values, array):
+        raise ValueError(f"{field.full_name} takes whole numbers of its size")
+    bits = values.astype(np.int64).view(np.uint64)
+    return _varint(bits), bits == 0
 
 
 def _repeated(field: FieldDescriptor, array: NDArray[np.generic], count: int) -> Cells:
@@ -122,10 +127,22 @@ def _repeated(field: FieldDescriptor, array: NDArray[np.generic], count: int) ->
 
 
 def _text(field: FieldDescriptor, value: Value, count: int) -> Cells:
-    if not isinstance(value, str | bytes):
-        raise TypeError(f"{field.full_name} takes one text for all messages")
-    body = _constant(value.encode() if isinstance(value, str) else value, count)
-    return _delimited(field, body, np.full(count, bool(value)))
+    """Texts or bytes: one for all, or one for each."""
+    if isinstance(value, Mapping):
+        raise TypeError(f"{field.full_name} takes a text")
+    texts = [value] * count if isinstance(value, str | bytes) else list(np.asarray(value, object))
+    if len(texts) != count or field.is_repeated:
+        raise ValueError(f"{field.full_name} takes one text, or {count} of them")
+    if not all(isinstance(text, str if field.type == F.TYPE_STRING else bytes) for text in texts):
+        raise TypeError(
+            f"{field.full_name} takes {'text' if field.type == F.TYPE_STRING else 'bytes'}"
+        )
+    parts = [text.encode() if isinstance(text, str) else bytes(text) for text in texts]
+    size = np.array([len(part) for part in parts], np.int64)
+    width = int(size.max(initial=0))
+    data = np.frombuffer(b"".join(part.ljust(width, b"\0") for part in parts), np.uint8)
+    body = Cells(data.reshape(count, width), np.arange(width) < size[:, None])
+    return _delimited(field, body, size > 0)
 
 
 def _delimited(field: FieldDescriptor, body: Cells, there: Mask) -> Cells:

@@ -20,11 +20,12 @@ from dmrl.recording.writer import RecordingWriter
 
 
 class Timed(NamedTuple):
-    """A message to write at a log time."""
+    """A message to write at a log time, and when it was received."""
 
     time_ns: int
     topic: str
     message: Any
+    publish_ns: int | None = None
 
 
 class Series(NamedTuple):
@@ -90,7 +91,7 @@ def rewrite(
         for part in _by_time(series):
             sink.write_columns(*part)
         for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
-            sink.write(*item)
+            sink.write(item.time_ns, item.topic, item.message, publish_ns=item.publish_ns)
 
 
 def _by_time(series: Sequence[Series]) -> Iterator[Series]:

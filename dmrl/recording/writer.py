@@ -129,8 +129,8 @@ class RecordingWriter:
         time_ns
             (N,) log times, nanoseconds.
         fields
-            By name: (N,) values, (N, K) for a repeated field, one value for all, or the fields of
-            a sub-message. Those that are missing have their default.
+            By name: (N,) numbers or texts, (N, K) for a repeated field, one value for all, or the
+            fields of a sub-message. Those that are missing have their default.
         publish_ns
             (N,) when they were received, nanoseconds. None: the log times.
 
@@ -138,7 +138,7 @@ class RecordingWriter:
         ------
         RecordingError
             If the topic is dmrl's and carries another message type, or a time is negative.
-        KeyError, TypeError, ValueError
+        TypeError, ValueError
             If a column is none of the type's.
         """
         if not len(time_ns):

@@ -1,9 +1,10 @@
 """``dmrl predict``: a model and a recording to a recording with detections."""
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -24,11 +25,12 @@ from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import (
     Provenance,
     RawMessage,
-    RecordingWriter,
-    copy_extras,
+    Summary,
+    Timed,
     parsed,
     provenance,
     read_raw,
+    rewrite,
     summary,
 )
 from dmrl.recording.inputs import sha256_of_file
@@ -38,8 +40,6 @@ from dmrl.terminal.tables import print_json, print_table
 
 Map = NDArray[np.floating]
 OWN = (topics.DETECTIONS, topics.GRID)
-HELD_MESSAGES = 10_000
-"""Messages held back until their batch of images is full: bounds the memory."""
 
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
@@ -116,19 +116,12 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     held = summary(recording)
     if not topics.robots(list(held.topics)):
         raise MissingTopic(topics.camera_image("*"), held.topics, recording)
-    kept = [t for t in held.topics if not any(topics.names(own, t) for own in OWN)]
-    total = sum(held.topics[t].count for t in kept)
-    messages = track(read_raw(recording, *kept), "Predicting", total)
-    images = believed = 0
-    with RecordingWriter(out, _provenance(model, recording, settings, detector)) as sink:
-        copy_extras(held, sink)
-        for batch in _batches(messages, settings.batch_size):
-            pictures = [_decode(raw, detector, recording) for raw in batch if _robot(raw)]
-            seen = _seen(pictures, detector, settings)
-            images += len(seen)
-            believed += sum(d.confidence >= detector.threshold for s in seen for d in s.detections)
-            _write(batch, seen, sink)
-    return Result(images, believed)
+    replaced = [t for t in held.topics if any(topics.names(own, t) for own in OWN)]
+    seen = Counter[str]()
+    found = _messages(recording, held, detector, settings, seen)
+    made = _provenance(model, recording, settings, detector)
+    rewrite(recording, out, made, without=replaced, fresh=[found])
+    return Result(seen["images"], seen["believed"])
 
 
 def origin(model: Path, recording: Path, settings: Settings) -> Provenance:
@@ -156,22 +149,25 @@ def _provenance(model: Path, recording: Path, settings: Settings, detector: Dete
     return made
 
 
-def _batches(messages: Iterable[RawMessage], images: int) -> Iterator[list[RawMessage]]:
-    """Stretches of messages with at most that many images each."""
-    held: list[RawMessage] = []
-    count = 0
-    for raw in messages:
-        held.append(raw)
-        count += _robot(raw) is not None
-        if count == images or len(held) == HELD_MESSAGES:
-            yield held
-            held, count = [], 0
-    yield held
+def _messages(
+    recording: Path, held: Summary, detector: Detector, settings: Settings, tally: Counter[str]
+) -> Iterator[Timed]:
+    """Of every image its detections and the map they were found in; counted on the way."""
+    pictured = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
+    total = sum(held.topics[t].count for t in pictured)
+    raws = track(read_raw(recording, *pictured), "Predicting", total)
+    while batch := list(islice(raws, settings.batch_size)):
+        seen = _seen([_decode(raw, detector, recording) for raw in batch], detector, settings)
+        tally["images"] += len(seen)
+        for raw, (made, grid) in zip(batch, seen, strict=True):
+            tally["believed"] += sum(d.confidence >= detector.threshold for d in made.detections)
+            robot = _robot(raw)
+            yield Timed(raw.time_ns, topics.detections(robot), made, raw.publish_ns)
+            yield Timed(raw.time_ns, topics.grid(robot), grid, raw.publish_ns)
 
 
-def _robot(raw: RawMessage) -> str | None:
-    found = topics.names(topics.CAMERA_IMAGE, raw.topic)
-    return found["robot"] if found else None
+def _robot(raw: RawMessage) -> str:
+    return (topics.names(topics.CAMERA_IMAGE, raw.topic) or {})["robot"]
 
 
 def _decode(raw: RawMessage, detector: Detector, recording: Path) -> Rgb:
@@ -186,10 +182,6 @@ class _Seen(NamedTuple):
 
     message: Any
     grid: Any
-
-    @property
-    def detections(self) -> Any:
-        return self.message.detections
 
 
 def _seen(pictures: list[Rgb], detector: Detector, settings: Settings) -> list[_Seen]:
@@ -233,20 +225,6 @@ def _grid(confidence: Map, depth_m: Map, stride_px: int) -> Any:
         data=np.stack((confidence, depth_m)).astype("<f4").tobytes(),
         stride_px=stride_px,
     )
-
-
-def _write(batch: list[RawMessage], seen: list[_Seen], sink: RecordingWriter) -> None:
-    """Write the messages as they are, each image followed by what was seen in it."""
-    following = iter(seen)
-    for raw in batch:
-        sink.write_raw(raw)
-        if robot := _robot(raw):
-            found = next(following)
-            for topic, own in (
-                (topics.detections(robot), found.message),
-                (topics.grid(robot), found.grid),
-            ):
-                sink.write(raw.time_ns, topic, own, publish_ns=raw.publish_ns)
 
 
 DEFAULTS = Settings()

@@ -45,6 +45,10 @@ def test_wrong_topics_fields_and_lengths_are_said(tmp_path: Path) -> None:
             out.write("/a/height", 0.0, {"altitude": 1.0})
         with pytest.raises(SettingError, match="3 values of height_m at 2 times"):
             out.write_columns("/a/height", [0.0, 0.1], {"height_m": [1.0, 2.0, 3.0]})
+        with pytest.raises(RecordingError, match="no field altitude"):
+            out.write_columns("/a/height", [0.0, 0.1], {"altitude": [1.0, 2.0]})
+        with pytest.raises(RecordingError, match="takes numbers"):
+            out.write_columns("/a/height", [0.0, 0.1], {"height_m": ["low", "high"]})
         with pytest.raises(SettingError, match=r"Give \(H, W, 3\)"):
             out.image("a", 0.0, np.zeros((4, 4, 4), np.uint8))
     with pytest.raises(OutputError, match="exists"):

@@ -23,7 +23,7 @@ def one(value: Any, k: int) -> Any:
         return {name: one(column, k) for name, column in value.items()}
     if isinstance(value, str | bytes | int | float):
         return value
-    return value[k].tolist()
+    return value[k].tolist() if hasattr(value[k], "tolist") else value[k]
 
 
 @pytest.mark.parametrize(
@@ -41,6 +41,7 @@ def one(value: Any, k: int) -> Any:
             },
         ),
         ("PeerPosition", {"covariance": np.zeros((COUNT, 0)), "frame_id": ""}),
+        ("PeerPosition", {"frame_id": np.array(["", "cf1", "Bär/horizontal"] * 100)}),
         ("GridMap", {"rows": RNG.integers(0, 2**31, COUNT) >> RNG.integers(0, 31, COUNT)}),
         (
             "PoseInFrame",
@@ -66,7 +67,8 @@ def test_the_bytes_are_protobufs_own(kind: str, fields: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
-        ({"height": np.zeros(3)}, KeyError),
+        ({"height": np.zeros(3)}, ValueError),
+        ({"height_m": ["1.0", "2.0", "3.0"]}, TypeError),
         ({"height_m": np.zeros(2)}, ValueError),
         ({"height_m": {"x": np.zeros(3)}}, TypeError),
     ],
@@ -74,6 +76,12 @@ def test_the_bytes_are_protobufs_own(kind: str, fields: dict[str, Any]) -> None:
 def test_columns_that_do_not_fit_are_refused(fields: dict[str, Any], error: type) -> None:
     with pytest.raises(error):
         encode(message("Height").DESCRIPTOR, fields, 3)
+
+
+@pytest.mark.parametrize("rows", [[1.5, 2.0], [2**40, 1], [np.nan, 1.0]])
+def test_numbers_that_are_not_whole_or_too_large_are_refused(rows: list[float]) -> None:
+    with pytest.raises(ValueError, match="whole numbers"):
+        encode(message("GridMap").DESCRIPTOR, {"rows": rows}, 2)
 
 
 def test_columns_become_the_recording_that_messages_become(tmp_path: Path) -> None:
