@@ -106,6 +106,7 @@ def test_images_of_one_colour_are_refused() -> None:
     plain = np.stack([np.full((16, 24, 3), level, np.uint8) for level in (0, 90, 255)])
     with pytest.raises(SettingError, match=r"the 3 calibration images is of a single colour"):
         calibrate(small(), [plain])
+    assert calibrate(small(), [NOISE, plain]).images == 6  # one that varies will do
 
 
 def test_no_images_are_refused() -> None:

@@ -1,7 +1,17 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.hypotheses import COST_UNIT, mirrored, passed_by, spread_of
+from dmrl.estimation.hypotheses import (
+    BEARINGS,
+    COST_UNIT,
+    HEADINGS,
+    alike,
+    distinct,
+    mirrored,
+    passed_by,
+    spread_of,
+    starts,
+)
 
 HERE = np.zeros((4, 3))
 THERE = np.tile([1.0, 0.0, 0.0], (4, 1))
@@ -67,3 +77,25 @@ def test_the_nearest_pass_is_tried_first_and_a_far_one_not_at_all() -> None:
     changed = [float(time_s[(copy != state).any(axis=1)].mean()) for copy in copies]
     assert [round(at / 5) * 5 for at in changed][:2] == [25, 15]
     assert passed_by(np.tile([2.0, 0.0, 0.0, 0.0, 0.0, 0.0], (200, 1)), 10.0) == []
+
+
+def test_starts_fill_the_circle_of_the_first_range() -> None:
+    found = starts(2.0, 1.2)
+    assert found.shape == (BEARINGS * HEADINGS, 3)
+    assert np.hypot(*found[:, :2].T) == pytest.approx(1.6)
+    bearing = np.arctan2(found[::HEADINGS, 1], found[::HEADINGS, 0])
+    assert np.diff(np.unwrap(bearing)) == pytest.approx(2 * np.pi / BEARINGS)
+    for k in range(BEARINGS):
+        mine = found[k * HEADINGS : (k + 1) * HEADINGS, 2]
+        first = np.pi / HEADINGS * (k % 2)  # neighbours fill the space between
+        assert mine == pytest.approx(first + 2 * np.pi / HEADINGS * np.arange(HEADINGS))
+    assert np.hypot(*starts(1.0, 1.5)[0, :2]) == pytest.approx(0.05)
+
+
+def test_starts_that_differ_are_kept_best_first() -> None:
+    near, turned, far = [0.3, 0.2, 0.4], [0.0, 0.0, 0.6], [0.41, 0.0, 0.0]
+    states = np.array([[0.0, 0.0, 0.0], near, turned, far, [0.0, 0.0, 2 * np.pi - 0.1]])
+    assert [alike(states[0], other) for other in states[1:]] == [True, False, False, True]
+    assert distinct(states, np.array([0, 1, 2, 3, 4]), 3) == [0, 2, 3]
+    assert distinct(states, np.array([3, 2, 1, 0, 4]), 2) == [3, 2]
+    assert distinct(states, np.array([0, 4]), 3) == [0, 0, 0]

@@ -1,0 +1,102 @@
+"""What cameras saw of peers: where they are expected, and which detection is whose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.camera_views import (
+    Flight,
+    Noise,
+    PeerPath,
+    expected,
+    match,
+    median_px,
+    mounted,
+    residual,
+)
+from dmrl.geometry.frames import AIDECK, Array, pixels_from_horizontal
+
+TIME_S = np.arange(0, 10, 0.1)
+XYZ = np.column_stack([2 + 0 * TIME_S, 0.08 * TIME_S - 0.4, 0.02 * TIME_S])
+SPREAD = np.array([[0.01, 0.002, 0.0], [0.002, 0.02, 0.001], [0.0, 0.001, 0.004]])
+PATH = PeerPath(TIME_S, XYZ, np.tile(SPREAD, (len(TIME_S), 1, 1)))
+ATTITUDE = np.column_stack([0.01 * TIME_S, -0.02 * TIME_S])
+CAMERA = replace(AIDECK, mount_rad=(0.02, -0.03, 0.05), delay_s=0.25)
+IMAGES_S = np.array([1.0, 2.0, 3.05, 4.0])
+
+
+def flight(image: list[int], uv: Array) -> Flight:
+    return Flight(IMAGES_S, np.array(image), uv, TIME_S, ATTITUDE, {"cf2": PATH})
+
+
+def seen() -> Array:
+    """(4, 2) pixels of the peer when the images were taken: a quarter of a second before."""
+    at_s = IMAGES_S - 0.25
+    xyz = np.column_stack([2 + 0 * at_s, 0.08 * at_s - 0.4, 0.02 * at_s])
+    uv, _, _ = pixels_from_horizontal(xyz, 0.01 * at_s, -0.02 * at_s, CAMERA)
+    return uv
+
+
+def test_a_peer_is_expected_where_it_was_at_the_exposure() -> None:
+    uv, jacobian = expected(flight([], np.zeros((0, 2))), CAMERA, PATH, IMAGES_S)
+    assert uv == pytest.approx(seen(), abs=1e-6)
+    assert jacobian.shape == (4, 3, 5)
+    assert mounted(AIDECK, np.array([0.02, -0.03, 0.05, 0.25])) == CAMERA
+
+
+def test_positions_are_known_between_samples_that_are_near() -> None:
+    times = np.array([0.0, 0.1, 0.2, 0.44, 0.7, 0.8])
+    path = PeerPath(times, XYZ[:6], np.stack([k * np.eye(3) for k in range(6)]))
+    at_s = np.array([-0.1, 0.0, 0.05, 0.3, 0.5, 0.75, 0.8, 0.9])
+    assert path.covers(at_s).tolist() == [False, False, True, True, False, True, True, False]
+    assert path.at(np.array([0.32]))[0] == pytest.approx((XYZ[2] + XYZ[3]) / 2)
+    assert path.spread(at_s)[:, 0, 0].tolist() == [0, 0, 1, 3, 4, 5, 5, 5]
+
+
+def test_the_nearest_detection_within_reach_is_the_peers() -> None:
+    uv = seen()
+    off = np.array([[3.0, 0], [0, -2.0], [90.0, 0], [0, 9.0], [0, 30.5]])
+    here = flight([0, 0, 1, 2, 3], uv[[0, 0, 1, 2, 3]] + off)
+    found = match([(here, PATH)], CAMERA, 30.0, Noise())
+    assert found.time_s.tolist() == [1.0, 3.05]
+    assert found.uv == pytest.approx(uv[[0, 2]] + off[[1, 3]])
+    assert (found.expected, found.view.tolist()) == (4, [0, 0])
+    wide = match([(here, PATH)], CAMERA, 30.5, Noise())
+    assert len(wide.time_s) == 3
+    values = np.array([*CAMERA.mount_rad, CAMERA.delay_s])
+    assert residual([(here, PATH)], AIDECK, found, values) == pytest.approx(off[[1, 3]], abs=1e-6)
+    assert median_px([(here, PATH)], AIDECK, found, values) == pytest.approx(5.5)
+    outside = replace(PATH, xyz_m=XYZ * [1, 1, 0] + [0, 0, 5.0])
+    assert match([(here, outside)], CAMERA, 900.0, Noise()).expected == 0
+
+
+def test_whitened_errors_have_the_variance_of_one() -> None:
+    here = flight([0, 1, 2, 3], seen())
+    noise = Noise(5.0, 0.02)
+    found = match([(here, PATH)], CAMERA, 30.0, noise)
+    rng, at_s = np.random.default_rng(0), IMAGES_S[1] - 0.25
+    centre = PATH.at(np.array([at_s]))[0]
+    xyz = rng.multivariate_normal(centre, SPREAD, 20_000)
+    roll, pitch = rng.normal([[0.01 * at_s], [-0.02 * at_s]], 0.02, (2, 20_000))
+    uv, _, _ = pixels_from_horizontal(xyz, roll, pitch, CAMERA)
+    error = uv + rng.normal(0, 5.0, uv.shape) - seen()[1]
+    assert np.cov(found.whiten[1] @ error.T) == pytest.approx(np.eye(2), abs=0.05)
+
+
+def test_a_thinner_flight_keeps_detections_with_their_images() -> None:
+    uv = np.arange(10.0).reshape(5, 2)
+    thin = flight([0, 1, 2, 2, 3], uv).thinned(2)
+    assert thin.image_s.tolist() == [1.0, 3.05]
+    assert thin.image.tolist() == [0, 1, 1]
+    assert thin.uv.tolist() == uv[[0, 2, 3]].tolist()
+    assert flight([0, 1, 2, 2, 3], uv).thinned(4).image.tolist() == [0, 1, 2, 2, 3]
+
+
+def test_attitude_is_smoothed_over_some_hundredths_of_a_second() -> None:
+    at_s = np.arange(0, 5, 0.01)
+    noise = np.random.default_rng(0).normal(0, 1, (len(at_s), 2))
+    rough = replace(flight([], np.zeros((0, 2))), attitude_s=at_s, attitude_rad=noise)
+    # A Gaussian of two samples leaves 1 / sqrt(2 sqrt(pi) 2) of white noise.
+    wanted = 1 / np.sqrt(2 * np.sqrt(np.pi) * 2)
+    assert rough.smoothed().attitude_rad.std() == pytest.approx(wanted, rel=0.1)

@@ -1,0 +1,142 @@
+"""Dead reckoning, and a pair cut into keyframes, of motions that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.confidence import (
+    CALM_S,
+    NOISE_FACTOR,
+    noise_energy,
+    path_of,
+    restlessness,
+    shrunk,
+)
+from dmrl.estimation.linear import step_variance
+from dmrl.estimation.motion import odometry, rotation
+from dmrl.estimation.pair import Array, Pair, Track
+from dmrl.estimation.problem import JUMP_M, SHIFT_S, Noise, problem, silence
+
+TIME_S = 3 + np.arange(0, 20.001, 0.01)
+VX, VY, TURN = 0.4, -0.2, 0.5
+
+
+def arc(turn: float = TURN, vx: float = VX, vy: float = VY) -> Track:
+    """A robot that flies a circle: constant velocity in its own frame, constant turning."""
+    ones = np.ones(len(TIME_S))
+    return Track(
+        vx * ones, vy * ones, turn * ones, 1 + 0.1 * (TIME_S - 3), np.zeros(len(ones), bool)
+    )
+
+
+def along_arc(lasts_s: Array, turn: float = TURN) -> Array:
+    """(N, 2) how far that brings a robot, in the frame of the start."""
+    z = (VX + 1j * VY) * (np.exp(1j * turn * lasts_s) - 1) / (1j * turn)
+    return np.column_stack([z.real, z.imag])
+
+
+def test_increments_are_arcs_seen_from_their_start() -> None:
+    from_s, to_s = np.array([3.0, 4.003, 10.0, 12.0]), np.array([3.5, 6.011, 10.0, 11.0])
+    found = odometry(arc(), TIME_S).increments(from_s, to_s)
+    lasts = to_s - from_s
+    assert found.turn_rad == pytest.approx(TURN * lasts)
+    assert found.shift_m == pytest.approx(along_arc(lasts), abs=1e-4)
+    for axis, step in ((0, {"vx": VX + 1e-3}), (1, {"vy": VY + 1e-3})):
+        biased = odometry(arc(**step), TIME_S).increments(from_s, to_s)
+        slope = (biased.shift_m - found.shift_m) / 1e-3
+        assert found.drift_s[:, :, axis] == pytest.approx(slope, abs=1e-9)
+    assert rotation(np.array([np.pi / 2]))[0] @ [1, 0] == pytest.approx([0, 1])
+
+
+def pair(ranges_s: Array, range_m: Array | None = None) -> Pair:
+    range_m = 2.0 + 0 * ranges_s if range_m is None else range_m
+    peer = replace(arc(-0.3), height_m=2 + 0.3 * (TIME_S - 3))
+    return Pair(TIME_S, arc(), peer, ranges_s, range_m)
+
+
+def test_keyframes_hold_what_happened_between_them_and_up_to_each_range() -> None:
+    ranges_s = np.array([3.0, 3.05, 7.77, 23.0])
+    task = problem(pair(ranges_s), 10.0)
+    assert task.key_s == pytest.approx(3 + np.arange(201) / 10)
+    assert task.steps_s == pytest.approx(0.1)
+    step = along_arc(np.full(200, 0.1))
+    assert task.own.shift_m == pytest.approx(step, abs=1e-5)
+    assert task.peer.turn_rad == pytest.approx(-0.03)
+    assert task.range_key.tolist() == [0, 0, 47, 200]
+    since = ranges_s - task.key_s[task.range_key]
+    assert task.own_to_range.shift_m == pytest.approx(along_arc(since), abs=1e-5)
+    assert task.peer_to_range.turn_rad == pytest.approx(-0.3 * since)
+    assert task.height_m == pytest.approx(1 + 0.2 * (ranges_s - 3))
+    # A peer whose clock is late did a moment ago what it seems to do now: no more, no less.
+    assert task.peer_by_clock[1:-1] == pytest.approx(0.0, abs=1e-6)
+    assert SHIFT_S < 0.1
+    speeding = replace(arc(0.0), vx_mps=0.5 * (TIME_S - 3))
+    later = problem(Pair(TIME_S, arc(), speeding, ranges_s, 2 + 0 * ranges_s), 10.0)
+    assert later.peer_by_clock[1:-1] == pytest.approx(np.tile([0.05, 0.0], (198, 1)), abs=1e-6)
+
+
+def test_silence_of_any_sensor_marks_its_keyframes() -> None:
+    dense = np.arange(3.0, 23.0, 0.1)
+    task = problem(pair(dense))
+    assert not task.silent[1:-1].any()  # before the first range and after the last it is
+    assert not task.gap_s.any()
+    quiet = (TIME_S > 10) & (TIME_S < 11)
+    for field, robot in (("gap", "own"), ("gap", "peer"), ("height_gap", "own")):
+        flight = pair(dense)
+        flight = replace(flight, **{robot: replace(getattr(flight, robot), **{field: quiet})})
+        found = problem(flight)
+        inner = found.key_s[found.silent & (found.key_s > 4) & (found.key_s < 22)]
+        assert inner[[0, -1]] == pytest.approx([10.0, 11.0], abs=0.11)
+        assert found.gap_s.sum() == pytest.approx(1.0 if field == "gap" else 0.0, abs=0.02)
+    unheard = dense[(dense < 10) | (dense > 10.65)]
+    assert silence(pair(unheard), np.array([9.0, 10.2, 11.0])).tolist() == [False, True, False]
+
+
+def test_a_shadow_is_guessed_by_its_jumps_and_small_ones_are_left_alone() -> None:
+    dense = np.arange(3.0, 23.0, 0.02)
+    shadow = (dense > 9) & (dense < 11)
+    for height_m, found_m in ((JUMP_M + 0.3, JUMP_M + 0.3), (JUMP_M - 0.2, 0.0)):
+        levels = problem(pair(dense, 2 + height_m * shadow)).range_level_m
+        assert np.median(levels[shadow]) == pytest.approx(found_m, abs=0.02)
+        assert not levels[(dense < 8.5) | (dense > 11.5)].any()
+
+
+def test_steps_vary_as_the_processes_do_that_make_them() -> None:
+    noise, seconds = Noise(), np.array([0.01, 0.1, 100.0])
+    task = problem(pair(np.arange(3.0, 23.0, 0.1)))
+    gap_s = np.array([0.0, 1.0, 0.0])
+    task = replace(task, key_s=np.concatenate([[0.0], np.cumsum(seconds)]), gap_s=gap_s)
+    shift, _, turn, error, _, longer = step_variance(task, noise).T
+    white = 2 * noise.velocity_white_psd * seconds  # of two robots
+    assert shift == pytest.approx(white + noise.gap_speed_mps**2 * gap_s)
+    assert turn == pytest.approx(2 * noise.yaw_rate_psd * seconds + noise.gap_turn_radps**2 * gap_s)
+    # Gauss-Markov: new noise at the rate of 2 std^2 / tau at first, all of it after long.
+    assert error[0] == pytest.approx(4 * noise.velocity_std_mps**2 * 0.01 / 0.3, rel=0.05)
+    assert error[2] == pytest.approx(2 * noise.velocity_std_mps**2)
+    assert longer[0] == pytest.approx(2 * noise.range_error_std_m**2 * 0.01 / 200, rel=0.01)
+
+
+def test_motion_is_shrunk_by_its_share_of_noise_and_nothing_is_left_of_noise_alone() -> None:
+    energy = 0.01
+    for speed in (0.05, 0.13, 0.2, 1.0):
+        steady = np.tile([0.6 * speed, -0.8 * speed], (300, 1))
+        share = np.sqrt(max(1 - NOISE_FACTOR * energy / speed**2, 0))
+        assert shrunk(steady, energy, 0.1) == pytest.approx(share * steady)
+    low = Noise(velocity_std_mps=0.01)
+    assert noise_energy(low) == noise_energy(Noise()) == 2 * Noise().velocity_psd / CALM_S
+    loud = Noise(velocity_std_mps=0.2)
+    assert noise_energy(loud) == pytest.approx(2 * (2 * 0.3 * 0.04 + 2e-4) / CALM_S)
+
+
+def test_paths_are_those_of_the_moves_and_their_energy_is_told() -> None:
+    task = problem(pair(np.arange(3.0, 23.0, 0.1)))
+    heading, place = path_of(task.own)
+    assert heading == pytest.approx(TURN * (task.key_s - 3))
+    assert place == pytest.approx(along_arc(task.key_s - 3), abs=1e-3)
+    own, peer, relative = restlessness(task, np.zeros((201, 6)))
+    # The mean over a second and a half cuts the corner of a circle.
+    cut = np.sinc(TURN * 1.5 / (2 * np.pi)) ** 2
+    assert own == pytest.approx(cut * (VX**2 + VY**2), rel=0.03)
+    assert peer == pytest.approx(np.sinc(0.3 * 1.5 / (2 * np.pi)) ** 2 * 0.2, rel=0.03)
+    assert relative == 0.0
