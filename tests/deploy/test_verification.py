@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.deploy import verification
+from dmrl.deploy import measure, verification
 from dmrl.deploy.c.harness import Answer
 from dmrl.deploy.c.source import STACK_BYTES
 from dmrl.deploy.measure import CLUSTER_HZ, KERNEL_MACS, Cost, rates, state_bytes
@@ -96,3 +96,24 @@ def test_the_header_states_the_bytes_of_the_state(tmp_path: Path) -> None:
     header.write_text("nothing")
     with pytest.raises(ModelError, match=r"random\.h is damaged"):
         state_bytes(random_network(1), tmp_path)
+
+
+def test_the_cost_of_an_image_is_what_a_second_one_adds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image, flags = np.zeros((4, 5, 3), np.uint8), []
+    counted = {"words": "executed {} instructions"}
+
+    def run_both(_command: object, _what: str, *, data: bytes) -> tuple[bytes, str]:
+        return b"", counted["words"].format(1000 + 7 * len(data))
+
+    monkeypatch.setattr(Build, "program", lambda *_: ["qemu", "program"])
+    monkeypatch.setattr(measure, "host_compiler", lambda: "cc")
+    monkeypatch.setattr(measure, "run", lambda command, _: flags.append(command))
+    monkeypatch.setattr(measure, "run_both", run_both)
+    for version, plugin in ((8, 1), (9, 2)):
+        monkeypatch.setattr(measure, "emulator_version", lambda version=version: version)
+        assert measure._instructions(random_network(1), tmp_path, tmp_path, image) == 7 * 60
+        assert f"-DPLUGIN_VERSION={plugin}" in flags[-1]
+    counted["words"] = "no plugins here"
+    assert measure._instructions(random_network(1), tmp_path, tmp_path, image) is None

@@ -1,0 +1,131 @@
+"""One model, opened for every way to compute it, says the same."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dmrl.deploy.backends import grids_of, integer, seen_by
+from dmrl.deploy.detector import Detector, open_detector
+from dmrl.deploy.float_onnx import float_onnx_of
+from dmrl.deploy.graph import grey_of
+from dmrl.deploy.store import INTEGER_NAME, save
+from dmrl.errors import ModelError, SettingError
+from dmrl.learn.model import Model, load_model, save_model
+from dmrl.learn.network import build
+
+from .graphs import quantised_network
+
+
+@pytest.mark.parametrize("backend", ["integer", "onnx-int8", "c"])
+def test_an_int8_network_says_the_same_by_every_backend(backend: str, tmp_path: Path) -> None:
+    network = replace(quantised_network(0), threshold=0.37)
+    save(network, tmp_path / INTEGER_NAME)
+    shape = (2, network.height_px, network.width_px, 3)
+    images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    detector = open_detector(tmp_path, backend)  # type: ignore[arg-type]
+    assert (detector.name, detector.stride_px) == (tmp_path.name, network.stride_px)
+    assert detector.threshold == pytest.approx(0.37)
+    assert detector.size_px == (network.width_px, network.height_px)
+    assert detector.file == tmp_path / INTEGER_NAME
+    wanted = grids_of(integer(network).outputs(images))
+    got = detector.grids(images)
+    np.testing.assert_allclose(got.confidence, wanted.confidence, atol=1e-6)
+    np.testing.assert_allclose(
+        np.log(got.depth_m + 1e-30), np.log(wanted.depth_m + 1e-30), atol=1e-4
+    )
+
+
+def run_folder(folder: Path) -> Path:
+    folder.mkdir()
+    network = build("locanet", seed=3).eval()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.03 * torch.randn(parameter.shape, generator=torch.manual_seed(1))
+    save_model(Model(network, "locanet", threshold=0.41, width_px=64, height_px=48), folder)
+    return folder
+
+
+def test_a_float_model_says_the_same_by_torch_and_onnx_and_as_an_export(tmp_path: Path) -> None:
+    run = run_folder(tmp_path / "run")
+    images = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
+    export = tmp_path / "export"
+    export.mkdir()
+    (export / "model.onnx").write_bytes(float_onnx_of(load_model(run), grey=False))
+    (export / "model.json").write_text(json.dumps({"stride_px": 8, "threshold": 0.41}))
+    found = {
+        name: open_detector(where, backend)  # type: ignore[arg-type]
+        for name, where, backend in (
+            ("torch", run, "torch"),
+            ("onnx", run, "onnx"),
+            ("export", export, "onnx"),
+        )
+    }
+    wanted = found["torch"].grids(images)
+    for detector in found.values():
+        assert (detector.stride_px, detector.threshold) == (8, pytest.approx(0.41))
+        got = detector.grids(images)
+        np.testing.assert_allclose(got.confidence, wanted.confidence, atol=1e-5)
+        np.testing.assert_allclose(got.depth_m, wanted.depth_m, rtol=1e-4)
+    assert [d.size_px for d in found.values()] == [None, (64, 48), (64, 48)]
+    weights, onnx = run / "model.safetensors", export / "model.onnx"
+    assert [d.file for d in found.values()] == [weights, weights, onnx]
+    with pytest.raises(ModelError, match=r"is an export folder, which torch cannot run"):
+        open_detector(export, "torch")
+    for backend in ("integer", "onnx-int8", "c"):
+        with pytest.raises(ModelError, match=f"as --backend {backend} needs"):
+            open_detector(run, backend)  # type: ignore[arg-type]
+        with pytest.raises(ModelError, match=f"--backend {backend} is int8"):
+            open_detector(weights, backend)  # type: ignore[arg-type]
+    for text in ('{"stride_px": 0, "threshold": 0.4}', '{"stride_px": 8}', "{"):
+        (export / "model.json").write_text(text)
+        with pytest.raises(ModelError, match=r"model\.json is damaged"):
+            open_detector(export, "onnx")
+    with pytest.raises(ModelError, match="no model"):
+        open_detector(tmp_path / "none", "torch")
+
+
+@pytest.mark.parametrize(
+    ("size_px", "image_px", "fits"),
+    [
+        (None, (64, 48), True),
+        (None, (68, 48), False),
+        (None, (64, 44), False),
+        ((64, 48), (64, 48), True),
+        ((64, 48), (48, 64), False),
+        ((64, 48), (72, 48), False),
+    ],
+)
+def test_images_are_of_its_size_or_of_whole_cells(
+    size_px: tuple[int, int] | None, image_px: tuple[int, int], fits: bool
+) -> None:
+    detector = Detector("m", lambda images: images, 8, 0.5, size_px, None)  # type: ignore[arg-type,return-value]
+    if fits:
+        detector.require_size(*image_px, "a.mcap")
+        return
+    with pytest.raises(SettingError, match=r"a\.mcap: images of {} x {} px".format(*image_px)):
+        detector.require_size(*image_px, "a.mcap")
+
+
+def test_grey_networks_are_shown_grey() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (4, 6, 3), np.uint8)
+    networks = [quantised_network(seed) for seed in range(4)]
+    assert {network.channels for network in networks} == {1, 3}
+    for network in networks:
+        wanted = grey_of(image[None])[0] if network.channels == 1 else image
+        assert (seen_by(network, image) == wanted).all()
+
+
+def test_logits_far_out_overflow_nothing() -> None:
+    far = np.array([[[-1e9, 0.0, 1e9]]])
+    grids = grids_of({"confidence": far, "log_depth": far, "offset_u": far, "offset_v": 2 * far})
+    assert grids.confidence[0, 0].tolist() == pytest.approx([0, 0.5, 1])
+    assert grids.depth_m[0, 0, :2].tolist() == [0, 1]
+    assert np.isfinite(grids.depth_m).all()
+    assert grids.offset is not None
+    assert (grids.offset[:, 0] == far).all()
+    assert (grids.offset[:, 1] == 2 * far).all()
+    assert grids_of({"confidence": far, "log_depth": far, "offset_u": far}).offset is None
