@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,7 @@ def test_publish_time_is_kept_apart_from_log_time(tmp_path: Path) -> None:
 
 KILLED = """
 import sys
+from dataclasses import replace
 from pathlib import Path
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
@@ -214,3 +216,15 @@ def test_what_is_rare_is_not_left_open_while_the_other_kind_is_written(tmp_path:
     # Two or three pictures are a chunk; labels wait for 16 chunks of them at most.
     assert kept["/cf1/camera/image"].count >= 57
     assert kept["/cf1/labels"].count >= 60 - 16 * 3
+
+
+@pytest.mark.parametrize(("time_ns", "publish_ns"), [(-1, 0), (0, -1)])
+def test_neither_time_of_a_copied_message_may_be_negative(
+    tmp_path: Path, flight: Path, time_ns: int, publish_ns: int
+) -> None:
+    raw = replace(next(read_raw(flight)), time_ns=time_ns, publish_ns=publish_ns)
+    with (
+        pytest.raises(RecordingError, match=f"time {time_ns} ns on .* is negative"),
+        RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink,
+    ):
+        sink.write_raw(raw)
