@@ -1,5 +1,6 @@
 """Relative positions of many pairs with covariance and status: the entrance of this room."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -8,34 +9,26 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from dmrl.estimation import ekf, keyframe_filter
-from dmrl.estimation.batch import ROUGH, Solution, near, solve_batch
+from dmrl.estimation.batch import solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
 from dmrl.estimation.gate import (
     AMBIGUOUS,
     GATE_M,
+    OK,
     UNCONVERGED,
     Statuses,
     statuses,
 )
 from dmrl.estimation.grading import noise_of, with_range_noise
-from dmrl.estimation.hypotheses import (
-    BESIDE,
-    KEPT,
-    START_STD,
-    candidates,
-    mirrored,
-    passed_by,
-    spread_of,
-)
+from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, spread_of
 from dmrl.estimation.keyframe_filter import QUARTER
-from dmrl.estimation.linear import CLOCK, OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
+from dmrl.estimation.linear import CLOCK, RANGE_ERROR
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array, Mask, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+from dmrl.estimation.search import KEY_HZ, solutions
 from dmrl.estimation.stretches import joined, mended, stretches
 
-KEY_HZ = 10.0
-"""Keyframes per second."""
 INFLATION = 1.03
 """Sigmas of the batch solve are multiplied by this, and where biases are larger than the
 default's by some more: the 95 % ellipse then holds 92 to 98 % in view."""
@@ -46,13 +39,14 @@ SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
-HOPELESS = 100.0
-"""Smoothed starts whose log likelihood is this far below the best's are not solved."""
-CHEAPER = 0.5
-"""A solution that costs so much less is another one, and its passes are tried again."""
 STEADY, REACH_M = 10, 0.5
 """A position is held against the medians of so many ranges before and after, and may be this
 much farther."""
+MOST = 0.5
+"""A share of a flight that says why nothing of it is OK."""
+Refused = Literal["still", "alike", "silent", "open", "imprecise"]
+"""Why nothing is OK: the observer hardly moves; one moves as the other; sensors were silent for
+most of it; the motion leaves the bearing open, or other solutions fit; nothing is exact enough."""
 SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
 """Order of the globals seen from the peer."""
 
@@ -79,6 +73,8 @@ class Estimate:
     range_error_m
         (K,) by how much the ranges were too long for a while, as behind something; None where the
         method does not say.
+    refused
+        Why nothing is OK; None where something is.
     """
 
     time_s: Array
@@ -88,6 +84,7 @@ class Estimate:
     constants: Array
     noise: Noise
     range_error_m: Array | None = None
+    refused: Refused | None = None
 
     def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
         """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
@@ -176,11 +173,25 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     floor = (flight.silent | far) * np.int8(UNCONVERGED)
     here = np.maximum(statuses(estimate.state, estimate.covariance * GATE_SIGMA**2, gate_m), floor)
     there = np.maximum(statuses(back.state, back.covariance * GATE_SIGMA**2, gate_m), floor)
-    if own < STILL or relative < ALIKE:
-        here[:] = AMBIGUOUS
-    if peer < STILL or relative < ALIKE:
-        there[:] = AMBIGUOUS
-    return replace(estimate, status=here), replace(back, status=there)
+    for status, moved in ((here, own), (there, peer)):
+        if moved < STILL or relative < ALIKE:
+            status[:] = AMBIGUOUS
+    silent = bool(flight.silent.mean() > MOST)
+    why = [_refused(s, moved, relative, silent) for s, moved in ((here, own), (there, peer))]
+    return (
+        replace(estimate, status=here, refused=why[0]),
+        replace(back, status=there, refused=why[1]),
+    )
+
+
+def _refused(status: Statuses, moved: float, relative: float, silent: bool) -> Refused | None:
+    if (status == OK).any():
+        return None
+    if moved < STILL or relative < ALIKE:
+        return "still" if moved < STILL else "alike"
+    if silent:
+        return "silent"
+    return "open" if (status == AMBIGUOUS).mean() > MOST else "imprecise"
 
 
 def within_reach(flight: Problem, estimate: Estimate) -> tuple[Estimate, Mask]:
@@ -258,12 +269,12 @@ def _from_smoother(
 
 
 def _from_batch(
-    flight: Problem, noise: Noise | None, score: Array, tracks: Array, pieced: list[Array]
+    flight: Problem, noise: Noise | None, score: Array, tracks: Array, pieced: Sequence[Array]
 ) -> Estimate:
     first = noise or Noise()
-    solutions = _solutions(flight, first, score, tracks.swapaxes(0, 1), pieced)
-    best = solutions[0]
-    costs, states = zip(*((s.cost, s.state[:, :3]) for s in solutions), strict=True)
+    ends = solutions(flight, first, score, tracks.swapaxes(0, 1), pieced)
+    best = ends[0]
+    costs, states = zip(*((s.cost, s.state[:, :3]) for s in ends), strict=True)
     apart = spread_of(np.array(costs), np.stack(states))
     found, best = (noise, best) if noise else noise_of(flight, first, best)
     if noise:
@@ -275,53 +286,6 @@ def _from_batch(
     none = np.zeros(len(tracks), np.int8)
     state, error_m = best.state[:, :3], best.state[:, RANGE_ERROR]
     return Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)
-
-
-def _solutions(
-    flight: Problem, noise: Noise, score: Array, tracks: Array, pieced: list[Array]
-) -> list[Solution]:
-    """What the likely starts (S, K, 5) lead to, and those joined of stretches (K, 6), best first.
-
-    Even starts that look alike half-way may pass the peer on different sides: all are solved that
-    are not hopeless, each until it comes to a solution that another one led to.
-    """
-    begun: list[Array] = []
-    found: list[Solution] = []
-    for number in np.argsort(-score):
-        start = tracks[number]
-        if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
-            begun.append(start)
-            found.append(solve_batch(flight, noise, *_start(flight, start), found, ROUGH))
-    found += [solve_batch(flight, noise, start, known=found, tolerance=ROUGH) for start in pieced]
-    best = min(found, key=lambda s: s.cost)
-    # What stuck on its way may come free once all that is constant starts from zero again.
-    found.append(solve_batch(flight, noise, best.state, known=found, tolerance=ROUGH))
-    best = min(found, key=lambda s: s.cost)
-    for start in mirrored(best.state, KEY_HZ):
-        found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
-    return sorted(_passed_by(flight, noise, found), key=lambda s: s.cost)
-
-
-def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Solution]:
-    """Solutions, and what the best leads to with the peer past the observer on the other side."""
-    found, best, tried = [*found], None, 0
-    while best is None or min(s.cost for s in found) < best.cost - CHEAPER:
-        best = min(found, key=lambda s: s.cost)
-        for start in passed_by(best.state, KEY_HZ)[: BESIDE - tried]:
-            tried += 1
-            found.append(solve_batch(flight, noise, start, best.constants, found, ROUGH))
-            if found[-1].cost < best.cost - CHEAPER:
-                break
-    return found
-
-
-def _start(flight: Problem, track: Array) -> tuple[Array, Array]:
-    """States (K, 6) and globals (G,) that a smoothed track (K, 5) says, with jumped ranges."""
-    state, constants = np.zeros((len(track), SIZE)), np.zeros(len(GLOBALS))
-    state[:, :3] = track[:, :3]
-    state[flight.range_key, RANGE_ERROR] = flight.range_level_m
-    constants[[OWN_GYRO, PEER_GYRO]] = track[-1, 3:]
-    return state, constants
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:

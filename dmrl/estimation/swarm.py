@@ -10,13 +10,14 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from dmrl.estimation.confidence import RESTLESS_S, noise_energy, shrunk
-from dmrl.estimation.estimate import KEY_HZ, STILL, Estimate
+from dmrl.estimation.estimate import STILL, Estimate
 from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, statuses
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.estimation.motion import odometry, rotation
 from dmrl.estimation.pair import Array, Pair, Track
 from dmrl.estimation.problem import GLOBALS
+from dmrl.estimation.search import KEY_HZ
 from dmrl.estimation.stretches import contradicts
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Link, Swarm, inverse, solved
 

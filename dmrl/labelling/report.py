@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.estimation.estimate import Estimate
+from dmrl.estimation.estimate import Estimate, Refused
+from dmrl.estimation.gate import OK
 from dmrl.estimation.linear import (
     BIAS,
     CLOCK,
@@ -22,6 +23,17 @@ from dmrl.recording import Contents
 
 TURNS_RADPS, LONGER_M, FASTER, LATER_S = 0.02, 0.2, 0.12, 0.05
 """What was solved for is worth a line beyond these: several times what sensors in order have."""
+
+WHY: dict[Refused, str] = {
+    "still": "{observer} hardly moves, and then ranges tell no bearing. Let it fly about",
+    "alike": "they move alike, and then ranges tell no bearing. Let them fly different ways",
+    "silent": "ranges or a sensor were silent for most of the flight. Try: dmrl info",
+    "open": "the motion leaves the bearing open, or several solutions fit. Fly longer and faster, "
+    "with turns; with a third robot try --method swarm",
+    "imprecise": "a position is exact to {sigma_m:.2f} m, one sigma. Sensors may do better: see "
+    "docs/labelling.md. A wider --gate-m takes more",
+}
+"""Why nothing of a flight is kept, and what to do about it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +112,24 @@ def pair_report(
         rmse_ok_m=_rms(error, ok),
         rmse_m=_rms(error, np.ones_like(ok)),
     )
+
+
+def refusal(pair: tuple[str, str], estimate: Estimate) -> list[str]:
+    """A line that says why nothing of a pair is kept, and what to do; none where something is.
+
+    Parameters
+    ----------
+    pair
+        Observer and peer.
+    estimate
+        Of the peer by the observer.
+    """
+    if (estimate.status == OK).any():
+        return []
+    largest = np.linalg.eigvalsh(estimate.covariance[:, :2, :2])[:, -1]
+    why = WHY[estimate.refused or "imprecise"]
+    told = why.format(observer=pair[0], sigma_m=float(np.sqrt(np.median(largest))))
+    return [f"{pair[0]} sees {pair[1]}: nothing is kept: {told}"]
 
 
 def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:

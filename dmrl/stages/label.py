@@ -26,7 +26,7 @@ try:
     from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import SENSED, Logs, read_logs
-    from dmrl.labelling.report import PairReport, doubts, pair_report
+    from dmrl.labelling.report import PairReport, doubts, pair_report, refusal
     from dmrl.labelling.sight import SEEN, read_sight
     from dmrl.labelling.sighted import sighted
     from dmrl.labelling.write import label_messages, position_series
@@ -144,6 +144,7 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     rewrite(recording, out, origin, without=replaced, fresh=made.values(), series=series)
     warnings = [*logs.warnings, *_blind(held, filming, cameras)]
     warnings += [line for pair in logs.pairs for line in doubts(pair, estimates[pair])]
+    warnings += [line for pair, found in estimates.items() for line in refusal(pair, found)]
     return Result(reports, _count(made.values()), warnings)
 
 

@@ -85,6 +85,7 @@ def test_motion_that_leaves_the_bearing_open_is_never_ok(
 ) -> None:
     (estimate, _) = solved(trajectory, noise, 1000)
     assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
+    assert estimate.refused == {"parallel": "alike"}.get(trajectory, "still")
 
 
 @pytest.mark.slow

@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dmrl.estimation.estimate import Estimate
 from dmrl.estimation.problem import GLOBALS, Noise
-from dmrl.labelling.report import doubts
+from dmrl.labelling.report import doubts, refusal
 
 
 def estimate(status: int = 0, **constants: float) -> Estimate:
@@ -32,3 +34,12 @@ def test_a_sensor_that_is_off_is_named_with_what_to_do(
     (line,) = doubts(("cf1", "cf2"), estimate(**{constant: value}))
     assert words in line
     assert line.startswith("cf1-cf2: ")
+
+
+def test_a_flight_of_which_nothing_is_kept_says_why_and_what_to_do() -> None:
+    assert refusal(("cf1", "cf2"), estimate(status=0)) == []
+    still = replace(estimate(status=2), refused="still")
+    (line,) = refusal(("cf1", "cf2"), still)
+    assert line.startswith("cf1 sees cf2: nothing is kept: cf1 hardly moves")
+    (line,) = refusal(("cf1", "cf2"), estimate(status=1))
+    assert "exact to 1.00 m" in line and "--gate-m" in line

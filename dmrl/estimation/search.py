@@ -1,0 +1,76 @@
+"""Where a flight's solve may end: from every likely start, and past what it sticks at."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dmrl.estimation.batch import ROUGH, Solution, near, solve_batch
+from dmrl.estimation.hypotheses import BESIDE, mirrored, passed_by
+from dmrl.estimation.linear import OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
+from dmrl.estimation.pair import Array
+from dmrl.estimation.problem import GLOBALS, Noise, Problem
+
+KEY_HZ = 10.0
+"""Keyframes per second."""
+HOPELESS = 100.0
+"""Smoothed starts whose log likelihood is this far below the best's are not solved."""
+CHEAPER = 0.5
+"""A solution that costs so much less is another one, and its passes are tried again."""
+
+
+def solutions(
+    flight: Problem, noise: Noise, score: Array, tracks: Array, pieced: Sequence[Array]
+) -> list[Solution]:
+    """What likely starts lead to, best first.
+
+    Even starts that look alike half-way may pass the peer on different sides: all are solved that
+    are not hopeless, each until it comes to a solution that another one led to.
+
+    Parameters
+    ----------
+    flight, noise
+        The flight, and what is believed about its sensors.
+    score
+        (S,) log likelihoods of smoothed starts.
+    tracks
+        (S, K, 5) those: x, y (m), psi (rad), biases of the yaw rates (rad/s).
+    pieced
+        (K, 6) states each, joined of what stretches of the flight led to.
+    """
+    begun: list[Array] = []
+    found: list[Solution] = []
+    for number in np.argsort(-score):
+        start = tracks[number]
+        if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
+            begun.append(start)
+            found.append(solve_batch(flight, noise, *_start(flight, start), found, ROUGH))
+    found += [solve_batch(flight, noise, start, known=found, tolerance=ROUGH) for start in pieced]
+    best = min(found, key=lambda s: s.cost)
+    # What stuck on its way may come free once all that is constant starts from zero again.
+    found.append(solve_batch(flight, noise, best.state, known=found, tolerance=ROUGH))
+    best = min(found, key=lambda s: s.cost)
+    for start in mirrored(best.state, KEY_HZ):
+        found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
+    return sorted(_passed_by(flight, noise, found), key=lambda s: s.cost)
+
+
+def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Solution]:
+    """Solutions, and what the best leads to with the peer past the observer on the other side."""
+    found, best, tried = [*found], None, 0
+    while best is None or min(s.cost for s in found) < best.cost - CHEAPER:
+        best = min(found, key=lambda s: s.cost)
+        for start in passed_by(best.state, KEY_HZ)[: BESIDE - tried]:
+            tried += 1
+            found.append(solve_batch(flight, noise, start, best.constants, found, ROUGH))
+            if found[-1].cost < best.cost - CHEAPER:
+                break
+    return found
+
+
+def _start(flight: Problem, track: Array) -> tuple[Array, Array]:
+    """States (K, 6) and globals (G,) that a smoothed track (K, 5) says, with jumped ranges."""
+    state, constants = np.zeros((len(track), SIZE)), np.zeros(len(GLOBALS))
+    state[:, :3] = track[:, :3]
+    state[flight.range_key, RANGE_ERROR] = flight.range_level_m
+    constants[[OWN_GYRO, PEER_GYRO]] = track[-1, 3:]
+    return state, constants
