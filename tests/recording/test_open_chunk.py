@@ -7,6 +7,8 @@ import pytest
 import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.records import Channel as McapChannel
+from mcap.records import Schema
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
@@ -43,7 +45,7 @@ def test_many_at_once_are_the_same_as_one_by_one(alone: int, skipped: int, defin
         one.add(*row)
     assert many.fill(records, at[skipped:]) == len(ROWS) - skipped
     assert (one.data, one.starts) == (many.data, many.starts)
-    assert list(scanned(np.frombuffer(bytes(one.data), np.uint8)).rows()) == (
+    assert list(scanned(np.frombuffer(bytes(one.data), np.uint8)).block.rows()) == (
         ROWS[:alone] + ROWS[skipped:]
     )
 
@@ -97,7 +99,7 @@ def test_blocks_are_appended_as_messages_are(
                 sink.write(k, "/cf2/height", message("Height")(height_m=-k))
     with RecordingWriter(paths[1], Provenance("test")) as sink:
         for block, channels in blocks(paths[0]):
-            sink.append(block, channels)
+            sink.chunks.append(block, channels)
     one, other = (
         sorted(read_raw(path), key=lambda raw: (raw.time_ns, raw.topic)) for path in paths
     )
@@ -117,37 +119,59 @@ def test_a_block_with_a_negative_time_is_refused_by_topic(
         pytest.raises(RecordingError, match=r"on /2 is negative"),
         RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink,
     ):
-        sink.append(block, channels)
+        sink.chunks.append(block, channels)
 
 
 def channel(topic: str, schema: str = "a", **more: str) -> Channel:
     return Channel(topic, schema, schema.encode(), **more)
 
 
-def test_channels_are_numbered_once_and_copies_keep_their_numbers_where_free() -> None:
+def definitions(defined: Defined, one: Channel) -> list[McapChannel | Schema]:
+    """What stands before the first message of a channel."""
+    begun = defined.begin(defined.number(one))
+    return list(scanned(np.frombuffer(begun, np.uint8)).definitions())
+
+
+def test_channels_are_numbered_once_and_defined_once() -> None:
     defined = Defined()
     assert [defined.number(channel(t)) for t in ("/a", "/b", "/a")] == [1, 2, 1]
-    assert defined.channels[1].schema_id == defined.channels[2].schema_id == 1
-    kept, taken = channel("/c", "b"), channel("/d", "c")
-    records = {9: Defined(), 2: Defined()}
-    for number, one in ((9, kept), (2, taken)):
-        records[number].number(one)
-    theirs = {number: records[number].channels[1] for number in records}
-    theirs[9].schema_id = 40
-    defined.adopt({9: kept, 2: taken}, theirs)
-    assert (defined.number(kept), defined.number(taken)) == (9, 10)
-    assert defined.channels[9].schema_id == 40
-    assert defined.schemas[40].name == "b"
-    new = channel("/f", "d")
-    defined.adopt({12: new}, {12: theirs[2]})  # whose schema has a number that is taken
-    assert defined.schemas[defined.channels[12].schema_id].name == "d"
-    assert defined.schemas[1].name == "a"
-    nameless = Channel("/e", "", b"", "")
-    assert defined.channels[defined.number(nameless)].schema_id == 0
-    assert defined.records(defined.number(nameless))[0] == b""
-    schema, own = defined.records(9)
-    assert b"b" in schema
-    assert b"/c" in own
+    schema, own = definitions(defined, channel("/a"))
+    assert isinstance(schema, Schema)
+    assert isinstance(own, McapChannel)
+    assert (schema.id, schema.name, schema.data) == (1, "a", b"a")
+    assert (own.id, own.topic, own.schema_id) == (1, "/a", 1)
+    assert definitions(defined, channel("/a")) == []
+    (second,) = definitions(defined, channel("/b"))  # of the same schema
+    assert isinstance(second, McapChannel)
+    assert (second.id, second.schema_id) == (2, 1)
+    nameless = definitions(defined, Channel("/e", "", b"", ""))
+    assert [(type(one), one.schema_id) for one in nameless if isinstance(one, McapChannel)] == [
+        (McapChannel, 0)
+    ]
+    schemas, channels = defined.all_begun()
+    assert ([s.id for s in schemas], [c.id for c in channels]) == ([1], [1, 2, 3])
+
+
+def test_copies_keep_their_numbers_where_these_are_free() -> None:
+    defined = Defined()
+    defined.number(channel("/a"))
+    kept, taken, other = channel("/c", "b"), channel("/d", "c"), channel("/f", "d")
+
+    def theirs(number: int, one: Channel, schema_id: int) -> dict[int, McapChannel]:
+        return {number: McapChannel(number, one.topic, "protobuf", {}, schema_id)}
+
+    for number, one, schema_id in ((9, kept, 40), (1, taken, 50), (12, other, 40)):
+        defined.adopt({number: one}, theirs(number, one, schema_id))
+    assert [defined.number(one) for one in (kept, other, taken)] == [9, 12, 13]
+    ids = []
+    for one, name in ((kept, "b"), (other, "d"), (taken, "c")):
+        schema, own = definitions(defined, one)
+        assert isinstance(schema, Schema)
+        assert isinstance(own, McapChannel)
+        assert (schema.name, own.schema_id) == (name, schema.id)
+        ids.append(schema.id)
+    assert ids[0] == 40
+    assert len({1, *ids}) == 4  # the schema of another with that number has one of its own
 
 
 def test_numbers_that_run_out_are_filled_up() -> None:
