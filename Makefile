@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all test-faults mutants check format lint types imports spell schemas docs layout clean
+.PHONY: help demo test test-all test-faults mutants check format lint types imports spell schemas docs site examples layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -56,6 +56,12 @@ schemas: $(VENV)/.dev ## Build the message classes again from schemas/dmrl/v1/*.
 
 docs: $(VENV)/.dev ## Write the generated parts of README.md and docs/ again.
 	$(BIN)/python docs/build.py
+
+site: $(VENV)/.dev ## Build the pages of docs/ as a site: build/site/index.html.
+	$(BIN)/mkdocs build --quiet
+
+examples: $(VENV)/.dev ## Run the examples, scripts and notebooks.
+	$(PYTEST) -m "slow or not slow" --timeout 900 tests/test_examples.py $(ARGS)
 
 clean: ## Remove what was built, .venv and demo/ as well.
 	rm -rf $(VENV) build demo *.egg-info
