@@ -150,21 +150,23 @@ def rows_of(
             tally.without_labels += 1
             yield None
             continue
-        mine = [label for label in labels.peers if label.source == source]
         split = split_of(image.time_ns)
+        mine = [label for label in labels.peers if label.source == source]
         if split is None:
             tally.in_no_split += 1
+            yield None
         elif source not in (looked_at(labels) or {source}):
             tally.of_other_sources += 1
+            yield None
         elif masks and covered is None and mine:
             tally.without_mask += 1
+            yield None
         elif not keep_all and any(label.status != STATUS_OK for label in mine):
             tally.not_ok += 1
+            yield None
         else:
             tally.kept += 1
             yield split, partial(_row, held.path, image, mine, covered, masks=masks)
-            continue
-        yield None
 
 
 def labelled_images(

@@ -1,7 +1,7 @@
 """Tracks of a recording beside the true positions, and beside what single images said."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,31 +88,44 @@ class _Row(NamedTuple):
 
 
 def _judge(held: Contents, robot: str, peers: list[str]) -> Judged:
-    """Tracks of one observer. A track is false if for most of its life it is at no peer."""
+    """Tracks of one observer. A track is false if for most of its life it is at no peer.
+
+    A track's life is counted in images. In an image, a track is astray if it is near no peer.
+    """
     sight = read_sight(held, robot, _camera(held, robot), 0.0)
     truth, shown = _truth(held, sight, peers)
     rows: list[_Row] = []
-    lives: Counter[int] = Counter()
-    strays: Counter[int] = Counter()
-    place = {int(time_ns): k for k, time_ns in enumerate(sight.logged_ns)}
-    for stamped in held.messages(topics.tracks(robot)):
-        k, tracks = place.get(stamped.time_ns), list(stamped.message.tracks)
-        if k is None:
-            continue
+    lived: Counter[int] = Counter()
+    astray: Counter[int] = Counter()
+    for k, tracks in _by_image(held, sight):
         rows += _rows(sight, k, tracks, truth[:, k], dict(enumerate(peers)), shown[:, k])
-        lives.update(t.id for t in tracks)
-        owned = set(assigned(truth[:, k], _places(tracks), NEAR_M).tolist())
-        strays.update(t.id for i, t in enumerate(tracks) if i not in owned)
+        lived.update(t.id for t in tracks)
+        at_peers = set(assigned(truth[:, k], _places(tracks), NEAR_M).tolist())
+        astray.update(t.id for i, t in enumerate(tracks) if i not in at_peers)
+    false_tracks = sum(2 * astray[number] > lived[number] for number in lived)
+    return _judged(sight, rows, false_tracks)
+
+
+def _by_image(held: Contents, sight: Sight) -> Iterator[tuple[int, list[Any]]]:
+    """Number of an image, and the tracks at its time; times without an image are left out."""
+    number = {int(time_ns): k for k, time_ns in enumerate(sight.logged_ns)}
+    for stamped in held.messages(topics.tracks(sight.robot)):
+        if (k := number.get(stamped.time_ns)) is not None:
+            yield k, list(stamped.message.tracks)
+
+
+def _judged(sight: Sight, rows: list[_Row], false_tracks: int) -> Judged:
+    """Rows as columns."""
     time_s = (sight.time_ns - sight.time_ns[:1]) * 1e-9
     return Judged(
-        robot,
+        sight.robot,
         np.asarray(time_s[np.array([row.image for row in rows], int)], float),
         [row.peer for row in rows],
         [row.named for row in rows],
         np.reshape([row.error_m for row in rows], (-1, 3)),
         np.reshape([row.single_error_m for row in rows], (-1, 3)),
         np.reshape([row.covariance for row in rows], (-1, 3, 3)),
-        sum(2 * strays[number] > lives[number] for number in lives),
+        false_tracks,
         float(time_s[-1]) if len(time_s) else 0.0,
     )
 

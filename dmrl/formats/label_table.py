@@ -133,7 +133,10 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
         raise SourceError(f"{path}:1: a column appears twice. Delete one")
 
 
-def _row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) -> LabelRow:
+def _texts(
+    where: str, cells: Mapping[str | None, Any], files: Collection[str]
+) -> Mapping[str, str]:
+    """The cells of a line by the names of their columns; one for each, and of a known picture."""
     if None in cells or None in cells.values():
         raise SourceError(f"{where}: not as many cells as the header. Mend the line")
     row = {str(name): str(cell).strip() for name, cell in cells.items()}
@@ -141,6 +144,11 @@ def _row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) ->
         near = get_close_matches(row["file"], files, n=1)
         hint = f"Did you mean {near[0]}?" if near else "Add the picture, or delete the line"
         raise SourceError(f"{where}: no picture {row['file']!r} in the folder. {hint}")
+    return row
+
+
+def _row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) -> LabelRow:
+    row = _texts(where, cells, files)
     split = row.get("split") or None
     if split is not None:
         split_name(split, f"{where}: the split")

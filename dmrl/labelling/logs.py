@@ -192,6 +192,24 @@ def _pair(
             "left out. Do their clocks agree?"
         )
         return None
+    measured = _ranges_within(name, ranges, start_s, end_s, warnings)
+    if measured is None:
+        return None
+    grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
+    tracks = [log.track(grid_s) for log in logs]
+    for robot, sensed in zip((one, other), tracks, strict=True):
+        if sensed.gap.any():
+            silent_s = sensed.gap.sum() / RATE_HZ
+            warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
+    time_s, range_m = measured
+    on_grid = time_s <= grid_s[-1]  # which ends up to a step before the logs do
+    return Pair(grid_s, tracks[0], tracks[1], time_s[on_grid], range_m[on_grid])
+
+
+def _ranges_within(
+    name: str, ranges: list[Signals], start_s: float, end_s: float, warnings: list[str]
+) -> tuple[Array, Array] | None:
+    """Times and usable ranges of a pair, in order; None, with a warning, where they are too few."""
     # Both directions measure the same distance, so they count as one series.
     time_s = np.concatenate([r[0] for r in ranges])
     range_m = np.concatenate([r[1][:, 0] for r in ranges])
@@ -204,11 +222,4 @@ def _pair(
     if good.sum() < LEAST_RANGES:
         warnings.append(f"{name}: {good.sum()} usable ranges, under {LEAST_RANGES}; left out")
         return None
-    grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
-    good &= time_s <= grid_s[-1]
-    tracks = [log.track(grid_s) for log in logs]
-    for robot, sensed in zip((one, other), tracks, strict=True):
-        if sensed.gap.any():
-            silent_s = sensed.gap.sum() / RATE_HZ
-            warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
-    return Pair(grid_s, tracks[0], tracks[1], time_s[good], range_m[good])
+    return time_s[good], range_m[good]

@@ -124,26 +124,25 @@ class FitSettings(LossSettings):
     processes: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size", "processes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: must be at least 1")
-        if self.learning_rate <= 0 or not 0 <= self.final_learning_rate <= self.learning_rate:
-            raise ValueError("learning_rate: must be over 0 and not below final_learning_rate")
+        for name in AT_LEAST_ONE:
+            _refuse(getattr(self, name) < 1, f"{name}: must be at least 1")
+        falls = 0 <= self.final_learning_rate <= self.learning_rate
+        _refuse(
+            self.learning_rate <= 0 or not falls,
+            "learning_rate: must be over 0 and not below final_learning_rate",
+        )
         for name in NOT_NEGATIVE:
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: must not be negative")
+            _refuse(getattr(self, name) < 0, f"{name}: must not be negative")
         for name in SHARES:
             value = getattr(self, name)
-            if value is not None and not 0 <= value <= 1:
-                raise ValueError(f"{name}: must be between 0 and 1")
-        if self.validation_share > 0.5:
-            raise ValueError("validation_share: must be at most 0.5")
-        if not 0 < self.zoom[0] <= self.zoom[1]:
-            raise ValueError("zoom: must be over 0, the lesser first")
-        if self.intrinsics and min(self.intrinsics[:2]) <= 0:
-            raise ValueError("intrinsics: fx and fy must be over 0")
-        if any(share < 0 for share in self.shares.values()):
-            raise ValueError("shares: must not be negative")
+            _refuse(value is not None and not 0 <= value <= 1, f"{name}: must be between 0 and 1")
+        _refuse(self.validation_share > 0.5, "validation_share: must be at most 0.5")
+        least, greatest = self.zoom
+        _refuse(not 0 < least <= greatest, "zoom: must be over 0, the lesser first")
+        focal_px = self.intrinsics[:2] if self.intrinsics else (1.0,)
+        _refuse(min(focal_px) <= 0, "intrinsics: fx and fy must be over 0")
+        negative = any(share < 0 for share in self.shares.values())
+        _refuse(negative, "shares: must not be negative")
 
     @property
     def extra(self) -> tuple[str, ...]:
@@ -171,9 +170,15 @@ SHARES = (
     *("validation_share", "threshold", "flip_share", "mosaic_share"),
     *("blur_share", "colour", "noise", "distill_share"),
 )
+AT_LEAST_ONE = ("epochs", "batch_size", "processes")
 NOT_NEGATIVE = (
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
     *(term.weight for term in TERMS),
     *("rotation_deg", "paste"),
     *("plain_epochs", "frozen_norm_epochs"),
 )
+
+
+def _refuse(wrong: bool, why: str) -> None:
+    if wrong:
+        raise ValueError(why)

@@ -82,22 +82,32 @@ def _each(table: Any, faults: list[str]) -> dict[str, Values]:
 def _values(value: Any) -> Values | str:
     """What a name stands for, or what is wrong with it."""
     if isinstance(value, str) and (match := RANGE.fullmatch(value)):
-        first, last = int(match[1]), int(match[2])
-        if first > last:
-            return f"{value} runs backwards. Write the smaller number first"
-        if last - first >= limits.STEPS:
-            return f"{value} is too long. A recipe may have {limits.STEPS} steps"
-        return range(first, last + 1)
+        return _range(value, int(match[1]), int(match[2]))
     if not isinstance(value, list) or not value:
         return 'must be a range, such as "1-144", or a list that is not empty'
-    if len(value) > limits.STEPS:
+    return _list_fault(value) or value
+
+
+def _range(text: str, first: int, last: int) -> Values | str:
+    """The numbers from the first to the last, or what is wrong with them."""
+    if first > last:
+        return f"{text} runs backwards. Write the smaller number first"
+    if last - first >= limits.STEPS:
+        return f"{text} is too long. A recipe may have {limits.STEPS} steps"
+    return range(first, last + 1)
+
+
+def _list_fault(values: list[Any]) -> str:
+    """What is wrong with a list of values; empty: nothing."""
+    if len(values) > limits.STEPS:
         return f"is too long. A recipe may have {limits.STEPS} steps"
-    plain = all(isinstance(v, int | float | str) and not isinstance(v, bool) for v in value)
-    if not plain and not all(isinstance(v, dict) and v for v in value):
+    plain = all(isinstance(v, int | float | str) and not isinstance(v, bool) for v in values)
+    tables = all(isinstance(v, dict) and v for v in values)
+    if not plain and not tables:
         return "must hold numbers, texts, or tables, all of one kind"
-    if any(value.index(v) != k for k, v in enumerate(value)):
+    if any(values.index(v) != k for k, v in enumerate(values)):
         return "has a value twice"
-    return value
+    return ""
 
 
 def _defaults(table: Any, faults: list[str]) -> dict[str, Table]:

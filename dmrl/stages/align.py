@@ -117,27 +117,14 @@ def run(recording: Path, out: Path, settings: Settings) -> dict[str, Clock]:
 
 
 def _robots(held: Contents, settings: Settings) -> dict[str, Clock]:
-    """Of every robot that ranges or motion capture tie to the reference."""
+    """Clocks of every robot that ranges or motion capture tie to the reference."""
     pairs = range_clocks(held)
     robots = {name for link in ranging(held) for name in link}
     if settings.mocap:
-        seen = mocap_clocks(held)
-        if not seen:
-            raise RecordingError(
-                f"{held.path} has no poses of robots on /tf or /<robot>/pose/truth. "
-                "Leave out --mocap"
-            )
+        seen = _seen_by_mocap(held)
         pairs |= {(MOCAP, robot): clock for robot, clock in seen.items() if clock is not None}
         robots |= {MOCAP, *seen}
-    reference = settings.reference or min(robots - {MOCAP}, default="")
-    if not robots:
-        raise RecordingError(
-            f"{held.path}: no robot ranged to another. --mocap and --cameras set clocks by other "
-            "signals"
-        )
-    if reference not in robots:
-        known = ", ".join(sorted(robots))
-        raise SettingError(f"--reference {reference}: no such robot with ranges. Known: {known}")
+    reference = _reference(held, robots, settings)
     clocks = connected(pairs, reference)
     if len(clocks) == 1 and not (settings.cameras or settings.steady_cameras):
         raise RecordingError(
@@ -147,6 +134,30 @@ def _robots(held: Contents, settings: Settings) -> dict[str, Clock]:
     for robot in sorted(robots - clocks.keys()):
         say(f"{held.path}: nothing ties the clock of {robot} to that of {reference}; it stays")
     return clocks
+
+
+def _seen_by_mocap(held: Contents) -> dict[str, Clock | None]:
+    """Clocks of the robots that motion capture saw; None: it could not be found."""
+    seen = mocap_clocks(held)
+    if not seen:
+        raise RecordingError(
+            f"{held.path} has no poses of robots on /tf or /<robot>/pose/truth. Leave out --mocap"
+        )
+    return seen
+
+
+def _reference(held: Contents, robots: set[str], settings: Settings) -> str:
+    """The robot whose times stay, or motion capture."""
+    if not robots:
+        raise RecordingError(
+            f"{held.path}: no robot ranged to another. --mocap and --cameras set clocks by other "
+            "signals"
+        )
+    reference = settings.reference or min(robots - {MOCAP}, default="")
+    if reference not in robots:
+        known = ", ".join(sorted(robots))
+        raise SettingError(f"--reference {reference}: no such robot with ranges. Known: {known}")
+    return reference
 
 
 def _cameras(

@@ -5,7 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -112,30 +112,33 @@ def fleet(
     flights = {robot: _flight(flight, robot) for robot in robots}
     clock = FlightClock(settings.speed, max(f.end_s for f in flights.values()))
     start_ns = summary(flight).start_ns
-    threads: list[FakeCrazyflie | FakeCamera] = []
-    try:
+    drones: list[FakeCrazyflie] = []
+    eyes: list[FakeCamera] = []
+    # Each has its socket as soon as it is made, so what was made is ended if the next fails.
+    with ExitStack() as made:
+        made.callback(_end, drones, eyes)
         for k, (robot, uri) in enumerate(zip(robots, uris, strict=False)):
             seed = settings.seed * 1000 + k
-            made = flights[robot], clock, faults[robot], seed
-            threads.append(FakeCrazyflie(robot, address(uri), *made))
+            behaves = flights[robot], clock, faults[robot], seed
+            drones.append(FakeCrazyflie(robot, address(uri), *behaves))
         for k, (robot, port) in enumerate(zip(robots, cameras, strict=False)):
             pictures, seed = _pictures(flight, robot, start_ns), settings.seed * 1000 + 500 + k
-            made_of = pictures, clock, faults[robot], settings.sends, seed
-            threads.append(FakeCamera(robot, (LOOPBACK, port), *made_of))
-        for thread in threads:
+            sends = pictures, clock, faults[robot], settings.sends, seed
+            eyes.append(FakeCamera(robot, (LOOPBACK, port), *sends))
+        for thread in (*drones, *eyes):
             thread.start()
-        yield Fleet(
-            tuple(t for t in threads if isinstance(t, FakeCrazyflie)),
-            tuple(t for t in threads if isinstance(t, FakeCamera)),
-            clock,
-        )
-    finally:
-        for thread in threads:
-            thread.stop()
-        for thread in threads:
-            thread.close()
-            if thread.is_alive():
-                thread.join(timeout=5.0)
+        yield Fleet(tuple(drones), tuple(eyes), clock)
+
+
+def _end(drones: Sequence[FakeCrazyflie], cameras: Sequence[FakeCamera]) -> None:
+    """Stop all, then wait for each: they end at the same time."""
+    threads = (*drones, *cameras)
+    for thread in threads:
+        thread.stop()
+    for thread in threads:
+        thread.close()
+        if thread.is_alive():
+            thread.join(timeout=5.0)
 
 
 def _robots(flight: Path, uris: Sequence[str], cameras: Sequence[int]) -> list[str]:

@@ -176,19 +176,14 @@ def _record(
     counts: Counter[str] = Counter()
 
     def take(timeout_s: float) -> bool:
+        """Write what has come, and say what was said; whether there was anything."""
         taken = feed.take(timeout_s)
         for item in taken:
             if isinstance(item, str):
                 table.say(item)
                 continue
-            sample = item.sample
-            sink.write(
-                sample.time_ns,
-                sample.topic,
-                message(sample.message)(**sample.fields),
-                publish_ns=item.arrival_ns,
-            )
-            counts[sample.topic] += 1
+            _write(sink, item)
+            counts[item.sample.topic] += 1
             if show is not None:
                 show(item)
         return bool(taken)
@@ -203,6 +198,13 @@ def _record(
     while take(0.0):
         pass
     return dict(sorted(counts.items()))
+
+
+def _write(sink: RecordingWriter, item: Received) -> None:
+    """A sample at its own time; the time of its arrival is kept beside it."""
+    sample = item.sample
+    made = message(sample.message)(**sample.fields)
+    sink.write(sample.time_ns, sample.topic, made, publish_ns=item.arrival_ns)
 
 
 def _until(

@@ -15,10 +15,12 @@ from dmrl.stages.sketch import Settings, run, sketch
 SMALL = Settings(images=12, seed=5, empty_share=0.3)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    run(tmp_path / "sketch", SMALL)
-    return tmp_path / "sketch"
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve pictures. To be read only."""
+    out = tmp_path_factory.mktemp("sketch") / "sketch"
+    run(out, SMALL)
+    return out
 
 
 def test_every_picture_is_labelled_and_those_without_a_robot_say_so(folder: Path) -> None:

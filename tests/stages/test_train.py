@@ -5,7 +5,9 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.datasets.for_training import examples_of, material
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
+from dmrl.learn import fit
 from dmrl.learn.batches import FIELDS
 from dmrl.learn.model import load_model
 from dmrl.stages import dataset as dataset_stage
@@ -108,6 +111,32 @@ run(
 """
 
 
+def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, partial = tmp_path / "run", tmp_path / "run.partial"
+    steps, step = count(), fit.train_step
+
+    def interrupted(*args: Any) -> Any:
+        if next(steps) == 7:  # of the five that an epoch has, the third of the second
+            raise KeyboardInterrupt
+        return step(*args)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(fit, "train_step", interrupted)
+        run(dataset, out, SETTINGS)
+    assert partial.is_dir()
+    assert not out.exists()
+    with pytest.raises(OutputError, match=r"holds an interrupted training\. Go on with --resume"):
+        run(dataset, out, SETTINGS)
+    run(dataset, out, SETTINGS, resume=True)
+    run(dataset, tmp_path / "whole", SETTINGS)
+    assert not partial.exists()
+    weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "whole")]
+    assert weights[0] == weights[1]
+
+
+@pytest.mark.slow
 def test_a_killed_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
     dataset: Path, tmp_path: Path
 ) -> None:
