@@ -16,7 +16,7 @@ _PLACES = {
     "Model": "models",
     "Recording": "recordings",
     "Rows": "data",
-    "Topic": "recordings",
+    "Topic": "topic",
     "Writer": "writing",
     "align": "stages",
     "calibrate": "stages",

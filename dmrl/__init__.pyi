@@ -6,7 +6,6 @@ from dmrl.api.models import Detection as Detection
 from dmrl.api.models import Model as Model
 from dmrl.api.models import load as load
 from dmrl.api.recordings import Recording as Recording
-from dmrl.api.recordings import Topic as Topic
 from dmrl.api.recordings import open as open
 from dmrl.api.stages import align as align
 from dmrl.api.stages import calibrate as calibrate
@@ -23,6 +22,7 @@ from dmrl.api.stages import sketch as sketch
 from dmrl.api.stages import track as track
 from dmrl.api.stages import train as train
 from dmrl.api.stages import trim as trim
+from dmrl.api.topic import Topic as Topic
 from dmrl.api.writing import Writer as Writer
 from dmrl.api.writing import writer as writer
 

@@ -121,7 +121,12 @@ def _robots(held: Contents, settings: Settings) -> dict[str, Clock]:
     pairs = range_clocks(held)
     robots = {name for link in ranging(held) for name in link}
     if settings.mocap:
-        seen = _seen_by_mocap(held)
+        seen = mocap_clocks(held)
+        if not seen:
+            raise RecordingError(
+                f"{held.path} has no poses of robots on /tf or /<robot>/pose/truth. "
+                "Leave out --mocap"
+            )
         pairs |= {(MOCAP, robot): clock for robot, clock in seen.items() if clock is not None}
         robots |= {MOCAP, *seen}
     reference = _reference(held, robots, settings)
@@ -134,16 +139,6 @@ def _robots(held: Contents, settings: Settings) -> dict[str, Clock]:
     for robot in sorted(robots - clocks.keys()):
         say(f"{held.path}: nothing ties the clock of {robot} to that of {reference}; it stays")
     return clocks
-
-
-def _seen_by_mocap(held: Contents) -> dict[str, Clock | None]:
-    """Clocks of the robots that motion capture saw; None: it could not be found."""
-    seen = mocap_clocks(held)
-    if not seen:
-        raise RecordingError(
-            f"{held.path} has no poses of robots on /tf or /<robot>/pose/truth. Leave out --mocap"
-        )
-    return seen
 
 
 def _reference(held: Contents, robots: set[str], settings: Settings) -> str:

@@ -161,17 +161,24 @@ def run(
         )
         _explain(recordings, images, tally, settings)
         made.write(partial)
-        facts = Facts(
-            {why: count for why, count in tally.left_out().items() if count},
-            {path.name: source for path, source in sources.items()},
-            beside,
-            {path.name: found for path in recordings if (found := label_findings(held[path]))},
-            licences(recordings),
-            twins.count,
-        )
-        facts.write(partial)
+        result = Result(images, {path.name: source for path, source in sources.items()}, tally)
+        _facts(result, held, beside, twins).write(partial)
         write_card(partial)
-    return Result(images, {path.name: source for path, source in sources.items()}, tally)
+    return result
+
+
+def _facts(
+    result: Result, held: Mapping[Path, Contents], beside: dict[str, list[str]], twins: Twins
+) -> Facts:
+    """What the card says beside the counts: what is left out, and what to be careful of."""
+    return Facts(
+        {why: count for why, count in result.tally.left_out().items() if count},
+        result.sources,
+        beside,
+        {path.name: found for path in held if (found := label_findings(held[path]))},
+        licences(list(held)),
+        twins.count,
+    )
 
 
 def _has_masks(recording: Path) -> bool:

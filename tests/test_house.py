@@ -1,0 +1,48 @@
+"""What holds for every source file: it says what it is for, and it is short.
+
+How well it reads is for people to say; this only stops what is plainly too long.
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("dmrl", "viewer", "schemas", "recipes")
+MODULES = sorted(path for name in PACKAGES for path in (ROOT / name).rglob("*.py"))
+LINES = 350
+"""Of a file, at most."""
+FUNCTION_LINES = 25
+"""Of nine functions in ten, at most; docstrings are not counted."""
+
+
+def name_of(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_a_module_opens_with_what_it_is_for_and_is_short(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    said = ast.get_docstring(ast.parse(text)) or ""
+    assert len(said.split()) >= 3
+    assert len(text.splitlines()) <= LINES
+
+
+def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function from its name to its end, without those of its docstring."""
+    first, last = function.body[0], function.end_lineno or function.lineno
+    said = ast.get_docstring(function) is not None
+    own = (first.end_lineno or first.lineno) - first.lineno + 1 if said else 0
+    return last - function.lineno + 1 - own
+
+
+def test_nine_functions_in_ten_are_short() -> None:
+    found = sorted(
+        (lines_of(node), name_of(path), node.name)
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    )
+    assert len(found) > 1000
+    assert found[len(found) * 9 // 10][0] <= FUNCTION_LINES, found[-20:]
