@@ -132,7 +132,7 @@ def fleet(
 
 def _end(drones: Sequence[FakeCrazyflie], cameras: Sequence[FakeCamera]) -> None:
     """Stop all, then wait for each: they end at the same time."""
-    threads = (*drones, *cameras)
+    threads: tuple[FakeCrazyflie | FakeCamera, ...] = (*drones, *cameras)
     for thread in threads:
         thread.stop()
     for thread in threads:
