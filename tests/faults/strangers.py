@@ -57,8 +57,8 @@ def _render(i: Inputs, source: Path, out: Path) -> None:
     cli("render", source, out)
 
 
-def _label(i: Inputs, source: Path, out: Path) -> None:
-    cli("label", i.flight, out, "--camera.cf1", source)
+def _seen_by(i: Inputs, source: Path, out: Path) -> None:
+    cli("render", i.scene, out, "--camera", source, "--images", 1)
 
 
 def _evaluate(i: Inputs, source: Path, out: Path) -> None:
@@ -70,7 +70,7 @@ SOURCES: dict[str, Source] = {
     "labels of pictures": Source(lambda i: i.pictures, "*.csv", _convert),
     "a recipe of a pipeline": Source(lambda i: i.chain, "", _run),
     "a recipe of renders": Source(lambda i: i.scene, "", _render),
-    "a camera": Source(lambda i: i.camera, "", _label),
+    "a camera": Source(lambda i: i.camera, "", _seen_by),
     "a recording that is judged": Source(lambda i: i.found, "", _evaluate),
     "a model's description": Source(lambda i: i.model, "model.json", _predict),
     "a model's weights": Source(lambda i: i.model, "*.safetensors", _predict),

@@ -31,6 +31,7 @@ STAND_INS = {
         ("dmrl.stages.render:", "ensure", "no_python"),
     ),
     "run": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
+    "trim": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
     "evaluate": (("matplotlib.figure:Figure", "draw", "blank"),),
     "dataset": (("dmrl.card:", "plots", "nothing"),),
     "card": (("dmrl.card:", "plots", "nothing"),),
@@ -104,6 +105,11 @@ class Inputs:
         """Eight seconds of two robots."""
         flags = "--duration-s", 8, "--seed", 1
         return self.made("flight.mcap", lambda path: cli("fly", "fly_in_view", path, *flags))
+
+    @property
+    def flights(self) -> Path:
+        """A folder with two recordings."""
+        return self.made("flights", lambda path: _flights(self, path))
 
     @property
     def seen(self) -> Path:
@@ -265,6 +271,12 @@ def _dots(path: Path) -> None:
                 sink.flush()
 
 
+def _flights(inputs: Inputs, folder: Path) -> None:
+    folder.mkdir()
+    for name in "ab":
+        shutil.copy(inputs.dots, folder / f"{name}.mcap")
+
+
 def _pair(path: Path) -> None:
     rng = np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.03, 0.05, 700))
@@ -332,6 +344,12 @@ WORKS = (
     Work("convert to csv", lambda i, out: cli("convert", i.flight, out, "--to", "csv"), "tables"),
     Work("convert to ros2", lambda i, out: cli("convert", i.dots, out, "--to", "ros2"), "bag"),
     Work("trim", lambda i, out: cli("trim", i.dots, out, "--to-s", 0.9), "a.mcap"),
+    Work(
+        "trim a folder",
+        lambda i, out: cli("trim", i.flights, out, "--to-s", 0.9, "--workers", 1),
+        "flights",
+        pieces=True,
+    ),
     Work("merge", lambda i, out: cli("merge", i.dots, i.seen, out), "a.mcap"),
     Work("recover", lambda i, out: cli("recover", i.cut, out), "a.mcap"),
     Work(

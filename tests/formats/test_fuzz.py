@@ -1,5 +1,6 @@
 """Damaged sources of every binary format: one line or a part of it, and nothing worse."""
 
+import os
 import resource
 import subprocess
 import sys
@@ -182,5 +183,12 @@ def test_damaged_sources_give_one_line_or_a_part(which: str, tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", SOURCES)
-def test_two_thousand_damages_are_survived(which: str, tmp_path: Path) -> None:
-    assert "of 2000 refused" in _in_a_process(which, 2000, tmp_path)
+def test_two_thousand_damages_are_survived(
+    which: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    cases = round(2000 * float(os.environ.get("DMRL_FAULTS", "1")))
+    said = _in_a_process(which, cases, tmp_path)
+    refused = int(said.partition(f" of {cases} refused")[0].split()[-1])
+    counts = {"cases": cases, "refused": refused, "right": cases - refused}
+    row = [f"damaged: a source, {which}", counts]
+    request.node.user_properties.append(("faults", row))  # see tests/faults/conftest.py
