@@ -1,7 +1,7 @@
 """Training: seeded, resumable, watched in TensorBoard."""
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.utils.tensorboard import SummaryWriter
 
 from dmrl.errors import SettingError
+from dmrl.learn import board as boards
 from dmrl.learn.augment import Augmenter
 from dmrl.learn.batches import Batch, Examples, ahead, batch_count, gathered, order
 from dmrl.learn.checkpoint import State, load_checkpoint, save_checkpoint
@@ -25,10 +25,6 @@ from dmrl.learn.step import ALONE, LOSSES, Average, train_step
 from dmrl.learn.validate import validation_figures
 
 WATCH_STEPS = 10  # reading a loss makes an accelerator wait, so not at every step
-
-
-Board = Callable[[str, float, int], None]
-"""Takes a curve's name, its value and the step."""
 
 
 class Step(NamedTuple):
@@ -192,13 +188,13 @@ class Training:
                     save_checkpoint(self._folder, self._networks(), self._optimizer, self._state)
 
     @contextmanager
-    def _board(self, first_step: int) -> Iterator[Board]:
+    def _board(self, first_step: int) -> Iterator[boards.Board]:
         """TensorBoard's log; nothing in processes that do not lead."""
         if not self._group.leads:
             yield lambda name, value, step: None
             return
-        with SummaryWriter(self._folder / "tensorboard", purge_step=first_step) as writer:
-            yield writer.add_scalar
+        with boards.opened(self._folder / "tensorboard", first_step) as board:
+            yield board
 
     def _networks(self) -> dict[str, Network]:
         averaged = {"average": self._average.network} if self._average else {}
@@ -222,7 +218,7 @@ class Training:
                     chosen, epoch=epoch, index=index * self._group.size + self._group.rank
                 )
 
-    def _epoch(self, epoch: int, board: Board) -> Generator[Step, None, dict[str, float]]:
+    def _epoch(self, epoch: int, board: boards.Board) -> Generator[Step, None, dict[str, float]]:
         """Train one epoch; returns its mean losses."""
         size = self._settings.batch_size
         seen: list[Tensor] = []
