@@ -107,6 +107,20 @@ def test_a_stretch_is_trimmed_out_of_its_chunks(flight: Path, tmp_path: Path) ->
     assert len(set(packed(flight)) & set(packed(out))) >= 4
 
 
+def test_a_stretch_that_begins_with_a_chunk_defines_what_it_holds(
+    flight: Path, tmp_path: Path
+) -> None:
+    for k, chunk in enumerate(chunks(flight)[2:6]):
+        out, start_ns = tmp_path / f"{k}.mcap", chunk.message_start_time
+        trim(flight, out, start_ns=start_ns, topics=["/*/attitude", "/*/height"])
+        ours = [r for r in read_raw(flight, "/*/attitude", "/*/height") if r.time_ns >= start_ns]
+        assert list(read_raw(out)) == ours
+        cut = out.with_suffix(".cut.mcap")
+        cut.write_bytes(out.read_bytes()[:-100])  # without its summary
+        recover(cut, tmp_path / f"{k}.whole.mcap")
+        assert summary(tmp_path / f"{k}.whole.mcap").count == len(ours)
+
+
 def test_parts_are_merged_to_what_they_were(flight: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     trim(flight, parts[0], topics=["/cf1/*", "/cf1/camera/*"])
