@@ -17,7 +17,6 @@ from dmrl.recording.provenance import Input, Provenance
 from dmrl.recording.reader import (
     Stamped,
     columns,
-    log_times,
     matching,
     parsed,
     read,
@@ -25,9 +24,11 @@ from dmrl.recording.reader import (
     read_table,
     stretches,
 )
-from dmrl.recording.recover import Recovery, recover
+from dmrl.recording.recover import recover
+from dmrl.recording.recovery import Recovery
 from dmrl.recording.resume import Interrupted, interrupted
 from dmrl.recording.rewrite import Series, Timed, retime, rewrite
+from dmrl.recording.times import log_times
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [

@@ -5,7 +5,6 @@ walked as NumPy arrays instead: one block holds the bytes of a chunk and, for ea
 in it, its times and where its payload starts and ends. Decoders work on whole blocks.
 """
 
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Set
 from io import BytesIO
@@ -17,8 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 from mcap.summary import Summary as McapSummary
 
-from dmrl.recording import sums
-from dmrl.recording.block import EMPTY, HEAD_BYTES, Block, Ints, concatenate, joined
+from dmrl.recording.block import EMPTY, HEAD_BYTES, Block, concatenate, joined
 from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import (
     RECORD_HEADER,
@@ -27,8 +25,8 @@ from dmrl.recording.chunks import (
     scanned,
     unpacked,
 )
-from dmrl.recording.container import INDEX
-from dmrl.recording.index import mcap_summary, metadata_of
+from dmrl.recording.index import mcap_summary
+from dmrl.recording.message_index import as_pairs, index_entries
 from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.walk import channel_of, walked
 
@@ -130,51 +128,6 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
         compare(path, summary, channels, found)
 
 
-def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
-    """Log times of topics, as they stand in the message indexes; chunks are not unpacked.
-
-    Raises
-    ------
-    RecordingError
-        If the file is not a complete recording, or its message indexes are damaged.
-    """
-    parts: dict[str, list[Ints]] = {topic: [_NO_TIMES] for topic in topics}
-    with opened(path) as stream:
-        summary = mcap_summary(path, stream)
-        if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
-            for topic, times in _times_in_indexes(path, stream, summary):
-                if topic in parts:
-                    parts[topic].append(times)
-            return {topic: np.concatenate(times) for topic, times in parts.items()}
-    for block, found in blocks(path, topics):
-        for number, channel in found.items():
-            parts[channel.topic].append(block.time_ns[block.channel == number])
-    return {topic: np.concatenate(times) for topic, times in parts.items()}
-
-
-def _times_in_indexes(
-    path: Path, stream: Bounded, summary: McapSummary
-) -> Iterator[tuple[str, Ints]]:
-    """Topic and log times of every message index, chunk by chunk; at last their CRC."""
-    said = metadata_of(path, stream, summary).get(sums.METADATA_NAME)
-    crc = 0
-    for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
-        first = chunk.chunk_start_offset + chunk.chunk_length
-        stream.seek(first)
-        raw = stream.read(chunk.message_index_length)
-        crc = zlib.crc32(raw, crc)
-        for number, at in chunk.message_index_offsets.items():
-            yield (
-                summary.channels[number].topic,
-                _entries(_index(path, raw, at - first, number))[:, 0],
-            )
-    if said and said[-1].get("indexes") != sums.text(crc):
-        raise damaged(path, "its message indexes fail their CRC")
-
-
-_NO_TIMES: Ints = np.empty(0, np.int64)
-
-
 def _in_time_order(
     path: Path,
     stream: Bounded,
@@ -270,7 +223,7 @@ def whole_chunk(
     if not said.message_index_offsets:
         return record, _within(path, said, of_channels(scanned(data).block, channels, known))
     places = {n: place - at for n, place in said.message_index_offsets.items() if n in channels}
-    entries = _entries(b"".join(_index(path, raw, at, n) for n, at in places.items()))
+    entries = as_pairs(b"".join(index_entries(path, raw, at, n) for n, at in places.items()))
     entries = entries[np.argsort(entries[:, 1])]
     # Indexes carry no CRC of their own, so they are held against the records they point at.
     if entries.size and not 0 <= entries[0, 1] <= entries[-1, 1] <= len(data) - HEAD_BYTES:
@@ -310,22 +263,6 @@ def _chunk_record(path: Path, raw: bytes, said: ChunkIndex) -> Chunk:
     ):
         raise damaged(path, f"the chunk at byte {at} is not the one that its summary lists")
     return chunk
-
-
-def _index(path: Path, raw: bytes, at: int, number: int) -> bytes:
-    """Entries of one channel's message index that stands there."""
-    opcode, length, channel, size = INDEX.unpack_from(raw, at)
-    if (opcode, length, channel) != (Opcode.MESSAGE_INDEX, size + 6, number) or size % 16:
-        raise damaged(path, f"message index of channel {number} is wrong")
-    entries = raw[at + INDEX.size : at + INDEX.size + size]
-    if len(entries) < size:
-        raise damaged(path, f"message index of channel {number} is cut")
-    return entries
-
-
-def _entries(raw: bytes) -> Ints:
-    """(N, 2) log times and offsets."""
-    return np.frombuffer(raw, "<i8").reshape(-1, 2).astype(np.int64)
 
 
 def _unindexed(

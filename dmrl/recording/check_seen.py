@@ -15,7 +15,9 @@ from dmrl.recording.block import Block, Ints, joined
 from dmrl.recording.blocks import in_file_order
 from dmrl.recording.channel import Channel
 from dmrl.recording.contents import Contents
-from dmrl.recording.reader import STRETCH_BYTES, apart, columns, decoded, log_times
+from dmrl.recording.decoded import apart, decoded
+from dmrl.recording.reader import STRETCH_BYTES, columns
+from dmrl.recording.times import log_times
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, LABELS, names, row_of
 
 STAMPED = ("CompressedImage", "PoseInFrame")

@@ -12,9 +12,11 @@ from dmrl.errors import MissingTopic
 from dmrl.recording.block import EMPTY, Block, Ints, joined
 from dmrl.recording.blocks import blocks
 from dmrl.recording.channel import Channel, RawMessage
+from dmrl.recording.decoded import apart, decoded
 from dmrl.recording.index import TopicInfo, channel_on, summary
 from dmrl.recording.kinds import descriptor_of, require_types
-from dmrl.recording.reader import Stamped, apart, decoded, log_times, parsed
+from dmrl.recording.reader import Stamped, parsed
+from dmrl.recording.times import log_times
 
 PART = re.compile(r"\\{\w+\\}")
 """A part of a pattern that is left open, escaped."""

@@ -10,7 +10,8 @@ from dmrl.recording.copying import Piece, Wanted, adopt, copy, pieces, put
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import Summary, summary
 from dmrl.recording.inputs import provenance, refuse_twice
-from dmrl.recording.reader import log_times, matching
+from dmrl.recording.reader import matching
+from dmrl.recording.times import log_times
 from dmrl.recording.writer import RecordingWriter
 from dmrl.terminal.progress import say
 from dmrl.topics import CALIBRATION, names, row_of

@@ -11,10 +11,10 @@ from mcap.summary import Summary as McapSummary
 from dmrl.recording.block import Block, joined
 from dmrl.recording.blocks import blocks, chunks_between, in_chunk
 from dmrl.recording.channel import Channel
+from dmrl.recording.decoded import by_topic
 from dmrl.recording.index import mcap_summary, summary
 from dmrl.recording.kinds import require_types
 from dmrl.recording.opening import opened
-from dmrl.recording.reader import by_topic
 from dmrl.recording.walk import channel_of
 
 CHUNKS = 16

@@ -1,27 +1,23 @@
 """Messages of a recording, one at a time or as Arrow columns, in log-time order."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
-from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
-from numpy.typing import NDArray
 
 from dmrl.errors import MissingTopic
 from dmrl.recording.block import EMPTY, Block, joined
-from dmrl.recording.blocks import blocks, indexed_times
+from dmrl.recording.blocks import blocks
 from dmrl.recording.channel import Channel, RawMessage
+from dmrl.recording.decoded import batch_of, by_topic, decoded
 from dmrl.recording.index import channel_on, summary
-from dmrl.recording.kinds import descriptor_of, one_type, require_types
+from dmrl.recording.kinds import descriptor_of, require_types
 from dmrl.recording.opening import damaged
-from dmrl.recording.values import WireError
-from dmrl.recording.wire import decode
 
 STRETCH_BYTES = 4 << 20
 """Bytes of messages that `stretches` decodes at once: few calls, little memory."""
@@ -218,101 +214,6 @@ def stretches(
         yield by_topic(path, joined(held), channels, fields)
 
 
-def log_times(
-    path: Path, topics: Iterable[str], *, start_ns: int | None = None, end_ns: int | None = None
-) -> dict[str, NDArray[np.int64]]:
-    """Log times of topics, as the index has them: no message is read.
-
-    Parameters
-    ----------
-    path
-        A complete recording.
-    topics
-        Those that the recording lacks are left out.
-    start_ns, end_ns
-        Only log times in [start_ns, end_ns), nanoseconds.
-
-    Returns
-    -------
-    dict
-        Topic to (N,) log times, sorted.
-
-    Raises
-    ------
-    RecordingError
-        If the file is not a complete recording.
-    """
-    present = summary(path).topics
-    names = frozenset(topic for topic in topics if topic in present)
-    require_types(path, present, names)
-    low = 0 if start_ns is None else start_ns
-    high = np.iinfo(np.int64).max if end_ns is None else end_ns
-    found = {topic: np.sort(times) for topic, times in indexed_times(path, names).items()}
-    return {topic: t[(t >= low) & (t < high)] for topic, t in found.items()}
-
-
-def by_topic(
-    path: Path,
-    block: Block,
-    channels: Mapping[int, Channel],
-    fields: Mapping[str, Sequence[str] | None],
-) -> dict[str, pa.RecordBatch]:
-    """The messages of a block as columns, by topic."""
-    return {
-        topic: decoded(path, topic, mine, channels, fields[topic])
-        for topic, mine in apart(block, channels).items()
-    }
-
-
-def apart(block: Block, channels: Mapping[int, Channel]) -> dict[str, Block]:
-    """The messages of a block by topic, in the order they have in it."""
-    topics = sorted({channels[number].topic for number in block.numbers()})
-    place = np.full(max(channels, default=0) + 1, -1, np.int64)
-    for number, channel in channels.items():
-        if channel.topic in topics:
-            place[number] = topics.index(channel.topic)
-    key = place[block.channel]
-    order = np.argsort(key, kind="stable")
-    ends = np.searchsorted(key[order], np.arange(len(topics)), side="right")
-    rows = np.split(order, ends[:-1])
-    return {topic: block.take(own) for topic, own in zip(topics, rows, strict=False)}
-
-
-def decoded(
-    path: Path,
-    topic: str,
-    block: Block,
-    channels: Mapping[int, Channel],
-    fields: Sequence[str] | None,
-) -> pa.RecordBatch:
-    """The messages of one topic as columns.
-
-    Raises
-    ------
-    RecordingError
-        If they are of several types, or not what they should be.
-    """
-    numbers = block.numbers()
-    own = [n for n, channel in channels.items() if channel.topic == topic]
-    kinds = {descriptor_of(path, channels[number]) for number in numbers or own}
-    return _decoded(path, topic, block, one_type(path, topic, kinds), fields)
-
-
-def _decoded(
-    path: Path, topic: str, block: Block, kind: Descriptor, fields: Sequence[str] | None
-) -> pa.RecordBatch:
-    try:
-        return _batch(block, kind, fields)
-    except WireError as e:
-        raise damaged(path, f"{topic}: {e}") from e
-
-
-def _batch(block: Block, kind: Descriptor, fields: Sequence[str] | None) -> pa.RecordBatch:
-    body = decode(block.data, block.start, block.end, kind, fields)
-    times = {"log_time": pa.array(block.time_ns), "publish_time": pa.array(block.publish_ns)}
-    return pa.RecordBatch.from_pydict(times | body)
-
-
 def read_table(
     path: Path,
     topic: str,
@@ -324,5 +225,5 @@ def read_table(
     """One topic as an Arrow table, all in memory; see ``columns``. It may have no rows."""
     batches = list(columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns))
     if not batches:
-        batches = [_batch(EMPTY, descriptor_of(path, channel_on(path, topic)), fields)]
+        batches = [batch_of(EMPTY, descriptor_of(path, channel_on(path, topic)), fields)]
     return pa.Table.from_batches(batches)

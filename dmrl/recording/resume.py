@@ -10,8 +10,9 @@ from dmrl.output import partial_of
 from dmrl.recording.channel import RawMessage, holds_pictures
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import Provenance
-from dmrl.recording.reader import log_times, read_raw
+from dmrl.recording.reader import read_raw
 from dmrl.recording.recover import recover
+from dmrl.recording.times import log_times
 from dmrl.recording.writer import RecordingWriter
 
 

@@ -1,0 +1,93 @@
+"""Log times of a recording's topics, as its message indexes have them."""
+
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from mcap.summary import Summary as McapSummary
+
+from dmrl.recording import sums
+from dmrl.recording.block import Ints
+from dmrl.recording.blocks import blocks
+from dmrl.recording.index import mcap_summary, metadata_of, summary
+from dmrl.recording.kinds import require_types
+from dmrl.recording.message_index import as_pairs, index_entries
+from dmrl.recording.opening import Bounded, damaged, opened
+
+_NO_TIMES: Ints = np.empty(0, np.int64)
+
+
+def log_times(
+    path: Path, topics: Iterable[str], *, start_ns: int | None = None, end_ns: int | None = None
+) -> dict[str, Ints]:
+    """Log times of topics, as the index has them: no message is read.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    topics
+        Those that the recording lacks are left out.
+    start_ns, end_ns
+        Only log times in [start_ns, end_ns), nanoseconds.
+
+    Returns
+    -------
+    dict
+        Topic to (N,) log times, sorted.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording.
+    """
+    present = summary(path).topics
+    names = frozenset(topic for topic in topics if topic in present)
+    require_types(path, present, names)
+    low = 0 if start_ns is None else start_ns
+    high = np.iinfo(np.int64).max if end_ns is None else end_ns
+    found = {topic: np.sort(times) for topic, times in indexed_times(path, names).items()}
+    return {topic: t[(t >= low) & (t < high)] for topic, t in found.items()}
+
+
+def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
+    """Log times of topics, as they stand in the message indexes; chunks are not unpacked.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording, or its message indexes are damaged.
+    """
+    parts: dict[str, list[Ints]] = {topic: [_NO_TIMES] for topic in topics}
+    with opened(path) as stream:
+        summary = mcap_summary(path, stream)
+        if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
+            for topic, times in _times_in_indexes(path, stream, summary):
+                if topic in parts:
+                    parts[topic].append(times)
+            return {topic: np.concatenate(times) for topic, times in parts.items()}
+    for block, found in blocks(path, topics):
+        for number, channel in found.items():
+            parts[channel.topic].append(block.time_ns[block.channel == number])
+    return {topic: np.concatenate(times) for topic, times in parts.items()}
+
+
+def _times_in_indexes(
+    path: Path, stream: Bounded, summary: McapSummary
+) -> Iterator[tuple[str, Ints]]:
+    """Topic and log times of every message index, chunk by chunk; at last their CRC."""
+    said = metadata_of(path, stream, summary).get(sums.METADATA_NAME)
+    crc = 0
+    for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
+        first = chunk.chunk_start_offset + chunk.chunk_length
+        stream.seek(first)
+        raw = stream.read(chunk.message_index_length)
+        crc = zlib.crc32(raw, crc)
+        for number, at in chunk.message_index_offsets.items():
+            yield (
+                summary.channels[number].topic,
+                as_pairs(index_entries(path, raw, at - first, number))[:, 0],
+            )
+    if said and said[-1].get("indexes") != sums.text(crc):
+        raise damaged(path, "its message indexes fail their CRC")
