@@ -184,7 +184,9 @@ def measured(copy: Copy, room: str, mutants: list[Mutant]) -> list[dict[str, obj
 
 def by_hand(copy: Copy, rooms: tuple[str, ...]) -> list[dict[str, object]]:
     """The same of the changes made by hand."""
-    changes = named(rooms)
+    changes, gone = named(rooms)
+    for line in gone:
+        print(line, flush=True)
     for tests in sorted({tests for _, tests in changes}):
         if copy.pytest(list(tests), LEAST_S):
             sys.exit((copy.folder / "pytest.log").read_text() + f"{tests} fail as they are")

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from . import mutations
-from .mutations import Mutant, drawn, mutants_of
+from .mutations import Mutant, drawn, mutants_of, named
 
 SOURCE = '''"""Words of 1 + 1."""
 from pathlib import Path
@@ -64,3 +64,36 @@ def test_a_seed_draws_the_same_again_and_every_kind_alike(found: list[Mutant]) -
     assert {m.kind for m in first} == {m.kind for m in found}
     assert len(drawn("room", 99, 1, ())) == len(found)
     assert drawn("room", 99, 1, ("a",)) == []
+
+
+LIST = """
+["dmrl/room/a.py"]
+"off by one" = ["a < 3", "a < 4"]
+"not there" = ["a < 9", "a < 8"]
+"twice" = ["1", "2"]
+["dmrl/other/b.py"]
+tests = ["tests/other/test_c.py", "tests/test_d.py"]
+"no file" = ["a", "b"]
+"""
+
+
+def test_changes_made_by_hand_are_found_and_those_that_are_gone_said(
+    found: list[Mutant], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert found
+    (tmp_path / "list.toml").write_text(LIST)
+    monkeypatch.setattr(mutations, "NAMED", tmp_path / "list.toml")
+    ((change, tests),), gone = named()
+    assert (change.line, change.kind, change.after) == (8, "off by one", "a < 4")
+    assert SOURCE.encode()[change.start : change.end] == b"a < 3"
+    assert tests == ("tests/room/test_a.py",)
+    assert [line.split(":")[1].strip() for line in gone] == ["not there", "twice", "no file"]
+    assert named(("nobody",)) == ([], [])
+
+
+def test_the_list_of_changes_can_be_read() -> None:
+    changes, gone = named()
+    assert len(changes) > 5 * len(gone)
+    for change, tests in changes:
+        assert change.before != change.after
+        assert all((mutations.REPOSITORY / test).exists() for test in tests)
