@@ -1,0 +1,93 @@
+"""Messages at the times that corrected clocks give them."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dmrl import topics
+from dmrl.estimation.clocks import Clock
+from dmrl.labelling.corrected import MOCAP, Corrected
+from dmrl.messages import message
+from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw
+
+SECOND = 1_000_000_000
+IMAGE, POSE, TRUTH = topics.camera_image("cf1"), topics.pose("cf1"), topics.true_pose("cf1")
+
+
+def frames(child: str) -> Any:
+    return message("FrameTransforms")(transforms=[{"child_frame_id": child}])
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Two robots from 10 s on, one message of each kind a second; received 7 ns later."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in (10, 11, 12):
+            stamp = {"seconds": 1}
+            for topic, made in (
+                (topics.height("cf1"), message("Height")(height_m=k)),
+                (topics.height("cf2"), message("Height")(height_m=k)),
+                (IMAGE, message("CompressedImage")(timestamp=stamp, format="png")),
+                (POSE, message("PoseInFrame")(timestamp=stamp)),
+                (TRUTH, message("PoseInFrame")(timestamp=stamp)),
+                (topics.TRANSFORMS, frames("cf2/horizontal")),
+            ):
+                sink.write(k * SECOND, topic, made, publish_ns=k * SECOND + 7)
+    return path
+
+
+def times(path: Path, topic: str) -> list[int]:
+    return [raw.time_ns for raw in read_raw(path, topic)]
+
+
+def written(held: Corrected, out: Path) -> Path:
+    with RecordingWriter(out, Provenance("test")) as sink:
+        held.write(sink)
+    return out
+
+
+def test_each_clock_corrects_its_own_by_offset_and_drift(recording: Path, tmp_path: Path) -> None:
+    clocks = {
+        "cf1": Clock(0.5, 0.1, at_s=1.0),  # at 11 s half a second is added, a second later 0.6
+        "cf1/camera": Clock(-0.25),
+        MOCAP: Clock(2.0),
+    }
+    held = Corrected(Contents(recording), clocks, {})
+    out = written(held, tmp_path / "b.mcap")
+    own = [10_400_000_000, 11_500_000_000, 12_600_000_000]
+    assert times(out, topics.height("cf1")) == times(out, POSE) == own
+    assert times(out, topics.height("cf2")) == [10 * SECOND, 11 * SECOND, 12 * SECOND]
+    assert times(out, IMAGE) == [9_750_000_000, 10_750_000_000, 11_750_000_000]
+    assert times(out, TRUTH) == times(out, topics.TRANSFORMS)
+    assert times(out, TRUTH) == [12 * SECOND, 13 * SECOND, 14 * SECOND]
+    assert all(raw.publish_ns == raw.time_ns + 7 for raw in read_raw(out))
+    for topic in (IMAGE, POSE, TRUTH):  # and what they say of themselves
+        for stamped in read(out, topic):
+            said = stamped.message.timestamp
+            assert said.seconds * SECOND + said.nanos == stamped.time_ns
+    assert held.earliest_ns() == 9_750_000_000
+
+
+def test_transforms_are_of_the_robot_that_they_turn(recording: Path, tmp_path: Path) -> None:
+    held = Corrected(Contents(recording), {"cf2": Clock(-3.0)}, {})
+    out = written(held, tmp_path / "b.mcap")
+    assert times(out, topics.TRANSFORMS) == [7 * SECOND, 8 * SECOND, 9 * SECOND]
+    assert times(out, topics.height("cf1"))[0] == 10 * SECOND
+    (first, *_) = read(out, topics.TRANSFORMS)
+    assert first.message.transforms[0].timestamp.seconds == 7
+    assert held.earliest_ns() == 7 * SECOND
+
+
+def test_even_times_come_before_clocks_and_all_move_together(
+    recording: Path, tmp_path: Path
+) -> None:
+    even = {IMAGE: {10 * SECOND: 9_900_000_000, 11 * SECOND: 10_900_000_000}}
+    held = Corrected(Contents(recording), {"cf1": Clock(1.0)}, even, later_ns=5 * SECOND)
+    out = written(held, tmp_path / "b.mcap")
+    assert times(out, IMAGE) == [15_900_000_000, 16_900_000_000, 18 * SECOND]
+    assert times(out, topics.height("cf1"))[0] == 16 * SECOND
+    assert times(out, topics.height("cf2"))[0] == 15 * SECOND
+    assert times(out, topics.TRANSFORMS)[0] == 15 * SECOND
+    assert held.earliest_ns() == 15 * SECOND
