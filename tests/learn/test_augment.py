@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from dmrl.learn import augment
 from dmrl.learn.augment import Augmentation, Augmenter
 from dmrl.learn.batches import FIELDS, Batch, Examples
+from dmrl.learn.settings import FitSettings
 
 GEOMETRY = Augmentation(
     flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0
@@ -161,3 +162,19 @@ def test_every_epoch_varies_images_anew_and_noise_is_no_louder_than_asked_for() 
     assert not torch.equal(first, second)
     loud = first.float().sub(128).std(dim=(1, 2, 3)) / 255
     assert 0.5 * 0.05 < loud.max() < 1.02 * 0.05  # anything up to what is asked for
+
+
+def test_every_key_of_a_recipe_varies_what_it_is_called() -> None:
+    values = {
+        "flip_share": 0.11,
+        "zoom": (0.7, 1.3),
+        "rotation_deg": 5.0,
+        "mosaic_share": 0.22,
+        "paste": 0.33,
+        "colour": 0.044,
+        "noise": 0.055,
+        "blur_share": 0.66,
+        "intrinsics": (1.0, 2.0, 3.0, 4.0),
+    }
+    made = FitSettings(**values).augmentation(0)  # type: ignore[arg-type]
+    assert {field.name: getattr(made, field.name) for field in fields(made)} == values

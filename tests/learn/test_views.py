@@ -74,3 +74,11 @@ def test_only_the_best_are_kept_and_one_always() -> None:
     assert agreed(views).count.tolist() == [1]
     sure = [found([(10, 20, 1, 0.5), (50, 20, 1, 0.4)])] * 2
     assert agreed(sure, most=1).u_px.tolist() == [[10]]
+
+
+def test_views_cover_the_cell_evenly() -> None:
+    halves = {(v.right, v.down) for v in VIEWS if v.right >= 0 and v.down >= 0}
+    assert halves == {(right, down) for right in (0, 0.5) for down in (0, 0.5)}
+    quarters = [(v.right, v.down) for v in VIEWS if (v.right, v.down) not in halves]
+    assert np.sum(quarters, axis=0).tolist() == [0, 0]  # what one shifts right another shifts left
+    assert {abs(part) for both in quarters for part in both} == {0.25}
