@@ -36,7 +36,7 @@ def test_a_script_runs_in_an_empty_folder(script: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_in_an_empty_folder(notebook: Path, tmp_path: Path) -> None:
-    words = ["jupyter", "nbconvert", "--to", "notebook", "--execute", "--output-dir", "."]
+    words = ["nbconvert", "--to", "notebook", "--execute", "--output-dir", "."]
     command = [sys.executable, "-m", *words, str(notebook)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
