@@ -1,12 +1,18 @@
 """Backgrounds made by code: rooms, gradients, textures and clutter of every size."""
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array
-from dmrl.rendering.canvas import Canvas, Colour, Picture
+from dmrl.images.canvas import Canvas, Colour, Picture, bands
+
+KNOTS = (3, 6, 12, 24, 48, 96)
+"""Of noise, from top to bottom, by the size of its detail."""
+SPREADS = (0.02, 0.05, 0.16)
+"""How far a colour is from grey."""
 
 
 def background(rng: Generator, width_px: int, height_px: int) -> Picture:
@@ -19,52 +25,74 @@ def background(rng: Generator, width_px: int, height_px: int) -> Picture:
     width_px, height_px
         Size.
     """
-    ground = (_gradient, _clouds, _room)[rng.integers(3)](rng, width_px, height_px)
-    canvas = Canvas(0, 0, width_px, height_px, fineness=2)
+    canvas = (_gradient, _clouds, _room)[rng.integers(3)](rng, width_px, height_px)
     for _ in range(int(rng.integers(4, 30))):
         _thing(rng, canvas)
-    rgb, opacity = canvas.result()
-    picture = ground * (1 - opacity) + rgb
-    grain = _noise(rng, width_px, height_px, 1, rough=0.85)
-    return np.clip(picture * (1 + rng.uniform(0.02, 0.35) * grain), 0, 1).astype(np.float32)
+    picture = canvas.rgb()
+    grain = _noise(rng, width_px, height_px, rough=0.85)
+    strength = np.float32(rng.uniform(0.02, 0.35))
+    for rows in bands(height_px):
+        picture[rows] *= (1 + strength * grain[rows].repeat(3, axis=1)).reshape(-1, width_px, 3)
+        np.clip(picture[rows], 0, 1, out=picture[rows])
+    return picture
 
 
 def _colour(rng: Generator) -> Colour:
     """A colour, mostly greyish as rooms are; now and then vivid."""
     grey = rng.uniform(0.03, 0.9)
-    return np.clip(grey + rng.normal(0, rng.choice([0.02, 0.05, 0.16]), 3), 0, 1)
+    return np.clip(grey + rng.normal(0, SPREADS[rng.integers(len(SPREADS))], 3), 0, 1)
 
 
-def _gradient(rng: Generator, width_px: int, height_px: int) -> Picture:
+def _on(ground: Picture) -> Canvas:
+    height_px, width_px, _ = ground.shape
+    return Canvas(0, 0, width_px, height_px, fineness=2, ground=ground)
+
+
+def _gradient(rng: Generator, width_px: int, height_px: int) -> Canvas:
     angle = rng.uniform(0, 2 * np.pi)
-    u = np.linspace(-0.5, 0.5, width_px) * np.cos(angle)
-    v = np.linspace(-0.5, 0.5, height_px) * np.sin(angle)
-    share = (0.5 + (v[:, None] + u) / 1.42)[..., None]
-    return np.asarray(_colour(rng) * share + _colour(rng) * (1 - share), np.float32)
+    u = np.linspace(-0.5, 0.5, width_px, dtype=np.float32) * np.float32(np.cos(angle) / 1.42)
+    v = np.linspace(-0.5, 0.5, height_px, dtype=np.float32) * np.float32(np.sin(angle) / 1.42)
+    return _on(_between(rng, 0.5 + v[:, None] + u))
 
 
-def _clouds(rng: Generator, width_px: int, height_px: int) -> Picture:
-    share = 0.5 + 0.5 * _noise(rng, width_px, height_px, 1, rough=rng.uniform(0.4, 0.8))
-    tint = 0.06 * _noise(rng, width_px, height_px, 3, rough=0.5)
-    return np.asarray(_colour(rng) * share + _colour(rng) * (1 - share) + tint, np.float32)
+def _between(rng: Generator, share: Picture) -> Picture:
+    """A mixture of two colours, (H, W, 3)."""
+    one, other = _colour(rng), _colour(rng)
+    return _tinted(share, one - other, other)
 
 
-def _room(rng: Generator, width_px: int, height_px: int) -> Picture:
+def _tinted(share: Picture, step: Colour, base: Colour) -> Picture:
+    """``base + share * step``: (H, W, 3) of (H, W)."""
+    # As rows of numbers: NumPy is slow at arrays that end in a side of 3.
+    steps, bases = (np.tile(part, share.shape[1]).astype(np.float32) for part in (step, base))
+    return np.asarray(share.repeat(3, axis=1) * steps + bases).reshape(*share.shape, 3)
+
+
+def _clouds(rng: Generator, width_px: int, height_px: int) -> Canvas:
+    share = 0.5 + 0.5 * _noise(rng, width_px, height_px, rough=rng.uniform(0.4, 0.8))
+    picture = _between(rng, share)
+    for channel in range(3):
+        picture[..., channel] += _noise(
+            rng, width_px, height_px, rough=0.5, deviation=0.024, knots=KNOTS[:4]
+        )
+    return _on(picture)
+
+
+def _room(rng: Generator, width_px: int, height_px: int) -> Canvas:
     """A wall and a floor with boards that meet far away."""
     horizon = height_px * rng.uniform(0.2, 0.8)
-    canvas = Canvas(0, 0, width_px, height_px, fineness=2)
+    floor, wall = _colour(rng), _colour(rng)
+    light = np.float32(0.12) * _noise(rng, width_px, height_px, rough=0.4)
+    canvas = _on(_tinted(light, np.ones(3), wall))
     lean = rng.uniform(-0.15, 0.15) * width_px
     edge = np.array([[0, horizon - lean], [width_px, horizon + lean]])
-    floor, wall = _colour(rng), _colour(rng)
     below = np.array([[width_px, 3 * height_px], [0, 3 * height_px]])
     canvas.fill(np.concatenate([edge, below]), floor)
     far = np.array([rng.uniform(0, width_px), horizon])
     for u in np.arange(-4, 5) * rng.uniform(0.25, 0.6) * width_px + far[0]:
         board = np.array([far, [u, 2 * height_px], [u + 0.04 * width_px, 2 * height_px]])
         canvas.fill(board, _colour(rng), 0.4)
-    rgb, opacity = canvas.result()
-    light = 0.12 * _noise(rng, width_px, height_px, 1, rough=0.4)
-    return np.asarray((wall + light) * (1 - opacity) + rgb, np.float32)
+    return canvas
 
 
 def _thing(rng: Generator, canvas: Canvas) -> None:
@@ -72,10 +100,10 @@ def _thing(rng: Generator, canvas: Canvas) -> None:
     at = rng.uniform((0, 0), (canvas.width_px, canvas.height_px))
     size = np.exp(rng.uniform(np.log(4), np.log(110)))
     turn = rng.uniform(0, np.pi) if rng.random() < 0.5 else rng.normal(0, 0.06)
-    opacity = rng.choice([1.0, 1.0, rng.uniform(0.3, 1.0)])
+    opacity = rng.uniform(0.3, 1.0) if rng.integers(3) == 0 else 1.0
     shape = SHAPES[rng.integers(len(SHAPES))]
     for outline in shape(rng, size):
-        canvas.fill(outline @ _turn(turn).T + at, _colour(rng), float(opacity))
+        canvas.fill(outline @ _turn(turn).T + at, _colour(rng), opacity)
 
 
 def _turn(angle_rad: float) -> Array:
@@ -129,17 +157,27 @@ def _stretch(size: int, knots: int) -> Picture:
 
 
 def _noise(
-    rng: Generator, width_px: int, height_px: int, channels: int, *, rough: float
+    rng: Generator,
+    width_px: int,
+    height_px: int,
+    *,
+    rough: float,
+    deviation: float = 0.4,
+    knots: Sequence[int] = KNOTS,
 ) -> Picture:
-    """(H, W, channels) noise with detail of every size, standard deviation about 0.4."""
-    total = np.zeros((channels, height_px, width_px), np.float32)
-    weight = 1.0
-    power = 0.0
-    for knots in (3, 6, 12, 24, 48, 96):
-        across = knots * width_px // height_px
-        grid = rng.standard_normal((channels, knots, across), np.float32)
-        total += weight * (_stretch(height_px, knots) @ grid @ _stretch(width_px, across).T)
-        power += weight**2
-        weight *= rough
-    total *= np.float32(0.6 / np.sqrt(power))
-    return np.moveaxis(total, 0, 2)
+    """(H, W) noise with detail of every size, or of some."""
+    across = [rows * width_px // height_px for rows in knots]
+    weights = rough ** np.arange(len(knots))
+    weights *= 1.5 * deviation / np.sqrt((weights**2).sum())
+    detail = [
+        np.float32(weight)
+        * (_stretch(height_px, rows) @ rng.standard_normal((rows, columns), np.float32))
+        for weight, rows, columns in zip(weights, knots, across, strict=True)
+    ]
+    # All sizes of detail in one product.
+    return np.asarray(np.concatenate(detail, axis=1) @ _stretches(width_px, tuple(across)))
+
+
+@cache
+def _stretches(size: int, knots: tuple[int, ...]) -> Picture:
+    return np.concatenate([_stretch(size, one) for one in knots], axis=1).T.copy()

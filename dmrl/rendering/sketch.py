@@ -11,11 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
+from dmrl.images.canvas import Canvas, Picture, bands
 from dmrl.rendering import quadrotor
-from dmrl.rendering.canvas import Canvas, Picture
 
 SEEN = 1 / 255
 """Opacity from which a pixel counts as covered by a robot."""
+BRIGHTEST = 2.0
+"""Of a robot in strong light."""
+GAMMA_STEPS = 4095
+"""Of the light that a sensor tells apart: fine enough for 255 levels at any gamma."""
 SMALLEST_FACE_PX2 = 0.1
 """Faces that cover less of a pixel are not drawn: far robots have many."""
 
@@ -125,22 +129,20 @@ def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
         raise ValueError("sketches are drawn without distortion; give a camera without")
     xyz = np.array([pose.xyz_camera for pose in poses]).reshape(-1, 3)
     uv_px, depth_m = project(xyz, camera.image_from_optical)
-    picture = np.zeros((camera.height_px, camera.width_px, 3), np.float32)
-    clear = np.ones((camera.height_px, camera.width_px, 1), np.float32)
+    picture = look.background.copy()
+    clear = np.ones((camera.height_px, camera.width_px), np.float32)
     box_px, share = np.full((len(poses), 4), np.nan), np.zeros(len(poses))
+    drawn = []
     for k in np.argsort(depth_m, kind="stable"):  # near first, each hides what follows
-        canvas = _robot(camera, poses[k], look)
-        if canvas is None:
-            continue
-        part = np.s_[
-            canvas.top_px : canvas.top_px + canvas.height_px,
-            canvas.left_px : canvas.left_px + canvas.width_px,
-        ]
-        rgb, opacity = canvas.result()
-        picture[part] += clear[part] * rgb
-        box_px[k], share[k] = _visible(canvas, opacity[..., 0], clear[part][..., 0])
-        clear[part] *= 1 - opacity
-    return Sketch(_sensor(picture + clear * look.background, look), uv_px, depth_m, box_px, share)
+        if (canvas := _robot(camera, poses[k], look)) is not None:
+            opacity = canvas.opacity()
+            box_px[k], share[k] = _visible(canvas, opacity[..., 0], clear[canvas.part])
+            clear[canvas.part] *= 1 - opacity[..., 0]
+            drawn.append((canvas, opacity))
+    for canvas, opacity in reversed(drawn):
+        picture[canvas.part] *= 1 - opacity
+        picture[canvas.part] += canvas.rgb()
+    return Sketch(_sensor(picture, look), uv_px, depth_m, box_px, share)
 
 
 def _visible(canvas: Canvas, opacity: Picture, clear: Picture) -> tuple[Array, float]:
@@ -187,10 +189,13 @@ def _robot(camera: Camera, pose: Pose, look: Look) -> Canvas | None:
     right, bottom = np.clip(np.ceil(uv.max(axis=0)), 0, limit).astype(int).tolist()
     if left >= right or top >= bottom:
         return None
-    canvas = Canvas(left, top, right - left, bottom - top)
-    parts = [(group, k) for group in groups for k in range(len(group.uv_px))]
-    for group, k in sorted(parts, key=lambda part: -part[0].distance_m[part[1]]):
-        canvas.fill(group.uv_px[k], group.colours[k], group.opacity)
+    canvas = Canvas(left, top, right - left, bottom - top, brightest=BRIGHTEST)
+    outlines = [
+        one for part in groups for one in canvas.outlines(part.uv_px, part.colours, part.opacity)
+    ]
+    distance_m = np.concatenate([part.distance_m for part in groups])
+    for k in np.argsort(-distance_m, kind="stable").tolist():
+        canvas.draw(outlines[k])
     return canvas
 
 
@@ -210,22 +215,33 @@ def _body(camera: Camera, pose: Pose, look: Look) -> _Outlines:
 
 def _sensor(picture: Picture, look: Look) -> NDArray[np.uint8]:
     """What a small camera makes of the light that reaches it, (H, W, 3) uint8."""
-    if look.blur > 0:
-        picture += np.float32(look.blur) * (_mean3(_mean3(picture, 0), 1) - picture)
     height, width, _ = picture.shape
-    v = np.linspace(-1, 1, height, dtype=np.float32)[:, None, None] ** 2
-    u = np.linspace(-1, 1, width, dtype=np.float32)[None, :, None] ** 2
-    picture *= (1 - np.float32(look.vignette / 2) * (u + v)) * look.gain.astype(np.float32)
-    np.clip(picture, 0, 1, out=picture)
-    np.power(picture, np.float32(look.gamma), out=picture)
-    picture += look.noise
-    picture *= 255
-    picture += 0.5
-    return np.asarray(np.clip(picture, 0, 255, out=picture), np.uint8)
+    # Rows of numbers, not of pixels: NumPy is slow at arrays that end in a side of 3.
+    v = np.linspace(-1, 1, height, dtype=np.float32)[:, None] ** 2
+    u = np.linspace(-1, 1, width, dtype=np.float32).repeat(3) ** 2
+    dim = np.float32(look.vignette / 2)
+    gain = np.tile(GAMMA_STEPS * look.gain, width).astype(np.float32)
+    noise = look.noise.reshape(height, -1)
+    curve = np.linspace(0, 1, GAMMA_STEPS + 1, dtype=np.float32) ** np.float32(look.gamma)
+    curve = 255 * curve + np.float32(0.5)
+    out = np.empty((height, 3 * width), np.uint8)
+    for rows in bands(height):
+        band = picture[rows].reshape(-1, 3 * width)
+        if look.blur > 0:
+            mean = _mean_of_9(picture, rows).reshape(band.shape)
+            band = band + np.float32(look.blur) * (mean - band)
+        band = band * gain * (1 - dim * (u + v[rows]))
+        np.clip(band, 0, GAMMA_STEPS, out=band)
+        band = curve[band.astype(np.uint16)]
+        band += np.float32(255) * noise[rows].repeat(3 * width // noise.shape[1], axis=1)
+        out[rows] = np.clip(band, 0, 255, out=band)
+    return out.reshape(picture.shape)
 
 
-def _mean3(picture: Picture, axis: int) -> Picture:
-    padded = np.concatenate([picture.take([0], axis), picture, picture.take([-1], axis)], axis=axis)
-    size = picture.shape[axis]
-    before, here, after = (padded.take(np.arange(k, k + size), axis) for k in range(3))
-    return np.asarray((before + here + after) / 3, np.float32)
+def _mean_of_9(picture: Picture, rows: slice) -> Picture:
+    """Every pixel of some rows the mean of the 3 x 3 around it; the border is repeated beyond."""
+    near = np.clip(np.arange(rows.start - 1, rows.stop + 1), 0, len(picture) - 1)
+    band = picture.take(near, axis=0)
+    band = band[:-2] + band[1:-1] + band[2:]
+    band = np.concatenate([band[:, :1], band, band[:, -1:]], axis=1)
+    return np.asarray((band[:, :-2] + band[:, 1:-1] + band[:, 2:]) * np.float32(1 / 9))

@@ -5,7 +5,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from dmrl.geometry.frames import AIDECK, Array, camera_from_horizontal, project
-from dmrl.rendering.canvas import Canvas
+from dmrl.images.canvas import Canvas
 from dmrl.rendering.quadrotor import DISCS, MESH, RADIUS_M
 from dmrl.rendering.scene import random_look, random_poses
 from dmrl.rendering.sketch import Look, Pose, Sketch, draw
@@ -130,13 +130,37 @@ def test_the_radius_holds_the_whole_quadrotor() -> None:
         assert np.linalg.norm(corners, axis=-1).max() <= RADIUS_M + 1e-9
 
 
-def test_a_polygon_covers_its_area_exactly_along_rows() -> None:
-    canvas = Canvas(10, 20, 8, 8)
-    canvas.fill(np.array([[11.25, 21], [14.5, 21], [14.5, 24], [11.25, 24]]), np.ones(3), 0.5)
-    rgb, opacity = canvas.result()
-    assert opacity.sum() == pytest.approx(0.5 * 3.25 * 3)
-    np.testing.assert_allclose(opacity[1, :, 0], [0, 0.375, 0.5, 0.5, 0.25, 0, 0, 0])
-    np.testing.assert_allclose(rgb, np.broadcast_to(opacity, rgb.shape))
+@pytest.mark.parametrize("opacity", [1.0, 0.5])
+def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
+    rng = np.random.default_rng(0)
+    excess, off = [], []
+    for _ in range(50):
+        canvas = Canvas(10, 20, 80, 60)
+        turn, half = rng.uniform(0, np.pi), rng.uniform(4, 15, 2)
+        c, s = np.cos(turn), np.sin(turn)
+        at = rng.uniform((35, 45), (65, 55))
+        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        canvas.fill((signs * half) @ [[c, s], [-s, c]] + at, np.array([1.0, 0.5, 0.0]), opacity)
+        cover = canvas.opacity()[..., 0]
+        np.testing.assert_allclose(
+            canvas.rgb(), cover[..., None] * np.array([1.0, 0.5, 0.0]), atol=0.01
+        )
+        excess.append((cover.sum() / opacity - 4 * half.prod()) / (4 * half.sum()))
+        v, u = (np.indices(cover.shape) + 0.5).reshape(2, -1)
+        middle = np.average([u, v], axis=1, weights=cover.ravel())
+        off.append(middle - (at - (10, 20)))
+    assert 0 <= np.mean(excess) < 0.1  # pixels to every side
+    assert np.abs(np.mean(off, axis=0)).max() < 0.02 and np.abs(off).max() < 0.2
+
+
+def test_what_is_drawn_on_a_ground_hides_it(plain: Look) -> None:
+    ground = np.full((8, 8, 3), 0.25, np.float32)
+    canvas = Canvas(0, 0, 8, 8, ground=ground)
+    canvas.fill(np.array([[0, 0], [4, 0], [4, 8], [0, 8]]), np.ones(3), 0.5)
+    row = canvas.rgb()[3, :, 0]
+    np.testing.assert_allclose(row[[0, 1, 2, 5, 6, 7]], [0.625] * 3 + [0.25] * 3, atol=0.005)
+    with pytest.raises(ValueError, match="no opacity"):
+        canvas.opacity()
 
 
 def test_poses_fill_the_image_and_the_depths() -> None:

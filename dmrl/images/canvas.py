@@ -1,0 +1,148 @@
+"""Filled polygons on a part of an image, with smooth edges.
+
+Colours are (red, green, blue), 0 to 1. Corners are pixels in pixel-edge coordinates, u right
+and v down.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from dmrl.geometry.frames import Array
+
+Picture = NDArray[np.float32]
+Colour = Array
+"""(3,) red, green, blue."""
+Outline = tuple[list[float], tuple[int, ...]]
+"""Corners in fine pixels, u and v by turns; red, green, blue and opacity, 0 to 255."""
+LEVELS = 255
+BAND_ROWS = 32
+
+
+def bands(rows: int) -> Iterator[slice]:
+    """Rows of a picture, some at a time: arrays that stay in a processor's cache."""
+    return (slice(k, min(k + BAND_ROWS, rows)) for k in range(0, rows, BAND_ROWS))
+
+
+class Canvas:
+    """A part of an image to draw on, transparent at first.
+
+    It is drawn several times as fine as the image, in whole numbers, so the same polygons give the
+    same bytes on every machine. The mean of the fine pixels makes edges smooth; polygons come out
+    about 0.2 fine pixels larger on every side, and in their place.
+
+    Parameters
+    ----------
+    left_px, top_px
+        Corner of the canvas in the image.
+    width_px, height_px
+        Its size.
+    fineness
+        Fine pixels per pixel, each way.
+    brightest
+        The highest value of a colour that is told from others.
+    ground
+        (H, W, 3) what is drawn upon. None: nothing; `opacity` says then how much still shows.
+    """
+
+    def __init__(
+        self,
+        left_px: int,
+        top_px: int,
+        width_px: int,
+        height_px: int,
+        *,
+        fineness: int = 4,
+        brightest: float = 1.0,
+        ground: Picture | None = None,
+    ) -> None:
+        self.left_px, self.top_px = left_px, top_px
+        self.width_px, self.height_px = width_px, height_px
+        self._fineness, self._brightest = fineness, brightest
+        size = (width_px * fineness, height_px * fineness)
+        self._rgb = Image.new("RGB", size) if ground is None else self._image(ground, size)
+        self._cover = Image.new("RGB", size) if ground is None else None
+        # Drawing in RGBA on an image that has no alpha blends, which takes longer than to replace.
+        images = [self._rgb] if self._cover is None else [self._rgb, self._cover]
+        self._over = [(ImageDraw.Draw(one), ImageDraw.Draw(one, "RGBA")) for one in images]
+
+    def _image(self, ground: Picture, size: tuple[int, int]) -> Image.Image:
+        levels = np.empty(ground.shape, np.uint8)
+        for rows in bands(len(ground)):
+            band = ground[rows] * np.float32(LEVELS / self._brightest) + np.float32(0.5)
+            levels[rows] = np.clip(band, 0, LEVELS, out=band)
+        return Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
+
+    def fill(self, corners_px: Array, colour: Colour, opacity: float = 1.0) -> None:
+        """Draw a polygon over what is there.
+
+        Parameters
+        ----------
+        corners_px
+            (K, 2) pixels of the image, in order around the polygon.
+        colour
+            Its colour.
+        opacity
+            1 hides what is below.
+        """
+        corners = ((corners_px - (self.left_px, self.top_px)) * self._fineness).ravel().tolist()
+        scale = LEVELS / self._brightest
+        levels = [min(max(round(value * scale), 0), LEVELS) for value in colour.tolist()]
+        self.draw((corners, (*levels, round(opacity * LEVELS))))
+
+    def outlines(self, corners_px: Array, colours: Array, opacity: float) -> list[Outline]:
+        """Polygons of one opacity as `draw` takes them.
+
+        Parameters
+        ----------
+        corners_px
+            (F, K, 2) as in `fill`.
+        colours
+            (F, 3) of each.
+        opacity
+            Of all of them.
+        """
+        fine = (corners_px - (self.left_px, self.top_px)) * self._fineness
+        levels = np.clip(np.rint(colours * (LEVELS / self._brightest)), 0, LEVELS).astype(int)
+        inks = np.insert(levels, 3, round(opacity * LEVELS), axis=1).tolist()
+        return list(zip(fine.reshape(len(fine), -1).tolist(), map(tuple, inks), strict=True))
+
+    def draw(self, outline: Outline) -> None:
+        """Draw one of `outlines` over what is there."""
+        corners, ink = outline
+        whole = ink[3] == LEVELS
+        for (replacing, blending), colour in zip(
+            self._over, (ink, (LEVELS, LEVELS, LEVELS, ink[3])), strict=False
+        ):
+            if whole:
+                replacing.polygon(corners, fill=colour[:3])
+            else:
+                blending.polygon(corners, fill=colour)
+
+    @property
+    def part(self) -> tuple[slice, slice]:
+        """Rows and columns of the image that it covers."""
+        return (
+            slice(self.top_px, self.top_px + self.height_px),
+            slice(self.left_px, self.left_px + self.width_px),
+        )
+
+    def rgb(self) -> Picture:
+        """(H, W, 3) colours; without a ground multiplied by their opacity."""
+        levels = np.asarray(self._rgb.reduce(self._fineness), np.float32)
+        return np.asarray(levels * np.float32(self._brightest / LEVELS), np.float32)
+
+    def opacity(self) -> Picture:
+        """(H, W, 1) how much of what is below is hidden, 0 to 1.
+
+        Raises
+        ------
+        ValueError
+            If there is a ground: it is whole.
+        """
+        if self._cover is None:
+            raise ValueError("a canvas with a ground has no opacity of its own")
+        levels = np.asarray(self._cover.getchannel(0).reduce(self._fineness), np.float32)
+        return np.asarray(levels[..., None] / np.float32(LEVELS), np.float32)
