@@ -1,5 +1,6 @@
 """ONNX files through onnxruntime: the fast way on a computer. The home of onnxruntime."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,9 @@ class OnnxRun:
 
     def __init__(self, model: Path | bytes, where: object = "the model", threads: int = 0) -> None:
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
+        # As all numeric libraries do, but this one by itself not.
+        given = os.environ.get("OMP_NUM_THREADS", "")
+        options.intra_op_num_threads = threads or (int(given) if given.isdecimal() else 0)
         options.log_severity_level = 3
         if not _has_vnni():
             # Such processors add pairs of products in 16 bits, which overflow; the slower way

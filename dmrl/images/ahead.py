@@ -8,11 +8,10 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
-AHEAD = 8
-"""Results of a thread that wait to be taken, at most: what bounds the memory."""
 
-
-def ahead(function: Callable[[Item], Made], items: Iterable[Item], threads: int) -> Iterator[Made]:
+def ahead(
+    function: Callable[[Item], Made], items: Iterable[Item], threads: int, *, held: int = 8
+) -> Iterator[Made]:
     """``function`` of every item, in their order, computed in threads before it is asked for.
 
     Parameters
@@ -23,13 +22,15 @@ def ahead(function: Callable[[Item], Made], items: Iterable[Item], threads: int)
         Taken one by one, in the caller's thread.
     threads
         How many.
+    held
+        Results of a thread that wait to be taken, at most: what bounds the memory.
     """
     waiting: deque[Future[Made]] = deque()
     pool = ThreadPoolExecutor(threads)
     try:
         for item in items:
             waiting.append(pool.submit(function, item))
-            if len(waiting) > threads * AHEAD:
+            if len(waiting) > threads * held:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

@@ -13,9 +13,10 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, open_detector
+from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, fastest, open_detector
 from dmrl.errors import MissingTopic
-from dmrl.images.codec import Rgb, decode
+from dmrl.images.ahead import ahead
+from dmrl.images.codec import Rgb, decode, size
 from dmrl.learn.decode import PER_DETECTION, Found, Grids
 from dmrl.learn.decode import decode as find
 from dmrl.learn.pretrained import resolved
@@ -25,17 +26,19 @@ from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import (
     Provenance,
     RawMessage,
+    Stamped,
     Summary,
     Timed,
     parsed,
     provenance,
+    read,
     read_raw,
     rewrite,
     summary,
 )
 from dmrl.recording.inputs import sha256_of_file
 from dmrl.terminal.arguments import Workers
-from dmrl.terminal.progress import track
+from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
 Map = NDArray[np.floating]
@@ -53,7 +56,8 @@ class Settings:
     ----------
     backend
         What computes. torch and onnx are float; onnx-int8, integer (NumPy) and c are int8, and
-        need a quantised model or an export folder.
+        need a quantised model or an export folder. Without it, onnx where it is installed and
+        gives all that the network says, else torch.
     threshold
         Confidence from which detections are to be believed, written beside them, 0 to 1.
         Without it, the model's.
@@ -69,7 +73,7 @@ class Settings:
         Images that go through the network together.
     """
 
-    backend: BackendName = "torch"
+    backend: BackendName | None = None
     threshold: Share | None = None
     min_confidence: Share = 0.01
     most: Positive = 20
@@ -112,10 +116,11 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
     OutputError
         If ``out`` exists.
     """
-    detector = _detector(model, settings)
     held = summary(recording)
     if not topics.robots(list(held.topics)):
         raise MissingTopic(topics.camera_image("*"), held.topics, recording)
+    settings = _settled(model, recording, settings)
+    detector = _detector(model, settings)
     replaced = [t for t in held.topics if any(topics.names(own, t) for own in OWN)]
     seen = Counter[str]()
     found = _messages(recording, held, detector, settings, seen)
@@ -126,18 +131,30 @@ def run(model: Path, recording: Path, out: Path, settings: Settings) -> Result:
 
 def origin(model: Path, recording: Path, settings: Settings) -> Provenance:
     """Provenance of what `run` would write."""
+    settings = _settled(model, recording, settings)
     return _provenance(model, recording, settings, _detector(model, settings))
 
 
+def _settled(model: Path, recording: Path, settings: Settings) -> Settings:
+    """The settings with a backend, said where it was not asked for."""
+    if settings.backend is not None:
+        return settings
+    first = next(read(recording, topics.camera_image("*")))
+    width_px, height_px, _ = size(first.message.data, _named(recording, first))
+    backend = fastest(resolved(model), (width_px, height_px))
+    say(f"{recording}: --backend {backend}")
+    return replace(settings, backend=backend)
+
+
 def _detector(model: Path, settings: Settings) -> Detector:
-    detector = open_detector(resolved(model), settings.backend)
+    detector = open_detector(resolved(model), settings.backend or "torch")
     if settings.threshold is not None:
         detector = replace(detector, threshold=settings.threshold)
     return detector
 
 
 def _provenance(model: Path, recording: Path, settings: Settings, detector: Detector) -> Provenance:
-    libraries = LIBRARIES[settings.backend]
+    libraries = LIBRARIES[settings.backend or "torch"]
     model = resolved(model)
     made = provenance("predict", settings, (model, recording), libraries=libraries)
     # It stands beside the weights, and in every message.
@@ -156,8 +173,10 @@ def _messages(
     pictured = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
     total = sum(held.topics[t].count for t in pictured)
     raws = track(read_raw(recording, *pictured), "Predicting", total)
-    while batch := list(islice(raws, settings.batch_size)):
-        seen = _seen([_decode(raw, detector, recording) for raw in batch], detector, settings)
+    batches = iter(lambda: list(islice(raws, settings.batch_size)), [])
+    decoded = partial(_pictures, detector, recording)
+    for batch, pictures in ahead(decoded, batches, threads=1, held=1):
+        seen = _seen(pictures, detector, settings)
         tally["images"] += len(seen)
         for raw, (made, grid) in zip(batch, seen, strict=True):
             tally["believed"] += sum(d.confidence >= detector.threshold for d in made.detections)
@@ -170,8 +189,19 @@ def _robot(raw: RawMessage) -> str:
     return (topics.names(topics.CAMERA_IMAGE, raw.topic) or {})["robot"]
 
 
+def _named(recording: Path, image: RawMessage | Stamped) -> str:
+    return f"{recording}: the image of {image.topic} at {image.time_ns} ns"
+
+
+def _pictures(
+    detector: Detector, recording: Path, batch: list[RawMessage]
+) -> tuple[list[RawMessage], list[Rgb]]:
+    """Messages, and the pictures in them."""
+    return batch, [_decode(raw, detector, recording) for raw in batch]
+
+
 def _decode(raw: RawMessage, detector: Detector, recording: Path) -> Rgb:
-    what = f"{recording}: the image of {raw.topic} at {raw.time_ns} ns"
+    what = _named(recording, raw)
     rgb = decode(parsed(raw, message("CompressedImage"), recording).data, what)
     detector.require_size(rgb.shape[1], rgb.shape[0], what)
     return rgb

@@ -1,11 +1,16 @@
 import json
+import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from dmrl.deploy import onnx_run
+from dmrl.deploy.detector import fastest
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
 from dmrl.images.codec import decode, encode_png
 from dmrl.learn.model import Model, load_model, save_model
@@ -171,3 +176,60 @@ def test_json_counts_images_and_detections(
     predict.command(model, dots, tmp_path / "out.mcap", settings=settings, as_json=True)
     said = json.loads(capsys.readouterr().out)
     assert said == {"recording": str(tmp_path / "out.mcap"), "images": 30, "believed": 0}
+
+
+def test_without_a_backend_the_fastest_is_taken_and_said(
+    dots: Path, settled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(settled, dots, tmp_path / "out.mcap", Settings())
+    assert "--backend onnx" in capsys.readouterr().err
+    run(settled, dots, tmp_path / "named.mcap", Settings(backend="onnx"))
+    assert "--backend" not in capsys.readouterr().err
+    assert (tmp_path / "out.mcap").read_bytes() == (tmp_path / "named.mcap").read_bytes()
+    made = summary(tmp_path / "out.mcap").provenance
+    assert made is not None and made.settings["backend"] == "onnx"
+    assert "onnxruntime" in made.libraries
+
+
+def test_torch_is_taken_where_onnx_would_not_do(
+    settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert fastest(settled, (64, 48)) == "onnx"
+    assert fastest(settled, (72, 48)) == "torch"  # ONNX files are of one size
+    (tmp_path / "more").mkdir()
+    network = build("dmrl-nano", seed=1, extra=("log_spread",)).eval()
+    save_model(Model(network, "dmrl-nano", width_px=64, height_px=48), tmp_path / "more")
+    assert fastest(tmp_path / "more", (64, 48)) == "torch"  # which says the spread as well
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    monkeypatch.delitem(sys.modules, "dmrl.deploy.onnx_run", raising=False)
+    assert fastest(settled, (64, 48)) == "torch"
+
+
+def test_onnxruntime_keeps_to_the_threads_of_a_worker(
+    dots: Path, settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    class Asked(onnx_run.onnxruntime.SessionOptions):  # type: ignore[misc]
+        def __setattr__(self, name: str, value: Any) -> None:
+            asked.extend([value] * (name == "intra_op_num_threads"))
+            super().__setattr__(name, value)
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setattr(onnx_run.onnxruntime, "SessionOptions", Asked)
+    run(settled, dots, tmp_path / "out.mcap", Settings(backend="onnx"))
+    assert asked == [1]
+
+
+def test_pictures_are_decoded_in_another_thread(
+    dots: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads: set[threading.Thread] = set()
+
+    def noted(data: bytes, what: str) -> Any:
+        threads.add(threading.current_thread())
+        return decode(data, what)
+
+    monkeypatch.setattr(predict, "decode", noted)
+    run(model, dots, tmp_path / "out.mcap", Settings(batch_size=3))
+    assert threads and threading.main_thread() not in threads
