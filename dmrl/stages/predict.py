@@ -137,9 +137,9 @@ def origin(model: Path, recording: Path, settings: Settings) -> Provenance:
 
 def _settled(model: Path, recording: Path, settings: Settings) -> Settings:
     """The settings with a backend, said where it was not asked for."""
-    if settings.backend is not None:
-        return settings
-    first = next(read(recording, topics.camera_image("*")))
+    first = next(read(recording, topics.camera_image("*")), None)
+    if settings.backend is not None or first is None:
+        return replace(settings, backend=settings.backend or "torch")
     width_px, height_px, _ = size(first.message.data, _named(recording, first))
     backend = fastest(resolved(model), (width_px, height_px))
     say(f"{recording}: --backend {backend}")
