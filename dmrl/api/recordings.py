@@ -4,7 +4,6 @@ import os
 import shutil
 import weakref
 from collections.abc import Iterator, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -14,10 +13,9 @@ import pyarrow as pa
 from dmrl import topics
 from dmrl.api import pages
 from dmrl.api.images import Images
-from dmrl.api.topic import Topic
-from dmrl.errors import MissingExtra, MissingTopic, SettingError
+from dmrl.api.topic import Topic, framed, log_time
+from dmrl.errors import MissingTopic, SettingError
 from dmrl.export.tables import flat
-from dmrl.messages import status_name
 from dmrl.recording import (
     Finding,
     Provenance,
@@ -86,10 +84,6 @@ class Recording:
         """How it was made; None for a recording that dmrl did not write."""
         return self._summary.provenance
 
-    def log_time(self, time_s: float | None) -> int | None:
-        """Nanoseconds of log time of seconds from the start; None stays None."""
-        return None if time_s is None else self.start_ns + round(time_s * 1e9)
-
     def __getitem__(self, topic: str) -> Topic:
         """A topic.
 
@@ -100,7 +94,7 @@ class Recording:
         """
         if topic not in self.topics:
             raise MissingTopic(topic, self.topics, self.path)
-        return Topic(self, topic)
+        return Topic(self.path, topic, self.topics[topic], self.start_ns)
 
     def __contains__(self, topic: object) -> bool:
         return topic in self.topics
@@ -122,7 +116,7 @@ class Recording:
         MissingTopic
             If one of them matches nothing.
         """
-        start_ns, end_ns = self.log_time(start_s), self.log_time(end_s)
+        start_ns, end_ns = log_time(start_s, self.start_ns), log_time(end_s, self.start_ns)
         return read(self.path, *wanted, start_ns=start_ns, end_ns=end_ns)
 
     def images(
@@ -185,27 +179,7 @@ class Recording:
             who = (topics.names(pattern, topic) or {})["robot"]
             column = pa.array([who] * len(table), pa.string())
             tables.append(table.rename_columns(names).append_column("robot", column))
-        return self.framed(pa.concat_tables(tables).sort_by("log_time"))
-
-    def framed(self, table: pa.Table) -> "pd.DataFrame":
-        """A table with ``log_time`` as a data frame over ``time_s``; a status has its name.
-
-        Raises
-        ------
-        MissingExtra
-            If pandas is not installed.
-        """
-        if find_spec("pandas") is None:
-            raise MissingExtra("pandas", "table", "a data frame")
-        frame = table.to_pandas()
-        if "status" in frame.columns:
-            known = frame["status"].notna()  # of an image without peers it is not
-            names = [status_name(int(number)) for number in frame["status"][known]]
-            frame["status"] = frame["status"].astype(object)
-            frame.loc[known, "status"] = names
-        frame.index = (frame["log_time"] - self.start_ns) / 1e9
-        frame.index.name = "time_s"
-        return frame
+        return framed(pa.concat_tables(tables).sort_by("log_time"), self.start_ns)
 
     def check(self) -> list[Finding]:
         """What is doubtful about it, as ``dmrl check`` finds it; best read as a table."""

@@ -1,21 +1,54 @@
 """A topic of a recording as an object: its messages as a table."""
 
 from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from dmrl.errors import MissingExtra
 from dmrl.export.tables import flat
-from dmrl.recording import (
-    read_table,
-)
+from dmrl.messages import status_name
+from dmrl.recording import TopicInfo, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from dmrl.api.recordings import Recording
+
+def log_time(time_s: float | None, start_ns: int) -> int | None:
+    """Nanoseconds of log time of seconds from a start; None stays None."""
+    return None if time_s is None else start_ns + round(time_s * 1e9)
+
+
+def framed(table: pa.Table, start_ns: int) -> "pd.DataFrame":
+    """A table with ``log_time`` as a data frame over ``time_s``; a status has its name.
+
+    Parameters
+    ----------
+    table
+        Without nested messages.
+    start_ns
+        Log time from which seconds count, nanoseconds.
+
+    Raises
+    ------
+    MissingExtra
+        If pandas is not installed.
+    """
+    if find_spec("pandas") is None:
+        raise MissingExtra("pandas", "table", "a data frame")
+    frame = table.to_pandas()
+    if "status" in frame.columns:
+        known = frame["status"].notna()  # of an image without peers it is not
+        names = [status_name(int(number)) for number in frame["status"][known]]
+        frame["status"] = frame["status"].astype(object)
+        frame.loc[known, "status"] = names
+    frame.index = (frame["log_time"] - start_ns) / 1e9
+    frame.index.name = "time_s"
+    return frame
 
 
 class Topic:
@@ -23,15 +56,19 @@ class Topic:
 
     Parameters
     ----------
-    recording
-        Where it stands.
+    path
+        The recording.
     name
         Of the topic.
+    info
+        Its message type and number of messages.
+    start_ns
+        Log time from which seconds count, nanoseconds.
     """
 
-    def __init__(self, recording: "Recording", name: str) -> None:
-        self.recording, self.name = recording, name
-        self._info = recording.topics[name]
+    def __init__(self, path: Path, name: str, info: TopicInfo, start_ns: int) -> None:
+        self.path, self.name = path, name
+        self._info, self._start_ns = info, start_ns
 
     @property
     def schema(self) -> str:
@@ -69,9 +106,8 @@ class Topic:
         RecordingError
             If the recording is damaged.
         """
-        start_ns, end_ns = self.recording.log_time(start_s), self.recording.log_time(end_s)
-        path = self.recording.path
-        return read_table(path, self.name, fields=fields, start_ns=start_ns, end_ns=end_ns)
+        start_ns, end_ns = log_time(start_s, self._start_ns), log_time(end_s, self._start_ns)
+        return read_table(self.path, self.name, fields=fields, start_ns=start_ns, end_ns=end_ns)
 
     def to_pandas(
         self,
@@ -93,7 +129,7 @@ class Topic:
             If the recording is damaged.
         """
         table = flat(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
-        return self.recording.framed(table)
+        return framed(table, self._start_ns)
 
     def to_numpy(
         self,
