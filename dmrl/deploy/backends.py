@@ -1,4 +1,4 @@
-"""The ways to compute a network's output without torch; each is asked the same question."""
+"""Backends: the ways to compute a network's output without torch, all with one interface."""
 
 from collections.abc import Callable
 from typing import Protocol

@@ -1,8 +1,8 @@
 """Weights rounded so that their errors cancel (Frantar et al. 2022, GPTQ, after OBQ).
 
-To the nearest level is the best that a weight can do alone. But the inputs of a convolution
-are alike: what one weight lost, the ones not yet rounded can make good, and the bias the
-rest. How the inputs go together, calibration images say.
+Rounding to the nearest level is best for a weight alone. But the inputs of a convolution are
+correlated: weights that are not yet rounded can correct the error of one that is, and the bias
+corrects the rest. How the inputs are correlated is measured on calibration images.
 """
 
 from collections.abc import Iterable

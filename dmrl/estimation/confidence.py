@@ -1,11 +1,13 @@
-"""Honest covariances: noise does not count as knowledge.
+"""Covariances that are large enough: noise in a robot's log does not count as motion.
 
-A robot's motion tells where its peer is: turn the whole solution, and the ranges no longer
-fit the motion. Gauss-Newton takes the measured motion for the true one, so the noise in the
-log of a robot that stands still seems to fix the bearing as well as a flight would. The
-covariance is therefore taken not at the solution but at a calmed copy of it: averaged over
-most of a second, with the observer's motion, and the peer's relative to it, shrunk where they are
-no more than their noise. A static observer or parallel flight then leaves the bearing open.
+A robot's motion tells in which direction its peer is: if the whole solution is turned, the ranges
+no longer fit the motion. Gauss-Newton takes the measured motion for the true one. So the noise in
+the log of a robot that stands still seems to fix the bearing, as a flight would.
+
+Therefore the covariance is not taken at the solution, but at a smoothed copy of it. There,
+motion is averaged over most of a second. The observer's motion, and the peer's relative to it,
+are shrunk where they are no larger than their noise. A static observer or a parallel flight then
+leaves the bearing open.
 """
 
 from dataclasses import replace

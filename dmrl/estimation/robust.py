@@ -1,4 +1,4 @@
-"""Losses that forgive: what is far off counts little, and what is constant may be large once.
+"""Robust losses: for residuals with outliers, and for errors that are constant over a flight.
 
 Every residual r has Cauchy's loss L log(1 + r^2 / L) with a limit L of its own: a square where
 r^2 is small against L, a logarithm beyond. It is the likelihood of Student's t, up to factors.

@@ -1,4 +1,4 @@
-"""Images as the AI-deck would send them: the other way round from ``cpx``."""
+"""Images packed into CPX packets, as the AI-deck sends them: the inverse of ``cpx``."""
 
 from collections.abc import Iterator
 

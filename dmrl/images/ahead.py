@@ -1,4 +1,4 @@
-"""Work on pictures ahead of who wants them, in threads: decoding lets other threads run."""
+"""Pictures worked on before they are needed, in threads: decoding lets other threads run."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator

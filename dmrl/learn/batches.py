@@ -1,4 +1,4 @@
-"""Batches out of images that stay where they are: shuffled, in stated shares, ahead of use.
+"""Batches of training images: shuffled, in stated shares, each made while the one before is used.
 
 The images of a dataset are a list of arrays mapped from its files. A plain batch is gathered
 into a buffer: one copy per image, still uint8. ``ahead`` makes the next batch in a thread

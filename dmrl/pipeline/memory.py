@@ -1,4 +1,4 @@
-"""What a pipeline's folder remembers: of what every output was made, and hashes of files.
+"""What a pipeline's folder remembers: what every output was made from, and hashes of files.
 
 One JSON file. A file is hashed again when its size or one of its times has changed.
 """

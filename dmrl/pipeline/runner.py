@@ -1,4 +1,4 @@
-"""Run the steps of a pipeline that are not as they would be made: in order, side by side."""
+"""Run the steps of a pipeline that are not up to date: in order, independent ones in parallel."""
 
 import shutil
 from collections import deque
