@@ -381,3 +381,13 @@ def test_every_epoch_has_an_order_of_its_own(examples: Examples, tmp_path: Path)
     seen = [torch.cat([b.images for b in training._batches(epoch)]) for epoch in (0, 0, 1)]
     assert torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[0], seen[2])
+
+
+def test_the_loss_that_is_shown_is_the_mean_over_the_images_since_the_last(
+    examples: Examples, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, epochs=2)
+    training = Training(new_network(settings, examples), examples, settings, tmp_path)
+    shown = [step.loss for step in training.steps()]
+    # Seven batches of an epoch, the last of two images: looked at once, at its end.
+    assert [shown[6], shown[13]] == pytest.approx([epoch["loss"] for epoch in training.history])
