@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.camera_views import (
+    SMOOTH_S,
     Flight,
     Noise,
     PeerPath,
@@ -97,6 +98,6 @@ def test_attitude_is_smoothed_over_some_hundredths_of_a_second() -> None:
     at_s = np.arange(0, 5, 0.01)
     noise = np.random.default_rng(0).normal(0, 1, (len(at_s), 2))
     rough = replace(flight([], np.zeros((0, 2))), attitude_s=at_s, attitude_rad=noise)
-    # A Gaussian of two samples leaves 1 / sqrt(2 sqrt(pi) 2) of white noise.
-    wanted = 1 / np.sqrt(2 * np.sqrt(np.pi) * 2)
+    # A Gaussian of s samples leaves 1 / sqrt(2 sqrt(pi) s) of white noise.
+    wanted = 1 / np.sqrt(2 * np.sqrt(np.pi) * SMOOTH_S / 0.01)
     assert rough.smoothed().attitude_rad.std() == pytest.approx(wanted, rel=0.1)
