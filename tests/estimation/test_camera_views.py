@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.camera_views import (
-    SMOOTH_S,
     Flight,
     Noise,
     PeerPath,
@@ -94,10 +93,15 @@ def test_a_thinner_flight_keeps_detections_with_their_images() -> None:
     assert flight([0, 1, 2, 2, 3], uv).thinned(4).image.tolist() == [0, 1, 2, 2, 3]
 
 
-def test_attitude_is_smoothed_over_some_hundredths_of_a_second() -> None:
+def test_attitude_loses_its_noise_and_keeps_its_motion() -> None:
     at_s = np.arange(0, 5, 0.01)
-    noise = np.random.default_rng(0).normal(0, 1, (len(at_s), 2))
-    rough = replace(flight([], np.zeros((0, 2))), attitude_s=at_s, attitude_rad=noise)
-    # A Gaussian of s samples leaves 1 / sqrt(2 sqrt(pi) s) of white noise.
-    wanted = 1 / np.sqrt(2 * np.sqrt(np.pi) * SMOOTH_S / 0.01)
-    assert rough.smoothed().attitude_rad.std() == pytest.approx(wanted, rel=0.1)
+    slow = np.column_stack([0.2 * np.sin(at_s), 0.1 * np.cos(2 * at_s)])
+    noise = np.random.default_rng(0).normal(0, 0.02, slow.shape)
+    rough = replace(flight([], np.zeros((0, 2))), attitude_s=at_s, attitude_rad=slow + noise)
+    for added, most_rad in ((noise, 0.6 * 0.02), (0 * noise, 0.002)):
+        found = replace(rough, attitude_rad=slow + added).smoothed()
+        left = [
+            np.interp(at_s, found.attitude_s, one) - wanted
+            for one, wanted in zip(found.attitude_rad.T, slow.T, strict=True)
+        ]
+        assert np.std(left, axis=1).max() < most_rad
