@@ -38,12 +38,18 @@ class Assembly:
         self._numbers, self._pictures = OpenChunk(), OpenChunk()
 
     def add(
-        self, number: int, chunk: OpenChunk, times_ns: tuple[int, int], payload: bytes, topic: str
+        self, number: int, chunk: OpenChunk, time_ns: int, publish_ns: int, payload: bytes
     ) -> None:
-        """Append one message of a channel that was begun, at its log and publish time."""
-        if min(times_ns) < 0:
-            raise self._negative(times_ns[0], topic)
-        chunk.add(number, *times_ns, payload)
+        """Append one message of a channel that was begun.
+
+        Raises
+        ------
+        RecordingError
+            If a time is negative.
+        """
+        if time_ns < 0 or publish_ns < 0:
+            raise self._negative(time_ns, self._defined.topic(number))
+        chunk.add(number, time_ns, publish_ns, payload)
         if chunk.full:
             self._close(chunk)
 

@@ -47,6 +47,10 @@ class Defined:
         found = self._numbers.get(channel)
         return self._define(channel, _free(self._channels), None) if found is None else found
 
+    def topic(self, number: int) -> str:
+        """Topic of a channel."""
+        return str(self._channels[number].topic)
+
     def begin(self, number: int) -> bytes:
         """What is to stand before the first message of a channel; empty for those after it."""
         if number in self.begun:

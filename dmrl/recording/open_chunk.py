@@ -6,17 +6,17 @@ from array import array
 
 import numpy as np
 import zstandard
-from mcap.opcode import Opcode
 
 from dmrl.recording.block import HEAD_BYTES, Bytes, Ints
-from dmrl.recording.chunks import messages_at
+from dmrl.recording.chunks import MESSAGE, RECORD_HEADER, messages_at
 from dmrl.recording.container import Packed
 
 CHUNK_BYTES = 256 * 1024
 """Costs no size against 1 MiB, and bounds what a crash can lose."""
 LEVEL = 1
 """Of zstd: half the time of its usual 3, and numbers of sensors are no larger."""
-MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
+HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
+BODY_BYTES = HEAD_BYTES - RECORD_HEADER  # of a head, that the length of its record counts
 
 
 class OpenChunk:
@@ -39,9 +39,9 @@ class OpenChunk:
 
     def add(self, number: int, time_ns: int, publish_ns: int, payload: bytes) -> None:
         """Put in one message."""
+        head = HEAD.pack(MESSAGE, len(payload) + BODY_BYTES, number, 0, time_ns, publish_ns)
         self.starts.append(len(self.data))
-        size = len(payload) + HEAD_BYTES - 9
-        self.data += MESSAGE.pack(Opcode.MESSAGE, size, number, 0, time_ns, publish_ns)
+        self.data += head
         self.data += payload
 
     def fill(self, records: Bytes, at: Ints) -> int:

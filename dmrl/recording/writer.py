@@ -106,8 +106,8 @@ class RecordingWriter:
             known = type(message), *self.chunks.begin(channel)
             self._topics[topic] = known
         _, number, chunk = known
-        times_ns = time_ns, time_ns if publish_ns is None else publish_ns
-        self.chunks.add(number, chunk, times_ns, message.SerializeToString(), topic)
+        publish_ns = time_ns if publish_ns is None else publish_ns
+        self.chunks.add(number, chunk, time_ns, publish_ns, message.SerializeToString())
 
     def write_columns(
         self,
@@ -151,7 +151,7 @@ class RecordingWriter:
     def write_raw(self, raw: RawMessage) -> None:
         """Append a message of another recording, bit for bit."""
         number, chunk = self.chunks.begin(raw.channel)
-        self.chunks.add(number, chunk, (raw.time_ns, raw.publish_ns), raw.data, raw.topic)
+        self.chunks.add(number, chunk, raw.time_ns, raw.publish_ns, raw.data)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Append named strings, such as the source's own split."""
