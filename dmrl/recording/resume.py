@@ -24,9 +24,12 @@ class Interrupted:
     ----------
     path
         Recording with every message that was kept; None: there is none.
+    pictured
+        Whether pictures belong to every moment.
     """
 
     path: Path | None
+    pictured: bool = False
 
     def moments(self) -> Iterator[tuple[int, list[RawMessage]]]:
         """Time and messages of every moment that is whole, numbers before pictures.
@@ -35,7 +38,7 @@ class Interrupted:
         """
         if self.path is None:
             return
-        end_ns = _whole_until_ns(self.path)
+        end_ns = _whole_until_ns(self.path, pictured=self.pictured)
         messages = read_raw(self.path, end_ns=end_ns)
         for time_ns, group in groupby(messages, key=lambda raw: raw.time_ns):
             yield time_ns, sorted(group, key=lambda raw: raw.channel.pictured)
@@ -75,7 +78,7 @@ class Interrupted:
             self.path.unlink(missing_ok=True)
 
 
-def interrupted(out: Path, *, resume: bool) -> Interrupted:
+def interrupted(out: Path, *, resume: bool, pictured: bool = False) -> Interrupted:
     """What is left of an interrupted writing of ``out``, mended as ``<out>.kept``.
 
     Parameters
@@ -84,6 +87,8 @@ def interrupted(out: Path, *, resume: bool) -> Interrupted:
         The recording that was being written.
     resume
         Whether to go on with it.
+    pictured
+        Whether every moment of it has pictures: one without is not whole.
 
     Raises
     ------
@@ -102,7 +107,7 @@ def interrupted(out: Path, *, resume: bool) -> Interrupted:
     if not partial.exists() and not kept.exists():
         raise RecordingError(f"no {partial} to resume. Run without --resume")
     _mend(partial, kept)
-    return Interrupted(kept if kept.exists() else None)
+    return Interrupted(kept if kept.exists() else None, pictured)
 
 
 def _mend(partial: Path, kept: Path) -> None:
@@ -124,12 +129,12 @@ def _count(path: Path) -> int:
     return sum(info.count for info in summary(path).topics.values())
 
 
-def _whole_until_ns(path: Path) -> int:
+def _whole_until_ns(path: Path, *, pictured: bool) -> int:
     """Log time before which nothing is missing, of pictures or of numbers."""
     last: dict[bool, int] = {}
     held = summary(path).topics
     for topic, times in log_times(path, held).items():
-        pictured = holds_pictures(held[topic].schema)
-        last[pictured] = max(last.get(pictured, 0), int(times.max(initial=0)))
+        picture = holds_pictures(held[topic].schema)
+        last[picture] = max(last.get(picture, 0), int(times.max(initial=0)))
     # Where there are pictures, there are numbers that tell of them: those of none were lost.
-    return min(last.values()) if False in last else 0
+    return min(last.values()) if False in last and (True in last or not pictured) else 0

@@ -133,7 +133,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
         If what is to be resumed is of other settings.
     """
     refuse_existing(out)
-    before = interrupted(out, resume=resume)
+    before = interrupted(out, resume=resume, pictured=True)
     camera = camera_of(settings)
     photos = None if settings.backgrounds is None else photos_of(settings.backgrounds)
     lights = None if settings.lights is None else _panoramas(settings.lights)

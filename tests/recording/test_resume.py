@@ -108,3 +108,13 @@ def test_pictures_without_what_was_said_of_them_are_not_whole(tmp_path: Path) ->
             write_pictures(sink, done, 600)
         assert (tmp_path / f"{stop}.mcap").read_bytes() == whole.read_bytes()
     assert done > 300
+
+
+def test_numbers_whose_pictures_were_lost_are_not_whole(tmp_path: Path) -> None:
+    """The chunk with the pictures could not be written any more."""
+    out = tmp_path / "out.mcap"
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(out, MADE, keep_on_error=True) as sink:
+        write(sink, 0, MOMENTS)
+        raise KeyboardInterrupt
+    assert sum(1 for _ in interrupted(out, resume=True).moments()) > 0
+    assert list(interrupted(out, resume=True, pictured=True).moments()) == []
