@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from dmrl.border.names import inside
 from dmrl.datasets import layout
 from dmrl.images.codec import encode_png
 
@@ -163,8 +164,9 @@ class SplitWriter:
             "dataset_name": None,
         }
         info = {**about, "features": layout.features(self.schema), "splits": {self.name: split}}
-        layout.write_json(self.folder / self.name / "state.json", state)
-        layout.write_json(self.folder / self.name / "dataset_info.json", info)
+        folder = inside(self.folder, self.name, "a split")
+        layout.write_json(folder / "state.json", state)
+        layout.write_json(folder / "dataset_info.json", info)
 
 
 def write_dataset(

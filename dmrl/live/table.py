@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from dmrl.border.names import one_line
 from dmrl.live.crazyflie import Link
 from dmrl.live.feed import Health
 
@@ -69,7 +70,7 @@ class LiveTable:
 
     def say(self, line: str) -> None:
         """Print a line of news above the table."""
-        self._console.print(line)
+        self._console.print(one_line(line))
 
     def update(self, messages: int) -> None:
         """Draw it again.

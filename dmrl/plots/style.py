@@ -40,6 +40,7 @@ __all__ = ["SIZE_INCHES", "STYLE", "Figure", "MaxNLocator", "mpl", "save"]
 
 # Equal input gives equal bytes: no date, no version, no random ids.
 STYLE: dict[Any, Any] = {
+    "text.parse_math": False,  # names come from files: a $ in them is no formula
     "svg.hashsalt": "dmrl",
     "font.size": 10,
     "axes.spines.top": False,

@@ -1,0 +1,204 @@
+"""Held by the source itself: what comes from a file becomes a path in `dmrl.border.names` alone.
+
+A path may be joined with a text that stands in the source. What else it is joined with goes
+through a function of `dmrl.border.names`, or stands below with the reason why it needs none.
+Documents of strangers are parsed in `dmrl.border.documents` alone, which knows their budgets.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import dmrl
+
+SOURCE = Path(dmrl.__file__).parent
+CHECKED = {"inside", "file_name", "split_name", "file_of_topic", "c_name", "shard_path"}
+"""Functions that give a name which can be that of a file, or a path that is made of one."""
+METHODS = {"resolve", "absolute", "expanduser", "with_name", "with_suffix", "relative_to"}
+CHECKED_BEFORE = "checked just before"
+OURS = "made of our own words and numbers"
+LISTED = "the name of a file that was found there"
+GIVEN = "a path of the user's, with an ending of ours"
+READ = "only read: names of files beside each other"
+REASONS = {
+    "api/stages.py: f'{stage}.mcap'": OURS,
+    "border/names.py: file_name(name, what) + suffix": CHECKED_BEFORE,
+    "datasets/layout.py: f'data-{number}.arrow'": OURS,
+    "datasets/layout.py: f'{split}-{number}.parquet'": CHECKED_BEFORE,
+    "datasets/layout.py: split": CHECKED_BEFORE,
+    "deploy/c/__init__.py: file": "named by c_name",
+    "deploy/c/text.py: template": OURS,
+    "deploy/compiled.py: f'{name}.c'": "named by c_name",
+    "deploy/compiled.py: name": OURS,
+    "deploy/measure.py: f'{name}.c'": "named by c_name",
+    "deploy/measure.py: f'{name}.o'": "named by c_name",
+    "deploy/targets.py: f'{name}.c'": "named by c_name",
+    "evaluation/report.py: name": OURS,
+    "export/ros2.py: path.name": LISTED,
+    "export/tables.py: name": "a number, and one of two endings",
+    "formats/flight_csv.py: log.robot": LISTED,
+    "formats/locanet.py: name": READ,
+    "formats/nanocockpit.py: FOLDERS[0]": OURS,
+    "formats/nanocockpit.py: f'{stem}{suffix}'": READ,
+    "formats/nanocockpit.py: folder": OURS,
+    "learn/checkpoint.py: name": OURS,
+    "learn/pretrained/__init__.py: model": LISTED,
+    "output.py: path.name + SUFFIX": GIVEN,
+    "page/gather.py: name": LISTED,
+    "page/sections.py: name": LISTED,
+    "pipeline/folders.py: n": LISTED,
+    "pipeline/folders.py: name": LISTED,
+    "pipeline/memory.py: name": LISTED,
+    "pipeline/plan.py: name": "only read, and checked by _source_fault",
+    "pipeline/plan.py: name.removeprefix(DATA).lstrip('/')": "only read, and checked likewise",
+    "pipeline/runner.py: f'{new.name}.old'": "checked by _out_fault of the plan",
+    "pipeline/runner.py: one.step.out": "checked by _out_fault of the plan",
+    "pipeline/runner.py: step.out": "checked by _out_fault of the plan",
+    "plots/style.py: stem.name + suffix": GIVEN,
+    "recording/resume.py: kept.name + '.new'": GIVEN,
+    "recording/resume.py: out.name + '.kept'": GIVEN,
+    "rendering/blender/passes.py: f'{name}{self.scene.frame_current:04d}.exr'": OURS,
+    "rendering/environment.py: f'{target.name}.partial-{os.getpid()}'": GIVEN,
+    "stages/card.py: card.name": OURS,
+    "stages/evaluate.py: name": OURS,
+    "stages/export.py: name": OURS,
+    "stages/sketch.py: name": OURS,
+}
+PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
+MAY_PARSE = {
+    "border/documents.py": "the home",
+    "rendering/blender/protocol.py": "what our own processes say to each other",
+    "pipeline/crew.py": "what our own processes say to each other",
+    "pipeline/work.py": "what our own processes say to each other",
+    "recipe.py": "what json.dumps has just made",
+    "recording/inputs.py": "what json.dumps has just made",
+    "learn/checkpoint.py": "what json.dumps has just made",
+}
+
+
+def sources() -> Iterator[tuple[str, ast.Module]]:
+    for path in sorted([*SOURCE.rglob("*.py"), *(SOURCE.parent / "viewer").rglob("*.py")]):
+        yield (
+            path.relative_to(SOURCE.parent).as_posix().removeprefix("dmrl/"),
+            ast.parse(path.read_text(encoding="utf-8")),
+        )
+
+
+def _is_path_hint(hint: ast.expr | None) -> bool:
+    return hint is not None and ast.unparse(hint).split(" | ")[0] == "Path"
+
+
+class Paths:
+    """What of a module is a path, as far as its annotations tell."""
+
+    def __init__(self, everywhere: list[ast.Module]) -> None:
+        self.fields, self.functions = {"parent"}, {"Path"}
+        for tree in everywhere:
+            for node in ast.walk(tree):
+                if isinstance(node, ast.ClassDef):
+                    self.fields |= {
+                        part.target.id
+                        for part in node.body
+                        if isinstance(part, ast.AnnAssign)
+                        and isinstance(part.target, ast.Name)
+                        and _is_path_hint(part.annotation)
+                    }
+                elif isinstance(node, ast.FunctionDef) and _is_path_hint(node.returns):
+                    self.functions.add(node.name)
+
+    def joined(self, tree: ast.Module) -> Iterator[ast.expr]:
+        """Everything that a path of a module is joined with."""
+        names = self._names(tree)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+                if self._is_path(node.left, names):
+                    yield node.right
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                if node.func.attr in ("joinpath", "with_name", "with_stem"):
+                    yield from node.args
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Path":
+                yield from node.args[1:]
+
+    def _names(self, tree: ast.Module) -> set[str]:
+        found = {
+            node.arg
+            for node in ast.walk(tree)
+            if isinstance(node, ast.arg) and _is_path_hint(node.annotation)
+        }
+        for _ in range(3):  # names that are made of names
+            for node in ast.walk(tree):
+                if isinstance(node, ast.Assign) and self._is_path(node.value, found):
+                    found |= {t.id for t in node.targets if isinstance(t, ast.Name)}
+                elif isinstance(node, ast.withitem) and isinstance(node.optional_vars, ast.Name):
+                    call = node.context_expr
+                    made = isinstance(call, ast.Call) and ast.unparse(call.func).split(".")[-1]
+                    if made in ("partial_file", "partial_folder", "rewritten_file"):
+                        found.add(node.optional_vars.id)
+        return found
+
+    def _is_path(self, node: ast.expr, names: set[str]) -> bool:
+        match node:
+            case ast.Name(id=name):
+                return name in names
+            case ast.Attribute(attr=field):
+                return field in self.fields
+            case ast.Call(func=ast.Name(id=name)):
+                return name in self.functions
+            case ast.Call(func=ast.Attribute(attr=name)):
+                return name in self.functions | METHODS
+            case ast.BinOp(left=left, op=ast.Div()):
+                return self._is_path(left, names)
+            case ast.IfExp(body=body):
+                return self._is_path(body, names)
+            case ast.BoolOp(values=values):
+                return any(self._is_path(value, names) for value in values)
+        return False
+
+
+def _is_ours(node: ast.expr) -> bool:
+    """Whether a text stands in the source, or has been checked."""
+    match node:
+        case ast.Constant():
+            return True
+        case ast.Name(id=name) | ast.Attribute(attr=name):
+            return name.isupper()
+        case ast.JoinedStr(values=values):
+            return all(
+                _is_ours(v.value) if isinstance(v, ast.FormattedValue) else True for v in values
+            )
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return _is_ours(left) and _is_ours(right)
+        case ast.Call(func=ast.Name(id=name)) | ast.Call(func=ast.Attribute(attr=name)):
+            return name in CHECKED
+        case ast.IfExp(body=body, orelse=other):
+            return _is_ours(body) and _is_ours(other)
+    return False
+
+
+def joins() -> set[str]:
+    """Every place where a path is joined with what may come from a file: file and text."""
+    every = list(sources())
+    paths = Paths([tree for _, tree in every])
+    return {
+        f"{name}: {ast.unparse(part)}"
+        for name, tree in every
+        for part in paths.joined(tree)
+        if not _is_ours(part)
+    }
+
+
+def test_a_path_is_joined_with_checked_names_alone() -> None:
+    found = joins()
+    assert found - REASONS.keys() == set(), "use dmrl.border.names, or add the reason"
+    assert REASONS.keys() - found == set(), "these are no more"
+
+
+def test_documents_of_strangers_are_parsed_in_one_place() -> None:
+    found = {
+        name
+        for name, tree in sources()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func).startswith(PARSERS)
+    }
+    assert found - MAY_PARSE.keys() == set()
+    assert MAY_PARSE.keys() - found == set()
