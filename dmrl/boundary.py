@@ -9,6 +9,7 @@ a bug of dmrl              1       the error, and the file that holds its traceb
 a bad command line         2       what is wrong with it
 SIGINT, as by Ctrl-C       130     what stands under its final name
 SIGTERM                    143     the same
+SIGHUP                     129     the same, if anybody still listens
 =========================  ======  ==========================================================
 
 With ``DMRL_DEBUG`` set, errors that are not the user's keep their traceback.
@@ -28,7 +29,7 @@ from dmrl import output
 from dmrl.border.names import one_line, without_middle
 from dmrl.errors import DmrlError
 
-ENDING = (signal.SIGINT, signal.SIGTERM)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stopped(KeyboardInterrupt):
@@ -56,7 +57,7 @@ def open_standard_streams() -> None:
 
 
 def end_by_signals() -> None:
-    """Let SIGINT and SIGTERM end the command in order; a second one ends it at once."""
+    """Let SIGINT, SIGTERM and SIGHUP end the command in order; a second one ends it at once."""
 
     def stop(number: int, _: FrameType | None) -> None:
         for ending in ENDING:
@@ -91,6 +92,8 @@ def _guarded(work: Callable[[], object]) -> int:
         return _end(str(e))
     except KeyboardInterrupt as e:
         return _end(_stopped(), 128 + getattr(e, "number", signal.SIGINT))
+    except UnicodeEncodeError as e:
+        return _end(f"{ascii(e.object)[:80]} is no text that can be stored. Rename the file")
     except BrokenPipeError:
         return 1  # the reader of our output, such as `head`, has gone: nobody is left to tell
     except Exception as e:

@@ -70,7 +70,7 @@ def test_what_the_system_refuses_is_one_line(
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_says_that_nothing_has_its_final_name(
     number: signal.Signals, tmp_path: Path
 ) -> None:
@@ -139,3 +139,15 @@ def test_no_file_is_opened_as_a_closed_standard_stream(tmp_path: Path) -> None:
     )
     command = ["sh", "-c", '"$@" <&- >&- 2>&-', "sh", sys.executable, "-c", code]
     assert subprocess.run(command, check=False).returncode > 2
+
+
+def test_nothing_of_the_process_is_needed(tmp_path: Path) -> None:
+    """No home, no temporary folder, no working folder, a name that is no text."""
+    out, gone = tmp_path / os.fsdecode(b"\xff.out"), tmp_path / "gone"
+    environment = {"PATH": os.environ["PATH"], "TMPDIR": "/nonexistent"}
+    gone.mkdir()
+    shell = f'cd "{gone}" && rmdir "{gone}" && "$@"'
+    command = ["sh", "-c", shell, "sh", *DMRL, "sketch", str(out), "--images", "2"]
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert out.is_dir()

@@ -27,13 +27,17 @@ from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter
 from dmrl.recording.provenance import Input
+from dmrl.recording.writer import channel_for
 
 from .deploy.networks import random_network
 
-ROBOTS = ("cf1", "..", "a\\b", "$(touch victim)", "`*/", "<img src=x>", "a.b")
+ROBOTS = ("cf1", "..", "a\\b", "$(touch victim)", "$x^{$y$", "`*/", "<img src=x>", "a.b")
 CONTROLS = ("cf1", "x\x1b[2J", "n\nm", "\u202ecf2", "-rf")
 PEERS = ("../../victim/keep", "/tmp/victim", "cf2", "|[x](y)|\n# z")
 ELSEWHERE = ("../../victim/keep", "..", "a/b", "{victim}/keep", "data", "x\ny", "", "-rf")
+HOSTILE_TEXT = (
+    '*/\n#include "/etc/passwd"\nint main(void){return 7;}/*\\\n??/\n$(shell touch victim)'
+)
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
 CHANGES += ("os.chmod", "os.system", "os.posix_spawn", "os.exec")
@@ -162,7 +166,7 @@ def _hostile(
                     ("velocity", message("Velocity")()),
                     (f"range/{robot}", message("UwbRange")(range_m=1.0 + k)),
                 ):
-                    channel = sink._channel_for(f"/{robot}/{topic}", one.DESCRIPTOR)
+                    channel = channel_for(f"/{robot}/{topic}", one.DESCRIPTOR)
                     time_ns = k * 100_000_000
                     sink.write_raw(RawMessage(time_ns, time_ns, channel, one.SerializeToString()))
         height = message("Height")(height_m=2.0)
@@ -175,45 +179,173 @@ def _hostile(
             "/..",
             "cf1/height",
         ):
-            like = sink._channel_for("/cf1/height", height.DESCRIPTOR)
+            like = channel_for("/cf1/height", height.DESCRIPTOR)
             channel = Channel(topic, like.schema_name, like.schema_data)
             sink.write_raw(RawMessage(0, 0, channel, height.SerializeToString()))
     return path
 
 
-@pytest.mark.parametrize("robots", [ROBOTS, CONTROLS])
-def test_no_command_writes_elsewhere_for_a_hostile_recording(
-    robots: tuple[str, ...], box: Box, capsys: pytest.CaptureFixture[str]
+EACH = """kind = "pipeline"
+[each]
+name = ["../../victim/x", "/tmp/victim", "..", "a\\u001b[2J", "recipe.toml", "x"]
+[[step]]
+stage = "sketch"
+out = "{name}"
+images = 1
+"""
+COLUMNS = """[time]
+name = "t"
+unit = "s"
+[range."../../victim/keep"]
+name = "r"
+unit = "m"
+"""
+HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
+    "demo": (("--out", "IN/bad.mcap"), ("--out", "IN/link")),
+    "run": (("IN/each.toml", "--out", "OUT/run"), ("IN/link.toml", "--out", "OUT/run")),
+    "render": (("IN/each.toml", "OUT/render.mcap"), ("IN/link", "OUT/render.mcap")),
+    "sketch": (("IN/link", "--images", "1"), ("OUT/sketch", "--images", "1")),
+    "fly": (("IN/each.toml", "OUT/fly.mcap"),),
+    "convert": (
+        ("IN/bad.mcap", "OUT/csv", "--to", "csv"),
+        ("IN/bad.mcap", "OUT/parquet", "--to", "parquet"),
+        ("IN/bad.mcap", "OUT/ros", "--to", "ros2"),
+        ("IN/logs", "OUT/logs.mcap", "--from", "csv"),
+        ("IN/logs", "OUT/columns.mcap", "--columns", "IN/columns.toml"),
+        ("IN/logs", "OUT/cfclient.mcap", "--from", "cfclient"),
+        ("IN/pictures", "OUT/pictures.mcap", "--from", "images"),
+        ("IN/link", "OUT/link.mcap"),
+    ),
+    "record": (("OUT/record.mcap", "--robot", "../../x=udp://127.0.0.1:1"),),
+    "fake-drone": (("--flight", "IN/bad.mcap", "--uri", "udp://127.0.0.1:0x"),),
+    "calibrate": (("IN/bad.mcap", "OUT/camera.toml"),),
+    "align": (("IN/bad.mcap", "OUT/align.mcap"),),
+    "label": (("IN/bad.mcap", "OUT/label.mcap"), ("IN/folder", "OUT/labels")),
+    "dataset": (("IN/bad.mcap", "OUT/set"), ("IN/bad.mcap", "OUT/sets", "--parquet")),
+    "card": (("IN/bad.mcap",), ("OUT/cards",)),
+    "train": (("OUT/cards", "OUT/run", "--epochs", "1"), ("IN/bad.mcap", "OUT/run")),
+    "predict": (
+        ("IN/model", "IN/bad.mcap", "OUT/predicted.mcap"),
+        ("dmrl-nano", "IN/bad.mcap", "OUT/nano.mcap"),
+    ),
+    "track": (("IN/bad.mcap", "OUT/track.mcap"),),
+    "evaluate": (("IN/bad.mcap",), ("IN/bad.mcap", "--plots", "OUT/judged")),
+    "quantize": (("IN/model", "OUT/cards", "OUT/int8"), ("dmrl-nano", "OUT/cards", "OUT/int8")),
+    "export": (("IN/model", "OUT/exported"), ("IN/link", "OUT/exported")),
+    "verify": (("IN/model",), ("IN/link",)),
+    "view": (("IN/bad.mcap", "--save", "OUT/view.rrd"),),
+    "doctor": ((),),
+    "report": (("IN", "OUT/page.html"), ("OUT/cards",)),
+    "info": (("IN/bad.mcap",), ("IN/bad.mcap", "--json"), ("IN/link",)),
+    "check": (("IN/bad.mcap",), ("IN/bad.mcap", "--json"), ("IN/link",)),
+    "recover": (("IN/bad.mcap", "OUT/recovered.mcap"), ("IN/link", "OUT/recovered2.mcap")),
+    "merge": (("IN/bad.mcap", "IN/other.mcap", "OUT/merged.mcap"),),
+    "trim": (("IN/bad.mcap", "OUT/trimmed.mcap"), ("IN/link", "OUT/trimmed2.mcap")),
+}
+"""What every command is given: inputs full of hostile names, links to what is not theirs."""
+
+
+@pytest.fixture(scope="module", params=[ROBOTS, CONTROLS], ids=["names", "controls"])
+def inputs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of everything a stranger can give, and a dataset made of it."""
+    root = tmp_path_factory.mktemp("hostile")
+    bad = _hostile(root / "bad.mcap", robots=request.param)
+    _hostile(root / "other.mcap", {"x": "[[0, 1]]"}, request.param)
+    (root / "each.toml").write_text(EACH)
+    (root / "columns.toml").write_text(COLUMNS)
+    for name in ("logs", "pictures", "folder", "model"):
+        (root / name).mkdir()
+    shutil.copy(bad, root / "folder" / "x\x1b[2J.mcap")
+    for robot in ("..cf1", "$(touch victim)", "a\nb", "\x1b[2J", "<img src=x>"):
+        log = "time_s,range_../../victim/keep_m\n0,1\n1,2\n"
+        (root / "logs" / f"{robot}.csv").write_text(log)
+        picture = encode_png(np.zeros((48, 64, 3), np.uint8))
+        (root / "pictures" / f"{robot}.png").write_bytes(picture)
+    layers = tuple(replace(layer, name=HOSTILE_TEXT) for layer in random_network(0).layers)
+    save(
+        replace(random_network(0), name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers),
+        root / "model" / INTEGER_NAME,
+    )
+    named = bad if request.param is ROBOTS else _hostile(root / "named.mcap")
+    made = ["dataset", str(named), str(root / "cards"), "--split", "recordings"]
+    assert boundary.status_of(lambda: app(made)) == 0
+    return root
+
+
+def test_every_command_is_given_hostile_inputs() -> None:
+    assert HOSTILE.keys() == COMMANDS.keys()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_command_writes_elsewhere_for_hostile_inputs(
+    name: str, inputs: Path, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bad, out = _hostile(box.root / "in" / "bad.mcap", robots=robots), box.out
-    other = _hostile(box.root / "in" / "other.mcap", {"x": "[[0, 1]]"}, robots)
-    for words in (
-        ("info", bad),
-        ("check", bad),
-        ("info", bad, "--json"),
-        ("trim", bad, out / "trim.mcap"),
-        ("merge", bad, other, out / "merge.mcap"),
-        ("recover", bad, out / "recovered.mcap"),
-        ("convert", bad, out / "csv", "--to", "csv"),
-        ("convert", bad, out / "parquet", "--to", "parquet"),
-        ("convert", bad, out / "ros", "--to", "ros2"),
-        ("dataset", bad, out / "set"),
-        ("dataset", bad, out / "parquet-set", "--parquet"),
-        ("label", bad, out / "label.mcap"),
-        ("align", bad, out / "align.mcap"),
-        ("track", bad, out / "track.mcap"),
-        ("calibrate", bad, out / "camera.toml"),
-        ("evaluate", bad),
-        ("evaluate", bad, "--plots", out / "judged"),
-        ("predict", bad, bad, out / "predicted.mcap"),
-        ("view", bad, "--save", out / "view.rrd"),
-        ("card", bad),
-        ("fake-drone", "--flight", bad, "--uri", "udp://127.0.0.1:0x"),
-    ):
-        _run(box, capsys, *words)
+    shutil.copytree(inputs, box.root / "in", dirs_exist_ok=True)
+    shutil.move(box.root / "in" / "cards", box.out / "cards")
+    (box.root / "in" / "link").symlink_to(box.victim / "keep")
+    (box.root / "in" / "link.toml").symlink_to(box.victim)
+    for words in HOSTILE[name]:
+        given = [
+            w.replace("IN", str(box.root / "in")).replace("OUT", str(box.out))
+            if w.startswith(("IN", "OUT"))
+            else w
+            for w in words
+        ]
+        _run(box, capsys, name, *given)
+    pages = [
+        p.read_text()
+        for p in (box.out / "page.html", box.out / "cards" / "report.html")
+        if p.is_file()
+    ]
+    assert not any("<img src=x" in page or "<script" in page for page in pages)
 
 
-@pytest.mark.usefixtures("empty_figures")
+@pytest.mark.parametrize(
+    ("words", "links"),
+    [
+        (("trim", "IN/bad.mcap", "OUT/x.mcap"), ("x.mcap", "x.mcap.partial")),
+        (("recover", "IN/bad.mcap", "OUT/x.mcap"), ("x.mcap", "x.mcap.partial")),
+        (("convert", "IN/bad.mcap", "OUT/x", "--to", "csv"), ("x", "x.partial")),
+        (("dataset", "IN/bad.mcap", "OUT/x"), ("x", "x.partial")),
+        (("sketch", "OUT/x", "--images", "1"), ("x", "x.partial")),
+        (("fly", "fly_in_view", "OUT/x", "--duration-s", "1"), ("x", "x.partial")),
+        (("export", "IN/model", "OUT/x"), ("x", "x.partial")),
+        (("evaluate", "IN/bad.mcap", "--plots", "OUT/x"), ("x", "x.partial")),
+        (("report", "OUT/cards"), ("cards/report.html", "cards/report.html.partial")),
+        (("card", "OUT/cards"), ("cards/README.md.partial", "cards/figures/depth.png")),
+        (("run", "IN/one.toml", "--out", "OUT/x"), ("x/recipe.toml.partial", "x/unfinished")),
+        (("run", "IN/one.toml", "--out", "OUT/x"), ("x/pipeline.json.partial", "x/s.partial")),
+        (("record", "OUT/x", "--robot", "cf1=udp://127.0.0.1:1"), ("x", "x.partial")),
+        (("train", "OUT/cards", "OUT/x", "--epochs", "1"), ("x", "x.partial")),
+    ],
+    ids=lambda words: words[0],
+)
+@pytest.mark.parametrize("target", ["victim", "victim/keep"])
+def test_links_in_out_are_not_written_through(
+    words: tuple[str, ...], links: tuple[str, ...], target: str, inputs: Path, box: Box,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    shutil.copytree(inputs, box.root / "in", dirs_exist_ok=True)
+    shutil.move(box.root / "in" / "cards", box.out / "cards")
+    one = EACH.replace(
+        '"../../victim/x", "/tmp/victim", "..", "a\\u001b[2J", "recipe.toml", "x"', '"s"'
+    )
+    (box.root / "in" / "one.toml").write_text(one)
+    given = [w.replace("IN", str(box.root / "in")).replace("OUT", str(box.out)) for w in words]
+    for link in links:
+        path = box.out / link
+        path.parent.mkdir(exist_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
+        path.symlink_to(box.root / target)
+        if words[0] == "run":
+            (path.parent / "pipeline.json").write_text('{"begun": {}, "done": {}, "hashes": {}}')
+        _run(box, capsys, *given)
+        if path.is_symlink():
+            path.unlink()
+
+
 @pytest.mark.parametrize("split", ELSEWHERE)
 def test_a_split_of_a_recording_stays_in_the_dataset(
     split: str, box: Box, capsys: pytest.CaptureFixture[str]
@@ -280,11 +412,6 @@ def test_a_hostile_dataset_is_read_and_carded_where_it_is(
         _run(box, capsys, "card", hurt)
         _run(box, capsys, "train", hurt, box.out / "run", "--epochs", "1", "--batch-size", "0")
         shutil.rmtree(hurt)
-
-
-HOSTILE_TEXT = (
-    '*/\n#include "/etc/passwd"\nint main(void){return 7;}/*\\\n??/\n$(shell touch victim)'
-)
 
 
 def test_a_model_s_names_do_not_become_code(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
@@ -402,7 +529,7 @@ def _with_junk(path: Path, junk: str, calibration: dict[str, Any]) -> Path:
                 "detections": message("Detections")(),
             }.items():
                 data = b"\xff\xff\xff\xff" if name == junk else one.SerializeToString()
-                channel = sink._channel_for(f"/cf1/{name}", one.DESCRIPTOR)
+                channel = channel_for(f"/cf1/{name}", one.DESCRIPTOR)
                 sink.write_raw(RawMessage(k * 10**8, k * 10**8, channel, data))
     return path
 
@@ -469,3 +596,46 @@ def test_a_recipe_s_step_writes_in_the_pipeline_s_folder(
     recipe.write_text(f'kind = "pipeline"\n{step}')
     assert _run(box, capsys, "run", recipe, "--out", box.out / "a") == 1
     assert list(box.out.iterdir()) == []
+
+
+def test_a_name_that_is_no_text_is_one_line(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = _with_junk(box.root / "in" / os.fsdecode(b"\xff.mcap"), "", {})
+    for words in (
+        ("info", flight),
+        ("check", flight),
+        ("trim", flight, box.out / "trim.mcap"),
+        ("merge", flight, box.out / "merge.mcap"),
+        ("recover", flight, box.out / "recover.mcap"),
+        ("label", flight, box.out / "label.mcap"),
+        ("convert", flight, box.out / "csv", "--to", "csv"),
+        ("convert", flight, box.out / "ros", "--to", "ros2"),
+        ("evaluate", flight),
+        ("view", flight, "--save", box.out / "view.rrd"),
+        ("report", box.root / "in", box.out / "page.html"),
+        ("dataset", flight, box.out / "set"),
+    ):
+        _run(box, capsys, *words)
+
+
+def test_a_pipe_in_place_of_a_file_is_one_line(
+    box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Opening it would wait for somebody who writes."""
+    pipe, folder = box.root / "in" / "x.mcap", box.root / "in"
+    for name in ("x.mcap", "x.h5", "model.json", "x.csv", "x.png", "labels.csv"):
+        os.mkfifo(folder / name)
+    for words in (
+        ("info", pipe),
+        ("recover", pipe, box.out / "recovered.mcap"),
+        ("convert", pipe, box.out / "x.mcap"),
+        ("convert", folder, box.out / "x.mcap"),
+        ("convert", folder / "x.csv", box.out / "x.mcap"),
+        ("convert", folder, box.out / "x.mcap", "--from", "images"),
+        ("convert", folder, box.out / "x.mcap", "--from", "csv"),
+        ("convert", folder, box.out / "x.mcap", "--from", "cfclient"),
+        ("predict", folder / "x.h5", pipe, box.out / "x.mcap"),
+        ("predict", folder, pipe, box.out / "x.mcap"),
+        ("train", folder, box.out / "run"),
+        ("report", folder, box.out / "page.html"),
+    ):
+        assert _run(box, capsys, *words) == 1

@@ -35,6 +35,8 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
         If it is missing, damaged, asks for more memory than its size explains, or is not laid out
         as a dataset.
     """
+    if path.exists() and not path.is_file():
+        raise DatasetError(f"shard {path} is no file. {AGAIN}")
     try:
         with Bounded(path.stat().st_size):
             table = _mapped(path)

@@ -68,6 +68,8 @@ def format_of(source: Path, name: str | None = None) -> Format:
         raise SourceError(f"no file or folder {source}. Name one to convert")
     if not (source.is_file() or source.is_dir()):
         raise SourceError(f"{source} is neither a file nor a folder. Save it to a file first")
+    if odd := next((p for p in _within(source) if _is_neither(p)), None):
+        raise SourceError(f"{odd} is neither a file nor a folder. Move it out of {source}")
     if name in added:
         return _plugged(added[name])
     if name is not None and name not in FORMATS:
@@ -85,6 +87,15 @@ def format_of(source: Path, name: str | None = None) -> Format:
     if source.suffix == ".mcap":
         raise SourceError(f"{source} is a recording already. Say --to: csv, parquet, ros2")
     raise SourceError(f"{source} looks like no kind that is known. Say --from: {known}")
+
+
+def _within(source: Path) -> Iterator[Path]:
+    return source.rglob("*") if source.is_dir() else iter(())
+
+
+def _is_neither(path: Path) -> bool:
+    """Whether something there would keep who opens it waiting, such as a pipe."""
+    return path.exists() and not (path.is_file() or path.is_dir())
 
 
 def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:

@@ -93,7 +93,7 @@ def _files(folder: Path) -> Iterator[Path]:
         for name in sorted(names):
             seen += 1
             path = inside / name
-            if seen <= MOST_FILES and not path.is_symlink():
+            if seen <= MOST_FILES and not path.is_symlink() and path.is_file():
                 yield path
 
 

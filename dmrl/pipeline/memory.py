@@ -14,7 +14,7 @@ from typing import Any
 from dmrl import __version__
 from dmrl.border.documents import parse_json
 from dmrl.errors import OutputError
-from dmrl.output import partial_of
+from dmrl.output import rewritten_file
 from dmrl.recording.inputs import sha256_of_file, sha256_of_folder
 
 
@@ -61,9 +61,8 @@ class Memory:
     def save(self) -> None:
         """Write it, whole or not at all."""
         kept = {key: value for key, value in asdict(self).items() if key != "file"}
-        partial = partial_of(self.file)
-        partial.write_text(json.dumps(kept, indent=0) + "\n", encoding="utf-8")
-        partial.replace(self.file)
+        with rewritten_file(self.file) as partial:
+            partial.write_text(json.dumps(kept, indent=0) + "\n", encoding="utf-8")
 
     def sha256(self, path: Path) -> str:
         """SHA-256 of a file, or of a folder's names and contents.

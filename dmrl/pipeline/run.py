@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.report import Done
-from dmrl.output import as_output_error, partial_of
+from dmrl.output import as_output_error, rewritten_file
 from dmrl.pipeline.crew import Crew
 from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located
@@ -98,6 +98,8 @@ def _owned(out: Path) -> Iterator[Path]:
         if not known and out.exists() and any(out.iterdir()):
             raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
         (out / UNFINISHED).mkdir(parents=True, exist_ok=True)
+        if (out / UNFINISHED).is_symlink():
+            raise OutputError(f"{out / UNFINISHED} is a link to another folder. Remove it")
     except (FileExistsError, NotADirectoryError):
         raise OutputError(f"{out} is a file. Name a folder: --out DIR") from None
     except OSError as e:
@@ -131,6 +133,5 @@ def _lock(held: int, out: Path) -> None:
 def _keep_recipe(folder: Path, plan: Plan) -> None:
     """Leave the recipe beside what it makes."""
     kept = folder / RECIPE_FILE
-    partial = partial_of(kept)
-    partial.write_text(plan.text, encoding="utf-8")
-    partial.replace(kept)
+    with rewritten_file(kept) as partial:
+        partial.write_text(plan.text, encoding="utf-8")

@@ -60,6 +60,8 @@ def opened(path: Path) -> Iterator[Bounded]:
     """
     if path.is_dir():
         raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
+    if path.exists() and not path.is_file():  # opening a pipe waits for its other end
+        raise RecordingError(f"{path} is no file. Save it to one first")
     try:
         with Bounded(path) as stream:
             _refuse_changed(path, stream)

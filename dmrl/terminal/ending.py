@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as an event that a loop asks for.
+"""Ctrl-C, SIGTERM and SIGHUP as an event that a loop asks for.
 
 Not as an exception: that comes at any line, where it can do harm or be lost.
 """
@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-ENDING = (signal.SIGINT, signal.SIGTERM)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
@@ -25,7 +25,12 @@ def ended_by_signal(ended: threading.Event) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in ENDING}
+    deaf = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # nohup
+    before = {
+        number: signal.signal(number, lambda *_: ended.set())
+        for number in ENDING
+        if not (deaf and number is signal.SIGHUP)
+    }
     try:
         yield
     finally:
