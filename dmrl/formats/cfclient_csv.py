@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
-from dmrl.formats.format import Content, Format, Options
+from dmrl.formats.format import Content, Format, Options, content_of
 from dmrl.formats.log_block import Block
 from dmrl.geometry.frames import Array
-from dmrl.samples.flight import in_order
 from dmrl.terminal.progress import say
 
 TIME = "Timestamp"
@@ -76,7 +75,7 @@ def content(source: Path, options: Options) -> Content:
         robot = options.names.get(name, name)
         blocks = _of_one_clock([read_block(path) for path in paths])
         streams += crazyflie_log.streams(robot, blocks, options.names, source)
-    return Content(in_order(streams))
+    return content_of(streams)
 
 
 def read_block(path: Path) -> Block:

@@ -18,10 +18,9 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
-from dmrl.formats.format import Content, Format, Options
+from dmrl.formats.format import Content, Format, Options, content_of
 from dmrl.formats.log_block import Block
 from dmrl.formats.mixed_records import Event, Rows, records_of
-from dmrl.samples.flight import in_order
 from dmrl.terminal.progress import say
 
 MAGIC = 0xBC
@@ -165,7 +164,7 @@ def content(source: Path, options: Options) -> Content:
         If a log cannot be used. A folder's empty files are left out, with a line that says so.
     """
     streams = [s for robot, path in _files(source, options) for s in _streams(robot, path, options)]
-    return Content(in_order(streams))
+    return content_of(streams)
 
 
 def _files(source: Path, options: Options) -> Iterator[tuple[str, Path]]:

@@ -38,7 +38,7 @@ from dmrl.geometry.frames import Array
 from dmrl.messages import LogType
 from dmrl.samples import flight
 from dmrl.samples.flight import Placed, Times
-from dmrl.samples.sample import Sample
+from dmrl.samples.sample import Columns, Sample
 from dmrl.terminal.progress import say
 
 RANGE_MAX_M = 60.0
@@ -46,7 +46,7 @@ ZRANGE_MAX_MM = 8000.0  # the sensor says 32766 and the like where it sees no fl
 TF_PERIOD_NS = 50_000_000
 DISTANCE = re.compile(r"ranging\.distance(\d+)")
 
-Stream = Iterator[Sample]
+Stream = Iterable[Sample]
 
 
 def streams(
@@ -98,13 +98,8 @@ def as_logged(robot: str, block: Block) -> Stream:
     codes = {name: values.dtype.char.replace("l", "i") for name, values in block.columns.items()}
     kind = LogType(block.name, tuple(codes.items()))
     topic = topics.log(robot, re.sub(r"[^A-Za-z0-9_-]", "_", block.name))
-    rows: Iterable[tuple[Any, ...]] = zip(
-        *(values.tolist() for values in block.columns.values()), strict=True
-    )
-    if not block.columns:
-        rows = ((),) * len(block.time_ns)
-    for moment, row in zip(block.time_ns.tolist(), rows, strict=True):
-        yield Sample(moment, topic, kind, dict(zip(kind.fields, row, strict=True)))
+    fields = dict(zip(kind.fields, block.columns.values(), strict=True))
+    return Columns(topic, kind, block.time_ns, fields)
 
 
 def _attitude(robot: str, attitude: Series, yaw_rate: Array) -> Stream:
@@ -114,8 +109,7 @@ def _attitude(robot: str, attitude: Series, yaw_rate: Array) -> Stream:
 
 
 def _samples(topic: str, message: str, time_ns: Times, names: Sequence[str], rows: Array) -> Stream:
-    for moment, row in zip(time_ns.tolist(), rows.tolist(), strict=True):
-        yield Sample(moment, topic, message, dict(zip(names, row, strict=True)))
+    return Columns(topic, message, time_ns, dict(zip(names, rows.T, strict=True)))
 
 
 def _motion(
@@ -179,7 +173,8 @@ def ranges_of(
             say(f"{where}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
         if peer == robot or not usable.any():
             continue
-        yield flight.ranges(robot, peer, time_ns[usable], range_m[usable])
+        topic = topics.uwb_range(robot, peer)
+        yield Columns(topic, "UwbRange", time_ns[usable], {"range_m": range_m[usable]})
 
 
 def _distances(blocks: Sequence[Block], where: object) -> Iterator[tuple[int, Times, Array]]:
@@ -244,15 +239,14 @@ def _pose(place: Series | None, turn: Series | None) -> tuple[Times, Array] | No
 
 
 def _pose_samples(topic: str, time_ns: Times, rows: Array) -> Stream:
-    for moment, row in zip(time_ns.tolist(), rows.tolist(), strict=True):
-        seconds, nanos = divmod(moment, 1_000_000_000)
-        pose = {
-            "position": dict(zip("xyz", row[:3], strict=True)),
-            "orientation": dict(zip("xyzw", row[3:], strict=True)),
-        }
-        stamp = {"seconds": seconds, "nanos": nanos}
-        fields = {"timestamp": stamp, "frame_id": "world", "pose": pose}
-        yield Sample(moment, topic, "PoseInFrame", fields)
+    pose = {
+        "position": dict(zip("xyz", rows.T[:3], strict=True)),
+        "orientation": dict(zip("xyzw", rows.T[3:], strict=True)),
+    }
+    seconds, nanos = np.divmod(time_ns, 1_000_000_000)
+    stamp = {"seconds": seconds, "nanos": nanos}
+    fields = {"timestamp": stamp, "frame_id": "world", "pose": pose}
+    return Columns(topic, "PoseInFrame", time_ns, fields)
 
 
 def _transforms(robot: str, time_ns: Times, rows: Array) -> Stream:

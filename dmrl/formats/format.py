@@ -4,12 +4,13 @@ A format is one file with two functions, ``recognises(source) -> bool`` and
 ``content(source, options) -> Content``, and a ``FORMAT``, by which `dmrl.formats.known` finds it.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from dmrl.geometry.frames import Camera
-from dmrl.samples.sample import Intervals, Sample
+from dmrl.samples.flight import in_order
+from dmrl.samples.sample import Columns, Intervals, Sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,16 +20,29 @@ class Content:
     Parameters
     ----------
     samples
-        In log-time order.
+        All of it, in log-time order.
     total
         Number of samples; None where it is not known beforehand.
     split
         Inclusive intervals of log time by split name; empty where the source has no split.
+    series, others
+        The same once more, for whoever writes it fast: topics as columns, and what is not among
+        them, in log-time order.
     """
 
     samples: Iterator[Sample]
     total: int | None = None
     split: Intervals = field(default_factory=dict)
+    series: tuple[Columns, ...] = ()
+    others: Iterator[Sample] = field(default_factory=lambda: iter(()))
+
+
+def content_of(streams: Iterable[Iterable[Sample]]) -> Content:
+    """What streams hold, of which some may be columns. One of both ways to read it can be taken."""
+    held = list(streams)
+    series = tuple(stream for stream in held if isinstance(stream, Columns))
+    others = in_order(stream for stream in held if not isinstance(stream, Columns))
+    return Content(in_order(held), series=series, others=others)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,11 @@ from dmrl.formats import crazyflie_log
 from dmrl.formats.column_map import ANGLE, RATE, ColumnMap, read_map
 from dmrl.formats.crazyflie_log import Stream
 from dmrl.formats.crazyflie_state import attitude_of
-from dmrl.formats.format import Content, Format, Options
+from dmrl.formats.format import Content, Format, Options, content_of
 from dmrl.formats.log_block import Block, Series
 from dmrl.geometry.frames import Array
 from dmrl.samples import flight
-from dmrl.samples.flight import Times, in_order
+from dmrl.samples.flight import Times
 from dmrl.terminal.progress import say
 
 NANOBENCH = Path(__file__).parent / "nanobench.toml"
@@ -85,7 +85,7 @@ def content(source: Path, options: Options) -> Content:
         files = {options.names.get(p.stem, p.stem): p for p in paths}
     if not files:
         raise SourceError(f"no CSV file in {source}. Name a folder with one per robot")
-    return Content(in_order([s for n, p in files.items() for s in _streams(n, p, table)]))
+    return content_of(s for n, p in files.items() for s in _streams(n, p, table))
 
 
 def _streams(robot: str, path: Path, table: ColumnMap) -> Iterator[Stream]:

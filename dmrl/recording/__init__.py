@@ -27,7 +27,7 @@ from dmrl.recording.reader import (
 from dmrl.recording.recover import recover
 from dmrl.recording.recovery import Recovery
 from dmrl.recording.resume import Interrupted, interrupted
-from dmrl.recording.rewrite import Series, Timed, retime, rewrite
+from dmrl.recording.rewrite import Series, Timed, retime, rewrite, time_slices
 from dmrl.recording.times import log_times
 from dmrl.recording.writer import RecordingWriter
 
@@ -73,5 +73,6 @@ __all__ = [
     "splits",
     "stretches",
     "summary",
+    "time_slices",
     "trim",
 ]

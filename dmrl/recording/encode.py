@@ -107,13 +107,16 @@ def _scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, 
         data = values.view(np.uint8).reshape(len(values), -1)
         # As protobuf: -0.0 is no default.
         return Cells(data, np.ones(data.shape, bool)), ~np.asarray(data.any(axis=1))
-    if field.type not in VARINTS or field.type in (F.TYPE_SINT32, F.TYPE_SINT64):
+    if field.type not in VARINTS:
         raise TypeError(f"{field.full_name} has a type that is not written from columns")
     with np.errstate(invalid="ignore"):  # what is no number is refused
         values = array.astype(VARINTS[field.type])
     if not np.array_equal(values, array):
         raise ValueError(f"{field.full_name} takes whole numbers of its size")
-    bits = values.astype(np.int64).view(np.uint64)
+    signed = values.astype(np.int64)
+    if field.type in (F.TYPE_SINT32, F.TYPE_SINT64):
+        signed = (signed << 1) ^ (signed >> 63)
+    bits = signed.view(np.uint64)
     return _varint(bits), bits == 0
 
 

@@ -95,11 +95,22 @@ def rewrite(
 
 
 def _by_time(series: Sequence[Series]) -> Iterator[Series]:
-    """One stretch of time after another, so that whoever reads by time holds little."""
-    times = np.sort(np.concatenate([np.empty(0, np.int64), *(one.time_ns for one in series)]))
-    for first_ns, end_ns in pairwise([*times[::ROWS].tolist(), EVER_NS]):
+    """One stretch of time after another."""
+    for first_ns, end_ns in time_slices([one.time_ns for one in series]):
         for one in series:
             yield one.between(first_ns, end_ns)
+
+
+def time_slices(times_ns: Sequence[Ints]) -> Iterator[tuple[int, int]]:
+    """Of log time, so many messages each that whoever reads by time holds little of topics.
+
+    Parameters
+    ----------
+    times_ns
+        (N,) log times of each topic.
+    """
+    times = np.sort(np.concatenate([np.empty(0, np.int64), *times_ns]))
+    yield from pairwise([*times[::ROWS].tolist(), EVER_NS])
 
 
 def retime(

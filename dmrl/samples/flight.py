@@ -135,7 +135,7 @@ def _frames(robot: str, placed: Placed) -> Iterator[dict[str, Any]]:
         yield {**names, "translation": translation, "rotation": rotation}
 
 
-def in_order(streams: Iterable[Iterator[Sample]]) -> Iterator[Sample]:
+def in_order(streams: Iterable[Iterable[Sample]]) -> Iterator[Sample]:
     """Samples of several streams, each in time order, in time order."""
     return heapq.merge(*streams, key=lambda sample: sample.time_ns)
 

@@ -1,8 +1,11 @@
 """A sample: a message by its fields, not built yet, as every format and simulation gives it."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.geometry.frames import Camera
@@ -34,6 +37,61 @@ class Sample:
     message: str | LogType
     fields: Mapping[str, Any]
     publish_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Many samples of one topic: written at once, in a tenth of the time, or one by one.
+
+    Parameters
+    ----------
+    topic, message
+        As of a `Sample`.
+    time_ns
+        (N,) log times, nanoseconds.
+    fields
+        By name: (N,) values, one value for all, or the fields of a nested message.
+    """
+
+    topic: str
+    message: str | LogType
+    time_ns: NDArray[np.int64]
+    fields: Mapping[str, Any]
+
+    def __iter__(self) -> Iterator[Sample]:
+        rows = _rows(self.fields, len(self.time_ns))
+        for moment, fields in zip(self.time_ns.tolist(), rows, strict=True):
+            yield Sample(moment, self.topic, self.message, fields)
+
+    def between(self, first_ns: int, end_ns: int) -> "Columns":
+        """Those of log times in [first_ns, end_ns)."""
+        there = (self.time_ns >= first_ns) & (self.time_ns < end_ns)
+        return replace(self, time_ns=self.time_ns[there], fields=_taken(self.fields, there))
+
+
+def _rows(fields: Mapping[str, Any], count: int) -> Iterator[dict[str, Any]]:
+    """Fields of one sample after another."""
+    columns: list[Iterable[Any]] = []
+    for value in fields.values():
+        if isinstance(value, Mapping):
+            columns.append(_rows(value, count))
+        else:
+            columns.append(value.tolist() if isinstance(value, np.ndarray) else [value] * count)
+    if not columns:
+        yield from ({} for _ in range(count))
+    for row in zip(*columns, strict=True) if columns else ():
+        yield dict(zip(fields, row, strict=True))
+
+
+def _taken(fields: Mapping[str, Any], there: NDArray[np.bool_]) -> dict[str, Any]:
+    return {
+        name: _taken(value, there)
+        if isinstance(value, Mapping)
+        else value[there]
+        if isinstance(value, np.ndarray)
+        else value
+        for name, value in fields.items()
+    }
 
 
 def intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:

@@ -7,6 +7,7 @@ import json
 import re
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,7 +30,9 @@ from dmrl.recording import (
     licence_words,
     provenance,
     say_findings,
+    time_slices,
 )
+from dmrl.samples.sample import Sample
 from dmrl.terminal.arguments import Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
@@ -136,11 +139,27 @@ def _write(content: Content, sink: RecordingWriter) -> dict[str, int]:
     if content.split:
         split = {name: json.dumps(times) for name, times in content.split.items()}
         sink.add_metadata(SPLIT_METADATA, split)
-    for sample in track(content.samples, "Converting", content.total):
-        made = message(sample.message)(**sample.fields)
-        sink.write(sample.time_ns, sample.topic, made, publish_ns=sample.publish_ns)
-        counts[sample.topic] += 1
-    return dict(sorted(counts.items()))
+    single = content.others if content.series else content.samples
+    samples = iter(track(single, "Converting", content.total))
+    waiting = next(samples, None)
+    for first_ns, end_ns in time_slices([one.time_ns for one in content.series]):
+        for series in content.series:
+            part = series.between(first_ns, end_ns)
+            sink.write_columns(part.topic, message(part.message), part.time_ns, part.fields)
+            counts[part.topic] += len(part.time_ns)
+        while waiting is not None and waiting.time_ns < end_ns:
+            counts[_put(waiting, sink)] += 1
+            waiting = next(samples, None)
+    for sample in samples if waiting is None else chain([waiting], samples):
+        counts[_put(sample, sink)] += 1
+    return dict(sorted((+counts).items()))
+
+
+def _put(sample: Sample, sink: RecordingWriter) -> str:
+    """Write a sample; returns its topic."""
+    made = message(sample.message)(**sample.fields)
+    sink.write(sample.time_ns, sample.topic, made, publish_ns=sample.publish_ns)
+    return sample.topic
 
 
 def _options(settings: Settings) -> Options:

@@ -20,11 +20,14 @@ from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.recording import (
+    LICENCES_METADATA,
     SPLIT_METADATA,
     Provenance,
     RecordingWriter,
     columns,
     interrupted,
+    licence_beside,
+    licence_words,
     provenance,
 )
 from dmrl.rendering.environment import ensure
@@ -152,6 +155,8 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
         before.check(made)
         sink = stack.enter_context(RecordingWriter(out, made, keep_on_error=True))
         sink.add_metadata(SPLIT_METADATA, _split(settings))
+        if beside := _licences(settings):
+            sink.add_metadata(LICENCES_METADATA, beside)
         done = before.copy(sink)
         world = World(
             settings,
@@ -185,6 +190,13 @@ def _provenance(settings: Settings, blender: str) -> Provenance:
     plain = replace(settings, workers=0)
     made = provenance("render", plain, inputs, seed=settings.seed, libraries=("numpy", "pillow"))
     return replace(made, libraries={**made.libraries, "blender": blender})
+
+
+def _licences(settings: Settings) -> dict[str, str]:
+    """What is said beside photos, panoramas and model: it holds for the images too."""
+    made_from = (settings.backgrounds, settings.lights, settings.model)
+    found = {path.name: licence_beside(path) for path in made_from if path is not None}
+    return {name: licence_words(path) for name, path in found.items() if path is not None}
 
 
 def _split(settings: Settings) -> dict[str, str]:

@@ -14,8 +14,8 @@ import pytest
 from dmrl.errors import BlenderError, OutputError, RecordingError, SettingError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.images.codec import decode
-from dmrl.recording import check, read, read_table, summary
+from dmrl.images.codec import decode, encode_png
+from dmrl.recording import check, licences, read, read_table, summary
 from dmrl.rendering import crazyflie
 from dmrl.rendering.lens import image_from_pinhole
 from dmrl.rendering.messages import quaternion
@@ -168,6 +168,18 @@ def _mesh_box(robot: Robot, camera: Camera) -> Array:
 
 
 OWN = Camera(160, 120, 100.0, 101.0, 81.0, 58.0, (-0.28, 0.09, 0.0, 0.0, 0.0))
+
+
+def test_what_stands_beside_the_photos_stands_in_the_recording(
+    blender: Path, tmp_path: Path
+) -> None:
+    photos, out = tmp_path / "hall", tmp_path / "out.mcap"
+    photos.mkdir()
+    (photos / "LICENSE").write_text("# CC BY-SA 3.0\n\nthe photographers\n")
+    for k in range(2):
+        (photos / f"{k}.png").write_bytes(encode_png(np.full((240, 320, 3), 90 + k, np.uint8)))
+    run(out, Settings(images=1, backgrounds=photos, samples=1, workers=1))
+    assert licences([out]) == {"hall": "CC BY-SA 3.0"}
 
 
 def test_renders_are_taken_with_a_camera_of_the_user_s(blender: Path, tmp_path: Path) -> None:

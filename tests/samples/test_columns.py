@@ -1,0 +1,48 @@
+"""Samples as columns are the same messages as one by one."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dmrl.messages import LogType, message
+from dmrl.recording.encode import encode
+from dmrl.samples.sample import Columns
+
+TIMES_NS = np.arange(4) * 10
+POSE = {
+    "timestamp": {"seconds": np.arange(4), "nanos": np.arange(4)[::-1]},
+    "frame_id": "world",
+    "pose": {"position": {"x": np.linspace(-1, 1, 4)}},
+}
+KIND = LogType("a", (("b.b", "b"), ("h.h", "h"), ("i.i", "i"), ("u.u", "I"), ("e.e", "e")))
+LOGGED = {
+    "b_b": np.array([-128, -1, 0, 127], np.int8),
+    "h_h": np.array([-32768, 0, 1, 32767], np.int16),
+    "i_i": np.array([-(2**31), -2, 0, 2**31 - 1], np.int32),
+    "u_u": np.array([0, 1, 2**31, 2**32 - 1], np.uint32),
+    "e_e": np.array([0, -0.0, 0.5, np.nan], np.float16),
+}
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [Columns("/a", "PoseInFrame", TIMES_NS, POSE), Columns("/b", KIND, TIMES_NS, LOGGED)],
+    ids=["nested", "logged"],
+)
+def test_they_are_the_same_bytes(columns: Columns) -> None:
+    kind = message(columns.message)
+    rows = [kind(**sample.fields).SerializeToString() for sample in columns]
+    data, at = encode(kind.DESCRIPTOR, columns.fields, len(TIMES_NS))
+    assert rows == [data[a:b].tobytes() for a, b in pairwise(at)]
+
+
+def test_a_part_of_them_is_nested_too() -> None:
+    part = Columns("/a", "PoseInFrame", TIMES_NS, POSE).between(10, 30)
+    assert part.time_ns.tolist() == [10, 20]
+    assert [sample.fields["timestamp"]["seconds"] for sample in part] == [1, 2]
+
+
+def test_an_event_without_variables_is_kept() -> None:
+    columns = Columns("/c", LogType("c", ()), TIMES_NS, {})
+    assert [sample.fields for sample in columns] == [{}] * 4
