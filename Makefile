@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all test-faults mutants check format lint types imports spell schemas docs site examples layout clean
+.PHONY: help bench demo test test-all test-faults mutants check format lint types imports spell schemas docs site examples layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -27,6 +27,12 @@ test: $(VENV)/.dev ## Run the tests that take seconds. ARGS="-k name" picks some
 
 test-all: $(VENV)/.dev ## Run every test, the slow ones too.
 	$(PYTEST) -m "slow or not slow" --timeout 3600 $(ARGS)
+
+bench: $(VENV)/.dev ## Time dmrl beside others, on flights it makes; JSON ends up in build/bench/.
+	$(BIN)/pip install --quiet --group bench
+	@mkdir -p build/bench
+	@set -e; for name in recording predict commands; do \
+	  $(BIN)/python benchmarks/bench_$$name.py --json build/bench/$$name.json; done
 
 mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. ARGS="geometry --seed 1".
 	$(BIN)/python tests/mutants.py $(ARGS)

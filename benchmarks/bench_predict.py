@@ -1,0 +1,108 @@
+"""`dmrl predict` beside a plain onnxruntime loop over pictures that are decoded already.
+
+Run as ``python benchmarks/bench_predict.py [--rounds 5] [--json FILE]``. The recording is a flight
+of `dmrl fly` with cameras: pictures and numbers. Everyone has one numeric thread. Figures are
+medians over rounds of CPU time for an image, all threads counted, and of the calling thread's,
+which is what one waits for where a second core is free; ratios are of the same round, to the plain
+loop.
+"""
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+import numpy as np  # after the number of its threads
+import onnxruntime
+
+from dmrl.deploy.float_onnx import float_onnx_of
+from dmrl.images.codec import decode
+from dmrl.learn.model import load_model
+from dmrl.learn.pretrained import resolved
+from dmrl.recording import read
+from dmrl.stages import fly, predict
+
+BATCH = 16
+
+
+def plain_loop(model: Path, recording: Path) -> tuple[int, Callable[[], None]]:
+    """How many images there are, and onnxruntime over all of them, decoded before."""
+    found = read(recording, "/*/camera/image")
+    images = np.stack([decode(one.message.data, str(one.time_ns)) for one in found])
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    written = float_onnx_of(load_model(model), grey=False)
+    session = onnxruntime.InferenceSession(written, options)
+
+    def run() -> None:
+        for k in range(0, len(images), BATCH):
+            session.run(None, {"image": images[k : k + BATCH]})
+
+    return len(images), run
+
+
+def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
+    """A row for each: milliseconds of CPU an image, and their ratio to the plain loop's."""
+    model, recording = resolved(Path("dmrl-nano")), folder / "flight.mcap"
+    fly.run(recording, fly.Settings(2, 30.0, camera=True, camera_rate_hz=5.0, seed=1))
+    count, loop = plain_loop(model, recording)
+    work: dict[str, Callable[[], object]] = {"onnxruntime, plain loop": loop}
+    for backend in ("onnx", "torch"):
+        out, how = folder / f"{backend}.mcap", predict.Settings(backend=backend)
+        work[f"dmrl predict --backend {backend}"] = lambda o=out, h=how: predict.run(
+            model, recording, o, h
+        )
+    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in work}
+    for number in range(rounds + 1):
+        for name, run in work.items():
+            begun = time.process_time(), time.thread_time()
+            run()
+            took = (time.process_time() - begun[0], time.thread_time() - begun[1])
+            if number:  # the first round loads packages
+                spent[name].append(took)
+            for path in folder.glob("*.mcap"):
+                if path != recording:
+                    path.unlink()
+    plain = spent["onnxruntime, plain loop"]
+    return [
+        {
+            "who": name,
+            "images": count,
+            "cpu_ms": median(all_ for all_, _ in took) / count * 1e3,
+            "own_thread_ms": median(own for _, own in took) / count * 1e3,
+            "ratio": median(a / b for (a, _), (b, _) in zip(took, plain, strict=True)),
+            "own_ratio": median(a / b for (_, a), (_, b) in zip(took, plain, strict=True)),
+        }
+        for name, took in spent.items()
+    ]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = measure(Path(folder), arguments.rounds)
+    print(f"{platform.platform()}, Python {platform.python_version()}, {found[0]['images']} images")
+    print(f"{'':30} {'cpu-ms/image':>13} {'ratio':>6} {'own thread':>11} {'ratio':>6}")
+    for row in found:
+        print(
+            f"{row['who']:30} {row['cpu_ms']:13.2f} {row['ratio']:6.2f} "
+            f"{row['own_thread_ms']:11.2f} {row['own_ratio']:6.2f}"
+        )
+    if arguments.json:
+        arguments.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
