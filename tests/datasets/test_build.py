@@ -196,6 +196,17 @@ def test_same_input_same_bytes(record: Record, tmp_path: Path) -> None:
             assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
+def test_any_number_of_threads_gives_the_same_bytes(record: Record, tmp_path: Path) -> None:
+    paths = [record(), record("other.mcap", seed=1)]
+    for workers in (1, 3):
+        run(paths, tmp_path / f"out-{workers}", Settings(), workers=workers)
+    one, three = (
+        {p.name: p.read_bytes() for p in (tmp_path / f"out-{k}").rglob("*") if p.is_file()}
+        for k in (1, 3)
+    )
+    assert one == three and "README.md" in one
+
+
 def test_shards_hold_no_more_images_than_asked(record: Record, tmp_path: Path) -> None:
     run([record(peers=[[peer()]] * 150)], tmp_path / "out", Settings(shard_images=70))
     info = json.loads((tmp_path / "out/train/dataset_info.json").read_text())
