@@ -18,7 +18,7 @@ from dmrl.recording.defined import Defined
 from dmrl.recording.open_chunk import CHUNK_BYTES, OpenChunk
 
 OLDEST = 16
-"""A chunk is written, full or not, once so many of the other kind were written after its start."""
+"""Chunks of pictures that numbers wait for at most: few and large ones are read faster."""
 
 
 class Assembly:
@@ -30,10 +30,13 @@ class Assembly:
         The recording, for errors.
     file
         Takes what is full.
+    oldest
+        A chunk is written, full or not, once so many of the other kind were written after its
+        start.
     """
 
-    def __init__(self, path: Path, file: Container) -> None:
-        self._path, self._file = path, file
+    def __init__(self, path: Path, file: Container, oldest: int = OLDEST) -> None:
+        self._path, self._file, self._oldest = path, file, oldest
         self._defined = Defined()
         self._numbers, self._pictures = OpenChunk(), OpenChunk()
 
@@ -206,7 +209,7 @@ class Assembly:
             raise as_output_error(self._path, e) from e
         other = self._pictures if chunk is self._numbers else self._numbers
         other.age += bool(other.starts)
-        if other.age >= OLDEST:
+        if other.age >= self._oldest:
             self._close(other)
 
     def _negative(self, time_ns: int, topic: str) -> RecordingError:

@@ -14,7 +14,7 @@ from google.protobuf.descriptor import Descriptor
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
 from dmrl.output import as_output_error, partial_file
-from dmrl.recording.assembly import Assembly
+from dmrl.recording.assembly import OLDEST, Assembly
 from dmrl.recording.block import HEAD_BYTES, Ints
 from dmrl.recording.channel import Channel, RawMessage
 from dmrl.recording.container import Container
@@ -68,7 +68,8 @@ class RecordingWriter:
         try:
             self._file = Container(partial, f"dmrl {provenance.dmrl_version}")
             self._resources.callback(self._file.close)
-            self.chunks = Assembly(path, self._file)
+            # What is left of work that stopped is whole moments: pictures with their numbers.
+            self.chunks = Assembly(path, self._file, 1 if keep_on_error else OLDEST)
             self._file.add_metadata(METADATA_NAME, provenance.to_metadata())
             text = provenance.to_recipe() if recipe is None else recipe
             self.add_attachment(RECIPE_NAME, "application/toml", text.encode())
