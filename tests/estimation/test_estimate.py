@@ -56,15 +56,10 @@ def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
     assert max(batch) < 0.35
 
 
-@pytest.mark.parametrize(
-    "seeds", [(1000,), pytest.param((1000, 1001, 1002), marks=pytest.mark.slow)]
-)
-def test_only_sensors_that_look_calibrated_are_taken_to_have_small_scales(
-    seeds: tuple[int, ...],
-) -> None:
+def test_only_sensors_that_look_calibrated_are_taken_to_have_small_scales() -> None:
     medians = []
     for noise in ("calibrated", "realistic", "harsh"):
-        found = [solved("in_view", noise, seed)[0] for seed in seeds]
+        found = [solved("in_view", noise, seed)[0] for seed in (1000, 1001, 1002)]
         medians.append(np.median([one.noise.scale_std for one in found]))
     assert medians[0] < 0.02 <= medians[1] < medians[2]
 
