@@ -74,6 +74,7 @@ class _Walk:
     chunks: int = 0
     unpacked: int = 0
     footer: bool = False
+    data_ended: bool = False
 
 
 def recover(path: Path, out: Path) -> Recovery:
@@ -204,6 +205,9 @@ def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord | _
             if end > edge:
                 raise McapError("it runs into the next record that is known")
             record = _parsed(opcode, stream.read(length), walk)
+            walk.data_ended |= opcode == Opcode.DATA_END
+            if walk.data_ended and opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                walk.recovery.doubtful = True  # no writer puts them there
             if opcode == Opcode.DATA_END and walk.end.statistics is None:
                 walk.end = _end(walk.path, stream, end)
         except DAMAGE:
@@ -284,4 +288,5 @@ def _account(walk: _Walk) -> None:
         and not (recovery.damaged_chunks or recovery.lost_bytes)
         and not (recovery.nameless or recovery.timeless)
         and not recovery.missing
+        and not walk.found - had  # some twice, or of another recording
     )

@@ -11,6 +11,7 @@ from io import BytesIO
 from itertools import chain
 from pathlib import Path
 
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -98,9 +99,11 @@ def _parsed(body: bytes) -> McapSummary:
             case Statistics():
                 found.statistics = record
             case Schema():
-                found.schemas[record.id] = record
+                if found.schemas.setdefault(record.id, record) != record:
+                    raise McapError(f"its summary has two message types {record.id}")
             case Channel():
-                found.channels[record.id] = record
+                if found.channels.setdefault(record.id, record) != record:
+                    raise McapError(f"its summary has two channels {record.id}")
             case AttachmentIndex():
                 found.attachment_indexes.append(record)
             case ChunkIndex():

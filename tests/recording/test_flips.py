@@ -1,5 +1,6 @@
 """Every byte of a small recording flipped: the flip is noticed, or changes nothing."""
 
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -233,3 +234,52 @@ def test_a_lost_channel_is_noticed_without_any_crc(tmp_path: Path) -> None:
     path.write_bytes(data[:index] + b"\x7f" + data[index + 1 :])
     with pytest.raises(RecordingError, match=r"lists \d of \d chunks.*dmrl recover"):
         list(read_raw(path))
+
+
+def rejoined(path: Path, parts: list[tuple[int, bytes]]) -> None:
+    """The file of these records, with a footer that finds its summary and sums up nothing."""
+    at, start = 8, 0
+    for opcode, record in parts:
+        at += len(record)
+        start = at if opcode == Opcode.DATA_END else start
+    footer = struct.pack("<BQQQI", Opcode.FOOTER, 20, start, 0, 0)
+    body = b"".join(footer if opcode == Opcode.FOOTER else record for opcode, record in parts)
+    path.write_bytes(b"\x89MCAP0\r\n" + body + b"\x89MCAP0\r\n")
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "complaint"),
+    [
+        (Opcode.CHANNEL, Opcode.FOOTER, "two channels"),
+        (Opcode.SCHEMA, Opcode.FOOTER, "two message types"),
+        (Opcode.CHUNK_INDEX, Opcode.FOOTER, r"lists 3 of 2 chunks"),
+        (Opcode.CHUNK, Opcode.DATA_END, "lacks the chunk"),
+    ],
+)
+def test_a_record_that_is_there_twice_is_noticed_without_any_crc(
+    tmp_path: Path, kind: Opcode, place: Opcode, complaint: str
+) -> None:
+    path = small(tmp_path / "a.mcap")
+    data = path.read_bytes()
+    parts = [(opcode, data[start:end]) for opcode, start, end in records(data)]
+    twin = next(part for part in reversed(parts) if part[0] == kind)
+    other = (kind, twin[1].replace(b"cf1", b"cf9").replace(b"Range", b"Ranje"))
+    at = next(k for k, (opcode, _) in enumerate(parts) if opcode == place)
+    rejoined(path, parts)
+    assert len(list(read_raw(path))) == 7
+    rejoined(path, [*parts[:at], other, *parts[at:]])
+    with pytest.raises(RecordingError, match=complaint):
+        list(read_raw(path))
+
+
+def test_recover_does_not_call_whole_what_has_messages_too_many(tmp_path: Path) -> None:
+    path = small(tmp_path / "a.mcap")
+    data = path.read_bytes()
+    parts = [(opcode, data[start:end]) for opcode, start, end in records(data)]
+    chunk = next(part for part in parts if part[0] == Opcode.CHUNK)
+    end = next(k for k, (opcode, _) in enumerate(parts) if opcode == Opcode.DATA_END)
+    body = b"".join(record for _, record in [*parts[: end + 1], chunk, *parts[end + 1 :]])
+    path.write_bytes(data[:8] + body + data[:8])
+    result = recover(path, tmp_path / "b.mcap")
+    assert result.messages > 7
+    assert not result.whole
