@@ -312,7 +312,8 @@ def draw(rows: list[Row], stem: Path) -> None:
         panels, ("rmse_m", "ellipse", "kept", "worst"), titles, strict=True
     ):
         for method, mark in zip(METHODS, "osx", strict=True):
-            mine = [row for row in rows if row.method == method]
+            if not (mine := [row for row in rows if row.method == method]):
+                continue  # the legend names what was run
             places = [faults.index(row.fault) for row in mine]
             axes.plot([getattr(row, key) for row in mine], places, mark, label=method, alpha=0.8)
         axes.set_title(title, fontsize=9)
