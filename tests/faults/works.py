@@ -207,7 +207,7 @@ class Work:
     slow
         Takes so long that it is broken less often.
     same
-        Whether it writes the same bytes each time; else they are as many.
+        Whether it writes the same bytes each time; else they are about as many.
     pieces
         Whether its output is a folder whose parts stand by themselves.
     """
