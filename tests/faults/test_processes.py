@@ -61,7 +61,6 @@ def test_of_six_writers_one_succeeds(name: str, disk: Disk, tmp_path: Path, coun
         "merge",
         "sketch",
         "export",
-        "view",
         "render",
     ],
 )
