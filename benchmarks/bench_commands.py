@@ -17,6 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # threads that wait for each other count as work
+
 import numpy as np
 
 from dmrl.cli import COMMANDS
