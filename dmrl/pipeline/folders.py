@@ -8,6 +8,7 @@ processes are on this machine.
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from glob import has_magic
 from pathlib import Path
@@ -220,9 +221,12 @@ def over_folder(
         raise SettingError(f"{out} is the folder that is read. Name another for what is made")
     found = recordings_in(source, but=out) if found is None else found
     tasks = tasks_of(stage, role, found, out, settings, inputs)
-    _make_folders(out, tasks)
+    made = _make_folders(out, tasks)
     with Crew(workers, bars=False) as crew:
         done = list(outcomes(tasks, crew, f"dmrl {stage}"))
+    for folder in made:
+        with suppress(OSError):  # it holds something
+            folder.rmdir()
     for task, answer in done:
         for warning in _part(answer.get("result"), "warnings"):
             say(f"{task.source}: {warning}")
@@ -234,16 +238,21 @@ def over_folder(
     end(done, "; the others are there. Run it again when these are mended")
 
 
-def _make_folders(out: Path, tasks: Iterable[Task]) -> None:
+def _make_folders(out: Path, tasks: Iterable[Task]) -> list[Path]:
+    """Make the folders of all outputs; those that were not there, the deepest first."""
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Many recordings go into a folder: name one")
     if not out.parent.is_dir():
         raise OutputError(f"no folder {out.parent} to make {out.name} in. Try: mkdir -p {out}")
-    for folder in dict.fromkeys(task.out.parent for task in tasks if task.out):
+    wanted = dict.fromkeys(task.out.parent for task in tasks if task.out)
+    below = {p for folder in wanted for p in (folder, *folder.parents) if p.is_relative_to(out)}
+    made = sorted((p for p in below if not p.exists()), key=lambda p: -len(p.parts))
+    for folder in wanted:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as e:
             raise OutputError(f"cannot make {folder}: {e.strerror}. Choose another place") from e
+    return made
 
 
 def came_of(answer: Answer) -> str:
