@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from typing import NoReturn, get_origin
 
 from cyclopts import App, CoercionError, CycloptsError, UnknownCommandError
+from rich.console import Console
 from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
@@ -69,6 +70,7 @@ app = App(
     version=__version__,
     help_format="plaintext",
     error_formatter=bad_command_line,
+    error_console=Console(stderr=True, soft_wrap=True),  # one line, however narrow a pipe is
     suppress_keyboard_interrupt=False,  # main says what stands
 )
 for _order, (_name, _help) in enumerate(COMMANDS.items()):

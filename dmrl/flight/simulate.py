@@ -154,9 +154,11 @@ def _clock(rng: Generator, k: int, noise: Noise) -> Clock:
 
 def _check(scenario: Scenario) -> None:
     if not 2 <= scenario.robots <= ROBOTS_MAX:
-        raise SettingError(f"{scenario.robots} robots cannot be flown. Choose 2 to {ROBOTS_MAX}")
+        raise SettingError(
+            f"{scenario.robots} robots cannot be flown. Choose 2 to {ROBOTS_MAX}: --robots"
+        )
     if not 1.0 <= scenario.duration_s <= 3600.0:
-        raise SettingError(f"a flight of {scenario.duration_s} s. Choose 1 to 3600 seconds")
+        raise SettingError(f"a flight of {scenario.duration_s} s. Choose 1 to 3600: --duration-s")
     if scenario.trajectory not in TRAJECTORIES:
         kinds = ", ".join(TRAJECTORIES)
         raise SettingError(f"no trajectory {scenario.trajectory!r}. There are: {kinds}")

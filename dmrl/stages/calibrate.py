@@ -30,7 +30,7 @@ except ModuleNotFoundError as e:
 
 NOISE = Noise()
 PICTURES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
-Positive = Annotated[float, Parameter(validator=validators.Number(gt=0))]
+Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
 
 
 @dataclass(frozen=True, slots=True)

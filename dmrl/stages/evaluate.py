@@ -71,7 +71,7 @@ class Settings:
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
     draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
     seed: int = 0
-    settle_s: Annotated[float | None, Parameter(validator=validators.Number(gte=0))] = None
+    settle_s: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))] = None
 
 
 @dataclass(frozen=True, slots=True)

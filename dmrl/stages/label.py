@@ -41,7 +41,7 @@ PAIRS_AT_ONCE = 15
 
 Times = NDArray[np.int64]
 Names = tuple[str, str]
-Positive = Annotated[float, Parameter(validator=validators.Number(gt=0))]
+Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Settings:
     attitude_std_rad: Positive = 0.015
     detections: bool = False
     pixel_std_px: Positive = 6.0
-    range_offset_m: float = 0.0
+    range_offset_m: Annotated[float, Parameter(validator=validators.Number(gt=-60, lt=60))] = 0.0
     undistorted: bool = False
     camera: dict[str, Path] = field(default_factory=dict)
 

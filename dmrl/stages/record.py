@@ -53,7 +53,7 @@ class Settings:
         cf<N>'s.
     """
 
-    duration_s: Annotated[float | None, Parameter(validator=validators.Number(gt=0))] = None
+    duration_s: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=1e6))] = None
     rate_hz: Annotated[float, Parameter(validator=validators.Number(gte=1, lte=100))] = 100.0
     pixels: Colours = "colour"
     images: Stored = "png"

@@ -29,7 +29,7 @@ except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 
 TUNING = Tuning()
-Positive = Annotated[float, Parameter(validator=validators.Number(gt=0))]
+Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
 Share = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1))]
 
 
