@@ -187,7 +187,8 @@ def test_the_report_knows_the_error_where_the_truth_is_recorded(
         result = label.run(flight, tmp_path / f"{method}.mcap", Settings(method=method))
         assert [(p.observer, p.peer) for p in result.pairs] == [("cf1", "cf2"), ("cf2", "cf1")]
         assert all(p.rmse_m is not None for p in result.pairs)
-        assert not result.warnings
+        # These methods are too unsure to label half a minute by the usual gate, and say so.
+        assert not [text for text in result.warnings if "nothing is kept" not in text]
 
 
 def test_an_output_that_exists_is_left_alone(flight: Path) -> None:
