@@ -42,6 +42,28 @@ class Curve:
 
 
 @dataclass(frozen=True, slots=True)
+class Doubt:
+    """Values of a sensor that no small robot keeps up: of another unit, as a rule.
+
+    Parameters
+    ----------
+    field
+        Of the message.
+    over
+        A tenth of the values beyond this, plus or minus, is doubted.
+    unit
+        Of the field.
+    perhaps
+        The unit that they may be in.
+    """
+
+    field: str
+    over: float
+    unit: str
+    perhaps: str
+
+
+@dataclass(frozen=True, slots=True)
 class Topic:
     """One row of the table.
 
@@ -67,6 +89,8 @@ class Topic:
     csv
         Floating-point fields that a flight's CSV file may have, named as here; for a pair with the
         peer before the unit: ``range_m`` is ``range_<peer>_m``.
+    doubts
+        Which of its values cannot be in its units.
     """
 
     pattern: str
@@ -78,6 +102,7 @@ class Topic:
     sensor: bool = False
     curve: Curve | None = None
     csv: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     @property
     def of_pairs(self) -> bool:
@@ -145,6 +170,11 @@ TOPICS = (
         "convert, record, render, fly",
         sensor=True,
         csv=("roll_rad", "pitch_rad", "yaw_rate_radps"),
+        doubts=(
+            Doubt("roll_rad", 0.8, "rad", "degrees"),
+            Doubt("pitch_rad", 0.8, "rad", "degrees"),
+            Doubt("yaw_rate_radps", 5.0, "rad/s", "degrees per second"),
+        ),
     ),
     Topic(
         VELOCITY,
@@ -156,6 +186,10 @@ TOPICS = (
         sensor=True,
         curve=Curve("speed, m/s", ("vx_mps", "vy_mps"), length=True),
         csv=("vx_mps", "vy_mps"),
+        doubts=(
+            Doubt("vx_mps", 20.0, "m/s", "mm/s or cm/s"),
+            Doubt("vy_mps", 20.0, "m/s", "mm/s or cm/s"),
+        ),
     ),
     Topic(
         HEIGHT,
@@ -167,6 +201,7 @@ TOPICS = (
         sensor=True,
         curve=Curve("height, m", ("height_m",)),
         csv=("height_m",),
+        doubts=(Doubt("height_m", 30.0, "m", "mm or cm"),),
     ),
     Topic(
         RANGE,
@@ -178,6 +213,7 @@ TOPICS = (
         sensor=True,
         curve=Curve("distance, m", ("range_m",), name="UWB"),
         csv=("range_m",),
+        doubts=(Doubt("range_m", 100.0, "m", "mm or cm"),),
     ),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
     Topic(

@@ -37,9 +37,8 @@ from dmrl.topics import Topic
 TIME = "time_s"
 REQUIRED = (TIME, *LOG_COLUMNS)
 GAP_S = 1.0
+TIME_MAX_S = 9e9  # nanoseconds of it fill 64 bits; the year 2255 of those who count from 1970
 RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios that found nothing say 65535 mm
-ANGLE_MAX_RAD = np.pi / 2
-YAW_RATE_MAX_RADPS = 12.0
 OWN = {field for row in topics.OWN_SENSORS for field in row.csv}
 OTHERS = tuple(
     row
@@ -175,20 +174,30 @@ def _check(log: Log) -> None:
             f"{log.path}:{log.lines[back[0] + 1]}: time goes back or stands still "
             f"({log.time_s[back[0] + 1]:.6f} s after {log.time_s[back[0]]:.6f} s). Sort the lines"
         )
+    if log.time_s[-1] > TIME_MAX_S:
+        raise SourceError(
+            f"{log.path}: time_s reaches {log.time_s[-1]:.3g}, which is no time in seconds. Are "
+            "these ms, us or ns? Divide them"
+        )
     if log.time_s[0] < 0:
         raise SourceError(f"{log.path} begins before time 0. Add a constant to time_s everywhere")
     if (gaps := np.flatnonzero(steps > GAP_S)).size:
         at = log.time_s[gaps[0]]
         say(f"{log.path}: {gaps.size} gaps, the first of {steps[gaps[0]]:.1f} s after {at:.3f} s")
-    _warn_of_degrees(log)
+    _warn_of_units(log)
 
 
-def _warn_of_degrees(log: Log) -> None:
-    for name in ("roll_rad", "pitch_rad", "yaw_rate_radps"):
-        most = float(np.abs(log.columns[name]).max())
-        limit = YAW_RATE_MAX_RADPS if name == "yaw_rate_radps" else ANGLE_MAX_RAD
-        if most > limit:
-            say(f"{log.path}: {name} reaches {most:.1f}. Are these degrees? Radians are expected")
+def _warn_of_units(log: Log) -> None:
+    """Doubt columns a tenth of whose values is too large for any small robot."""
+    for doubt in (doubt for row in topics.OWN_SENSORS for doubt in row.doubts):
+        if doubt.field not in log.columns:
+            continue
+        often = float(np.nanquantile(np.abs(log.columns[doubt.field]), 0.9))
+        if often > doubt.over:
+            say(
+                f"{log.path}: {doubt.field}: a tenth is over {often:.3g}. "
+                f"Are these {doubt.perhaps}? {doubt.unit} is expected"
+            )
 
 
 def _check_together(logs: list[Log]) -> None:

@@ -14,6 +14,7 @@ from dmrl.recording.block import Ints
 from dmrl.recording.check_clocks import clocks
 from dmrl.recording.check_labels import labels
 from dmrl.recording.check_seen import HELD, Seen, Size, carries, glimpse, look
+from dmrl.recording.check_units import periods
 from dmrl.recording.contents import Contents
 from dmrl.recording.finding import Finding
 from dmrl.terminal.progress import say
@@ -40,10 +41,10 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
     RecordingError
         If the file is not a complete recording.
     """
-    rules: tuple[Callable[[Seen], Iterator[Finding]], ...] = (_times, _clocks, labels)
+    rules: tuple[Callable[[Seen], Iterator[Finding]], ...] = (_times, _clocks, _units, labels)
     seen = glimpse(Contents(path, *HELD)) if quick else look(path)
     if not quick:
-        rules = _types, _times, _clocks, _images, labels
+        rules = _types, _times, _clocks, _units, _images, labels
     findings = [finding for rule in rules for finding in rule(seen)]
     if not seen.contents.summary.count:
         findings.append(Finding("error", "", "has no messages"))
@@ -105,6 +106,12 @@ def _times(seen: Seen) -> Iterator[Finding]:
 def _clocks(seen: Seen) -> Iterator[Finding]:
     """Times that do not belong together."""
     return (Finding("warning", topic, text) for topic, text in clocks(seen))
+
+
+def _units(seen: Seen) -> Iterator[Finding]:
+    """Values and times that cannot be in the units of their topics."""
+    for topic, text in (*seen.values.doubted(), *periods(seen.times)):
+        yield Finding("warning", topic, text)
 
 
 def _gaps(topic: str, step_ns: Ints) -> Iterator[Finding]:

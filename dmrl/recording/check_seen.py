@@ -14,6 +14,7 @@ from dmrl.images.codec import size
 from dmrl.recording.block import Block, Ints, joined
 from dmrl.recording.blocks import in_file_order
 from dmrl.recording.channel import Channel
+from dmrl.recording.check_units import Sizes
 from dmrl.recording.contents import Contents
 from dmrl.recording.decoded import apart, decoded
 from dmrl.recording.reader import STRETCH_BYTES, columns
@@ -44,6 +45,8 @@ class Seen:
         By topic of images: how many are of which size; the first one's comes first.
     unset
         By topic: how many messages have a time stamp of 0, and stand at another time.
+    values
+        How large what sensors say is.
     """
 
     contents: Contents
@@ -51,6 +54,7 @@ class Seen:
     broken: dict[str, str] = field(default_factory=dict)
     sizes: dict[str, Counter[Size]] = field(default_factory=lambda: defaultdict(Counter))
     unset: Counter[str] = field(default_factory=Counter)
+    values: Sizes = field(default_factory=Sizes)
 
 
 def carries(topic: str, schema: str) -> bool:
@@ -143,6 +147,7 @@ def _decode(seen: Seen, topic: str, block: Block, channels: dict[int, Channel]) 
         return
     if stamped and "timestamp" in batch.schema.names:
         seen.unset[topic] += _unset(batch)
+    seen.values.add(topic, batch)
     if names(CAMERA_IMAGE, topic):
         seen.sizes[topic].update(_size(data.as_buffer()) for data in batch["data"])
 

@@ -148,10 +148,19 @@ def warned(folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
 def test_degrees_are_warned_of(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert warned(flight, capsys) == []
     data = rows()
-    data[5][1] = -8.0
+    for row in data[::5]:
+        row[1] = -8.0
     write(flight, "cf2", data)
     (line,) = warned(flight, capsys)
-    assert line.endswith("roll_rad reaches 8.0. Are these degrees? Radians are expected")
+    assert line.endswith("roll_rad: a tenth is over 8. Are these degrees? rad is expected")
+
+
+def test_times_that_no_clock_shows_in_seconds_are_refused(flight: Path) -> None:
+    data = rows()
+    for row in data:
+        row[0] *= 1e12
+    write(flight, "cf2", data)
+    assert "which is no time in seconds. Are these ms, us or ns? Divide them" in refused(flight)
 
 
 def test_gaps_are_warned_of(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:

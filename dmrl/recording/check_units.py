@@ -1,0 +1,71 @@
+"""Are a recording's values in the units of their topics? Topic and text of what cannot be.
+
+How large values are is counted while they pass, in powers of two, so that it takes no memory.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from dmrl.topics import SENSORS, Doubt, names
+
+RARELY_S, OFTEN_S = 5.0, 1e-5
+"""Usual periods of a sensor beyond which its times are doubted."""
+FEW = 20
+"""Fewer messages have no usual period, and no usual size."""
+STEPS = 4
+"""Bins for each power of two."""
+BINS, ZERO = 2048, 1024
+Times = NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Sizes:
+    """How large the values of sensors are, by topic and field, in bins of their logarithm."""
+
+    counts: dict[tuple[str, str], NDArray[np.int64]] = field(
+        default_factory=lambda: defaultdict(lambda: np.zeros(BINS, np.int64))
+    )
+
+    def add(self, topic: str, batch: pa.RecordBatch) -> None:
+        """Count values of a topic."""
+        for doubt in _doubts(topic):
+            if doubt.field in batch.schema.names:
+                size = np.abs(batch[doubt.field].to_numpy(zero_copy_only=False).astype(float))
+                size = size[np.isfinite(size) & (size > 0)]
+                place = np.floor(np.log2(size) * STEPS).astype(int) + ZERO
+                counted = np.bincount(np.clip(place, 0, BINS - 1), minlength=BINS)
+                self.counts[topic, doubt.field] += counted
+
+    def doubted(self) -> Iterator[tuple[str, str]]:
+        """Fields a tenth of whose values is beyond what their unit explains."""
+        for (topic, name), counts in self.counts.items():
+            total = int(counts.sum())
+            doubt = next(doubt for doubt in _doubts(topic) if doubt.field == name)
+            beyond = int(counts[int(np.floor(np.log2(doubt.over) * STEPS)) + ZERO + 1 :].sum())
+            if total >= FEW and beyond * 10 > total:
+                yield (
+                    topic,
+                    f"{name}: {beyond / total:.0%} of the values are over {doubt.over:g} "
+                    f"{doubt.unit}. Are they {doubt.perhaps}?",
+                )
+
+
+def periods(times: Mapping[str, Times]) -> Iterator[tuple[str, str]]:
+    """Sensors that measure so rarely, or so often, that their times are of another unit."""
+    for topic, time_ns in times.items():
+        if len(time_ns) < FEW or not any(names(row.pattern, topic) for row in SENSORS):
+            continue
+        period_s = float(np.median(np.diff(np.sort(time_ns)))) * 1e-9
+        if period_s > RARELY_S:
+            yield topic, f"one message in {period_s:.3g} s. Were its times in ms, us or ns?"
+        elif 0 < period_s < OFTEN_S:
+            yield topic, f"one message in {period_s:.3g} s. Were its times in s, ms or us?"
+
+
+def _doubts(topic: str) -> tuple[Doubt, ...]:
+    return next((row.doubts for row in SENSORS if names(row.pattern, topic)), ())
