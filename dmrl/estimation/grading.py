@@ -21,15 +21,11 @@ The likeliest is a fifth too low and scatters by a tenth, so that the flights th
 would be believed too much: sensors are taken for the default's unless they are clearly better.
 A flight shows a scale once at most: real flow with little noise was seen to be 7 % off."""
 
-CLEARLY, USUAL = (5.0, 30.0), 0.85
-"""By so much more evidence, a logarithm, than the default's a better grade is not believed at all,
-and wholly: half a minute tells little. What is not believed counts as the second, which the
-default's sensors mostly seem to have."""
 FADING_M, FADING_S = (0.03, 0.06), 1.0
 """Errors of ranges that fade, as where reflections or antennas make them: 0.1 m, and gone after one
 or two seconds, was seen between robots on the ground. Standard deviations that are tried."""
 SURE, TAILED = 15.0, 2.0
-"""So much more evidence it takes: clean ranges were seen to have some. Steps with Cauchy's loss
+"""So much more evidence, a logarithm, it takes: clean ranges were seen to have some. Steps with Cauchy's loss
 leave half of their spread to its tails."""
 NOISIER, NOTICED = 4, 1.1
 """So often ranges may turn out noisier, and by how much for another solve: less of what is wrong
@@ -96,11 +92,7 @@ def _graded(
     bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
     likeliest, velocity, constants = TAKEN
-    better = float(np.interp(tried[best] - tried[GRADES.index(1.0)], CLEARLY, (0.0, 1.0)))
-    believed = max(peak, USUAL) ** (1 - better) * peak**better
-    grades_taken = [
-        float(np.interp(believed, likeliest, grades)) for grades in (velocity, constants)
-    ]
+    grades_taken = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
     return noise.graded(*grades_taken), best, tried[best], solved[best]
 
 

@@ -60,7 +60,7 @@ class Noise:
     range_error_std_m: float = 0.02
     range_tau_s: float = 200.0
     jump: float = 1.0
-    bias_std_m: float = 0.20
+    bias_std_m: float = 0.15
     scale_std: float = 0.02
     gyro_std_radps: float = 0.003
     velocity_scale_std: float = 0.05

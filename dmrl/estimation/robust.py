@@ -16,7 +16,7 @@ MOTION = 25.0
 """Limit of the motion's residuals: five sigmas are no noise."""
 
 SQUARE = 1e9
-PRIOR: Array = np.array([4.0, SQUARE, 4.0, 4.0, *[SQUARE] * 6, 4.0])
+PRIOR: Array = np.array([SQUARE, SQUARE, 4.0, 4.0, *[SQUARE] * 6, 4.0])
 """Limits of what is constant, as in ``GLOBALS``. Biases of yaw rates and clocks are mostly small,
 and at times not at all. A scale that may be anything would shrink the path away."""
 
