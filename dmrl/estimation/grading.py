@@ -25,8 +25,8 @@ FADING_M, FADING_S = (0.03, 0.06), 1.0
 """Errors of ranges that fade, as where reflections or antennas make them: 0.1 m, and gone after one
 or two seconds, was seen between robots on the ground. Standard deviations that are tried."""
 SURE, TAILED = 15.0, 2.0
-"""So much more evidence, a logarithm, it takes: clean ranges were seen to have some. Steps with Cauchy's loss
-leave half of their spread to its tails."""
+"""So much more evidence, a logarithm, it takes: clean ranges were seen to have some. Steps with
+Cauchy's loss leave half of their spread to its tails."""
 NOISIER, NOTICED = 4, 1.1
 """So often ranges may turn out noisier, and by how much for another solve: less of what is wrong
 with them hides in the solution each time."""
