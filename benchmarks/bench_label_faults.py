@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import GATE_M, OK, statuses
 from dmrl.estimation.pair import RATE_HZ, Mask, Pair, usable_ranges
 from dmrl.estimation.score import CHI2_95_OF_2, GOOD_M, Judged, squared_distances

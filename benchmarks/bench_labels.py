@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import AMBIGUOUS, OK, probability_beyond
 from dmrl.estimation.pair import Mask, Pair, Track, usable_ranges
 from dmrl.estimation.score import GOOD_M, Figures, Judged, figures, overall

@@ -9,19 +9,16 @@ and the whole flight contradicts it, the stretch counts.
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import chi2
 
 from dmrl.estimation.confidence import path_of
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array, Mask, Pair, Track
 from dmrl.estimation.problem import Problem
-
-if TYPE_CHECKING:
-    from dmrl.estimation.estimate import Estimate
 
 SILENCE_S = 3.0
 """Ranges or odometry that are silent for so long part a flight."""
@@ -32,7 +29,7 @@ INSIDE, CONTRADICTED = 0.99, 0.2
 that one's 99 % ellipse."""
 
 
-def contradicts(whole: "Estimate", sure: "Estimate") -> bool:
+def contradicts(whole: Estimate, sure: Estimate) -> bool:
     """Whether one solution lies where another, where it was sure, says that nobody was.
 
     Parameters
@@ -75,7 +72,7 @@ def stretches(pair: Pair) -> list[Pair]:
     return [part for part in made if len(part.range_m) >= LEAST_RANGES]
 
 
-def joined(flight: Problem, parts: "Sequence[Estimate]") -> Array:
+def joined(flight: Problem, parts: Sequence[Estimate]) -> Array:
     """(K, 6) states of a flight that stretches of it say, by dead reckoning in between.
 
     Parameters
@@ -106,7 +103,7 @@ def joined(flight: Problem, parts: "Sequence[Estimate]") -> Array:
     return np.column_stack([xy, state[:, 2], np.zeros((len(key_s), 2)), _errors(key_s, parts)])
 
 
-def _errors(key_s: Array, parts: "Sequence[Estimate]") -> Array:
+def _errors(key_s: Array, parts: Sequence[Estimate]) -> Array:
     """(K,) by how much ranges were too long, as the stretches found; 0 between them."""
     out = np.zeros(len(key_s))
     for part in parts:
@@ -117,8 +114,8 @@ def _errors(key_s: Array, parts: "Sequence[Estimate]") -> Array:
 
 
 def mended(
-    both: "tuple[Estimate, Estimate]", parts: "Sequence[tuple[Estimate, Estimate]]"
-) -> "tuple[Estimate, Estimate]":
+    both: tuple[Estimate, Estimate], parts: Sequence[tuple[Estimate, Estimate]]
+) -> tuple[Estimate, Estimate]:
     """Both directions of a pair, with the stretches that are surer alone.
 
     Parameters
@@ -135,7 +132,7 @@ def mended(
     return here, there
 
 
-def _with(whole: "Estimate", part: "Estimate") -> "Estimate":
+def _with(whole: Estimate, part: Estimate) -> Estimate:
     """The whole flight's solution with that of a part of it."""
     at = (whole.time_s >= part.time_s[0]) & (whole.time_s <= part.time_s[-1])
     time_s = whole.time_s[at]

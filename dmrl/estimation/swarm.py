@@ -10,7 +10,8 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from dmrl.estimation.confidence import RESTLESS_S, noise_energy, shrunk
-from dmrl.estimation.estimate import STILL, Estimate
+from dmrl.estimation.estimate import STILL
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, statuses
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO

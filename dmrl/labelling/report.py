@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.estimation.estimate import Estimate, Refused
+from dmrl.estimation.estimated import Estimate, Refused
 from dmrl.estimation.gate import OK
 from dmrl.estimation.linear import (
     BIAS,

@@ -19,7 +19,8 @@ from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs
+    from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
+    from dmrl.estimation.estimated import Estimate
     from dmrl.estimation.gate import GATE_M
     from dmrl.estimation.pair import Pair
     from dmrl.estimation.swarm import estimate_swarm

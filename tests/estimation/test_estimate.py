@@ -7,7 +7,8 @@ import pytest
 
 from dmrl import messages
 from dmrl.estimation import gate as room
-from dmrl.estimation.estimate import Estimate, estimate_ekf, estimate_pairs, from_peer, swapped
+from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
+from dmrl.estimation.estimated import Estimate, from_peer, swapped
 from dmrl.estimation.pair import Pair, Track
 from dmrl.estimation.problem import Noise
 from dmrl.flight import Trajectory

@@ -2,7 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dmrl.estimation.estimate import Estimate, estimate_pairs
+from dmrl.estimation.estimate import estimate_pairs
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK
 from dmrl.estimation.grading import FADING_S
 from dmrl.estimation.pair import Pair

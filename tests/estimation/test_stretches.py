@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dmrl.estimation.estimate import Estimate
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK, UNCONVERGED
 from dmrl.estimation.pair import Pair
 from dmrl.estimation.problem import GLOBALS, Noise, problem

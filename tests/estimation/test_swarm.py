@@ -7,7 +7,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from dmrl.estimation.estimate import Estimate, estimate_pairs
+from dmrl.estimation.estimate import estimate_pairs
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import AMBIGUOUS, OK
 from dmrl.estimation.pair import Pair
 from dmrl.estimation.stretches import contradicts

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.estimate import Estimate
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.problem import GLOBALS, Noise
 from dmrl.labelling.report import doubts, refusal
 

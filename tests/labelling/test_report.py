@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.estimation.estimate import Estimate
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.report import PairReport, pair_report

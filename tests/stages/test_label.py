@@ -7,7 +7,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
-from dmrl.estimation.estimate import Estimate
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.pair import Pair, Track
 from dmrl.estimation.problem import Noise
 from dmrl.flight import NOISE
