@@ -9,6 +9,7 @@ labelling and the table in README.md follow it.
 import re
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 from dmrl.border.names import topic_part
 
@@ -41,20 +42,10 @@ class Curve:
         return {f"{topic}/{field}": (field,) for field in self.fields}
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """Values of a sensor that no small robot keeps up: of another unit, as a rule.
+class Doubt(NamedTuple):
+    """Values of which a tenth is too large for a small robot: ``perhaps`` of another unit.
 
-    Parameters
-    ----------
-    field
-        Of the message.
-    over
-        A tenth of the values beyond this, plus or minus, is doubted.
-    unit
-        Of the field.
-    perhaps
-        The unit that they may be in.
+    ``field`` of the message, in ``unit``; ``over`` that, plus or minus, it is doubted.
     """
 
     field: str
