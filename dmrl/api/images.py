@@ -30,17 +30,20 @@ class Images(Sequence[Rgb]):
         Log time from which seconds count, nanoseconds.
     time_ns
         (N,) log times of the images, sorted.
+    kept
+        What keeps a temporary recording there as long as this.
     """
 
     path: Path
     topic: str
     start_ns: int
     time_ns: NDArray[np.int64]
+    kept: object = None
 
     @classmethod
-    def of(cls, path: Path, topic: str, start_ns: int) -> "Images":
+    def of(cls, path: Path, topic: str, start_ns: int, kept: object = None) -> "Images":
         """All images on a topic."""
-        return cls(path, topic, start_ns, log_times(path, [topic])[topic])
+        return cls(path, topic, start_ns, log_times(path, [topic])[topic], kept)
 
     @property
     def time_s(self) -> NDArray[np.float64]:

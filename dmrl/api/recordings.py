@@ -33,6 +33,13 @@ if TYPE_CHECKING:
 PathLike = str | os.PathLike[str]
 
 
+class _Kept:
+    """A temporary folder, there as long as somebody holds this."""
+
+    def __init__(self, folder: Path) -> None:
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+
+
 class Recording:
     """A recording, opened: its summary is read, its messages only when they are asked for.
 
@@ -41,7 +48,7 @@ class Recording:
     path
         A whole .mcap file.
     temporary
-        Folder that it lies in and that goes with this object. None: it stays.
+        Folder that it lies in, which goes with this object and its topics. None: it stays.
 
     Raises
     ------
@@ -52,8 +59,7 @@ class Recording:
     def __init__(self, path: PathLike, temporary: Path | None = None) -> None:
         self.path = Path(path)
         self._summary = summary(self.path)
-        if temporary is not None:
-            weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
+        self._kept = None if temporary is None else _Kept(temporary)
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -94,7 +100,7 @@ class Recording:
         """
         if topic not in self.topics:
             raise MissingTopic(topic, self.topics, self.path)
-        return Topic(self.path, topic, self.topics[topic], self.start_ns)
+        return Topic(self.path, topic, self.topics[topic], self.start_ns, self._kept)
 
     def __contains__(self, topic: object) -> bool:
         return topic in self.topics
@@ -143,7 +149,7 @@ class Recording:
             raise SettingError(f"{self.path} has images of {', '.join(filming)}. Name one of them")
         topic = topics.camera_image(robot or (filming[0] if filming else "*"))
         matching(self.path, [topic])
-        return Images.of(self.path, topic, self.start_ns).between(start_s, end_s)
+        return Images.of(self.path, topic, self.start_ns, self._kept).between(start_s, end_s)
 
     def labels(self, robot: str | None = None) -> "pd.DataFrame":
         """A row per labelled peer of an image: where it is, its sigmas, status and source.

@@ -64,11 +64,15 @@ class Topic:
         Its message type and number of messages.
     start_ns
         Log time from which seconds count, nanoseconds.
+    kept
+        What keeps a temporary recording there as long as this.
     """
 
-    def __init__(self, path: Path, name: str, info: TopicInfo, start_ns: int) -> None:
+    def __init__(
+        self, path: Path, name: str, info: TopicInfo, start_ns: int, kept: object = None
+    ) -> None:
         self.path, self.name = path, name
-        self._info, self._start_ns = info, start_ns
+        self._info, self._start_ns, self._kept = info, start_ns, kept
 
     @property
     def schema(self) -> str:

@@ -30,6 +30,17 @@ def test_a_recording_without_a_name_lives_as_long_as_its_object(flight: Path) ->
     assert not path.exists()
 
 
+def test_topics_and_images_keep_a_temporary_recording_there(flight: Path) -> None:
+    topic = dmrl.trim(flight, from_s=1.0, to_s=2.0)["/cf1/height"]
+    images = dmrl.trim(flight, from_s=1.0, to_s=2.0).images("cf1")[:1]
+    gc.collect()
+    assert len(topic.to_numpy()) == len(topic) and len(images[0]) == 224
+    paths = [topic.path, images.path]
+    del topic, images
+    gc.collect()
+    assert not any(path.exists() for path in paths)
+
+
 def test_wrong_settings_are_said(flight: Path) -> None:
     with pytest.raises(RecipeError, match="gate: "):
         dmrl.label(flight, gate=0.4)
