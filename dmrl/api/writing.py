@@ -169,19 +169,7 @@ class Writer:
 
 
 def writer(path: PathLike, /, **settings: Any) -> Writer:
-    """A recording to write.
-
-    Parameters
-    ----------
-    path
-        File to write. Must not exist.
-    settings
-        What made it, as plain values; they stand in its provenance.
-
-    Raises
-    ------
-    OutputError
-        If the file exists, is not called ``.mcap``, or cannot be written.
+    """A recording to write; parameters and errors as those of `Writer`.
 
     Examples
     --------

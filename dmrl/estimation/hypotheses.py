@@ -130,6 +130,13 @@ def spread_of(cost: Array, states: Array) -> Array:
     return np.asarray(np.einsum("s,ski,skj->kij", share / share.sum(), apart, apart))
 
 
+def _passes(state: Array, rate_hz: float, within_m: float) -> tuple[Array, NDArray[np.intp]]:
+    """(K,) distances of the peer, and the keyframes at which it is nearest and so near."""
+    distance = np.hypot(*state[:, :2].T)
+    least = minimum_filter1d(distance, 2 * round(rate_hz) + 1)
+    return distance, np.flatnonzero((distance == least) & (distance < within_m))
+
+
 def mirrored(state: Array, rate_hz: float) -> list[Array]:
     """Copies of a solution with the peer on the other side between two close passes.
 
@@ -140,9 +147,7 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
     rate_hz
         Keyframes per second.
     """
-    distance, second = np.hypot(*state[:, :2].T), round(rate_hz)
-    least = minimum_filter1d(distance, 2 * second + 1)
-    passes = np.flatnonzero((distance == least) & (distance < PASS_M))
+    second, (_, passes) = round(rate_hz), _passes(state, rate_hz, PASS_M)
     between = sorted(pairwise(passes.tolist()), key=lambda ends: ends[1] - ends[0])
     out = []
     for start, end in between[:MIRRORED]:
@@ -164,9 +169,7 @@ def passed_by(state: Array, rate_hz: float) -> list[Array]:
     rate_hz
         Keyframes per second.
     """
-    distance, second = np.hypot(*state[:, :2].T), round(rate_hz)
-    least = minimum_filter1d(distance, 2 * second + 1)
-    passes = np.flatnonzero((distance == least) & (distance < BESIDE_M))
+    distance, passes = _passes(state, rate_hz, BESIDE_M)
     out = []
     for at in passes[np.argsort(distance[passes])].tolist():
         farther = np.flatnonzero(distance > distance[at] + ROUND_M)
