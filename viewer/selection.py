@@ -129,8 +129,7 @@ class Selection:
 
     def found(self, pattern: str) -> list[dict[str, str]]:
         """Robots and peers of the topics of a pattern that hold messages, sorted."""
-        every = {t for kept in self.recordings.values() for t, i in kept.topics.items() if i.count}
-        names = (topics.names(pattern, topic) for topic in sorted(every))
+        names = (topics.names(pattern, topic) for topic in _topics_of(self.recordings))
         return [n for n in names if n is not None]
 
     def pairs(self, robot: str | None) -> list[Names]:
@@ -151,7 +150,23 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
     """
     found = {path: summary(path) for path in dict.fromkeys(paths)}
     names = ", ".join(str(path) for path in found)
-    every = sorted({t for kept in found.values() for t, info in kept.topics.items() if info.count})
+    layout, robots = _layout(_topics_of(found), names, settings)
+    whole = _whole(found)
+    asked = _asked(settings, whole)
+    image_ns = _image_times(found, robots, *asked)
+    chosen = {r: times[:: settings.every] for r, times in image_ns.items() if times.size}
+    lasts = max(asked[0], whole[0]) < min(asked[1], whole[1])
+    if not lasts or (layout in OF_IMAGES and not chosen):
+        raise SettingError(
+            f"no image of {names} in that time; it lasts from 0 to "
+            f"{(whole[1] - 1 - whole[0]) / 1e9:.3f} s. Change --from-s or --to-s"
+        )
+    shown = _shown(layout, chosen, asked, whole)
+    return Selection(found, layout, whole[0], shown, chosen, settings.every == 1)
+
+
+def _layout(every: list[str], names: str, settings: Settings) -> tuple[Layout, list[str]]:
+    """How topics are shown, and of which robots the images."""
     layout = settings.layout if settings.layout != "auto" else _fitting(every)
     if layout == "dataset":
         raise SettingError(f"{names}: layout dataset is for datasets. Make one: dmrl dataset")
@@ -162,19 +177,18 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
         )
     if settings.robot is None:
         _say_blind(every)
+    return layout, robots
+
+
+def _topics_of(found: Mapping[Path, Summary]) -> list[str]:
+    """Topics that hold messages, sorted."""
+    return sorted({t for kept in found.values() for t, info in kept.topics.items() if info.count})
+
+
+def _whole(found: Mapping[Path, Summary]) -> tuple[int, int]:
+    """Log times [first, end) of all that the recordings hold; one of them at least holds some."""
     held = [kept for kept in found.values() if kept.count]
-    whole = min(kept.start_ns for kept in held), max(kept.end_ns for kept in held) + 1
-    asked = _asked(settings, whole)
-    image_ns = _image_times(found, robots, *asked)
-    chosen = {r: times[:: settings.every] for r, times in image_ns.items() if times.size}
-    empty = max(asked[0], whole[0]) >= min(asked[1], whole[1])
-    if empty or (robots and not chosen and layout in OF_IMAGES):
-        raise SettingError(
-            f"no image of {names} in that time; it lasts from 0 to "
-            f"{(whole[1] - 1 - whole[0]) / 1e9:.3f} s. Change --from-s or --to-s"
-        )
-    shown = _shown(layout, chosen, asked, whole)
-    return Selection(found, layout, whole[0], shown, chosen, settings.every == 1)
+    return min(kept.start_ns for kept in held), max(kept.end_ns for kept in held) + 1
 
 
 def _asked(settings: Settings, whole: tuple[int, int]) -> tuple[int, int]:

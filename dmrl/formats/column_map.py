@@ -137,21 +137,30 @@ def _faults(key: str, table: Any) -> Iterator[str]:
     if units is None:
         near = get_close_matches(key, QUANTITIES, n=1)
         yield f"[{key}]: no such quantity" + (f", did you mean {near[0]}?" if near else "")
-        return
-    if not isinstance(table, dict):
+    elif not isinstance(table, dict):
         yield f"{key}: no table with name and unit"
-        return
-    yield from (f"[{key}] {name}: no such key" for name in table if name not in KEYS)
-    if not (isinstance(table.get("name"), str) and table["name"]):
-        yield f"[{key}] name: not the name of a column"
-    if table.get("unit", "1" if units is PLAIN else None) not in units:
-        yield f"[{key}] unit: not one of {', '.join(units)}"
-    if table.get("sign", 1) not in (1, -1) or isinstance(table.get("sign"), bool):
-        yield f"[{key}] sign: not 1 or -1"
-    if units is SPEED and table.get("frame") not in FRAMES:
-        yield f"[{key}] frame: not one of {', '.join(FRAMES)}"
+    else:
+        wrong = {name: "no such key" for name in table if name not in KEYS}
+        wrong |= _wrong_values(units, table)
+        yield from (f"[{key}] {name}: {what}" for name, what in wrong.items())
+
+
+def _wrong_values(units: Mapping[str, float], table: Mapping[str, Any]) -> dict[str, str]:
+    """What is wrong with the values of a quantity's table, by their keys."""
+    wrong = {}
+    name, unit, sign, frame = (table.get(key) for key in KEYS)
+    if not (isinstance(name, str) and name):
+        wrong["name"] = "not the name of a column"
+    has_unit = unit is not None or units is not PLAIN  # a plain number needs none
+    if has_unit and unit not in tuple(units):
+        wrong["unit"] = f"not one of {', '.join(units)}"
+    if "sign" in table and (isinstance(sign, bool) or sign not in (1, -1)):
+        wrong["sign"] = "not 1 or -1"
+    if units is SPEED and frame not in FRAMES:
+        wrong["frame"] = f"not one of {', '.join(FRAMES)}"
     if units is not SPEED and "frame" in table:
-        yield f"[{key}] frame: of velocities only"
+        wrong["frame"] = "of velocities only"
+    return wrong
 
 
 def _column(units: Mapping[str, float], table: Mapping[str, Any]) -> Column:

@@ -8,10 +8,11 @@ import multiprocessing
 import os
 import signal
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -165,29 +166,40 @@ def _others(size: int, work: Work[Any]) -> Iterator[str]:
     with tempfile.TemporaryDirectory() as folder:
         meeting = (Path(folder) / "meeting").as_uri()
         started = [_start(meeting, rank, size, work) for rank in range(1, size)]
+        processes = [process for _, process in started]
         try:
             for ready, _ in started:
                 ready.recv()
             yield meeting
-            for _, process in started:
-                process.join(LAST_WORDS_S)
+            _wait_for(processes, LAST_WORDS_S)
         except (EOFError, RuntimeError, SettingError) as e:
-            for _, process in started:
-                process.join(LAST_WORDS_S / size)
-            # One that raised has said so itself, or fails because this one did.
-            if all((process.exitcode or 0) >= 0 for _, process in started):
+            # What was seen here may come of one that is gone: then that is what is said. One that
+            # raised has said so itself, or fails because this one did.
+            if not _any_killed(processes):
                 raise
             raise SettingError(
                 f"one of the {size} processes was killed, for want of memory perhaps. "
                 "Go on with --resume, or begin again with fewer --processes"
             ) from e
         finally:
-            for _, process in started:
+            for process in processes:
                 process.kill()
                 process.join()
 
 
-def _start(meeting: str, rank: int, size: int, work: Work[Any]) -> tuple[Connection, Any]:
+def _wait_for(processes: Sequence[SpawnProcess], seconds: float) -> None:
+    """Until all have ended, each for so long."""
+    for process in processes:
+        process.join(seconds)
+
+
+def _any_killed(processes: Sequence[SpawnProcess]) -> bool:
+    """Whether a signal ended one: only then is its exit code negative."""
+    _wait_for(processes, LAST_WORDS_S / (len(processes) + 1))
+    return any((process.exitcode or 0) < 0 for process in processes)
+
+
+def _start(meeting: str, rank: int, size: int, work: Work[Any]) -> tuple[Connection, SpawnProcess]:
     here, there = SPAWN.Pipe(duplex=False)
     process = SPAWN.Process(target=_follow, args=(there, meeting, rank, size, work), daemon=True)
     process.start()

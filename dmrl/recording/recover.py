@@ -195,31 +195,41 @@ def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord | _
     """Where they start and whole records up to the footer, over what is damaged between."""
     known = sorted(start for start, _ in places(walk.end))
     at = len(MAGIC)
-    while at < stream.size:
+    while at < stream.size and not walk.footer:
         later = bisect_right(known, at)
         edge = known[later] if later < len(known) else stream.size
         try:
-            stream.seek(at)
-            opcode, length = RECORD.unpack(stream.read(RECORD.size))
-            end = at + RECORD.size + length
-            if end > edge:
-                raise McapError("it runs into the next record that is known")
-            record = _parsed(opcode, stream.read(length), walk)
-            walk.data_ended |= opcode == Opcode.DATA_END
-            if walk.data_ended and opcode in (Opcode.CHUNK, Opcode.MESSAGE):
-                walk.recovery.doubtful = True  # no writer puts them there
-            if opcode == Opcode.DATA_END and walk.end.statistics is None:
-                walk.end = _end(walk.path, stream, end)
-        except DAMAGE:
+            record, end = _record_at(stream, walk, at, edge)
+        except DAMAGE:  # the next record that is known is where reading goes on
             walk.recovery.lost_bytes += edge - at
             at = edge
             continue
-        if opcode == Opcode.FOOTER:
-            walk.footer = True
-            return
         if record is not None:
             yield at, record
         at = end
+
+
+def _record_at(
+    stream: Bounded, walk: _Walk, at: int, edge: int
+) -> tuple[McapRecord | _Indexed | None, int]:
+    """The record that starts here, None if it is of no use, and where it ends.
+
+    One that would end after ``edge`` is damaged: there starts a record that is known.
+    """
+    stream.seek(at)
+    opcode, length = RECORD.unpack(stream.read(RECORD.size))
+    end = at + RECORD.size + length
+    if end > edge:
+        raise McapError("it runs into the next record that is known")
+    record = _parsed(opcode, stream.read(length), walk)
+    if opcode == Opcode.DATA_END:
+        walk.data_ended = True
+        if walk.end.statistics is None:
+            walk.end = _end(walk.path, stream, end)
+    elif walk.data_ended and opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+        walk.recovery.doubtful = True  # no writer puts them there
+    walk.footer |= opcode == Opcode.FOOTER
+    return record, end
 
 
 _KINDS: dict[int, type[Any]] = {
