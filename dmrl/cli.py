@@ -44,6 +44,8 @@ COMMANDS = {
     "report": "Show what a folder comes to, as one HTML page that needs nothing else.",
     "info": "Show what a recording holds and where it comes from.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",
+    "index": "List what a folder's recordings hold in one table, catalogue.parquet, for dmrl find.",
+    "find": "Find recordings by what they hold: what dmrl index wrote, asked in SQL.",
     "recover": "Bring back the messages of a recording that was cut short.",
     "merge": "Merge recordings into one, by time.",
     "trim": "Keep a stretch of a recording, or some of its topics.",

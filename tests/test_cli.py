@@ -25,7 +25,7 @@ HEAVY = {
 OPTIONAL = (
     *("torch", "safetensors", "tensorboard", "h5py", "rerun", "rerun_cli", "matplotlib", "pandas"),
     *("filterpy", "datasets", "foxglove_schemas_protobuf", "grpc_tools", "mcap_protobuf"),
-    *("onnx", "onnxruntime"),
+    *("onnx", "onnxruntime", "duckdb"),
 )
 STAGES = Path(cli.__file__).parent / "stages"
 

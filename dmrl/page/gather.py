@@ -6,7 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from dmrl.border.documents import parse_json
+from dmrl.catalogue import NAME as CATALOGUE
+from dmrl.catalogue import open_catalogue
 from dmrl.datasets import is_dataset
 from dmrl.errors import DmrlError, SettingError
 from dmrl.recording import Provenance, Summary, summary
@@ -21,6 +25,8 @@ DOCUMENTS = {
 }
 """Names of files that say what an output folder is, and what it is here."""
 MOST_FILES, MOST_BYTES, DEEPEST = 20_000, 16 << 20, 6
+MANY = 100
+"""Recordings of a catalogue from which on they are told of together, and not opened."""
 PICTURE_KINDS = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -40,6 +46,8 @@ class Found:
         Of each kind of `DOCUMENTS`: the document of an output.
     pictures
         Pictures that lie beside outputs rather than in one.
+    catalogues
+        Their tables, of `dmrl.catalogue`.
     made
         How each output was made, where it says so.
     unread
@@ -51,6 +59,7 @@ class Found:
     datasets: dict[str, Path] = field(default_factory=dict)
     documents: dict[str, dict[str, Mapping[str, Any]]] = field(default_factory=dict)
     pictures: list[Path] = field(default_factory=list)
+    catalogues: dict[str, pa.Table] = field(default_factory=dict)
     made: dict[str, Provenance] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
 
@@ -70,12 +79,17 @@ def gather(folder: Path) -> Found:
     if not folder.is_dir():
         raise SettingError(f"{folder} is no folder. Name one with recordings, models, evaluations")
     found = Found(folder)
-    for path in _files(folder):
+    files = list(_files(folder))
+    together: set[Path] = set()
+    for path in sorted(files, key=lambda path: path.name != CATALOGUE):
         try:
-            _take(found, path)
+            if path.name == CATALOGUE:
+                together |= _listed(found, path)
+            elif path not in together:
+                _take(found, path)
         except (DmrlError, ValueError, OSError) as e:
             found.unread[_name(found, path)] = str(e)
-    if not (found.recordings or found.datasets or found.documents):
+    if not (found.recordings or found.datasets or found.documents or found.catalogues):
         raise SettingError(
             f"{folder} holds no recording, dataset, model or evaluation. Try: dmrl demo"
         )
@@ -115,6 +129,14 @@ def _take(found: Found, path: Path) -> None:
             _remember(found, root)
     elif path.suffix.lower() in PICTURE_KINDS and path.parent == found.folder:
         found.pictures.append(path)
+
+
+def _listed(found: Found, path: Path) -> set[Path]:
+    """Keep a catalogue; its recordings, if they are many."""
+    table = open_catalogue(path.parent).table
+    found.catalogues[_name(found, path)] = table
+    names = table["recording"].to_pylist() if table.num_rows > MANY else []
+    return {path.parent / name for name in names}
 
 
 def _remember(found: Found, output: Path) -> None:

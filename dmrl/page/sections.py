@@ -16,6 +16,7 @@ from dmrl.page import document as html
 from dmrl.page.ancestry import ancestry
 from dmrl.page.document import Pictures, chart, row, table, text
 from dmrl.page.gather import Found
+from dmrl.page.listed import listed
 from dmrl.plots import charts
 from dmrl.topics import robots
 
@@ -49,6 +50,7 @@ def page(found: Found) -> str:
         ("int8", _int8(found, pictures)),
         ("Datasets", _datasets(found, pictures)),
         ("Pictures", row(pictures.figure(path, path.name) for path in found.pictures[:MOST_SHOWN])),
+        ("Catalogue", "".join(listed(*one) for one in found.catalogues.items())),
         ("Recordings", _recordings(found)),
         ("Where it comes from", _origin(found)),
         ("Not read", table(("file", "why"), found.unread.items()) if found.unread else ""),
@@ -58,6 +60,7 @@ def page(found: Found) -> str:
 
 def _lead(found: Found) -> str:
     counts = {
+        "catalogue": len(found.catalogues),
         "recording": len(found.recordings),
         "dataset": len(found.datasets),
         "model": len(found.of("models")),

@@ -311,6 +311,24 @@ def _explain(
         )
 
 
+def _found(folders: Iterable[Path], query: str) -> list[Path]:
+    """Recordings of indexed folders that a query is true of.
+
+    Raises
+    ------
+    RecordingError
+        If a folder has no catalogue, or one of them has changed since.
+    SettingError
+        If the query is wrong, or true of none.
+    """
+    from dmrl.catalogue.query import found_in  # noqa: PLC0415 - an extra
+
+    paths = [path for folder in folders for path in found_in(folder, query)]
+    if not paths:
+        raise SettingError(f"--from-index {query!r} is true of no recording. Ask: dmrl find")
+    return paths
+
+
 DEFAULTS = Settings()
 
 
@@ -320,6 +338,7 @@ def command(
     /,
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    from_index: str | None = None,
     workers: Workers = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
@@ -331,12 +350,16 @@ def command(
         Recordings with images and labels, or folders of them.
     out
         Folder to write. Must not exist.
+    from_index
+        Of the recordings in folders that dmrl index has seen, only those that this is true of, such
+        as 'camera = "cf1" and ok_labels > 100'; see dmrl find.
     workers
         Threads that decode images. Without it, as many as there are cores. Changes no byte.
     as_json
         Print one JSON document in place of the tables.
     """
-    result = run(all_recordings(recordings), out, settings, workers=workers)
+    named = all_recordings(recordings) if from_index is None else _found(recordings, from_index)
+    result = run(named, out, settings, workers=workers)
     left_out = {why: count for why, count in result.tally.left_out().items() if count}
     if as_json:
         document = {"dataset": str(out), "images": result.images}

@@ -35,6 +35,7 @@ EXTRAS = {
     "table": "dmrl convert --to csv",
     "record": "dmrl record; cflib: GPL-3.0",
     "deploy": "ONNX: dmrl export, predict",
+    "index": "dmrl find, dataset --from-index",
 }
 """What each extra of pyproject.toml is for."""
 DRIVERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")

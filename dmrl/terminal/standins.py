@@ -16,7 +16,19 @@ from typing import Any
 
 PACKAGES = frozenset(
     {
-        *("PIL", "bpy", "cflib", "cv2", "filterpy", "google", "h5py", "lz4", "matplotlib", "mcap"),
+        *(
+            "PIL",
+            "bpy",
+            "cflib",
+            "cv2",
+            "duckdb",
+            "filterpy",
+            "google",
+            "h5py",
+            "lz4",
+            "matplotlib",
+            "mcap",
+        ),
         *("numpy", "onnx", "onnxruntime", "packaging", "pandas", "pyarrow", "pydantic", "rerun"),
         *("rerun_cli", "rosbags", "safetensors", "scipy", "tensorboard", "tomli_w", "torch"),
         *("zstandard",),

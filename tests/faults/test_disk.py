@@ -20,7 +20,7 @@ SIZES = 8
 STAYING = (errno.ENOSPC, errno.EIO, errno.EROFS)
 """Of these every second stays: the disk is full, broken or read-only from there on."""
 PATIENCE_S = 30.0
-WRITES_NOTHING = {"check", "doctor", "fake-drone", "info"}
+WRITES_NOTHING = {"check", "doctor", "fake-drone", "find", "info"}
 IS_A_RUN = {"demo"}
 """It is `dmrl run demo`."""
 

@@ -22,7 +22,7 @@ from ..stages.detector import with_detections
 
 RECORD_S = 2.5
 STEP_NS = 100_000_000
-TIMED = {"tensorboard", "pipeline.json", "unfinished"}
+TIMED = {"tensorboard", "pipeline.json", "unfinished", "catalogue.parquet"}
 """Names of what tells when something was made, and differs each time; of what is not done."""
 STAND_INS = {
     "render": (
@@ -33,6 +33,7 @@ STAND_INS = {
     "run": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
     "trim": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
     "evaluate": (("matplotlib.figure:Figure", "draw", "blank"),),
+    "index": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
     "report": (("matplotlib.figure:Figure", "draw", "blank"),),
     "dataset": (("dmrl.card:", "plots", "nothing"),),
     "card": (("dmrl.card:", "plots", "nothing"),),
@@ -371,6 +372,7 @@ WORKS = (
     Work("card", _card, "set", before=_copied, pieces=True),
     Work("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
     Work("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots", slow=True),
+    Work("index", lambda i, out: cli("index", out), "set", before=_flights, pieces=True),
     Work("report", lambda i, out: cli("report", i.flights, out), "a.html"),
     Work("train", _train, "model", keeps=True),
     Work("quantize", lambda i, out: cli("quantize", i.model, i.set, out), "int8", slow=True),

@@ -1,0 +1,104 @@
+"""What one recording comes to, as a row of the catalogue."""
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
+
+from dmrl import topics
+from dmrl.messages import status_name
+from dmrl.recording import Contents, Provenance, check
+from dmrl.recording.inputs import sha256_of_file
+
+Row = dict[str, Any]
+"""Values of `table.COLUMNS` by name, but for what only the file system says."""
+
+
+def describe(path: Path) -> Row:
+    """What a recording holds, where it comes from, and what `dmrl check` says of it.
+
+    Parameters
+    ----------
+    path
+        A recording.
+
+    Raises
+    ------
+    RecordingError
+        If it is not a complete recording.
+    """
+    findings = check(path)
+    held = Contents(path, topics.LABELS, topics.CALIBRATION)
+    found = held.summary
+    return {
+        "sha256": sha256_of_file(path),
+        "start_ns": found.start_ns,
+        "duration_s": (found.end_ns - found.start_ns) / 1e9,
+        "messages": found.count,
+        "robots": _robots(held),
+        "topics": [
+            {"topic": topic, "message": info.schema, "count": info.count}
+            for topic, info in held.topics.items()
+        ],
+        "cameras": list(_cameras(held)),
+        "labels": list(_labels(held)),
+        "errors": sum(one.level == "error" for one in findings),
+        "warnings": sum(one.level == "warning" for one in findings),
+        "findings": [asdict(one) for one in findings],
+        **_origin(found.provenance),
+    }
+
+
+def unread(why: str) -> Row:
+    """The row of a recording that cannot be read."""
+    return {"error": why}
+
+
+def _robots(held: Contents) -> list[str]:
+    """Every robot that one of dmrl's topics names first."""
+    rows = ((topics.row_of(topic), topic) for topic in held.topics)
+    named = (topics.names(row.pattern, topic) for row, topic in rows if row is not None)
+    return sorted({found["robot"] for found in named if found and "robot" in found})
+
+
+def _cameras(held: Contents) -> Iterator[Row]:
+    """Every camera: its pictures, and what it is calibrated for."""
+    for camera in topics.robots(list(held.topics)):
+        row = {"camera": camera, "images": held.topics[topics.camera_image(camera)].count}
+        if topics.calibration(camera) in held.topics:
+            for one in islice(held.messages(topics.calibration(camera)), 1):
+                said = one.message
+                row |= {"width_px": said.width, "height_px": said.height}
+                row["focal_px"] = said.K[0] if len(said.K) == 9 else None
+        yield row
+
+
+def _labels(held: Contents) -> Iterator[Row]:
+    """Labels by camera, source and status."""
+    for topic in held.topics:
+        if not (named := topics.names(topics.LABELS, topic)):
+            continue
+        peers = held.table(topic, ["peers"])["peers"].combine_chunks().flatten()
+        sources = pc.struct_field(peers, "source").to_pylist()
+        statuses = pc.struct_field(peers, "status").to_pylist()
+        counts = Counter(zip(sources, statuses, strict=True))
+        for (source, status), count in sorted(counts.items()):
+            row = {"camera": named["robot"], "source": source, "status": status_name(status)}
+            yield {**row, "count": count}
+
+
+def _origin(made: Provenance | None) -> Row:
+    """Which stage made it, of what, with which settings."""
+    if made is None:
+        return {}
+    return {
+        "stage": made.stage,
+        "dmrl_version": made.dmrl_version,
+        "settings": json.dumps(dict(made.settings), sort_keys=True, default=str),
+        "inputs": [{"name": one.name, "sha256": one.sha256} for one in made.inputs],
+    }

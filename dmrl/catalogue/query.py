@@ -1,0 +1,113 @@
+"""Questions to a catalogue, in the SQL of DuckDB: what stands after WHERE.
+
+There is a row for each recording, camera and source of its labels; a recording is found if one of
+its rows is. The query reads nothing but these columns: no file, no other table.
+"""
+
+import re
+from pathlib import Path
+
+import pyarrow as pa
+
+from dmrl.border.names import inside
+from dmrl.catalogue.table import NAME, Catalogue, open_catalogue, stamp
+from dmrl.errors import MissingExtra, RecordingError, SettingError
+
+try:
+    import duckdb
+except ModuleNotFoundError as e:
+    raise MissingExtra("duckdb", "index", "dmrl find") from e
+
+FLAT = """
+WITH seen AS (SELECT recording, unnest(cameras) AS c FROM held),
+counted AS (SELECT recording, unnest(labels) AS l FROM held),
+labelled AS (
+  SELECT recording, l.camera AS camera, l.source AS source, sum(l.count)::BIGINT AS labels,
+    coalesce(sum(l.count) FILTER (l.status = 'OK'), 0)::BIGINT AS ok_labels
+  FROM counted GROUP BY ALL
+)
+SELECT held.* REPLACE (
+    [one.topic FOR one IN held.topics] AS topics,
+    [one.camera FOR one IN held.cameras] AS cameras,
+    coalesce(labelled.labels, 0) AS labels
+  ),
+  coalesce(seen.c.camera, labelled.camera) AS camera, seen.c.images AS images,
+  seen.c.width_px AS width_px, seen.c.height_px AS height_px, seen.c.focal_px AS focal_px,
+  labelled.source AS source, coalesce(labelled.ok_labels, 0) AS ok_labels
+FROM held LEFT JOIN seen ON seen.recording = held.recording
+LEFT JOIN labelled ON labelled.recording = held.recording AND labelled.camera = seen.c.camera
+"""
+QUOTED = re.compile(r"""'(?:[^']|'')*'|"((?:[^"]|"")*)\"""")
+
+
+def find(catalogue: Catalogue, query: str) -> pa.Table:
+    """Rows of the recordings that a query is true of, in the order of their names.
+
+    Parameters
+    ----------
+    catalogue
+        Of a folder.
+    query
+        Such as ``camera = 'cf1' and ok_labels > 100``. A text in double quotes that is no
+        column's name is a text as well, so that a shell needs no more quotes.
+
+    Raises
+    ------
+    SettingError
+        If the query cannot be answered: says what DuckDB says.
+    """
+    own = {"enable_external_access": False, "python_enable_replacements": False}
+    with duckdb.connect(config={**own, "lock_configuration": True}) as asked:
+        flat = asked.from_arrow(catalogue.table).query("held", FLAT)
+        try:
+            chosen = flat.filter(_quoted(query, flat.columns)).project("recording").distinct()
+            names = {name for (name,) in chosen.fetchall()}
+        except duckdb.Error as e:
+            raise SettingError(_wrong(query, str(e), flat.columns)) from None
+    mask = pa.array([name in names for name in catalogue.table["recording"].to_pylist()])
+    return catalogue.table.filter(mask.cast(pa.bool_()))
+
+
+def found_in(folder: Path, query: str) -> list[Path]:
+    """Recordings of a folder that a query is true of, in the order of their names.
+
+    Raises
+    ------
+    RecordingError
+        If the folder has no catalogue, or one of them is not as it was when that was made.
+    SettingError, MissingExtra
+        As `find`.
+    """
+    found = find(open_catalogue(folder), query)
+    rows = zip(found["recording"].to_pylist(), found["stamp"].to_pylist(), strict=True)
+    return [_as_it_was(folder, name, was) for name, was in rows]
+
+
+def _as_it_was(folder: Path, name: str, was: str) -> Path:
+    path = folder
+    for part in name.split("/"):
+        path = inside(path, part, f"{folder / NAME}: a recording")
+    try:
+        same = stamp(path) == was
+    except OSError:
+        same = False
+    if not same:
+        raise RecordingError(f"{path} has changed since it was indexed. Run: dmrl index {folder}")
+    return path
+
+
+def _quoted(query: str, columns: list[str]) -> str:
+    """The query with texts in single quotes, as SQL has them."""
+
+    def single(found: re.Match[str]) -> str:
+        name = found[1]
+        if name is None or name in columns:
+            return found[0]
+        return "'" + name.replace('""', '"').replace("'", "''") + "'"
+
+    return QUOTED.sub(single, query)
+
+
+def _wrong(query: str, said: str, columns: list[str]) -> str:
+    why = said.splitlines()[0].removesuffix("!") if said else "it cannot be answered"
+    return f"the query {query!r}: {why}. Columns: {', '.join(columns)}"

@@ -1,0 +1,209 @@
+"""A catalogue says what its recordings hold, looks again at what changed, and answers queries."""
+
+import json
+import os
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from dmrl import boundary, topics
+from dmrl.catalogue import NAME, open_catalogue
+from dmrl.catalogue.query import find
+from dmrl.cli import app
+from dmrl.errors import RecordingError, SettingError
+from dmrl.images.codec import encode_png
+from dmrl.messages import message
+from dmrl.page import gather, page
+from dmrl.recording import Provenance, RecordingWriter
+from dmrl.recording.provenance import Input
+from dmrl.stages import index
+
+STEP_NS = 100_000_000
+
+
+def record(path: Path, camera: str, images: int, statuses: tuple[int, ...]) -> Path:
+    """A flight with true labels, and estimated ones of some statuses."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    made = Provenance("label", {"k": 1}, inputs=(Input("raw.mcap", "0" * 64),))
+    with RecordingWriter(path, made) as sink:
+        calibration = message("CameraCalibration")(width=64, height=48, K=[90.0, *[0.0] * 8])
+        sink.write(0, topics.calibration(camera), calibration)
+        for k in range(images):
+            data = encode_png(np.full((48, 64, 3), 10 * k, np.uint8))
+            sink.write(
+                k * STEP_NS, topics.camera_image(camera), message("CompressedImage")(data=data)
+            )
+            truth = {"peer": "cf9", "u_px": 20, "v_px": 20, "depth_m": 1.0, "source": "truth"}
+            peers = [truth, *({**truth, "source": "estimate", "status": s} for s in statuses)]
+            sink.write(k * STEP_NS, topics.labels(camera), message("PeerLabels")(peers=peers))
+    return path
+
+
+@pytest.fixture
+def flights(tmp_path: Path) -> Path:
+    folder = tmp_path / "flights"
+    record(folder / "a.mcap", "cf1", 4, (0, 1))
+    record(folder / "monday" / "a.mcap", "cf2", 6, (0,))
+    record(folder / "monday" / "b.mcap", "cf1", 2, ())
+    (folder / "torn.mcap").write_bytes((folder / "a.mcap").read_bytes()[:300])
+    return folder
+
+
+def names(folder: Path, query: str) -> list[str]:
+    found = find(open_catalogue(folder), query)["recording"].to_pylist()
+    return [str(name) for name in found]
+
+
+def test_a_row_says_what_its_recording_holds(flights: Path) -> None:
+    made = index.update(flights, workers=1)
+    assert made == index.Result(recordings=4, looked_at=4, known=0, gone=0, unread=1)
+    table = pq.read_table(flights / NAME)
+    rows = {row["recording"]: row for row in table.to_pylist()}
+    assert list(rows) == ["a.mcap", "monday/a.mcap", "monday/b.mcap", "torn.mcap"]
+    row = rows["a.mcap"]
+    assert row["robots"] == ["cf1"] and row["messages"] == 9 and row["duration_s"] == 0.3
+    assert row["bytes"] == (flights / "a.mcap").stat().st_size and len(row["sha256"]) == 64
+    camera = {"camera": "cf1", "images": 4, "width_px": 64, "height_px": 48, "focal_px": 90.0}
+    assert row["cameras"] == [camera]
+    counts = {(one["source"], one["status"]): one["count"] for one in row["labels"]}
+    assert counts == {("estimate", "OK"): 4, ("estimate", "UNCONVERGED"): 4, ("truth", "OK"): 4}
+    assert row["stage"] == "label" and row["inputs"] == [{"name": "raw.mcap", "sha256": "0" * 64}]
+    assert row["errors"] == 0 and row["warnings"] == len(row["findings"])
+    assert "cut short" in rows["torn.mcap"]["error"] and rows["torn.mcap"]["messages"] is None
+
+
+def test_queries_are_of_a_recording_its_cameras_and_their_labels(flights: Path) -> None:
+    index.update(flights, workers=1)
+    assert names(flights, 'camera = "cf1" and ok_labels > 3') == ["a.mcap"]
+    assert names(flights, "camera = 'cf1' and images < 4") == ["monday/b.mcap"]
+    assert names(flights, "source = 'estimate' and ok_labels = labels") == ["monday/a.mcap"]
+    assert names(flights, "error is not null") == ["torn.mcap"]
+    assert names(flights, "list_contains(topics, '/cf2/labels')") == ["monday/a.mcap"]
+    assert names(flights, "\"recording\" like 'monday/%'") == ["monday/a.mcap", "monday/b.mcap"]
+    assert names(flights, "false") == []
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "colour = 1",
+        "messages >",
+        "1); select 2 --",
+        "recording in (select * from read_text('/etc/passwd'))",
+        "recording in (select recording from table)",
+        "",
+    ],
+)
+def test_a_query_that_cannot_be_answered_is_one_line_and_reads_nothing_else(
+    query: str, flights: Path
+) -> None:
+    index.update(flights, workers=1)
+    with pytest.raises(SettingError, match="Columns: recording, bytes") as caught:
+        find(open_catalogue(flights), query)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_what_changed_is_looked_at_again(flights: Path) -> None:
+    index.update(flights, workers=1)
+    before = (flights / NAME).stat().st_mtime_ns
+    (flights / "torn.mcap").unlink()
+    index.update(flights, workers=1)
+    assert index.update(flights, workers=1) == index.Result(3, 0, 3, 0, 0)
+    unchanged = (flights / NAME).stat().st_mtime_ns
+    index.update(flights, workers=1)
+    assert (flights / NAME).stat().st_mtime_ns == unchanged > before
+    (flights / "a.mcap").unlink()
+    record(flights / "a.mcap", "cf7", 3, ())
+    (flights / "monday" / "b.mcap").rename(flights / "monday" / "c.mcap")
+    assert index.update(flights, workers=1) == index.Result(3, 2, 1, 1, 0)
+    assert names(flights, "camera = 'cf7'") == ["a.mcap"]
+
+
+def test_what_was_seen_before_a_stop_is_kept(
+    flights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = index.outcomes
+
+    def stopped(*given: object) -> object:
+        for k, one in enumerate(real(*given)):  # type: ignore[arg-type]
+            if k == 2:
+                raise KeyboardInterrupt
+            yield one
+
+    monkeypatch.setattr(index, "outcomes", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        index.update(flights, workers=1)
+    monkeypatch.undo()
+    again = index.update(flights, workers=1)
+    assert (again.looked_at, again.known) == (3, 1)  # one of the two cannot be read
+
+
+def test_a_file_that_is_no_catalogue_is_left_alone(flights: Path) -> None:
+    with pytest.raises(RecordingError, match=r"has no catalogue\. Make it: dmrl index"):
+        open_catalogue(flights)
+    (flights / NAME).write_text("my notes")
+    with pytest.raises(RecordingError, match="is damaged"):
+        index.update(flights, workers=1)
+    pq.write_table(pq.read_table(_indexed(flights)).select(["recording"]), flights / NAME)
+    with pytest.raises(RecordingError, match="is no catalogue"):
+        index.update(flights, workers=1)
+
+
+def _indexed(flights: Path) -> Path:
+    (flights / NAME).unlink()
+    index.update(flights, workers=1)
+    return flights / NAME
+
+
+def test_the_commands_print_tables_paths_and_json(
+    flights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said(*words: str) -> str:
+        assert boundary.status_of(lambda: app([*words], result_action="return_value")) == 0
+        return capsys.readouterr().out
+
+    assert "4 recordings; 4 looked at, 0 known" in said("index", str(flights), "--workers", "1")
+    assert json.loads(said("index", str(flights), "--json"))["known"] == 3
+    assert "estimate 4 of 8, truth 4 of 4" in said("find", "camera = 'cf1'", str(flights))
+    paths = said("find", "camera = 'cf1'", str(flights), "--paths").splitlines()
+    assert paths == [str(flights / "a.mcap"), str(flights / "monday" / "b.mcap")]
+    found = json.loads(said("find", "error is not null", str(flights), "--json"))
+    assert [one["recording"] for one in found["recordings"]] == ["torn.mcap"]
+
+
+def test_a_dataset_of_what_a_query_finds(
+    flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    index.update(flights, workers=1)
+    out = tmp_path / "set"
+
+    def status(query: str) -> int:
+        words = ["dataset", str(flights), str(out), "--from-index", query, "--workers", "1"]
+        return boundary.status_of(lambda: app(words, result_action="return_value"))
+
+    assert status("camera = 'cf9'") == 1
+    assert "is true of no recording" in capsys.readouterr().err
+    os.utime(flights / "a.mcap")
+    assert status("camera = 'cf1'") == 1
+    assert "has changed since it was indexed. Run: dmrl index" in capsys.readouterr().err
+    assert not out.exists()
+    index.update(flights, workers=1)
+    assert status("camera = 'cf1' and source = 'truth'") == 0
+    made = json.loads((out / "provenance.json").read_text())
+    assert [one["name"] for one in made["inputs"]] == ["a.mcap", "b.mcap"]
+
+
+def test_the_page_tells_of_a_catalogue_and_opens_no_thousand_recordings(
+    flights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index.update(flights, workers=1)
+    shown = page(gather(flights))
+    assert "<h2>Catalogue</h2>" in shown and "4 recordings, 0.0 h" in shown
+    assert "estimate" in shown and "cut short" in shown and "<h2>Recordings</h2>" in shown
+    module = import_module("dmrl.page.gather")
+    monkeypatch.setattr(module, "MANY", 3)
+    monkeypatch.setattr(module, "summary", None)
+    assert "<h2>Recordings</h2>" not in page(gather(flights))
