@@ -1,7 +1,7 @@
 """Estimated positions of a recording against the ground truth, pair by pair."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,7 @@ from dmrl.estimation.score import (
     overall,
 )
 from dmrl.geometry.frames import Array
+from dmrl.labelling.truth import TOLD, true_pairs, true_path
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Contents, input_of, summary
 
@@ -81,11 +82,11 @@ class Pair:
 
 def has_positions(recording: Path) -> bool:
     """Whether a recording holds estimated positions."""
-    return bool(_pairs(recording, topics.POSITION))
+    return bool(_estimated(summary(recording).topics))
 
 
-def _pairs(recording: Path, pattern: str) -> list[tuple[str, str]]:
-    found = (topics.names(pattern, topic) for topic in summary(recording).topics)
+def _estimated(held: Iterable[str]) -> list[tuple[str, str]]:
+    found = (topics.names(topics.POSITION, topic) for topic in held)
     return sorted((n["robot"], n["peer"]) for n in found if n is not None)
 
 
@@ -95,18 +96,17 @@ def judge(recording: Path) -> list[Pair]:
     Parameters
     ----------
     recording
-        With ``/<robot>/peer/<peer>/position`` and ``.../truth``.
+        With ``/<robot>/peer/<peer>/position`` and the truth; see `labelling.truth`.
 
     Raises
     ------
     RecordingError
         If it cannot be read, or has no pair with both.
     """
-    estimated = _pairs(recording, topics.POSITION)
+    held = Contents(recording, topics.POSITION, *TOLD)
+    estimated, known = _estimated(held.topics), true_pairs(held.topics)
     if not estimated:
         raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
-    known = set(_pairs(recording, topics.TRUTH))
-    held = Contents(recording, topics.POSITION, topics.TRUTH)
     pairs = [_judge(held, *names) for names in estimated if names in known]
     pairs = [pair for pair in pairs if len(pair.judged.time_s)]
     if not pairs:
@@ -141,23 +141,24 @@ def paths(recording: Path) -> dict[tuple[str, str], Paths]:
     RecordingError
         If it cannot be read.
     """
-    known = set(_pairs(recording, topics.TRUTH))
-    estimated = [pair for pair in _pairs(recording, topics.POSITION) if pair in known]
-    held = Contents(recording, topics.POSITION, topics.TRUTH)
-    return {pair: _matched(*_tables(held, *pair)) for pair in estimated}
+    held = Contents(recording, topics.POSITION, *TOLD)
+    known = true_pairs(held.topics)
+    pairs = [pair for pair in _estimated(held.topics) if pair in known]
+    return {
+        pair: _matched(held.table(topics.position(*pair)), *true_path(held, *pair))
+        for pair in pairs
+    }
 
 
-def _tables(held: Contents, robot: str, peer: str) -> tuple[pa.Table, pa.Table]:
-    return held.table(topics.position(robot, peer)), held.table(topics.truth(robot, peer))
-
-
-def _matched(estimate: pa.Table, true: pa.Table) -> Paths:
-    time_ns, true_ns = _column(estimate, "log_time"), _column(true, "log_time")
-    near = inside_truth(time_ns.astype(np.int64), true_ns.astype(np.int64))
+def _matched(estimate: pa.Table, true_ns: Times, true_m: Array) -> Paths:
+    time_ns = _column(estimate, "log_time")
+    near = inside_truth(time_ns.astype(np.int64), true_ns)
     return Paths(
         time_ns[near],
         np.stack([_column(estimate, axis)[near] for axis in "xy"], axis=1),
-        np.stack([np.interp(time_ns[near], true_ns, _column(true, axis)) for axis in "xy"], axis=1),
+        np.stack([np.interp(time_ns[near], true_ns, axis) for axis in true_m.T[:2]], axis=1)
+        if near.any()
+        else np.empty((0, 2)),
         _covariance(estimate)[near],
         _column(estimate, "status")[near] == STATUS_OK,
         float(time_ns[0]) if len(time_ns) else 0.0,
@@ -165,8 +166,9 @@ def _matched(estimate: pa.Table, true: pa.Table) -> Paths:
 
 
 def _judge(held: Contents, robot: str, peer: str) -> Pair:
-    estimate, true = _tables(held, robot, peer)
-    found = _matched(estimate, true)
+    estimate = held.table(topics.position(robot, peer))
+    true_ns, true_m = true_path(held, robot, peer)
+    found = _matched(estimate, true_ns, true_m)
     judged = Judged(
         time_s=(found.time_ns - found.started_ns) * 1e-9,
         error_m=found.estimate_m - found.true_m,
@@ -174,7 +176,7 @@ def _judge(held: Contents, robot: str, peer: str) -> Pair:
         distance_m=np.linalg.norm(found.true_m, axis=1),
         kept=found.kept,
     )
-    time_ns, true_ns = (_column(table, "log_time").astype(np.int64) for table in (estimate, true))
+    time_ns = _column(estimate, "log_time").astype(np.int64)
     covered = inside_truth(true_ns, time_ns)
     return Pair(
         robot, peer, judged, len(time_ns) - len(found.kept), len(covered), int(covered.sum())

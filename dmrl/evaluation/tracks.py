@@ -22,6 +22,7 @@ from dmrl.geometry.frames import (
 )
 from dmrl.labelling.camera import camera_of
 from dmrl.labelling.sight import SEEN, Sight, read_sight
+from dmrl.labelling.truth import TOLD, true_pairs, true_path
 from dmrl.recording import Contents, input_of, summary
 
 TITLE, EACH = "tracks against truth", "observer"
@@ -36,8 +37,7 @@ def can_judge(recording: Path) -> bool:
 
 
 def _peers(held: list[str], robot: str) -> list[str]:
-    links = (topics.names(topics.TRUTH, topic) for topic in held)
-    return sorted(n["peer"] for n in links if n is not None and n["robot"] == robot)
+    return [peer for observer, peer in true_pairs(held) if observer == robot]
 
 
 def judge(recording: Path) -> list[Judged]:
@@ -46,7 +46,7 @@ def judge(recording: Path) -> list[Judged]:
     Parameters
     ----------
     recording
-        With ``/<robot>/tracks``, what they were made from, and ``/<robot>/peer/<peer>/truth``.
+        With ``/<robot>/tracks``, what they were made from, and the truth; see `labelling.truth`.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def judge(recording: Path) -> list[Judged]:
     robots = topics.robots(held, topics.TRACKS)
     if not robots:
         raise RecordingError(f"{recording} has no tracks. Try: dmrl track {recording} OUT.mcap")
-    contents = Contents(recording, *SEEN, topics.TRACKS, topics.TRUTH)
+    contents = Contents(recording, *SEEN, topics.TRACKS, *TOLD)
     judged = [_judge(contents, robot, peers) for robot in robots if (peers := _peers(held, robot))]
     if not judged:
         raise RecordingError(
@@ -172,13 +172,10 @@ def _truth(held: Contents, sight: Sight, peers: list[str]) -> tuple[Array, NDArr
     xyz = np.full((len(peers), len(sight.time_ns), 3), np.nan)
     shown = np.zeros(xyz.shape[:2], bool)
     for j, peer in enumerate(peers):
-        true = held.table(topics.truth(sight.robot, peer), ("x", "y", "z"))
-        true_ns = true["log_time"].to_numpy()
+        true_ns, true_m = true_path(held, sight.robot, peer)
         known = inside_truth(sight.time_ns, true_ns)
         at = sight.time_ns[known]
-        xyz[j, known] = np.column_stack(
-            [np.interp(at, true_ns, true[axis].to_numpy()) for axis in "xyz"]
-        )
+        xyz[j, known] = np.column_stack([np.interp(at, true_ns, axis) for axis in true_m.T])
         roll, pitch = sight.attitude_rad.T
         uv, depth_m, _ = pixels_from_horizontal(xyz[j], roll, pitch, sight.camera)
         shown[j] = inside(uv, sight.camera.width_px, sight.camera.height_px) & (depth_m > 0)

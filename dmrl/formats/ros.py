@@ -6,7 +6,7 @@ What is taken, by the message's type; all else is left out, with a line that nam
 * ``nav_msgs/Odometry``: attitude, velocity (in the body's frame), height, pose;
 * ``sensor_msgs/Imu`` and ``geometry_msgs/TwistStamped``, for a robot without odometry;
 * ``geometry_msgs/PoseStamped``: a true pose where the topic names motion capture, else a pose;
-* ``sensor_msgs/Range`` on ``.../<robot>/<peer>/...`` or ``/<robot>/range/<peer>``: UWB;
+* ``sensor_msgs/Range`` on a topic that names two robots, ``/<robot>/uwb/<peer>``: UWB;
 * ``dmrl_msgs/*``, as ``dmrl convert --to ros2`` writes them, on the topics of dmrl.
 
 Times are those of the headers. Where they are empty, the time at which the bag received a message
@@ -36,12 +36,12 @@ SUFFIXES = (".db3", ".bag", ".mcap")
 NO_PICTURES = (topics.MASKS, topics.DEPTHS)
 """Images that are no pictures of a camera: of a render that was exported."""
 CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
-PAIR = re.compile(r"/(?P<robot>[^/]+)/(?:range/)?(?P<peer>[^/]+)(?:/(?:distance|range|uwb))?$")
 ODD_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
 # Parts of a topic that say what it is, not whose.
 GENERIC = re.compile(
     r"odom\w*|odometry|pose\w*|imu\w*|data|raw|twist|velocity|image\w*|color|colour|camera\w*|rgb|"
-    r"compressed|info|camera_info|filtered|local|vrpn_client_node|mavros|state|truth|calibration",
+    r"compressed|info|camera_info|filtered|local|vrpn_client_node|mavros|state|truth|calibration|"
+    r"uwb\w*|rang(e|es|ing)|dist(ance|ances)?|peers?|to|from",
     re.IGNORECASE,
 )
 
@@ -140,13 +140,12 @@ def _line(topic: str, kind: str, count: int, options: Options) -> Line | None:
         return Line(topic, kind, count, "")
     if kind not in HANDLERS or any(topics.names(one, topic) for one in NO_PICTURES):
         return None
-    if kind == "sensor_msgs/msg/Range":
-        match = PAIR.search(topic)
-        if match is None:
-            return None
-        return Line(topic, kind, count, name(match["robot"]), name(match["peer"]))
-    own = [part for part in topic.split("/") if part and not GENERIC.fullmatch(part)]
-    return Line(topic, kind, count, name(own[-1]) if own else options.robot)
+    own = [name(part) for part in topic.split("/") if part and not GENERIC.fullmatch(part)]
+    if kind != "sensor_msgs/msg/Range":
+        return Line(topic, kind, count, own[-1] if own else options.robot)
+    if len(own) < 2 or own[-2] == own[-1]:
+        return None
+    return Line(topic, kind, count, own[-2], own[-1])
 
 
 def _reader(source: Path) -> Any:
@@ -219,6 +218,7 @@ def _guarded(source: Path, of: Any) -> Iterator[Any]:
 def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sample]:
     calibrated: set[str] = set()
     unstamped: Counter[str] = Counter()
+    fixed: set[str] = set()
     moving = {line.robot for line in lines.values() if line.kind == "nav_msgs/msg/Odometry"}
 
     def messages(reader: Any) -> Iterator[Any]:
@@ -229,7 +229,12 @@ def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sa
 
     for line, bag_ns, decoded in _guarded(source, messages):
         where = Placed(
-            source, line.robot, line.peer, bool(CAPTURE.search(line.topic)), line.robot in moving
+            source,
+            line.robot,
+            line.peer,
+            bool(CAPTURE.search(line.topic)),
+            line.robot in moving,
+            fixed,
         )
         time_ns = _stamp_ns(decoded)
         unstamped[line.topic] += time_ns == 0 < bag_ns
@@ -239,6 +244,11 @@ def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sa
                     continue
                 calibrated.add(sample.topic)
             yield replace(sample, publish_ns=max(bag_ns, 0))
+    if fixed:
+        say(
+            f"{source}: left out: velocities of {', '.join(sorted(fixed))}, which are in a frame "
+            "that does not turn with the robot. Record its odometry"
+        )
     if told := [f"{count} on {topic}" for topic, count in unstamped.items() if count]:
         say(f"{source}: a stamp of 0 have {', '.join(told)}; they are at the times of the bag")
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ HALF_PX = 0.5  # ROS has the first pixel's centre at 0, dmrl its edge
 RANGE_MAX_M = 60.0
 OWN = "dmrl_msgs/msg/"
 SIDE_MAX_PX = 10_000
+FIXED = ("odom", "map", "world", "earth")
+"""Last part of the names of frames that do not turn with a robot (REP 105)."""
 LETTERS = {"uint32": "I", "int32": "i", "float32": "f", "float64": "d"}
 
 
@@ -38,6 +40,9 @@ class Placed:
         It comes from motion capture.
     odometry
         The robot has odometry, which says all that other messages say.
+    fixed
+        Robots whose velocities are in a fixed frame and cannot be turned into their own: filled
+        here.
     """
 
     source: Path
@@ -45,6 +50,7 @@ class Placed:
     peer: str = ""
     captured: bool = False
     odometry: bool = False
+    fixed: set[str] = field(default_factory=set)
 
 
 def _picture(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
@@ -111,20 +117,38 @@ def _angles(q: Any) -> Array | None:
     return euler_zyx(values[None] / norm)[0] if abs(norm - 1) < 0.1 else None
 
 
-def _attitude(robot: str, time_ns: int, angles: Array, turning: Array) -> Sample:
+def _is_fixed(frame: str, parent: str = "") -> bool:
+    return bool(frame) and (frame == parent or frame.rsplit("/", 1)[-1] in FIXED)
+
+
+def _attitude(robot: str, time_ns: int, angles: Array, yaw_rate: float) -> Sample:
     roll, pitch, yaw = angles.tolist()
-    rate = (turning[1] * math.sin(roll) + turning[2] * math.cos(roll)) / math.cos(pitch)
-    fields = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw, "yaw_rate_radps": float(rate)}
+    fields = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw, "yaw_rate_radps": yaw_rate}
     return Sample(time_ns, topics.attitude(robot), "Attitude", fields)
 
 
-def _velocity(robot: str, time_ns: int, body: Array, angles: Array) -> Sample:
-    """A velocity in the body's frame, levelled."""
+def _yaw_rate(turning: Array, angles: Array) -> float:
+    """Rate of the yaw, from turning rates about the body's axes."""
     roll, pitch, _ = angles.tolist()
-    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
-    level = np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]]) @ body
+    return float((turning[1] * math.sin(roll) + turning[2] * math.cos(roll)) / math.cos(pitch))
+
+
+def _velocity(robot: str, time_ns: int, level: Array) -> Sample:
     fields = dict(zip(("vx_mps", "vy_mps", "vz_mps"), level.tolist(), strict=True))
     return Sample(time_ns, topics.velocity(robot), "Velocity", fields)
+
+
+def _levelled(body: Array, angles: Array) -> Array:
+    """A vector in the body's frame, in the robot's horizontal one."""
+    roll, pitch, _ = angles.tolist()
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    return np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]]) @ body
+
+
+def _turned_back(fixed: Array, angles: Array) -> Array:
+    """A vector in the frame that the yaw is told in, in the robot's horizontal one."""
+    c, s = math.cos(angles[2]), math.sin(angles[2])
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ fixed
 
 
 def pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sample:
@@ -146,20 +170,31 @@ def _odometry(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
     height = {"height_m": float(held.position.z)}
     yield Sample(time_ns, topics.height(where.robot), "Height", height)
     angles = _angles(held.orientation)
-    if angles is not None:
-        yield _attitude(where.robot, time_ns, angles, _xyz(twist.angular))
-        yield _velocity(where.robot, time_ns, _xyz(twist.linear), angles)
+    if angles is None:
+        return
+    # The twist is in the child's frame, says the message; some drivers name a fixed one there.
+    fixed = _is_fixed(message.child_frame_id, message.header.frame_id)
+    turning, linear = _xyz(twist.angular), _xyz(twist.linear)
+    yaw_rate = float(turning[2]) if fixed else _yaw_rate(turning, angles)
+    yield _attitude(where.robot, time_ns, angles, yaw_rate)
+    level = _turned_back(linear, angles) if fixed else _levelled(linear, angles)
+    yield _velocity(where.robot, time_ns, level)
 
 
 def _imu(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
     angles = _angles(message.orientation)
     if angles is not None and not where.odometry:
-        yield _attitude(where.robot, time_ns, angles, _xyz(message.angular_velocity))
+        yaw_rate = _yaw_rate(_xyz(message.angular_velocity), angles)
+        yield _attitude(where.robot, time_ns, angles, yaw_rate)
 
 
 def _twist(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
-    if not where.odometry:
-        yield _velocity(where.robot, time_ns, _xyz(message.twist.linear), np.zeros(3))
+    if where.odometry:
+        return
+    if _is_fixed(message.header.frame_id):
+        where.fixed.add(where.robot)
+    else:
+        yield _velocity(where.robot, time_ns, _xyz(message.twist.linear))
 
 
 def _pose_stamped(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:

@@ -12,14 +12,13 @@ from dmrl import topics
 from dmrl.estimation.pair import RATE_HZ, Array, Pair, Track, usable_ranges
 from dmrl.estimation.sensors import Signals, track
 from dmrl.recording import Contents
+from dmrl.recording.check_units import unit_doubts
 
 LEAST_S = 5.0
 """Shortest common stretch of two logs that is worth estimating."""
 LEAST_RANGES = 20
 SENSED = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE)
 """What positions are estimated from."""
-STEEP_RAD, FAST_RADPS = 0.8, 6.0
-"""Tilt and turning rate that no small drone keeps up: probably degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,17 +144,7 @@ def _robot(held: Contents, name: str, warnings: list[str]) -> RobotLog | None:
     attitude, velocity, height = signals
     if attitude is None or velocity is None or height is None:
         return None
-    _warn_of_degrees(name, attitude[1], warnings)
     return RobotLog(attitude, velocity, height)
-
-
-def _warn_of_degrees(name: str, attitude: Array, warnings: list[str]) -> None:
-    tilt, rate = np.quantile(np.abs(attitude[:, :2]), 0.9), np.quantile(np.abs(attitude[:, 2]), 0.9)
-    if tilt > STEEP_RAD or rate > FAST_RADPS:
-        warnings.append(
-            f"{name}: a tilt of {tilt:.3g} rad and a yaw rate of {rate:.3g} rad/s (90 % are "
-            "less) look like degrees; convert them to radians"
-        )
 
 
 def _signals(
@@ -163,6 +152,7 @@ def _signals(
 ) -> Signals | None:
     """Finite samples of a topic; None, with a warning, where there is none."""
     table = held.table(topic, fields)
+    warnings += [f"{topic}: {doubt}" for doubt in unit_doubts(topic, table)]
     values = np.column_stack([table[field].to_numpy() for field in fields]).astype(float)
     time_ns, received_ns = (table[c].to_numpy() for c in ("log_time", "publish_time"))
     good = np.isfinite(values).all(axis=1)

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from dmrl import topics
 from dmrl.estimation.estimated import Estimate, Refused
 from dmrl.estimation.gate import OK
 from dmrl.estimation.linear import (
@@ -18,6 +17,7 @@ from dmrl.estimation.linear import (
 )
 from dmrl.estimation.score import inside_truth
 from dmrl.labelling.labels import Positions
+from dmrl.labelling.truth import true_pairs, true_path
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 from dmrl.recording import Contents
 
@@ -176,13 +176,13 @@ def _rms(error: Any, chosen: Any) -> float | None:
 
 def _errors(held: Contents, pair: tuple[str, str], positions: Positions) -> Any:
     """(N,) horizontal errors, metres, NaN outside the truth; None where there is no truth."""
-    topic = topics.truth(*pair)
-    if topic not in held.topics or held.topics[topic].count < 2:
+    if pair not in true_pairs(held.topics):
         return None
-    truth = held.table(topic, ("x", "y"))
-    time_ns = truth["log_time"].to_numpy()
+    time_ns, true_m = true_path(held, *pair)
+    if len(time_ns) < 2:
+        return None
     offsets = [
-        np.interp(positions.time_ns, time_ns, truth[axis].to_numpy()) - values
-        for axis, values in zip(("x", "y"), positions.xyz_m.T[:2], strict=True)
+        np.interp(positions.time_ns, time_ns, true) - values
+        for true, values in zip(true_m.T[:2], positions.xyz_m.T[:2], strict=True)
     ]
     return np.where(inside_truth(positions.time_ns, time_ns), np.hypot(*offsets), np.nan)

@@ -11,6 +11,7 @@ from dmrl.errors import MissingTopic, RecordingError
 from dmrl.estimation.camera_views import Flight, PeerPath
 from dmrl.estimation.view import Motion, View
 from dmrl.geometry.frames import Array, Camera
+from dmrl.labelling.truth import true_pairs, true_path
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Contents
 
@@ -27,6 +28,9 @@ LONGEST_GAP_S = 0.1
 """A range further from an image than this says nothing about it."""
 UNSAID = np.eye(3) * 0.1**2
 """(3, 3) m^2, covariance of a position that comes without: a decimetre each way."""
+
+CAPTURED = np.eye(3) * 0.01**2
+"""(3, 3) m^2, covariance of a position by motion capture: markers are not quite at the middle."""
 
 Times = NDArray[np.int64]
 
@@ -144,15 +148,19 @@ def camera_flight(held: Contents, robot: str, threshold: float | None, positions
     threshold
         Least confidence of a detection; None: what the detector named.
     positions
-        Pattern of the topics of positions, `topics.POSITION` or `topics.TRUTH`.
+        Pattern of the topics of positions: `topics.POSITION`, or `topics.TRUTH`, for which
+        motion capture of both robots does as well.
 
     Raises
     ------
     RecordingError
         If it cannot be read, or lacks one of these.
     """
-    links = {topic: topics.names(positions, topic) for topic in held.topics}
-    peers = {n["peer"]: topic for topic, n in links.items() if n and n["robot"] == robot}
+    links = [n for topic in held.topics if (n := topics.names(positions, topic))]
+    pairs = [(n["robot"], n["peer"]) for n in links]
+    if positions == topics.TRUTH:
+        pairs = true_pairs(held.topics)
+    peers = [peer for observer, peer in pairs if observer == robot]
     if not peers:
         raise MissingTopic(positions.format(robot=robot, peer="*"), held.topics, held.path)
     time_ns, detections, first = _detections(held, robot, threshold)
@@ -161,7 +169,7 @@ def camera_flight(held: Contents, robot: str, threshold: float | None, positions
     def seconds(at_ns: Times) -> Array:
         return np.asarray((at_ns - held.start_ns) * 1e-9)
 
-    paths = ((peer, _known(held, topic)) for peer, topic in peers.items())
+    paths = ((peer, _known(held, positions, robot, peer)) for peer in peers)
     return Flight(
         seconds(time_ns),
         np.repeat(np.arange(len(time_ns)), np.diff(first)),
@@ -172,8 +180,13 @@ def camera_flight(held: Contents, robot: str, threshold: float | None, positions
     )
 
 
-def _known(held: Contents, topic: str) -> PeerPath:
-    """The positions of a topic that are OK."""
+def _known(held: Contents, positions: str, robot: str, peer: str) -> PeerPath:
+    """The positions of a peer that are OK."""
+    topic = positions.format(robot=robot, peer=peer)
+    if topic not in held.topics:
+        true_ns, true_m = true_path(held, robot, peer)
+        sure = np.tile(CAPTURED, (len(true_ns), 1, 1))
+        return PeerPath(np.asarray((true_ns - held.start_ns) * 1e-9), true_m, sure)
     table = held.table(topic)
     table = table.filter(pc.equal(table["status"], STATUS_OK))
     rows = table["covariance"].to_pylist()

@@ -55,6 +55,22 @@ class Sizes:
                 )
 
 
+def unit_doubts(topic: str, table: pa.Table) -> list[str]:
+    """What is doubted of the values of a topic.
+
+    Parameters
+    ----------
+    topic
+        Its name.
+    table
+        Messages of it, with the fields whose values may be doubted, or some of them.
+    """
+    sizes = Sizes()
+    for batch in table.to_batches():
+        sizes.add(topic, batch)
+    return [text for _, text in sizes.doubted()]
+
+
 def periods(times: Mapping[str, Times]) -> Iterator[tuple[str, str]]:
     """Sensors that measure so rarely, or so often, that their times are of another unit."""
     for topic, time_ns in times.items():

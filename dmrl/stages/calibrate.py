@@ -25,6 +25,7 @@ try:
     from dmrl.estimation.camera_views import Noise
     from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.sight import SEEN, camera_flight
+    from dmrl.labelling.truth import TOLD
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "calibrate", "dmrl calibrate") from e
 
@@ -181,11 +182,11 @@ def _robot(source: Path, settings: Settings, pattern: str) -> str:
 
 def _flights(sources: list[Path], settings: Settings) -> Result:
     robots = [_robot(source, settings, topics.DETECTIONS) for source in sources]
-    positions = topics.POSITION if settings.against == "estimate" else topics.TRUTH
+    positions, *more = (topics.POSITION,) if settings.against == "estimate" else TOLD
     camera = None
     flights = []
     for source, robot in zip(track(sources, "Reading"), robots, strict=True):
-        held = Contents(source, *SEEN, positions)
+        held = Contents(source, *SEEN, positions, *more)
         if settings.camera:
             camera = camera_given(held, robot, settings.camera)
         camera = camera or camera_of(held, robot)

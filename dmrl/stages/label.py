@@ -30,12 +30,13 @@ try:
     from dmrl.labelling.report import PairReport, doubts, pair_report, refusal
     from dmrl.labelling.sight import SEEN, read_sight
     from dmrl.labelling.sighted import sighted
+    from dmrl.labelling.truth import TOLD
     from dmrl.labelling.write import label_messages, position_series
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl label") from e
 
 POSITION_HZ = 20.0
-BESIDE = (topics.LABELS, topics.CALIBRATION, topics.TRUTH)
+BESIDE = (topics.LABELS, topics.CALIBRATION, *TOLD)
 """What labels are made with, beside what positions are estimated from."""
 PAIRS_AT_ONCE = 15
 """Pairs that are filtered side by side: more are no faster, and need more memory."""
