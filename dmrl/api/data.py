@@ -117,9 +117,9 @@ class Rows:
         light = table.drop_columns([name for name in HEAVY if name in table.column_names])
         light = light.append_column("row", pa.array(np.arange(len(self))))
         found = flat(light)
-        return found.rename_columns(
-            [name.removeprefix("peers.") for name in found.column_names]
-        ).to_pandas()
+        names = [name.removeprefix("peers.") for name in found.column_names]
+        frame: pd.DataFrame = found.rename_columns(names).to_pandas()
+        return frame
 
     def torch(self) -> "TorchDataset[Any]":
         """The same as a dataset of torch: images (3, H, W) uint8, grids float32.

@@ -40,7 +40,7 @@ def framed(table: pa.Table, start_ns: int) -> "pd.DataFrame":
     """
     if find_spec("pandas") is None:
         raise MissingExtra("pandas", "table", "a data frame")
-    frame = table.to_pandas()
+    frame: pd.DataFrame = table.to_pandas()
     if "status" in frame.columns:
         known = frame["status"].notna()  # of an image without peers it is not
         names = [status_name(int(number)) for number in frame["status"][known]]

@@ -33,8 +33,9 @@ from dmrl.formats.crazyflie_state import (
     turn_of,
     yaw_rate_of,
 )
-from dmrl.formats.log_block import Block, Series, euler_zyx, series
+from dmrl.formats.log_block import Block, Series, series
 from dmrl.geometry.frames import Array
+from dmrl.geometry.turns import euler_zyx
 from dmrl.messages import LogType
 from dmrl.samples import flight
 from dmrl.samples.flight import Placed, Times

@@ -4,15 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dmrl.formats.log_block import (
-    Block,
-    Series,
-    euler_zyx,
-    quaternion_zyx,
-    series,
-    unpacked_quaternion,
-)
+from dmrl.formats.log_block import Block, Series, series, unpacked_quaternion
 from dmrl.geometry.frames import Array
+from dmrl.geometry.turns import euler_zyx, quaternion_zyx
 
 ANGLES = ("roll", "pitch", "yaw")
 

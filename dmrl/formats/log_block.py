@@ -74,24 +74,3 @@ def unpacked_quaternion(packed: NDArray[np.int64]) -> Array:
     rest = np.sqrt(np.clip(1 - (out**2).sum(axis=1), 0, None))
     out[np.arange(len(out)), largest] = rest
     return out
-
-
-def euler_zyx(quaternion: Array) -> Array:
-    """(N, 3) roll, pitch, yaw of Rz(yaw) Ry(pitch) Rx(roll) from (N, 4) x, y, z, w."""
-    x, y, z, w = quaternion.T
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.stack([roll, pitch, yaw], axis=1)
-
-
-def quaternion_zyx(angles: Array) -> Array:
-    """(N, 4) x, y, z, w from (N, 3) roll, pitch, yaw; the inverse of ``euler_zyx``."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles / 2).T, np.sin(angles / 2).T
-    xyzw = (
-        cy * cp * sr - sy * sp * cr,
-        cy * sp * cr + sy * cp * sr,
-        sy * cp * cr - cy * sp * sr,
-        cy * cp * cr + sy * sp * sr,
-    )
-    return np.stack(xyzw, axis=1)

@@ -16,6 +16,7 @@ from dmrl.estimation.clocks import Clock, estimate_clock
 from dmrl.estimation.exchanges import estimate_from_exchanges
 from dmrl.estimation.image_motion import rates, shift, small
 from dmrl.geometry.frames import Array
+from dmrl.geometry.turns import euler_zyx
 from dmrl.images import codec
 from dmrl.recording import Contents, read
 from dmrl.terminal.progress import track
@@ -182,14 +183,12 @@ def _of_pose(time_s: Array, rows: Array) -> Signals:
     time_s, rows = time_s[keep], rows[keep]
     if len(keep) < 2:
         return {}
-    # Angles of Rz(yaw) Ry(pitch) Rx(roll), as `geometry.frames` has them. Yaw jumps by a whole
-    # turn where it passes half of one; its rate must not.
-    x, y, z, w = rows[:, 3:].T
-    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    roll, pitch, yaw = euler_zyx(rows[:, 3:]).T
+    yaw = np.unwrap(yaw)  # it jumps by a whole turn where it passes half of one; its rate must not
     middle, step = (time_s[1:] + time_s[:-1]) / 2, np.diff(time_s)
     return {
-        "roll": (time_s, np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
-        "pitch": (time_s, np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))),
+        "roll": (time_s, roll),
+        "pitch": (time_s, pitch),
         "yaw rate": (middle, np.diff(yaw) / step),
         "speed": (middle, np.hypot(*np.diff(rows[:, :2], axis=0).T) / step),
         "height": (time_s, rows[:, 2]),

@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.estimation.score import inside_truth
 from dmrl.geometry.frames import Array
+from dmrl.geometry.turns import euler_zyx
 from dmrl.recording import Contents
 
+UNIT = 0.1
+"""A quaternion whose length is further from 1 is none."""
 TOLD = (topics.TRUTH, topics.TRUE_POSE)
 """Topics that tell it: what `Contents` has to hold."""
 Times = NDArray[np.int64]
@@ -79,11 +82,10 @@ def _poses(held: Contents, robot: str) -> tuple[Times, Array, Array]:
     pose = pa.Table.from_struct_array(table["pose"])
     place = _stack(pa.Table.from_struct_array(pose["position"]), "xyz")
     turn = _stack(pa.Table.from_struct_array(pose["orientation"]), "xyzw")
-    x, y, z, w = turn.T
-    yaw = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-    good = np.isfinite(place).all(axis=1) & np.isfinite(turn).all(axis=1)
-    good &= np.abs(turn).max(axis=1, initial=0) > 0
-    return time_ns[good], place[good], yaw[good]
+    size = np.linalg.norm(turn, axis=1)
+    good = np.isfinite(place).all(axis=1) & (np.abs(size - 1) < UNIT)
+    yaw = euler_zyx(turn[good] / size[good, None])[:, 2]
+    return time_ns[good], place[good], yaw
 
 
 def _stack(table: pa.Table, names: str) -> Array:

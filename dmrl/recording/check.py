@@ -109,8 +109,8 @@ def _clocks(seen: Seen) -> Iterator[Finding]:
 
 
 def _units(seen: Seen) -> Iterator[Finding]:
-    """Values and times that cannot be in the units of their topics."""
-    for topic, text in (*seen.values.doubted(), *periods(seen.times)):
+    """Values and times that cannot be in the units, frames and signs of their topics."""
+    for topic, text in (*seen.values.doubted(), *periods(seen.times), *seen.moved.doubted()):
         yield Finding("warning", topic, text)
 
 

@@ -14,6 +14,7 @@ from dmrl.images.codec import size
 from dmrl.recording.block import Block, Ints, joined
 from dmrl.recording.blocks import in_file_order
 from dmrl.recording.channel import Channel
+from dmrl.recording.check_motion import Moved
 from dmrl.recording.check_units import Sizes
 from dmrl.recording.contents import Contents
 from dmrl.recording.decoded import apart, decoded
@@ -47,6 +48,8 @@ class Seen:
         By topic: how many messages have a time stamp of 0, and stand at another time.
     values
         How large what sensors say is.
+    moved
+        What robots measured of their motion, and their poses.
     """
 
     contents: Contents
@@ -55,6 +58,7 @@ class Seen:
     sizes: dict[str, Counter[Size]] = field(default_factory=lambda: defaultdict(Counter))
     unset: Counter[str] = field(default_factory=Counter)
     values: Sizes = field(default_factory=Sizes)
+    moved: Moved = field(default_factory=Moved)
 
 
 def carries(topic: str, schema: str) -> bool:
@@ -148,6 +152,7 @@ def _decode(seen: Seen, topic: str, block: Block, channels: dict[int, Channel]) 
     if stamped and "timestamp" in batch.schema.names:
         seen.unset[topic] += _unset(batch)
     seen.values.add(topic, batch)
+    seen.moved.add(topic, batch)
     if names(CAMERA_IMAGE, topic):
         seen.sizes[topic].update(_size(data.as_buffer()) for data in batch["data"])
 

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.formats.crazyflie_log import attitude_of, streams, yaw_rate_of
-from dmrl.formats.log_block import Block, Series, euler_zyx, quaternion_zyx, unpacked_quaternion
+from dmrl.formats.log_block import Block, Series, unpacked_quaternion
 from dmrl.geometry.frames import Array, camera_from_horizontal
+from dmrl.geometry.turns import euler_zyx, quaternion_zyx
 
 MS = 1_000_000
 TIMES = np.arange(3) * 10 * MS

@@ -11,7 +11,7 @@ from dmrl.formats import mapped_csv
 from dmrl.formats.column_map import QUANTITIES, read_map
 from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
-from dmrl.formats.log_block import euler_zyx
+from dmrl.geometry.turns import euler_zyx
 from dmrl.samples.sample import Sample
 
 TABLE = """

@@ -303,7 +303,7 @@ def test_degrees_are_suspected(changed: Callable[[Change], Path]) -> None:
             stamped.message.pitch_rad *= 57.3
         return [stamped]
 
-    assert "cf1: a tilt of" in warnings_of(changed(degrees))
+    assert "Are they degrees?" in warnings_of(changed(degrees))
 
 
 def test_clocks_an_hour_apart_are_an_error_of_one_line(

@@ -1,0 +1,29 @@
+"""How a body is turned: angles of Rz(yaw) Ry(pitch) Rx(roll), z up, and quaternions.
+
+Pitch is positive nose down. Frames of cameras are in ``geometry.frames``.
+"""
+
+import numpy as np
+
+from dmrl.geometry.frames import Array
+
+
+def euler_zyx(quaternion: Array) -> Array:
+    """(N, 3) roll, pitch, yaw of Rz(yaw) Ry(pitch) Rx(roll) from (N, 4) x, y, z, w."""
+    x, y, z, w = quaternion.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.stack([roll, pitch, yaw], axis=1)
+
+
+def quaternion_zyx(angles: Array) -> Array:
+    """(N, 4) x, y, z, w from (N, 3) roll, pitch, yaw; the inverse of ``euler_zyx``."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles / 2).T, np.sin(angles / 2).T
+    xyzw = (
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+        cy * cp * cr + sy * sp * sr,
+    )
+    return np.stack(xyzw, axis=1)
