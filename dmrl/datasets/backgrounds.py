@@ -1,4 +1,4 @@
-"""What is put behind rendered robots: a folder of photos, or the images of a dataset.
+"""What is put behind rendered robots: a folder of photos, rooms, or the images of a dataset.
 
 Images of a dataset are where its robots fly, as their camera sees it; the robots in them are
 painted over.
@@ -16,6 +16,7 @@ from dmrl.errors import SettingError
 from dmrl.images.bayer import load_opencv
 from dmrl.images.codec import Rgb
 from dmrl.rendering.backdrops import Photos, photos_in
+from dmrl.rendering.interiors import ROOMS, rooms
 
 MOST_HIDDEN = 0.15
 """Share of an image that may be painted over; of more, too little is left to be a background."""
@@ -31,7 +32,7 @@ Ellipse = tuple[float, float, float, float]
 
 
 def photos_of(folder: Path) -> Photos:
-    """Photos of a folder, or images of the train split of a dataset, without their robots.
+    """Photos of a folder, rooms, or images of the train split of a dataset, without their robots.
 
     Raises
     ------
@@ -40,6 +41,8 @@ def photos_of(folder: Path) -> Photos:
     DatasetError
         If it is a dataset without a train split, or a damaged one.
     """
+    if str(folder) == ROOMS:
+        return rooms()
     if not is_dataset(folder):
         return photos_in(folder)
     split = open_dataset(folder).split("train")

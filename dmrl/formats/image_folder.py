@@ -15,7 +15,8 @@ Or ``label.txt`` as the published firmware's tools write it, ``imgNNNNN.ppm roll
 a line: see ``aideck``. Labels of it need a camera.
 
 Pixels are those of the stored picture, pixel-edge coordinates. ``calibration.toml`` in the
-folder is the camera that took the pictures as they are stored (keys: see ``Camera``).
+folder is the camera that took the pictures as they are stored (keys: see ``Camera``). Pictures of
+the AI-deck's whole sensor, 324x244, with a camera of 320x224 are cut to what that is of.
 """
 
 from collections.abc import Collection, Iterator
@@ -29,6 +30,7 @@ from dmrl.formats.crop import Crop
 from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.label_table import LabelRow, read_labels
 from dmrl.geometry.camera_file import read_camera
+from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX, Camera
 from dmrl.images import codec
 from dmrl.images.bayer import rgb_of
 from dmrl.samples.sample import Sample, calibration, image, intervals, labels
@@ -158,7 +160,7 @@ def _samples(
     for k, (time_ns, path) in enumerate(pictures):
         crop, data, kind = _stored(path, options)
         if options.camera is not None and k == 0:
-            yield calibration(time_ns, options.robot, crop.camera(options.camera))
+            yield calibration(time_ns, options.robot, _camera_after(crop, options.camera))
         yield image(time_ns, options.robot, data, kind)
         if path.name in rows:
             peers = [crop.label(row) for row in rows[path.name] if row.peer]
@@ -166,7 +168,7 @@ def _samples(
             yield labels(time_ns, options.robot, [row.fields() for row in peers], sources)
         if path.name in states:
             known = options.camera if path.name not in rows else None
-            camera = crop.camera(known) if known else None
+            camera = _camera_after(crop, known) if known else None
             peer = options.names.get("0", "cf2")
             yield from aideck.samples(time_ns, options.robot, peer, states[path.name], camera)
 
@@ -192,13 +194,26 @@ def _colours(data: bytes, path: Path) -> codec.Rgb:
 
 
 def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
-    camera = options.camera
-    if camera is not None and (width_px, height_px) != (camera.width_px, camera.height_px):
-        raise SettingError(
-            f"{path} is {width_px}x{height_px} px, its camera {camera.width_px}x"
-            f"{camera.height_px}. Give the calibration of the pictures as they are stored"
-        )
-    return Crop(width_px, height_px, *(options.size_px or (width_px, height_px)))
+    camera, size = options.camera, (width_px, height_px)
+    if camera is None or size == _size(camera):
+        return Crop(*size, *(options.size_px or size))
+    if size == AIDECK_SENSOR_PX and _size(camera) == _size(AIDECK) == (
+        options.size_px or _size(AIDECK)
+    ):
+        return Crop(*size, *_size(AIDECK), cut_px=AIDECK_CORNER_PX)
+    raise SettingError(
+        f"{path} is {width_px}x{height_px} px, its camera {camera.width_px}x"
+        f"{camera.height_px}. Give the calibration of the pictures as they are stored"
+    )
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width_px, camera.height_px
+
+
+def _camera_after(crop: Crop, camera: Camera) -> Camera:
+    """The camera of the pictures as they are written: of what is cut out it is told already."""
+    return camera if crop.cut_px is not None else crop.camera(camera)
 
 
 FORMAT = Format("images", "a folder of pictures", recognises, content)

@@ -78,6 +78,9 @@ class Camera:
 AIDECK = Camera(320, 224, 183.73, 184.12, 166.90, 77.51, (-0.0957, 0.0211, 0.0, 0.0, 0.0))
 """The AI-deck camera of the paper (eq. 1): 324x244 cropped to 320x224."""
 
+AIDECK_SENSOR_PX, AIDECK_CORNER_PX = (324, 244), (2, 10)
+"""Width and height of all that the AI-deck's sensor sees, and where in it that camera begins."""
+
 AIDECK_PINHOLE = replace(AIDECK, distortion=())
 """The same without its distortion: what flights and sketches are seen with."""
 

@@ -46,6 +46,7 @@ FOCUS_SHARE = 0.8
 """Share of mosaic windows that hold a robot of their image; the rest fall where they may."""
 LEAST_AHEAD = 0.25
 """Least over greatest depth, along the source's axis, of what a turned camera's corners see."""
+LUMA = torch.tensor([0.299, 0.587, 0.114])
 DEPTH_SLACK = 1.1
 """How far beyond the nearest and the farthest label zooming may bring a robot."""
 
@@ -76,6 +77,8 @@ class Augmentation:
     intrinsics
         Of the camera, undistorted. With them a window is what the camera would have seen had it
         been turned; without, it is cut out.
+    grey_share
+        Share of images whose three channels become their luma, as of a grey camera.
     """
 
     flip_share: float = 0.0
@@ -87,6 +90,7 @@ class Augmentation:
     noise: float = 0.0
     blur_share: float = 0.0
     intrinsics: Intrinsics | None = None
+    grey_share: float = 0.0
 
     @property
     def plain(self) -> "Augmentation":
@@ -286,7 +290,7 @@ class Augmenter:
             pixels.add_(torch.from_numpy(lift.astype(np.float32)))
 
     def _spoil(self, canvas: Tensor, rng: Rng) -> None:
-        """Defocus and sensor noise, in place."""
+        """Defocus, sensor noise and the loss of colours, in place."""
         if rng.random() < self._settings.blur_share:
             share = rng.uniform(0.1, 1 / 3)
             for lines in (canvas, canvas.transpose(0, 1)):
@@ -296,3 +300,5 @@ class Augmenter:
             at = int(rng.integers(len(self._grain) - canvas.numel()))
             grain = self._grain[at : at + canvas.numel()].view(canvas.shape)
             canvas.add_(grain, alpha=255 * self._settings.noise * rng.random())
+        if self._settings.grey_share and rng.random() < self._settings.grey_share:
+            canvas.copy_((canvas @ LUMA)[..., None].expand_as(canvas))

@@ -18,12 +18,15 @@ from dmrl.learn.augment import Augmenter
 from dmrl.learn.batches import Batch, Examples, ahead, batch_count, gathered, order
 from dmrl.learn.checkpoint import State, load_checkpoint, save_checkpoint
 from dmrl.learn.group import Group
+from dmrl.learn.mining import mined
 from dmrl.learn.network import Network, build
 from dmrl.learn.optimizer import new_optimizer
 from dmrl.learn.settings import FitSettings
 from dmrl.learn.step import ALONE, LOSSES, Average, train_step
 from dmrl.learn.validate import validation_figures
 
+Shares = NDArray[np.float64] | None
+"""(N,) how often each image comes in an epoch, 1 on average; None: once."""
 WATCH_STEPS = 10  # reading a loss makes an accelerator wait, so not at every step
 
 
@@ -200,9 +203,9 @@ class Training:
         averaged = {"average": self._average.network} if self._average else {}
         return {"network": self._learning, **averaged}
 
-    def _batches(self, epoch: int) -> Iterator[Batch]:
+    def _batches(self, epoch: int, shares: Shares) -> Iterator[Batch]:
         size, seed = self._settings.batch_size, self._settings.seed
-        indices = order(len(self._examples), seed=seed, epoch=epoch, shares=self._shares)
+        indices = order(len(self._examples), seed=seed, epoch=epoch, shares=shares)
         augmentation = self._settings.augmentation(epoch)
         augmenter = (
             None if augmentation.is_nothing else Augmenter(self._examples, augmentation, seed=seed)
@@ -218,12 +221,18 @@ class Training:
                     chosen, epoch=epoch, index=index * self._group.size + self._group.rank
                 )
 
+    def _epoch_shares(self) -> Shares:
+        """How often each image comes in the next epoch: hard ones without a robot more often."""
+        share = self._settings.hard_share
+        return mined(self.network, self._examples, self._shares, share) if share else self._shares
+
     def _epoch(self, epoch: int, board: boards.Board) -> Generator[Step, None, dict[str, float]]:
         """Train one epoch; returns its mean losses."""
         size = self._settings.batch_size
         seen: list[Tensor] = []
         total, loss = torch.zeros(len(LOSSES)), math.nan
-        for index, batch in enumerate(ahead(self._batches(epoch)), start=1):
+        shares = self._epoch_shares()
+        for index, batch in enumerate(ahead(self._batches(epoch, shares)), start=1):
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
             whole = min(size, len(self._examples) - (index - 1) * size)

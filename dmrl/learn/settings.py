@@ -53,7 +53,15 @@ class FitSettings(LossSettings):
         together.
     threshold
         Confidence from which the model's detections are to be believed, 0 to 1. Without it,
-        that of the best F1 on the images held out, or 0.33 where these hold fewer than 10 robots.
+        that of the best F1 on the images held out among those that keep to ``false_alarms``, or
+        0.33 where these hold fewer than 10 robots.
+    false_alarms
+        Detections at or above the threshold in an image without a robot, on average, at most:
+        of the images held out, where at least 20 of them have none.
+    hard_share
+        Share of an epoch that is images without a robot, those first that the network believes
+        to hold one: each as often as the square of its greatest confidence. They are looked at
+        anew before every epoch. 0: as often as the other images.
     flip_share
         Share of windows mirrored left to right, 0 to 1.
     zoom
@@ -80,6 +88,8 @@ class FitSettings(LossSettings):
         fx, fy, cx and cy of the camera, pixels, of images without distortion. With them windows
         of images are what the camera would have seen had it been turned; without, they are cut
         out, and carry along the stretch of where they were.
+    grey_share
+        Share of images whose colours are taken away, 0 to 1, for grey cameras as well.
     precision
         What the network is trained in. "bfloat16": the body in bfloat16, weights, head and
         losses in float32; half as long again as fast on CPUs that have it.
@@ -107,6 +117,8 @@ class FitSettings(LossSettings):
     shares: dict[str, float] = field(default_factory=dict)
     validation_share: float = 0.1
     threshold: float | None = None
+    false_alarms: float = 0.05
+    hard_share: float = 0.0
     flip_share: float = 0.5
     zoom: tuple[float, float] = (0.6, 1.6)
     rotation_deg: float = 8.0
@@ -118,6 +130,7 @@ class FitSettings(LossSettings):
     noise: float = 0.01
     blur_share: float = 0.1
     intrinsics: Intrinsics | None = None
+    grey_share: float = 0.0
     precision: Literal["float32", "bfloat16"] = "float32"
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -162,20 +175,21 @@ class FitSettings(LossSettings):
             self.noise,
             self.blur_share,
             self.intrinsics,
+            self.grey_share,
         )
         return whole if epoch < self.epochs - self.plain_epochs else whole.plain
 
 
 SHARES = (
     *("validation_share", "threshold", "flip_share", "mosaic_share"),
-    *("blur_share", "colour", "noise", "distill_share"),
+    *("blur_share", "colour", "noise", "distill_share", "grey_share", "hard_share"),
 )
 AT_LEAST_ONE = ("epochs", "batch_size", "processes")
 NOT_NEGATIVE = (
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
     *(term.weight for term in TERMS),
     *("rotation_deg", "paste"),
-    *("plain_epochs", "frozen_norm_epochs"),
+    *("plain_epochs", "frozen_norm_epochs", "false_alarms"),
 )
 
 

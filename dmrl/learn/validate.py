@@ -1,8 +1,7 @@
-"""How good a network is on images held out, and which threshold suits it."""
+"""How good a network is on images held out."""
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from dmrl.learn.batches import DEPTH, Examples, U, V, in_order
 from dmrl.learn.decode import decode
@@ -15,8 +14,6 @@ from dmrl.learn.step import losses
 
 WATCHED = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
 """Figures of ``metrics`` that are watched during a training."""
-LEAST_LABELS = 10
-"""Labels below which a threshold would hang on chance."""
 EVERYWHERE = (0.0, np.inf)
 
 
@@ -66,21 +63,3 @@ def labels(examples: Examples) -> Points:
     image, _ = np.nonzero(inside)
     depth_m = robots[..., DEPTH][inside]
     return Points(image, u[inside], v[inside], depth_m, np.ones(len(image)))
-
-
-def best_threshold(scored: Scored) -> float | None:
-    """Confidence that gives the best F1, detections right within 16 px; None with few labels.
-
-    Halfway between the last detection that pays and the next below it, so that the choice does
-    not hang on one detection's last digits.
-    """
-    right: NDArray[np.bool_] = scored.right_16_px >= 0
-    if len(scored.labels) < LEAST_LABELS or not right.any():
-        return None
-    descending = np.argsort(-scored.detections.confidence, kind="stable")
-    confidence = scored.detections.confidence[descending]
-    true = np.cumsum(right[descending])
-    f1 = 2 * true / (np.arange(1, len(true) + 1) + len(scored.labels))
-    best = int(np.argmax(f1))
-    below = confidence[best + 1] if best + 1 < len(confidence) else 0.0
-    return float((confidence[best] + below) / 2)

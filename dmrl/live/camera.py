@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.counters import SteadySender
 from dmrl.formats.cpx import PORT, Image, ImageReader
-from dmrl.geometry.frames import AIDECK, Camera
+from dmrl.geometry.frames import AIDECK, AIDECK_SENSOR_PX, Camera
 from dmrl.live.clocks import HostTime, SenderClock
 from dmrl.live.feed import Feed, Health, Received
-from dmrl.live.pictures import SENSOR_PX, Colours, Stored, encoded
+from dmrl.live.pictures import Colours, Stored, encoded
 from dmrl.samples.sample import calibration
 from dmrl.samples.sample import image as image_sample
 
@@ -187,7 +187,7 @@ class CameraClient(threading.Thread):
 
     def _calibrate(self, sent_px: tuple[int, int], time_ns: int, arrival_ns: int) -> None:
         """Hand on the calibration before the first image, if there is one of its size."""
-        size_px = (AIDECK.width_px, AIDECK.height_px) if sent_px == SENSOR_PX else sent_px
+        size_px = (AIDECK.width_px, AIDECK.height_px) if sent_px == AIDECK_SENSOR_PX else sent_px
         if size_px == self._size_px:
             return
         if self._size_px is not None:

@@ -11,10 +11,9 @@ from dmrl.errors import SettingError
 from dmrl.formats.cpx import Image
 from dmrl.formats.cpx_pack import pack_image
 from dmrl.formats.cpx_state import State
-from dmrl.geometry.frames import AIDECK
+from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
 from dmrl.live.fake_flight import Faults, FlightClock, Pictures
-from dmrl.live.pictures import LEFT_PX, SENSOR_PX, TOP_PX
 
 Sends = Literal["plain", "stamped", "streamer", "jpeg"]
 """The layouts of raw images, or plain JPEG."""
@@ -165,7 +164,8 @@ def whole_sensor(rgb: codec.Rgb) -> codec.Rgb:
     """What the whole sensor saw of (H, W, 3), with the cut-off border made up; or as it was."""
     if rgb.shape[:2] != (AIDECK.height_px, AIDECK.width_px):
         return rgb
-    width_px, height_px = SENSOR_PX
-    rows = TOP_PX, height_px - TOP_PX - AIDECK.height_px
-    cols = LEFT_PX, width_px - LEFT_PX - AIDECK.width_px
+    width_px, height_px = AIDECK_SENSOR_PX
+    left, top = AIDECK_CORNER_PX
+    rows = top, height_px - top - AIDECK.height_px
+    cols = left, width_px - left - AIDECK.width_px
     return np.pad(rgb, (rows, cols, (0, 0)), mode="edge")

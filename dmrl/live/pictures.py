@@ -6,13 +6,8 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.cpx import Image
-from dmrl.geometry.frames import AIDECK
+from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
-
-SENSOR_PX = (324, 244)
-"""Width and height of all that the AI-deck's camera sees."""
-LEFT_PX, TOP_PX = 2, 10
-"""What is cut off on the left and at the top: the calibration is of the rest."""
 
 Colours = Literal["colour", "grey"]
 Stored = Literal["png", "jpeg"]
@@ -39,7 +34,7 @@ def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[byt
     SourceError
         If a JPEG cannot be decoded, or has another size than the camera said.
     """
-    whole = (image.width_px, image.height_px) == SENSOR_PX
+    whole = (image.width_px, image.height_px) == AIDECK_SENSOR_PX
     if image.encoding == "jpeg":
         width_px, height_px, kind = codec.size(image.data, "the camera's JPEG")
         if (width_px, height_px) != (image.width_px, image.height_px) or kind != "jpeg":
@@ -63,4 +58,5 @@ def _stored(pixels: codec.Rgb, stored: Stored) -> bytes:
 
 
 def _cut(pixels: codec.Rgb) -> codec.Rgb:
-    return pixels[TOP_PX : TOP_PX + AIDECK.height_px, LEFT_PX : LEFT_PX + AIDECK.width_px]
+    left, top = AIDECK_CORNER_PX
+    return pixels[top : top + AIDECK.height_px, left : left + AIDECK.width_px]

@@ -14,7 +14,7 @@ from dmrl.geometry.lens import undistort
 from dmrl.images.codec import Rgb, crop_and_scale, decode, size
 from dmrl.rendering.lens import Picture, between
 
-PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm")
+PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm")
 KEPT = 64
 """Decoded photos that are kept; bounds memory."""
 

@@ -40,14 +40,14 @@ class Model:
     scale
         Metres per unit of the file; of the drawn one, times its life size.
     up
-        Axis of the file that points up.
+        Axis of the file that points up; auto: y of .obj and .glb, z of .stl and .blend.
     centre
         What labels are about: the middle of the model's box, or the file's origin.
     """
 
     path: Path | None = None
     scale: float = 1.0
-    up: Literal["y", "z"] = "z"
+    up: Literal["auto", "y", "z"] = "auto"
     centre: Literal["box", "origin"] = "box"
 
 
@@ -114,10 +114,7 @@ class Renderer:
         size_m = float(np.ptp(self._pool.points, axis=0).max())
         if not SMALLEST_M <= size_m <= LARGEST_M:
             self._pool.__exit__()
-            raise SettingError(
-                f"--scale {model.scale:g} makes robots of {size_m:.3g} m; they must be "
-                f"{SMALLEST_M:g} to {LARGEST_M:g} m. Change --scale, metres per unit of the model"
-            )
+            raise SettingError(_why_not(model, size_m))
 
     @property
     def radius_m(self) -> float:
@@ -193,6 +190,20 @@ def shipped_lights(python: Path) -> list[Path]:
         "lib/python*/site-packages/bpy/*/datafiles/studiolights/world"
     )
     return sorted(path for folder in found for path in folder.glob("*.exr"))
+
+
+def _why_not(model: Model, size_m: float) -> str:
+    """What is wrong with robots of this size."""
+    limits = f"they must be {SMALLEST_M:g} to {LARGEST_M:g} m"
+    if model.path is None:
+        return (
+            f"the Crazyflie that dmrl draws, {model.scale:g} times life size, is {size_m:.3g} m; "
+            f"{limits}. Give the --model that this scale is for, or --scale 1"
+        )
+    return (
+        f"--scale {model.scale:g} makes robots of {size_m:.3g} m; {limits}. Change --scale, "
+        "metres per unit of the model"
+    )
 
 
 def _check_model(model: Model) -> None:

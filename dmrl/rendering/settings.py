@@ -72,13 +72,15 @@ class Settings:
     model
         .blend, .glb, .obj or .stl of the robot. Without it, the Crazyflie that dmrl draws.
     model_up
-        Axis of the model's file that points up.
+        Axis of the model's file that points up. auto: as is usual for its kind, y of .obj and
+        .glb, z of .stl and .blend.
     model_centre
         What of the model its labels are about: the middle of its box, or the file's origin.
     scale
         Metres per unit of the model; without a model, times life size.
     backgrounds
-        Folder of photos, or a dataset. Without it, what the panoramas show.
+        Folder of photos, a dataset, or rooms, which are made by code. Without it, what the
+        panoramas show.
     lights
         Folder of panoramas (.exr, .hdr). Without it, those that come with Blender.
     masks
@@ -175,7 +177,7 @@ class Settings:
     camera: Path = Path("aideck")
     distorted: bool = True
     model: Path | None = None
-    model_up: Literal["y", "z"] = "z"
+    model_up: Literal["auto", "y", "z"] = "auto"
     model_centre: Literal["box", "origin"] = "box"
     scale: float = 1.0
     backgrounds: Path | None = None
@@ -245,7 +247,7 @@ def _faults(settings: Settings) -> list[str]:
 
 # Defaults of a recipe that says `preset`; its own keys come before them.
 PRESETS: dict[str, dict[str, Any]] = {
-    # The HM01B0 of the AI-deck: raw response, no white balance, small lens, much noise.
+    # The HM01B0 of the AI-deck: raw response, no white balance, small lens.
     "himax": {
         "camera": "aideck",
         "distorted": True,
@@ -253,18 +255,18 @@ PRESETS: dict[str, dict[str, Any]] = {
         "speed_max_mps": 0.6,
         "shutter_s": [0.002, 0.012],
         "shake_max_dps": 40.0,
-        "background_blur_px": [0.2, 1.2],
-        "robot_gain": [0.2, 1.0],
-        "brightness": [0.28, 0.55],
+        "background_blur_px": [0.0, 1.0],
+        "robot_gain": [0.25, 1.4],
+        "brightness": [0.28, 0.58],
         "contrast_gamma": [1.2, 1.9],
         "warmth": [0.5, 4.0],
-        "saturation": [0.4, 0.8],
-        "vignetting": [0.5, 0.9],
-        "defocus_px": [0.6, 1.4],
+        "saturation": [0.2, 0.7],
+        "vignetting": [0.55, 0.95],
+        "defocus_px": [0.2, 1.2],
         "bayer": True,
-        "shot_noise": [0.0005, 0.003],
-        "read_noise": [0.004, 0.015],
-        "jpeg_quality": [80, 95],
+        "shot_noise": [0.0001, 0.001],
+        "read_noise": [0.001, 0.005],
+        "jpeg_quality": [98, 100],  # below, JPEG makes the grain as coarse as it is not
     },
     # The authors' renders: f = 120 px about the middle, twice life size, a clean camera.
     "published": {

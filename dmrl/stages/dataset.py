@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
@@ -69,6 +70,9 @@ class Settings:
         recordings. "none": everything is train.
     test_share
         Share of the recordings that become the test split, 0 to 1.
+    val
+        Pattern of the recordings' names that become the split val, on which a training chooses its
+        threshold and never learns, such as "held*". Empty: none.
     seed
         Another seed holds out other recordings.
     masks
@@ -91,6 +95,7 @@ class Settings:
     keep_all: bool = False
     split: Literal["auto", "recordings", "none"] = "auto"
     test_share: Share = 0.2
+    val: str = ""
     seed: int = 0
     masks: bool = False
     png: bool = False
@@ -200,17 +205,19 @@ def _splits(
 ) -> dict[Path, SplitOf]:
     hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=True)}
     _refuse_twins(recordings, made)
-    own = {path: splits(path, summary(path)) for path in recordings if settings.split == "auto"}
+    watched = [path for path in recordings if fnmatchcase(path.name, settings.val)]
+    if settings.val and not watched:
+        names = ", ".join(path.name for path in recordings)
+        raise SettingError(f"--val {settings.val} fits none of {names}. Give another pattern")
+    learnt = [path for path in recordings if path not in watched]
+    own = {path: splits(path, summary(path)) for path in learnt if settings.split == "auto"}
     by_source = {path: parts for path, parts in own.items() if parts}
-    whole = {path: hashes[path] for path in recordings if path not in by_source}
+    whole = {path: hashes[path] for path in learnt if path not in by_source}
     share = 0.0 if settings.split == "none" else settings.test_share
     test = held_out(whole, share, settings.seed)
-    return {
-        path: of_source(path, by_source[path])
-        if path in by_source
-        else _constant("test" if path in test else "train")
-        for path in recordings
-    }
+    named = {path: _constant("test" if path in test else "train") for path in whole}
+    named |= {path: of_source(path, parts) for path, parts in by_source.items()}
+    return named | {path: _constant("val") for path in watched}
 
 
 def _warn_of_lenses(held: Iterable[Contents]) -> None:

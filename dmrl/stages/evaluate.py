@@ -15,7 +15,9 @@ from dmrl import topics
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
-from dmrl.learn.metrics import DEFINITIONS, BandFigures, Figure, Scored, by_band, curves, score
+from dmrl.evaluation.tables import by_band_table
+from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, curves, score
+from dmrl.learn.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.pipeline.folders import all_recordings
 from dmrl.recording import input_of, summary
@@ -55,6 +57,9 @@ class Settings:
     threshold
         Confidence from which a detection counts in precision, recall and F1, 0 to 1. Without
         it, the one in the recording.
+    false_alarms
+        Choose the threshold on these images: that of the best F1 among those at which an image
+        without a robot has at most so many detections, on average, such as 0.05.
     draws
         Bootstrap samples behind the 95 % intervals.
     seed
@@ -69,6 +74,7 @@ class Settings:
     split: str | None = None
     partial: Annotated[bool, Parameter(negative=())] = False
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
+    false_alarms: Annotated[float | None, Parameter(validator=validators.Number(gte=0))] = None
     draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
     seed: int = 0
     settle_s: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))] = None
@@ -175,10 +181,8 @@ def _folder(out: Path, name: str, made: Document) -> Iterator[Path]:
 def run_detections(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Evaluation:
     """Judge the detections of all recordings, image by image; see `run`."""
     pairs = join(recordings, settings.against, settings.split, partial=settings.partial)
-    threshold = settings.threshold
-    if threshold is None:
-        threshold = pairs.threshold or FALLBACK_THRESHOLD
     scored = score(pairs.images, pairs.labels, pairs.detections)
+    threshold = _threshold(scored, pairs, settings)
     bands = by_band(scored, threshold=threshold, draws=settings.draws, seed=settings.seed)
     evaluation = Evaluation(pairs, scored, bands, threshold)
     if out is not None:
@@ -187,6 +191,23 @@ def run_detections(recordings: Sequence[Path], out: Path | None, settings: Setti
             assert figures is not None
             figures.draw(folder, pairs, scored, settings.against, threshold)
     return evaluation
+
+
+def _threshold(scored: Scored, pairs: Pairs, settings: Settings) -> float:
+    """The one that is asked for, that keeps to the rate of false alarms, or the detector's own."""
+    if settings.false_alarms is None:
+        own = pairs.threshold or FALLBACK_THRESHOLD
+        return own if settings.threshold is None else settings.threshold
+    if settings.threshold is not None:
+        raise SettingError("--threshold and --false-alarms are two answers. Give one of them")
+    empty = alarms(scored, 0.0).empty_images
+    chosen = best_threshold(scored, settings.false_alarms)
+    if chosen is None or empty < LEAST_EMPTY:
+        raise SettingError(
+            f"--false-alarms wants {LEAST_LABELS} labels, some of them found, and {LEAST_EMPTY} "
+            f"images without a robot: there are {len(scored.labels)} and {empty}. Give --threshold"
+        )
+    return chosen
 
 
 def document(
@@ -209,6 +230,10 @@ def document(
         "partial": settings.partial,
         "images_without_detections": evaluation.pairs.unseen,
         "left_out": evaluation.pairs.left_out,
+        **{
+            name: _finite(value)
+            for name, value in asdict(alarms(evaluation.scored, evaluation.threshold)).items()
+        },
         "bootstrap": {"draws": settings.draws, "seed": settings.seed},
         "overall": overall,
         "bands": bands,
@@ -240,51 +265,31 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-# Name of a figure, its words in the table, and its format.
-ROWS = (
-    ("median_px", "median error, px", ".2f"),
-    ("mean_px", "mean error, px", ".1f"),
-    ("rmse_px", "RMS error, px", ".1f"),
-    ("p95_px", "95th percentile, px", ".1f"),
-    ("within_8_px", "within 8 px", ".1%"),
-    ("within_20_px", "within 20 px", ".1%"),
-    ("bias_u_px", "median error in u, px", ".2f"),
-    ("bias_v_px", "median error in v, px", ".2f"),
-    ("depth_mae_m", "depth MAE, m", ".3f"),
-    ("depth_rmse_m", "depth RMSE, m", ".3f"),
-    ("precision", "precision", ".1%"),
-    ("recall", "recall", ".1%"),
-    ("f1", "F1", ".3f"),
-    ("ap_8_px", "AP at 8 px", ".3f"),
-    ("ap_16_px", "AP at 16 px", ".3f"),
-)
-
-
 def print_evaluation(
     recordings: Sequence[Path], settings: Settings, evaluation: Evaluation
 ) -> None:
     """Print the figures, one column per band that holds labels."""
-    overall, *others = evaluation.bands
-    shown = [overall, *(band for band in others if band.labels)]
-    headers = ["all", *(_range(band) for band in shown[1:])]
-    rows: list[list[object]] = [["labels", *(str(band.labels) for band in shown)]]
-    for name, words, form in ROWS:
-        cells = [_cell(band.figures[name], form) for band in shown]
-        rows.append([words, *cells])
+    headers, rows = by_band_table(evaluation.bands)
     split = f", split {settings.split}" if settings.split else ""
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     part = ", only those with detections" if settings.partial else ""
     title = f"{name}: {evaluation.pairs.images} images against {settings.against}{split}{part}"
     print_table(title, ["label minus detection", *headers], rows)
     notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
-    if overall.unmatched:
-        notes.append(f"{overall.unmatched} labels without any detection")
+    if unmatched := evaluation.bands[0].unmatched:
+        notes.append(f"{unmatched} labels without any detection")
     for note in notes:
         print_line(f"left out: {note}")
     if unseen := evaluation.pairs.unseen:
         print_line(
             f"{unseen} images have no Detections message: nothing was found there. "
             "--partial leaves them out"
+        )
+    quiet = alarms(evaluation.scored, evaluation.threshold)
+    if quiet.empty_images:
+        print_line(
+            f"nobody in view: an alarm in {quiet.alarmed_images} of {quiet.empty_images} images, "
+            f"{quiet.false_alarms:.3f} an image"
         )
     print_line(
         f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
@@ -298,18 +303,6 @@ def print_document(recording: Path, made: Document) -> None:
     headers = [words for _, words, _ in kind.COLUMNS]
     print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
     print_line(f"{kind.NOTE}; settled after {made['settle_s']:g} s")
-
-
-def _range(band: BandFigures) -> str:
-    to = f" to {band.to_m:g} m" if math.isfinite(band.to_m) else " m and more"
-    return f"{band.from_m:g}{to}"
-
-
-def _cell(figure: Figure, form: str) -> str:
-    if math.isnan(figure.value):
-        return "-"
-    low, high = format(figure.low, form), format(figure.high, form)
-    return f"{figure.value:{form}} [{low.removesuffix('%')}, {high.removesuffix('%')}]"
 
 
 DEFAULTS = Settings()

@@ -31,6 +31,7 @@ from dmrl.recording import (
     provenance,
 )
 from dmrl.rendering.environment import ensure
+from dmrl.rendering.interiors import ROOMS
 from dmrl.rendering.lens import canvas_of
 from dmrl.rendering.messages import ROBOT, samples
 from dmrl.rendering.randomise import Drawn, World, draw_scene
@@ -184,7 +185,7 @@ def _counts(out: Path) -> tuple[int, int]:
 
 def _provenance(settings: Settings, blender: str) -> Provenance:
     """How the recording is made; the number of workers changes nothing, so it is left out."""
-    inputs = [path for path in (settings.model, settings.backgrounds, settings.lights) if path]
+    inputs = _made_from(settings)
     if str(settings.camera) not in KNOWN:
         inputs.append(settings.camera)
     plain = replace(settings, workers=0)
@@ -192,10 +193,15 @@ def _provenance(settings: Settings, blender: str) -> Provenance:
     return replace(made, libraries={**made.libraries, "blender": blender})
 
 
+def _made_from(settings: Settings) -> list[Path]:
+    """Files and folders that the images are made from."""
+    named = (settings.model, settings.backgrounds, settings.lights)
+    return [path for path in named if path is not None and str(path) != ROOMS]
+
+
 def _licences(settings: Settings) -> dict[str, str]:
     """What is said beside photos, panoramas and model: it holds for the images too."""
-    made_from = (settings.backgrounds, settings.lights, settings.model)
-    found = {path.name: licence_beside(path) for path in made_from if path is not None}
+    found = {path.name: licence_beside(path) for path in _made_from(settings)}
     return {name: licence_words(path) for name, path in found.items() if path is not None}
 
 
@@ -273,8 +279,8 @@ def command(
     workers
         Blender processes; 0: as many as there are cores. Changes no byte of the output.
     backgrounds
-        What to put behind the robots: a folder of photos, or a dataset whose train images are
-        put there, their robots painted over.
+        What to put behind the robots: a folder of photos; rooms, which are made by code; or a
+        dataset whose train images are put there, their robots painted over.
     camera
         Calibration of the camera, a TOML file as dmrl calibrate writes, or aideck or published.
     model

@@ -22,6 +22,7 @@ from dmrl.terminal.tables import print_json, print_table
 try:
     from dmrl.datasets.for_training import material
     from dmrl.learn.batches import Examples
+    from dmrl.learn.calibrate import Calibration, calibrate, calibration
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.fit import Step, Training, device_of, new_network
     from dmrl.learn.group import Group, in_group
@@ -35,7 +36,8 @@ try:
     )
     from dmrl.learn.network import Network
     from dmrl.learn.settings import FitSettings
-    from dmrl.learn.validate import best_threshold, scores
+    from dmrl.learn.threshold import best_threshold
+    from dmrl.learn.validate import scores
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "train", "dmrl train") from e
 
@@ -64,8 +66,8 @@ def run(
 ) -> Result:
     """Train on the train split of ``dataset`` and write the run folder ``out``.
 
-    The threshold is chosen on images held out: the split named val or, where there is none, a
-    share of the train split.
+    Confidence is calibrated, and the threshold chosen, on images held out: the split named val
+    or, where there is none, a share of the train split.
 
     Parameters
     ----------
@@ -140,8 +142,8 @@ def _run(
             made.write(folder)
         result = _train(training, settings, len(examples), group)
         if group.leads:
-            threshold = _threshold(training.network, held_out, settings)
-            save_model(_model(training, settings, train, len(examples), threshold), folder)
+            judged = _judged(training.network, held_out, settings)
+            save_model(_model(training, settings, train, len(examples), judged), folder)
             remove_checkpoint(folder)
     return result
 
@@ -155,11 +157,30 @@ def _refuse_unfinished(partial: Path, *, resume: bool) -> None:
         )
 
 
-def _threshold(network: Network, held_out: Examples | None, settings: Settings) -> float:
+class Judged(NamedTuple):
+    """What the images held out said of a network: its threshold, and what its logits lacked."""
+
+    threshold: float
+    calibration: Calibration | None
+
+
+def _judged(network: Network, held_out: Examples | None, settings: Settings) -> Judged:
+    """Calibrate the network on the images held out, and choose its threshold there."""
+    if held_out is None:
+        return Judged(_or_published(settings.threshold), None)
+    scored = scores(network, held_out)
+    found = calibration(scored)
+    if found is not None and calibrate(network, found):
+        scored = scores(network, held_out)
+    else:
+        found = None
     if settings.threshold is not None:
-        return settings.threshold
-    best = best_threshold(scores(network, held_out)) if held_out is not None else None
-    return PUBLISHED_THRESHOLD if best is None else best
+        return Judged(settings.threshold, found)
+    return Judged(_or_published(best_threshold(scored, settings.false_alarms)), found)
+
+
+def _or_published(threshold: float | None) -> float:
+    return PUBLISHED_THRESHOLD if threshold is None else threshold
 
 
 def _first_network(settings: Settings, examples: Examples, init: Path | None) -> Network:
@@ -199,7 +220,7 @@ def _train(training: Training, settings: Settings, images: int, group: Group) ->
 
 
 def _model(
-    training: Training, settings: Settings, train: Split, images: int, threshold: float
+    training: Training, settings: Settings, train: Split, images: int, judged: Judged
 ) -> Model:
     height_px, width_px = train.image_shape
     peers = pc.list_flatten(train.table.column("peers"))
@@ -209,9 +230,14 @@ def _model(
         settings.architecture,
         width_px=width_px,
         height_px=height_px,
-        threshold=threshold,
+        threshold=judged.threshold,
         label_source=", ".join(sorted(sources)),
-        training={"images": images, "settings": asdict(settings), "history": training.history},
+        training={
+            "images": images,
+            "calibration": judged.calibration and judged.calibration._asdict(),
+            "settings": asdict(settings),
+            "history": training.history,
+        },
     )
 
 
@@ -227,6 +253,9 @@ class Flags:
         Images per step. Without it, the recipe's.
     learning_rate
         At the end of the warm-up. Without it, the recipe's.
+    false_alarms
+        Detections of an image without a robot, on average, that the threshold lets through at
+        most. Without it, the recipe's.
     seed
         Of the first weights and the order of the images. Without it, the recipe's.
     device
@@ -238,6 +267,7 @@ class Flags:
     epochs: int | None = None
     batch_size: int | None = None
     learning_rate: float | None = None
+    false_alarms: float | None = None
     seed: int | None = None
     device: Literal["auto", "cpu", "cuda"] | None = None
     processes: int | None = None

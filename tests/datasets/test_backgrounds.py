@@ -51,3 +51,15 @@ def test_a_folder_of_photos_is_what_it_was(tmp_path: Path) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
     (tmp_path / "a.png").write_bytes(encode_png(photo))
     assert (photos_of(tmp_path).photo(0) == photo).all()
+
+
+def test_rooms_are_made_by_code_and_are_the_same_by_number() -> None:
+    photos = photos_of(Path("rooms"))
+    rooms = [photos.photo(k) for k in range(6)]
+    assert {room.shape for room in rooms} == {(336, 480, 3)}
+    assert (photos_of(Path("rooms")).photo(3) == rooms[3]).all()
+    assert len({room.tobytes() for room in rooms}) == 6
+    # Bright walls with dark things on them: both ends of the scale are there.
+    levels = np.stack(rooms).mean(axis=-1)
+    assert (levels.reshape(6, -1).max(axis=1) > 100).all()
+    assert (levels < 60).mean() > 0.02

@@ -55,6 +55,19 @@ def test_recordings_are_held_out_whole(record: Record, tmp_path: Path) -> None:
     assert (len(held), len(kept), held & kept) == (2, 3, set())
 
 
+def test_recordings_named_for_it_are_the_split_val(record: Record, tmp_path: Path) -> None:
+    own = {"train": "[[0, 0]]"}
+    flights = [record(f"{k}.mcap", seed=k, split=own) for k in range(2)]
+    flights.append(record("held.mcap", seed=2, split=own))
+    run(flights, tmp_path / "out", Settings(val="held*", split="none"))
+    dataset = open_dataset(tmp_path / "out")
+    assert set(dataset.split("val").table["source"].to_pylist()) == {"held.mcap"}
+    assert len(dataset.split("val")) == 6
+    assert set(dataset.split("train").table["source"].to_pylist()) == {"0.mcap", "1.mcap"}
+    with pytest.raises(SettingError, match=r"--val none fits none of 0\.mcap, 1\.mcap"):
+        run(flights, tmp_path / "no", Settings(val="none"))
+
+
 def test_one_recording_is_all_train_and_says_that_nothing_is_held_out(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

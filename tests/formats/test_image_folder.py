@@ -243,3 +243,19 @@ def test_raw_pictures_get_their_colours(tmp_path: Path) -> None:
 def test_coloured_pictures_are_not_raw(folder: Path) -> None:
     with pytest.raises(SourceError, match=r"has colours already.* Leave out --raw"):
         samples(folder, "CompressedImage", Options(raw=True))
+
+
+def test_pictures_of_the_whole_sensor_are_cut_to_what_the_camera_is_of(tmp_path: Path) -> None:
+    whole = np.random.default_rng(0).integers(0, 256, (244, 324, 3), np.uint8)
+    (tmp_path / "a.png").write_bytes(encode_png(whole))
+    (tmp_path / "labels.csv").write_text("file,peer,u_px,v_px,depth_m\na.png,cf2,102,110,1\n")
+    for size_px in (None, (320, 224)):
+        options = Options(camera=AIDECK, size_px=size_px)
+        (picture,) = samples(tmp_path, "CompressedImage", options)
+        np.testing.assert_array_equal(decode(picture.fields["data"]), whole[10:234, 2:322])
+        (camera,) = samples(tmp_path, "CameraCalibration", options)
+        assert camera.fields["K"][2] == AIDECK.cx_px
+        (label,) = samples(tmp_path, "PeerLabels", options)
+        assert (label.fields["peers"][0]["u_px"], label.fields["peers"][0]["v_px"]) == (100, 100)
+    with pytest.raises(SettingError, match="as they are stored"):
+        samples(tmp_path, "CompressedImage", Options(camera=AIDECK, size_px=(160, 112)))

@@ -175,6 +175,16 @@ def test_every_key_of_a_recipe_varies_what_it_is_called() -> None:
         "noise": 0.055,
         "blur_share": 0.66,
         "intrinsics": (1.0, 2.0, 3.0, 4.0),
+        "grey_share": 0.77,
     }
     made = FitSettings(**values).augmentation(0)  # type: ignore[arg-type]
     assert {field.name: getattr(made, field.name) for field in fields(made)} == values
+
+
+def test_a_grey_share_of_images_has_no_colours() -> None:
+    settings = Augmentation(colour=0.2, noise=0.02, grey_share=0.5)
+    images = torch.cat([batch.images for batch in batches(settings)]).float()
+    grey = (images.amax(dim=1) == images.amin(dim=1)).flatten(1).all(dim=1)
+    assert 0.4 < grey.float().mean() < 0.6
+    whole = torch.cat([batch.images for batch in batches(replace(settings, grey_share=1.0), 1)])
+    assert (whole.amax(dim=1) == whole.amin(dim=1)).all()

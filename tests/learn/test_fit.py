@@ -18,7 +18,8 @@ from dmrl.learn.model import Model, save_model
 from dmrl.learn.network import Network, build
 from dmrl.learn.settings import FitSettings
 from dmrl.learn.step import Average, losses, train_step
-from dmrl.learn.validate import best_threshold, scores
+from dmrl.learn.threshold import best_threshold
+from dmrl.learn.validate import scores
 
 PUBLISHED = recipe.load("locanet", "train", FitSettings)
 SETTINGS = replace(PUBLISHED, epochs=4, batch_size=3, warmup_epochs=1, device="cpu")

@@ -6,7 +6,8 @@ from dmrl.learn.matching import Points
 from dmrl.learn.metrics import score
 from dmrl.learn.network import build
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.validate import WATCHED, best_threshold, labels, validation_figures
+from dmrl.learn.threshold import alarms, best_threshold
+from dmrl.learn.validate import WATCHED, labels, validation_figures
 
 
 def points(image: list[int], u_px: list[float], confidence: list[float]) -> Points:
@@ -20,6 +21,36 @@ def test_the_threshold_lies_below_the_last_detection_that_pays() -> None:
     confidence = [0.9] * 10 + [0.6, 0.5, 0.3, 0.2]
     found = points([*range(12), 11, 11], [50.0] * 10 + [200.0, 50.0, 200.0, 250.0], confidence)
     assert best_threshold(score(12, truth, found)) == pytest.approx(0.4)
+
+
+def test_the_threshold_keeps_to_the_rate_of_false_alarms() -> None:
+    truth = points(list(range(12)), [50.0] * 12, [1.0] * 12)
+    # In 40 images without a robot three are believed to hold one: at 0.7, 0.55 and 0.45.
+    confidence = [0.9] * 8 + [0.6, 0.5, 0.4, 0.3] + [0.7, 0.55, 0.45]
+    found = points([*range(12), 20, 30, 40], [50.0] * 12 + [80.0] * 3, confidence)
+    scored = score(52, truth, found)
+    assert best_threshold(scored) == pytest.approx(0.15)
+    assert best_threshold(scored, false_alarms=0.05) == pytest.approx(0.475)  # two of 40
+    assert best_threshold(scored, false_alarms=0.0) == pytest.approx(0.8)
+    # Nineteen empty images cannot tell a rate of one in twenty.
+    few = score(31, truth, points([*range(12), 20], [50.0] * 12 + [80.0], confidence[:13]))
+    assert best_threshold(few, false_alarms=0.0) == pytest.approx(0.15)
+
+
+def test_a_false_alarm_that_is_the_surest_of_all_is_not_let_through() -> None:
+    truth = points(list(range(12)), [50.0] * 12, [1.0] * 12)
+    found = points([*range(12), 20], [50.0] * 12 + [80.0], [0.9] * 12 + [0.96])
+    assert best_threshold(score(40, truth, found), false_alarms=0.01) == pytest.approx(0.98)
+
+
+def test_alarms_are_counted_where_nobody_is() -> None:
+    truth = points([0], [50.0], [1.0])
+    found = points([0, 0, 1, 1, 2], [50.0, 150.0, 60.0, 90.0, 60.0], [0.9, 0.8, 0.7, 0.6, 0.2])
+    scored = score(5, truth, found)
+    at_half = alarms(scored, 0.5)
+    assert (at_half.empty_images, at_half.alarmed_images, at_half.false_alarms) == (4, 1, 0.5)
+    assert alarms(scored, 0.1).alarmed_images == 2
+    assert np.isnan(alarms(score(1, truth, truth), 0.5).false_alarms)
 
 
 def test_few_labels_or_nothing_right_give_no_threshold() -> None:

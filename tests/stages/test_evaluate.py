@@ -233,6 +233,32 @@ def test_the_threshold_is_the_detectors_unless_one_is_given(write: Callable[...,
     assert figures(path, Settings(threshold=0.5, draws=5))["recall"] == 1
 
 
+def test_alarms_where_nobody_is_are_counted(
+    write: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty: list[Any] = [([], [found(10, 10, 0.5), found(40, 30, 0.4)])] * 2 + [([], [])] * 6
+    path = write({"cf1": empty}, threshold=0.45, looked=["truth"])
+    made = document([path], FAST, run([path], None, FAST))
+    assert (made["empty_images"], made["alarmed_images"], made["false_alarms"]) == (8, 2, 0.25)
+    app(["evaluate", str(path), "--draws", "5"], result_action="return_value")
+    assert "nobody in view: an alarm in 2 of 8 images, 0.250 an image" in capsys.readouterr().out
+
+
+def test_the_threshold_of_a_rate_of_false_alarms(write: Callable[..., Path]) -> None:
+    seen = [([peer(10, 10)], [found(10, 10, 0.6)])] * 12
+    quiet: list[Any] = [([], [found(30, 10, 0.7)]), *[([], [found(30, 10, 0.5)])] * 39]
+    path = write({"cf1": [*seen, *quiet]}, looked=["truth"])
+    settings = Settings(draws=20, false_alarms=0.05)
+    judged = run([path], None, settings)
+    assert isinstance(judged, evaluate.Evaluation)
+    assert judged.threshold == pytest.approx(0.55)
+    few = write({"cf1": [*seen, *quiet[:5]]}, looked=["truth"], name="few.mcap")
+    with pytest.raises(SettingError, match=r"there are 12 and 5\. Give --threshold"):
+        run([few], None, settings)
+    with pytest.raises(SettingError, match="two answers"):
+        run([path], None, Settings(threshold=0.5, false_alarms=0.05))
+
+
 def test_what_is_missing_is_named(write: Callable[..., Path], dots: Path) -> None:
     path = write({"cf1": [([peer(10, 10, source="hand")], [found(10, 10)])]})
     with pytest.raises(SettingError, match=r"no labels from truth\. Give --against one of: hand"):

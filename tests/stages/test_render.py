@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot
-from dmrl.stages.render import camera_of, run
+from dmrl.stages.render import camera_of, run, settings_of
 
 SMALL = Settings(
     images=6,
@@ -207,6 +208,26 @@ def test_a_lens_that_cannot_fill_its_image_is_refused(tmp_path: Path) -> None:
 CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
     "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
 )
+
+
+@pytest.mark.parametrize(("up", "height_m"), [("auto", 0.3), ("y", 0.3), ("z", 0.2)])
+def test_an_obj_stands_upright(
+    blender: Path, tmp_path: Path, up: Literal["auto", "y", "z"], height_m: float
+) -> None:
+    path = tmp_path / "tower.obj"  # as .obj files are: y up
+    tower = [line.split() for line in CUBE.splitlines() if line.startswith("v")]
+    places = "".join(f"v {x} {3 * int(y)} {2 * int(z)}\n" for _, x, y, z in tower)
+    path.write_text(places + "".join(f"{line}\n" for line in CUBE.splitlines() if line[0] == "f"))
+    with Renderer(blender, Model(path, 0.1, up), workers=1) as renderer:
+        sides = np.ptp(renderer.points, axis=0)
+    assert sides[2] == pytest.approx(height_m, abs=1e-6)
+    assert sorted(sides) == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
+
+
+def test_a_scale_for_a_model_that_is_not_given_asks_for_it(blender: Path, tmp_path: Path) -> None:
+    settings = settings_of("synthetic_published", images=1, workers=1)
+    with pytest.raises(SettingError, match=r"Give the --model that this scale is for"):
+        run(tmp_path / "out.mcap", settings)
 
 
 @pytest.mark.slow

@@ -15,6 +15,8 @@ import bpy
 import numpy as np
 from nodes import calc, node, of_object
 
+TURNED = (".glb", ".gltf", ".obj")
+
 
 def drawn(head, arrays):
     """The robot that dmrl draws: vertices in metres, triangles, a material each."""
@@ -51,14 +53,24 @@ def loaded(path, scale, up, *, boxed):
     if not faces:
         raise ValueError("it has no surface")
     points = np.concatenate(corners) * scale
-    if up == "y":
-        points = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
+    points = _upright(points, path.suffix.lower(), up)
     if boxed:
         points -= (points.min(axis=0) + points.max(axis=0)) / 2
     robot.from_pydata(points.tolist(), [], faces)
     robot.polygons.foreach_set("material_index", np.array(indices, np.int32))
     robot.update()
     return robot
+
+
+def _upright(points, kind, up):
+    """Points with z up, of a file whose axis ``up`` points up; auto: as is usual for its kind.
+
+    Blender's importers have turned .obj and .glb, whose y is up as a rule, already.
+    """
+    x, y, z = points.T
+    if kind in TURNED:
+        return np.column_stack([x, z, -y]) if up == "z" else points
+    return np.column_stack([x, -z, y]) if up == "y" else points
 
 
 def _paint(material, number):

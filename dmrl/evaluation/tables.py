@@ -1,0 +1,53 @@
+"""Figures of detections as rows of a table, a column for each range of depth."""
+
+import math
+from collections.abc import Sequence
+
+from dmrl.learn.metrics import BandFigures, Figure
+
+# Name of a figure, its words in the table, and its format.
+ROWS = (
+    ("median_px", "median error, px", ".2f"),
+    ("mean_px", "mean error, px", ".1f"),
+    ("rmse_px", "RMS error, px", ".1f"),
+    ("p95_px", "95th percentile, px", ".1f"),
+    ("within_8_px", "within 8 px", ".1%"),
+    ("within_20_px", "within 20 px", ".1%"),
+    ("bias_u_px", "median error in u, px", ".2f"),
+    ("bias_v_px", "median error in v, px", ".2f"),
+    ("depth_mae_m", "depth MAE, m", ".3f"),
+    ("depth_rmse_m", "depth RMSE, m", ".3f"),
+    ("precision", "precision", ".1%"),
+    ("recall", "recall", ".1%"),
+    ("f1", "F1", ".3f"),
+    ("ap_8_px", "AP at 8 px", ".3f"),
+    ("ap_16_px", "AP at 16 px", ".3f"),
+)
+
+
+def by_band_table(bands: Sequence[BandFigures]) -> tuple[list[str], list[list[object]]]:
+    """Headers and rows: all labels, then each band that holds any.
+
+    Parameters
+    ----------
+    bands
+        All distances first.
+    """
+    overall, *others = bands
+    shown = [overall, *(band for band in others if band.labels)]
+    rows: list[list[object]] = [["labels", *(str(band.labels) for band in shown)]]
+    for name, words, form in ROWS:
+        rows.append([words, *(_cell(band.figures[name], form) for band in shown)])
+    return ["all", *(_range(band) for band in shown[1:])], rows
+
+
+def _range(band: BandFigures) -> str:
+    to = f" to {band.to_m:g} m" if math.isfinite(band.to_m) else " m and more"
+    return f"{band.from_m:g}{to}"
+
+
+def _cell(figure: Figure, form: str) -> str:
+    if math.isnan(figure.value):
+        return "-"
+    low, high = format(figure.low, form), format(figure.high, form)
+    return f"{figure.value:{form}} [{low.removesuffix('%')}, {high.removesuffix('%')}]"
