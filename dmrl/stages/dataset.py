@@ -15,6 +15,7 @@ from dmrl import topics
 from dmrl.card import write_card
 from dmrl.card.facts import Facts
 from dmrl.card.front import check_license
+from dmrl.datasets.inputs import refuse_twins
 from dmrl.datasets.rows import (
     Tally,
     count_images,
@@ -33,7 +34,6 @@ from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import all_recordings
 from dmrl.recording import (
     Contents,
-    Input,
     Provenance,
     label_findings,
     licences,
@@ -204,7 +204,7 @@ def _splits(
     recordings: Sequence[Path], made: Provenance, settings: Settings
 ) -> dict[Path, SplitOf]:
     hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=True)}
-    _refuse_twins(recordings, made)
+    refuse_twins(recordings, made)
     watched = [path for path in recordings if fnmatchcase(path.name, settings.val)]
     if settings.val and not watched:
         names = ", ".join(path.name for path in recordings)
@@ -238,35 +238,6 @@ def _warn_of_lenses(held: Iterable[Contents]) -> None:
 
 def _constant(name: str) -> SplitOf:
     return lambda time_ns: name
-
-
-def _refuse_twins(recordings: Sequence[Path], made: Provenance) -> None:
-    names: dict[str, Path] = {}
-    contents: dict[str, Path] = {}
-    for path, source in zip(recordings, made.inputs, strict=True):
-        if (twin := names.setdefault(path.name, path)) is not path:
-            raise SettingError(
-                f"{twin} and {path} have one name, so rows could not be traced. Rename one"
-            )
-        if (twin := contents.setdefault(source.sha256, path)) is not path:
-            raise SettingError(f"{twin} and {path} hold the same bytes. Name only one of them")
-    for path, source in zip(recordings, made.inputs, strict=True):
-        # Its images are the other's: one would be in train, the other in test.
-        for twin in (contents[sha] for sha in _shown_by(source) if sha in contents):
-            raise SettingError(f"{path} is made from {twin}. Name only one of them")
-
-
-def _shown_by(recording: Input) -> Iterator[str]:
-    """Hashes of what a recording has its images from.
-
-    Not of what went through a dataset: renders over its images, labels of a model that learned
-    from them, show other images.
-    """
-    made = recording.provenance
-    if made is not None and made.stage != "dataset":
-        for source in made.inputs:
-            yield source.sha256
-            yield from _shown_by(source)
 
 
 def _rows(
