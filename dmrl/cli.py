@@ -5,10 +5,19 @@ act on become one line and exit status 1.
 """
 
 import sys
+from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import NoReturn, get_origin
+from typing import Any, NoReturn, get_args, get_origin
 
-from cyclopts import App, CoercionError, CycloptsError, UnknownCommandError
+from cyclopts import (
+    App,
+    CoercionError,
+    CycloptsError,
+    Parameter,
+    Token,
+    UnknownCommandError,
+    convert,
+)
 from rich.console import Console
 from rich.text import Text
 
@@ -66,8 +75,24 @@ def bad_command_line(error: CycloptsError) -> Text:
     return Text(f"dmrl: no command {word}. {hint}")
 
 
+def exact(kind: Any, tokens: Sequence[Token | str]) -> Any:
+    """A value as its type says; no number with a fraction where a whole one is asked for.
+
+    Raises
+    ------
+    ValueError
+        If one is given: cyclopts would round it.
+    """
+    words = [token if isinstance(token, str) else token.value for token in tokens]
+    whole = int in (kind, *get_args(kind)) and float not in get_args(kind)
+    if whole and any("." in word for word in words):
+        raise ValueError("a whole number is needed")
+    return convert(kind, tokens)
+
+
 app = App(
     name="dmrl",
+    default_parameter=Parameter(converter=exact),
     help="Teach tiny camera drones to see each other: recordings in, recordings out.",
     version=__version__,
     help_format="plaintext",

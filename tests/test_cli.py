@@ -187,7 +187,10 @@ def test_a_command_that_does_not_exist_is_a_bad_command_line_with_or_without_ext
         assert done.stderr == "dmrl: no command trian. Did you mean train?\n"
 
 
-@pytest.mark.parametrize("arguments", [["info"], ["info", "a.mcap", "--colour"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["info"], ["info", "a.mcap", "--colour"], ["fly", "fly_in_view", "a.mcap", "--seed", "1.5"]],
+)
 def test_a_bad_command_line_is_told_on_stderr_with_status_2(arguments: list[str]) -> None:
     done = dmrl(*arguments)
     assert (done.returncode, done.stdout) == (2, "")

@@ -43,7 +43,7 @@ def wrong() -> Iterator[tuple[str, str, str]]:
             elif "float" in kind:
                 yield from ((command, flag, value) for value in ("many", "nan", "inf"))
             elif "int" in kind:
-                yield command, flag, "many"
+                yield from ((command, flag, value) for value in ("many", "1.5"))
 
 
 CONTRADICTIONS = [
