@@ -119,9 +119,10 @@ def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Arra
     """Normal equations with the losses' weights and the globals' prior."""
     weights = weights_of(linear, noise, constants)
     equations = normal(linear, problem.range_key, weights, WEAK)
-    std_m = noise.range_error_std_m
-    equations.diagonal[0, RANGE_ERROR, RANGE_ERROR] += weights.first / std_m**2
-    equations.gradient[0, RANGE_ERROR] += weights.first * linear.first / std_m
+    held = weights.free.copy()
+    held[0] += weights.first
+    equations.diagonal[:, RANGE_ERROR, RANGE_ERROR] += held
+    equations.gradient[:, RANGE_ERROR] += held * linear.error_m
     information = weights.prior * noise.prior_std() ** -2
     equations.corner[...] += np.diag(information)
     equations.corner_gradient[...] += information * constants

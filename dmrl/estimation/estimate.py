@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from dmrl.estimation import ekf, keyframe_filter
-from dmrl.estimation.batch import solve_batch
+from dmrl.estimation.batch import ROUGH, Solution, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
 from dmrl.estimation.estimated import Estimate, Refused, swapped
 from dmrl.estimation.gate import (
@@ -25,7 +25,7 @@ from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, spread_of
 from dmrl.estimation.linear import RANGE_ERROR
 from dmrl.estimation.pair import Array, Mask, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
-from dmrl.estimation.search import KEY_HZ, solutions
+from dmrl.estimation.search import KEY_HZ, distinct, solutions
 from dmrl.estimation.stretches import joined, mended, stretches
 
 INFLATION = 1.03
@@ -41,6 +41,9 @@ flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03
 STEADY, REACH_M = 10, 0.5
 """A position is held against the medians of so many ranges before and after, and may be this
 much farther."""
+RIVAL, RIVALS = 8.0, 3
+"""Solutions that cost at most so much more, and so many, are weighed again once it is known how
+good the sensors are."""
 MOST = 0.5
 """A share of a flight that says why nothing of it is OK."""
 
@@ -197,16 +200,27 @@ def _from_batch(
 ) -> Estimate:
     first = noise or Noise()
     ends = solutions(flight, first, score, tracks.swapaxes(0, 1), pieced)
+    found, best = (noise, ends[0]) if noise else noise_of(flight, first, ends[0])
+    ends = _weighed(flight, found, best, ends)
+    apart = spread_of(np.array([s.cost for s in ends]), np.stack([s.state[:, :3] for s in ends]))
     best = ends[0]
-    costs, states = zip(*((s.cost, s.state[:, :3]) for s in ends), strict=True)
-    apart = spread_of(np.array(costs), np.stack(states))
-    found, best = (noise, best) if noise else noise_of(flight, first, best)
-    if noise:
-        best = solve_batch(flight, found, best.state, best.constants)
-    else:
+    if not noise:
         found, best = with_range_noise(flight, found, best)
     worse = max(1.0, found.scale_std / Noise().scale_std) ** 0.75
     spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
     none = np.zeros(len(tracks), np.int8)
     state, error_m = best.state[:, :3], best.state[:, RANGE_ERROR]
     return Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)
+
+
+def _weighed(
+    flight: Problem, noise: Noise, best: Solution, ends: Sequence[Solution]
+) -> list[Solution]:
+    """Solutions of a flight under the noise that was found, best first.
+
+    How much worse another solution is depends on how good the sensors are.
+    """
+    found = [solve_batch(flight, noise, best.state, best.constants)]
+    for end in distinct(ends, RIVAL)[1 : 1 + RIVALS]:
+        found.append(solve_batch(flight, noise, end.state, end.constants, found, ROUGH))
+    return sorted(found, key=lambda s: s.cost)

@@ -15,8 +15,10 @@ TAKEN = (
     (0.41, 0.55, 0.65, 0.80, 2.80),
     (0.55, 0.60, 1.00, 1.00, 3.50),
     (0.80, 0.90, 1.20, 1.20, 3.50),
+    (0.08, 0.08, 0.15, 0.15, 0.15),
 )
-"""The likeliest grade, the grade that velocities are taken for, and that of what is constant.
+"""The likeliest grade, the grade that velocities are taken for, that of scales, and the standard
+deviation of the ranges' offset, metres: who calibrated one sensor will have measured the other.
 The likeliest is a fifth too low and scatters by a tenth, so that the flights that look best
 would be believed too much: sensors are taken for the default's unless they are clearly better.
 A flight shows a scale once at most: real flow with little noise was seen to be 7 % off."""
@@ -91,9 +93,9 @@ def _graded(
     around = range(middle - 1, middle + 2)
     bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
-    likeliest, velocity, constants = TAKEN
-    grades_taken = [float(np.interp(peak, likeliest, grades)) for grades in (velocity, constants)]
-    return noise.graded(*grades_taken), best, tried[best], solved[best]
+    velocity, scales, offset_m = (float(np.interp(peak, TAKEN[0], taken)) for taken in TAKEN[1:])
+    found = replace(noise.graded(velocity, scales), bias_std_m=offset_m)
+    return found, best, tried[best], solved[best]
 
 
 def with_range_noise(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:

@@ -43,14 +43,13 @@ class Linear:
         keyframe before, by the one after, by the globals; the residual.
     ranges
         (R, 4 + 2 + 1) by x, y, psi, b; by bias and scale of the ranges; the residual.
-
-    first
-        The first keyframe's b over its standard deviation.
+    error_m
+        (K,) b, metres.
     """
 
     steps: Array
     ranges: Array
-    first: float
+    error_m: Array
 
     @property
     def step(self) -> Array:
@@ -76,8 +75,7 @@ def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) ->
         (G,) as in ``GLOBALS``.
     """
     steps = _steps(problem, noise, state, constants)
-    first = float(state[0, RANGE_ERROR]) / noise.range_error_std_m
-    return Linear(steps, _ranges(problem, noise, state, constants), first)
+    return Linear(steps, _ranges(problem, noise, state, constants), state[:, RANGE_ERROR])
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,9 @@ class Noise:
         Coloured noise of the ranges, and its correlation time.
     jump
         A change of that noise this many standard deviations large counts half: it may jump.
+    free_m, free_weight
+        It may jump by anything, but mostly goes back to none: at every keyframe it is held against
+        zero with this weight, and counts half where it is so large.
     bias_std_m, scale_std
         Offset and scale of a pair's ranges.
     gyro_std_radps
@@ -60,6 +63,8 @@ class Noise:
     range_error_std_m: float = 0.02
     range_tau_s: float = 200.0
     jump: float = 1.0
+    free_m: float = 0.05
+    free_weight: float = 0.02
     bias_std_m: float = 0.15
     scale_std: float = 0.02
     gyro_std_radps: float = 0.003

@@ -16,9 +16,9 @@ MOTION = 25.0
 """Limit of the motion's residuals: five sigmas are no noise."""
 
 SQUARE = 1e9
-PRIOR: Array = np.array([SQUARE, SQUARE, 4.0, 4.0, *[SQUARE] * 6, 4.0])
-"""Limits of what is constant, as in ``GLOBALS``. Biases of yaw rates and clocks are mostly small,
-and at times not at all. A scale that may be anything would shrink the path away."""
+PRIOR: Array = np.array([2.0, SQUARE, 4.0, 4.0, *[SQUARE] * 6, 4.0])
+"""Limits of what is constant, as in ``GLOBALS``. Offsets of ranges, biases of yaw rates and clocks
+are mostly small, and at times not at all. A scale that may be anything would shrink the path away."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,9 @@ class Weights:
     range
         (R,) of the ranges.
     first
-        Of the first range error.
+        Of the first range error, per square metre.
+    free
+        (K,) of every range error, likewise.
     prior
         (G,) of what is constant.
     """
@@ -40,6 +42,7 @@ class Weights:
     step: Array
     range: Array
     first: float
+    free: Array
     prior: Array
 
 
@@ -55,7 +58,8 @@ def cost_of(linear: Linear, noise: Noise, constants: Array) -> float:
     step, ranges = limits(noise)
     total = (step * np.log1p(linear.step**2 / step)).sum()
     total += ranges * np.log1p(linear.range**2 / ranges).sum()
-    total += noise.jump**2 * np.log1p((linear.first / noise.jump) ** 2)
+    total += noise.jump**2 * np.log1p(_first(linear, noise))
+    total += noise.free_weight * np.log1p((linear.error_m / noise.free_m) ** 2).sum()
     total += (PRIOR * np.log1p((constants / noise.prior_std()) ** 2 / PRIOR)).sum()
     return float(total) / 2
 
@@ -66,6 +70,12 @@ def weights_of(linear: Linear, noise: Noise, constants: Array) -> Weights:
     return Weights(
         1 / (1 + linear.step**2 / step),
         1 / (1 + linear.range**2 / ranges),
-        float(1 / (1 + (linear.first / noise.jump) ** 2)),
+        1 / (1 + _first(linear, noise)) / noise.range_error_std_m**2,
+        noise.free_weight / (noise.free_m**2 + linear.error_m**2),
         1 / (1 + (constants / noise.prior_std()) ** 2 / PRIOR),
     )
+
+
+def _first(linear: Linear, noise: Noise) -> float:
+    """The first range error's square against what may jump."""
+    return float(linear.error_m[0] / (noise.jump * noise.range_error_std_m)) ** 2

@@ -14,6 +14,11 @@ KEY_HZ = 10.0
 """Keyframes per second."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
+BESIDE_PIECES = 2
+"""So many starts of a flight are solved beside what its stretches led to."""
+STUCK, AGAIN = 200.0, 4
+"""Solutions that cost at most so much more than the best, and so many, are solved afresh: the true
+one was seen to stick 130 above a wrong one."""
 CHEAPER = 0.5
 """A solution that costs so much less is another one, and its passes are tried again."""
 
@@ -38,20 +43,39 @@ def solutions(
         (K, 6) states each, joined of what stretches of the flight led to.
     """
     begun: list[Array] = []
-    found: list[Solution] = []
-    for number in np.argsort(-score):
+    found = [solve_batch(flight, noise, start, tolerance=ROUGH) for start in pieced]
+    for number in np.argsort(-score)[: BESIDE_PIECES if pieced else None]:
         start = tracks[number]
         if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
             begun.append(start)
             found.append(solve_batch(flight, noise, *_start(flight, start), found, ROUGH))
-    found += [solve_batch(flight, noise, start, known=found, tolerance=ROUGH) for start in pieced]
-    best = min(found, key=lambda s: s.cost)
-    # What stuck on its way may come free once all that is constant starts from zero again.
-    found.append(solve_batch(flight, noise, best.state, known=found, tolerance=ROUGH))
+    found += [
+        solve_batch(flight, noise, _afresh(flight, s.state), known=found, tolerance=ROUGH)
+        for s in distinct(found, STUCK)[: 1 if pieced else AGAIN]
+    ]
     best = min(found, key=lambda s: s.cost)
     for start in mirrored(best.state, KEY_HZ):
         found.append(solve_batch(flight, noise, start, known=found, tolerance=ROUGH))
     return sorted(_passed_by(flight, noise, found), key=lambda s: s.cost)
+
+
+def distinct(found: Sequence[Solution], within: float) -> list[Solution]:
+    """Solutions that differ, best first, whose costs are at most so far above the best's.
+
+    Parameters
+    ----------
+    found
+        Solutions of one flight.
+    within
+        How far.
+    """
+    ordered = sorted(found, key=lambda s: s.cost)
+    out: list[Solution] = []
+    for one in ordered:
+        close = one.cost <= ordered[0].cost + within
+        if close and not any(near(one.state, other.state) for other in out):
+            out.append(one)
+    return out
 
 
 def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Solution]:
@@ -65,6 +89,15 @@ def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Sol
             if found[-1].cost < best.cost - CHEAPER:
                 break
     return found
+
+
+def _afresh(flight: Problem, state: Array) -> Array:
+    """States (K, 6) with the ranges' errors of the first guess: solved again with constants of
+    zero, what stuck on its way may come free, and what is worse now may be the best then."""
+    out = state.copy()
+    out[:, RANGE_ERROR] = 0.0
+    out[flight.range_key, RANGE_ERROR] = flight.range_level_m
+    return out
 
 
 def _start(flight: Problem, track: Array) -> tuple[Array, Array]:

@@ -12,14 +12,17 @@ STEPS, RANGES = 3, 4
 
 
 def linear(residuals: np.ndarray) -> tuple[Linear, np.ndarray]:
-    """A flight of these residuals, one after the other: steps, ranges, the first, constants."""
+    """A flight of these residuals, one after the other: steps, ranges, the first error, constants;
+    and of errors of ranges that are not small."""
     steps = np.zeros((STEPS, SIZE, 2))
     ranges = np.zeros((RANGES, 2))
     end = STEPS * SIZE
     steps[..., -1] = residuals[:end].reshape(STEPS, SIZE)
     ranges[:, -1] = residuals[end : end + RANGES]
     constants = residuals[end + RANGES + 1 :] * NOISE.prior_std()
-    return Linear(steps, ranges, float(residuals[end + RANGES])), constants
+    error_m = np.linspace(0.0, 0.2, STEPS + 1)
+    error_m[0] = residuals[end + RANGES] * NOISE.range_error_std_m
+    return Linear(steps, ranges, error_m), constants
 
 
 def test_a_weight_times_its_residual_is_the_slope_of_the_cost() -> None:
@@ -27,7 +30,8 @@ def test_a_weight_times_its_residual_is_the_slope_of_the_cost() -> None:
     at = np.random.default_rng(0).normal(0, 3, count)
     found, constants = linear(at)
     weights = weights_of(found, NOISE, constants)
-    every = np.concatenate([weights.step.ravel(), weights.range, [weights.first], weights.prior])
+    first = (weights.first + weights.free[0]) * NOISE.range_error_std_m**2
+    every = np.concatenate([weights.step.ravel(), weights.range, [first], weights.prior])
     for k, step in enumerate(1e-6 * np.eye(count)):
         ahead, behind = (linear(at + sign * step) for sign in (1, -1))
         slope = (cost_of(ahead[0], NOISE, ahead[1]) - cost_of(behind[0], NOISE, behind[1])) / 2e-6
@@ -44,9 +48,17 @@ def test_a_residual_at_its_limit_counts_half_and_small_ones_in_full() -> None:
         weights = weights_of(*_at(share * np.sqrt(limit)))
         assert weights.step == pytest.approx(np.full((STEPS, SIZE), weight))
         assert weights.range == pytest.approx(np.full(RANGES, weight))
-        assert weights.first == pytest.approx(weight)
+        assert weights.first * NOISE.range_error_std_m**2 == pytest.approx(weight)
         assert weights.prior == pytest.approx(np.full(len(GLOBALS), weight))
     assert size == weights.step.size
+
+
+def test_an_error_of_a_range_is_held_against_none_and_a_long_detour_hardly() -> None:
+    found, constants = linear(np.zeros(STEPS * SIZE + RANGES + 1 + len(GLOBALS)))
+    for error_m, weight in ((0.0, 1.0), (NOISE.free_m, 0.5), (3 * NOISE.free_m, 0.1)):
+        found.error_m[:] = error_m
+        free = weights_of(found, NOISE, constants).free * NOISE.free_m**2 / NOISE.free_weight
+        assert free == pytest.approx(np.full(STEPS + 1, weight))
 
 
 def _at(residuals: np.ndarray) -> tuple[Linear, Noise, np.ndarray]:
