@@ -18,7 +18,7 @@ MOTION = 25.0
 SQUARE = 1e9
 PRIOR: Array = np.array([2.0, SQUARE, 4.0, 4.0, *[SQUARE] * 6, 4.0])
 """Limits of what is constant, as in ``GLOBALS``. Offsets of ranges, biases of yaw rates and clocks
-are mostly small, and at times not at all. A scale that may be anything would shrink the path away."""
+are mostly small, and at times not. A scale that may be anything would shrink the path away."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,8 +92,11 @@ def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Sol
 
 
 def _afresh(flight: Problem, state: Array) -> Array:
-    """States (K, 6) with the ranges' errors of the first guess: solved again with constants of
-    zero, what stuck on its way may come free, and what is worse now may be the best then."""
+    """States (K, 6) with the ranges' errors of the first guess.
+
+    Solved again from there, with constants of zero, what stuck on its way may come free, and what
+    is worse now may be the best then.
+    """
     out = state.copy()
     out[:, RANGE_ERROR] = 0.0
     out[flight.range_key, RANGE_ERROR] = flight.range_level_m

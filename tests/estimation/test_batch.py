@@ -5,7 +5,7 @@ import pytest
 
 from dmrl.estimation import banded
 from dmrl.estimation.batch import Solution, equations_of, near, solve_batch
-from dmrl.estimation.linear import RANGED, SIZE, linearise
+from dmrl.estimation.linear import RANGE_ERROR, RANGED, SIZE, linearise
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
 
@@ -142,3 +142,19 @@ def test_a_solve_that_starts_at_the_solution_stays_there(
     assert again.cost <= solution.cost
     assert np.abs(again.state - solution.state).max() < 1e-2
     assert np.abs(again.constants - solution.constants).max() < 1e-3
+
+
+def test_after_bursts_the_ranges_are_as_long_as_before() -> None:
+    flight = flown("in_view", "calibrated", 1000, 60.0)
+    pair, begins_s = pair_of(flight), np.arange(5.0, 55.0, 9.0)
+    late_s = pair.range_time_s[:, None] - begins_s
+    bursts = ((late_s > 0.0) & (late_s < 3.0)).any(axis=1)
+    whole = problem(replace(pair, range_m=pair.range_m + bursts))
+    state = np.zeros((len(whole.key_s), SIZE))
+    state[:, :2] = truth_at(flight, whole.key_s)
+    state[:, 2] = np.subtract(*(flight.truth[who].yaw_at(whole.key_s) for who in ("cf2", "cf1")))
+    state[whole.range_key, RANGE_ERROR] = bursts
+    found = solve_batch(whole, Noise(), state)
+    since_s = whole.key_s[:, None] - begins_s
+    free = ~((since_s > -1.0) & (since_s < 4.0)).any(axis=1)
+    assert np.abs(found.state[free, RANGE_ERROR]).max() < 0.03  # a jump by anything left 0.06 m

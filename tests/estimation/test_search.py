@@ -1,0 +1,48 @@
+"""Where a flight's solve may end: what sticks is solved afresh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation import search
+from dmrl.estimation.batch import Solution
+from dmrl.estimation.linear import RANGE_ERROR, SIZE
+from dmrl.estimation.pair import Array
+from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+
+from .flights import flown, pair_of
+
+
+def solution(x_m: float, cost: float, error_m: float = 0.0) -> Solution:
+    """A peer that stands ten metres and more in front for a second, ranges so much too long."""
+    state = np.zeros((11, SIZE))
+    state[:, 0], state[:, RANGE_ERROR] = 10.0 + x_m, error_m
+    return Solution(state, np.zeros(len(GLOBALS)), cost)
+
+
+def flight() -> Problem:
+    return problem(pair_of(flown("in_view", "ideal", 1000, 1.0)))
+
+
+def test_solutions_are_told_apart_by_place_and_left_out_by_cost() -> None:
+    found = [solution(1.0, 9.0), solution(0.0, 5.0), solution(0.01, 5.1), solution(2.0, 30.0)]
+    assert [s.cost for s in search.distinct(found, 10.0)] == [5.0, 9.0]
+    assert [s.cost for s in search.distinct(found, 1.0)] == [5.0]
+    assert [s.cost for s in search.distinct(found, 100.0)] == [5.0, 9.0, 30.0]
+
+
+def test_what_sticks_above_the_best_is_solved_afresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stuck(_: Problem, __: Noise, state: Array, *given: object, **named: object) -> Solution:
+        """Comes to the true one from x = 3 only, and only without constants and range errors."""
+        begun, place = bool(given), round(float(state[0, 0]) - 10.0)
+        if place == 3 and not begun and not state[:, RANGE_ERROR].any():
+            return solution(4.0, 1.0)
+        return solution(place, 50.0 - 10.0 * (place == 2), error_m=0.2)
+
+    monkeypatch.setattr(search, "solve_batch", stuck)
+    short = flight()
+    level = replace(short, range_level_m=np.zeros(len(short.range_m)))
+    tracks = np.stack([solution(x, 0.0).state[:, :5] for x in (2.0, 3.0)])
+    best = search.solutions(level, Noise(), np.zeros(2), tracks, [])[0]
+    assert best.cost == 1.0
