@@ -1,7 +1,7 @@
 """Gauss-Newton over a whole flight: keyframe states and what is constant, together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -106,13 +106,16 @@ def evidence(problem: Problem, noise: Noise, solution: Solution) -> float:
     Up to a constant that depends on the flight alone, so that noise models can be compared.
     """
     linear = linearise(problem, noise, solution.state, solution.constants)
+    # That the ranges' errors mostly go back to none is no density, so it says nothing here.
+    noise = replace(noise, free_weight=0.0)
+    cost = cost_of(linear, noise, solution.constants)
     equations = equations_of(problem, noise, linear, solution.constants)
     spread = np.log(step_variance(problem, noise)).sum() / 2
     gains = 1 / (1 + solution.constants[[OWN_SCALE, PEER_SCALE]])
     spread += len(METRIC) * len(problem.steps_s) * np.log((gains**2).mean()) / 2
     spread += len(problem.range_m) * np.log(noise.range_std_m)
     spread += np.log(noise.prior_std()).sum()
-    return -solution.cost - float(spread) - log_determinant(equations) / 2
+    return -cost - float(spread) - log_determinant(equations) / 2
 
 
 def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Array) -> Normal:

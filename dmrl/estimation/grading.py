@@ -58,18 +58,19 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, 
     found, number, likely, solution = _graded(flight, noise, solution)
     tried: list[tuple[float, float, Solution]] = []
     for std_m in FADING_M:
-        fading = replace(noise, range_error_std_m=std_m, range_tau_s=FADING_S).graded(
-            GRADES[number]
-        )
+        fading = _fading(noise, std_m).graded(GRADES[number])
         before = solution.state, solution.constants
         solved = solve_batch(flight, fading, *before, tolerance=ROUGH)
         tried.append((evidence(flight, fading, solved), std_m, solved))
     best, std_m, solved = max(tried, key=lambda one: one[0])
     if best < likely + SURE:
         return found, solution
-    fading = replace(noise, range_error_std_m=TAILED * std_m, range_tau_s=FADING_S)
-    found, _, _, solution = _graded(flight, fading, solved)
+    found, _, _, solution = _graded(flight, _fading(noise, TAILED * std_m), solved)
     return found, solution
+
+
+def _fading(noise: Noise, std_m: float) -> Noise:
+    return replace(noise, range_error_std_m=std_m, range_tau_s=FADING_S, free_weight=0.0)
 
 
 def _graded(
