@@ -1,5 +1,6 @@
 """What every test may use."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -9,6 +10,16 @@ from hypothesis import settings
 from dmrl.rendering import environment
 
 REPOSITORY = Path(__file__).parents[1]
+
+# What is imported stays: Python need not look through all of it for garbage, again and again.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """From the first test on garbage is collected, among what the tests make."""
+    gc.freeze()
+    gc.enable()
+
 
 # On a machine that is busy an example may take long; a test that hangs ends by pytest-timeout.
 # The same few examples every time: a failure is one that everybody sees, and costs little.

@@ -350,6 +350,7 @@ def test_links_in_out_are_not_written_through(
             path.unlink()
 
 
+@pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize("split", ELSEWHERE)
 def test_a_split_of_a_recording_stays_in_the_dataset(
     split: str, box: Box, capsys: pytest.CaptureFixture[str]

@@ -20,6 +20,19 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 GENERATED = {"schemas/dmrl.binpb"}
 """What `make schemas` writes."""
+ALL_OF_THEM = """
+import contextlib, io, json, sys
+from dmrl.cli import main
+said = []
+for words in json.loads(sys.argv[1]):
+    sys.argv, out = ["dmrl", *words], io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        try: main()
+        except SystemExit as e: assert not e.code, (words, out.getvalue())
+    said.append(out.getvalue())
+print(json.dumps(said))
+"""
+"""Runs one command after the other: what they import is imported once."""
 
 
 def promised(row: str) -> int:
@@ -78,9 +91,11 @@ class Clone:
         assert done.returncode == 0, done.stderr
         return done.stdout + done.stderr
 
-    def dmrl(self, *words: str) -> str:
-        """What a command of the copy prints."""
-        return self.python("-m", "dmrl.cli", *words)
+    def dmrl(self, *commands: list[str | Path]) -> list[str]:
+        """What each of several commands of the copy prints."""
+        words = json.dumps([[str(word) for word in command] for command in commands])
+        said: list[str] = json.loads(self.python("-c", ALL_OF_THEM, words).splitlines()[-1])
+        return said
 
 
 @pytest.fixture
@@ -151,20 +166,23 @@ def test_a_sensor(clone: Clone, tmp_path: Path) -> None:
     values = {"pressure_pa": 101_325.0, "range_up_m": 1.5, "sonar_cf2_m": 2.5}
     source = flight(tmp_path / "flight", values)
     out, again, short = (tmp_path / f"{name}.mcap" for name in ("out", "again", "short"))
-    said = clone.dmrl("convert", str(source), str(out))
-    assert "ranges to up" not in said
-    held = json.loads(clone.dmrl("info", str(out), "--json"))["topics"]
+    shown, alone = tmp_path / "shown.rrd", tmp_path / "alone.rrd"
+    converted, info, _, merged, *_ = clone.dmrl(
+        ["convert", source, out],
+        ["info", out, "--json"],
+        ["trim", out, short, "--topic", "/cf1/pressure"],
+        ["merge", short, out, again],
+        ["view", out, "--save", shown],
+        ["view", short, "--save", alone],
+    )
+    assert "ranges to up" not in converted
+    held = json.loads(info)["topics"]
     assert held["/cf1/pressure"] == {"message": "dmrl.v1.Pressure", "count": 3}
     assert held["/cf1/range_up"]["count"] == held["/cf1/sonar/cf2"]["count"] == 3
     assert "/cf1/range/up" not in held
-    clone.dmrl("trim", str(out), str(short), "--topic", "/cf1/pressure")
-    assert "both have /cf1/pressure" in clone.dmrl("merge", str(short), str(out), str(again))
-    shown = tmp_path / "shown.rrd"
-    clone.dmrl("view", str(out), "--save", str(shown))
+    assert "both have /cf1/pressure" in merged
     assert {"pressure, Pa", "height, m", "distance of cf2, m"} <= panels(shown)
-    # Alone, without anything that dmrl had before.
-    clone.dmrl("view", str(short), "--save", str(tmp_path / "alone.rrd"))
-    assert "pressure, Pa" in panels(tmp_path / "alone.rrd")
+    assert "pressure, Pa" in panels(alone)  # without anything that dmrl had before
     shutil.copytree(ROOT / "docs", clone.root / "docs")
     place = str(clone.root / "docs")
     code = f"import sys; sys.path.insert(0, {place!r}); import build; print(build.topics())"
@@ -203,7 +221,8 @@ def test_a_foreign_format(clone: Clone, tmp_path: Path) -> None:
     assert clone.touched() == promised("a foreign format")
     source, out = tmp_path / "flight.alt", tmp_path / "out.mcap"
     source.write_text("1000 0.5\n2000 0.75\n")
-    assert "/cf1/height" in clone.dmrl("convert", str(source), str(out))
+    (said,) = clone.dmrl(["convert", source, out])
+    assert "/cf1/height" in said
 
 
 NETWORK = """
@@ -230,14 +249,18 @@ def test_a_network(clone: Clone, tmp_path: Path) -> None:
     assert clone.touched() == promised("a network")
     made, out = tmp_path / "tiny", tmp_path / "export"
     made.mkdir()
-    clone.python(
+    said = clone.python(
         "-c",
+        "import sys\n"
         "from pathlib import Path\n"
+        "from dmrl.cli import main\n"
         "from dmrl.learn.model import Model, save_model\n"
         "from dmrl.learn.network import build\n"
-        f"save_model(Model(build('tiny').eval(), 'tiny'), Path({str(made)!r}))",
+        f"save_model(Model(build('tiny').eval(), 'tiny'), Path({str(made)!r}))\n"
+        f"sys.argv = ['dmrl', 'export', {str(made)!r}, {str(out)!r}]\n"
+        "main()\n",
     )
-    assert "model.onnx" in clone.dmrl("export", str(made), str(out))
+    assert "model.onnx" in said
 
 
 LOSS = """
@@ -286,8 +309,9 @@ def test_a_command(clone: Clone) -> None:
     clone.write("dmrl/stages/hello.py", COMMAND)
     clone.after("dmrl/cli.py", "COMMANDS = {\n", '    "hello": "Greet somebody.",\n')
     assert clone.touched() == promised("a command")
-    assert clone.dmrl("hello", "cf1") == "hello cf1\n"
-    assert "Greet somebody." in clone.dmrl("--help")
+    greeted, listed = clone.dmrl(["hello", "cf1"], ["--help"])
+    assert greeted == "hello cf1\n"
+    assert "Greet somebody." in listed
 
 
 VIEW = '''
@@ -319,10 +343,13 @@ def test_a_view(clone: Clone, tmp_path: Path) -> None:
     clone.write("viewer/views/heights.py", VIEW)
     assert clone.touched() == promised("a view")
     out, shown = tmp_path / "out.mcap", tmp_path / "shown.rrd"
-    clone.dmrl("convert", str(flight(tmp_path / "flight", {})), str(out))
-    clone.dmrl("view", str(out), "--layout", "heights", "--save", str(shown))
+    *_, explained = clone.dmrl(
+        ["convert", flight(tmp_path / "flight", {}), out],
+        ["view", out, "--layout", "heights", "--save", shown],
+        ["view", "--help"],
+    )
     assert panels(shown) == {"heights alone, m"}
-    assert "heights" in clone.dmrl("view", "--help")
+    assert "heights" in explained
 
 
 def test_every_row_of_the_table_is_tried() -> None:

@@ -1,5 +1,7 @@
 """Random small float networks, and their int8 form by the quantiser."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,6 +95,7 @@ def random_graph(seed: int) -> tuple[Graph, tuple[str, ...], NDArray[np.uint8]]:
     return Graph(tuple(net.layers), outputs, images.shape[3]), channels, images
 
 
+@cache
 def quantised_network(seed: int) -> IntegerNetwork:
     """The int8 form of ``random_graph(seed)``, of at most 40 x 40 px."""
     graph, channels, images = random_graph(seed)

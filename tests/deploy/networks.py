@@ -1,5 +1,7 @@
 """Random small int8 networks that use every layer: strides, dilations, depthwise, adds, heads."""
 
+from functools import cache
+
 import numpy as np
 
 from dmrl.deploy.integer import (
@@ -75,6 +77,7 @@ class _Growing:
         self.grow(Add(name, sources, multipliers, int(self.rng.integers(20, 23)), signed=signed))
 
 
+@cache
 def random_network(seed: int) -> IntegerNetwork:
     """A network of 3 to 9 layers on an image of at most 40 x 40 px."""
     rng = np.random.default_rng(seed)

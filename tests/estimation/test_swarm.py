@@ -23,9 +23,13 @@ Estimates = dict[Names, Estimate]
 
 @cache
 def solved(
-    trajectory: Trajectory, noise: str, robots: int = 3, faults: tuple[Fault, ...] = ()
+    trajectory: Trajectory,
+    noise: str,
+    robots: int = 3,
+    faults: tuple[Fault, ...] = (),
+    duration_s: float = 40.0,
 ) -> tuple[Flight, dict[Names, Pair], Estimates, Estimates]:
-    flight = simulate(Scenario(robots, 40.0, trajectory), NOISE[noise], 1, faults)
+    flight = simulate(Scenario(robots, duration_s, trajectory), NOISE[noise], 1, faults)
     pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
     both: Estimates = {}
     for names, (here, there) in zip(pairs, estimate_pairs(list(pairs.values())), strict=True):
@@ -75,13 +79,13 @@ def test_the_frame_is_one_positions_agree_around_a_triangle() -> None:
 
 @pytest.mark.parametrize("trajectory", ["parallel", "hover"])
 def test_what_no_motion_tells_is_ambiguous_here_too(trajectory: Trajectory) -> None:
-    *_, swarm = solved(trajectory, "calibrated")
+    *_, swarm = solved(trajectory, "calibrated", duration_s=20.0)
     for estimate in swarm.values():
         assert not (estimate.status == OK).any()
 
 
 def test_an_observer_that_stands_still_has_no_bearings() -> None:
-    *_, swarm = solved("observer_static", "calibrated")
+    *_, swarm = solved("observer_static", "calibrated", duration_s=20.0)
     for peer in ("cf2", "cf3"):
         assert (swarm["cf1", peer].status == AMBIGUOUS).all()
 

@@ -88,17 +88,17 @@ def whole(
 ) -> tuple[FitSettings, Path]:
     """A training that nothing stopped: its settings and its folder."""
     folder = tmp_path_factory.mktemp("whole")
-    trained(dots(20), folder, request.param)
+    trained(dots(9), folder, request.param)
     return request.param, folder
 
 
-@pytest.mark.parametrize("steps", [1, 5])
+@pytest.mark.parametrize("steps", [1, 3])
 def test_a_resumed_training_ends_with_the_same_bytes(
-    examples: Examples, tmp_path: Path, steps: int, whole: tuple[FitSettings, Path]
+    tmp_path: Path, steps: int, whole: tuple[FitSettings, Path]
 ) -> None:
     settings, folder = whole
-    stopped(examples, tmp_path / "resumed", 2, steps, settings)
-    trained(examples, tmp_path / "resumed", settings, resume=True)
+    stopped(dots(9), tmp_path / "resumed", 2, steps, settings)
+    trained(dots(9), tmp_path / "resumed", settings, resume=True)
     for name in ("model.safetensors", "model.json"):
         assert (folder / name).read_bytes() == (tmp_path / "resumed" / name).read_bytes()
 
@@ -140,10 +140,8 @@ def test_dmrl_nano_finds_the_dot_within_its_cell(tmp_path: Path) -> None:
     assert 0.05 < threshold < 0.95
 
 
-def test_the_kept_weights_are_the_mean_of_those_of_many_steps(
-    examples: Examples, tmp_path: Path
-) -> None:
-    settings = replace(EVERYTHING, epochs=2)
+def test_the_kept_weights_are_the_mean_of_those_of_many_steps(tmp_path: Path) -> None:
+    examples, settings = dots(12), replace(EVERYTHING, epochs=2)
     _, last = trained(examples, tmp_path / "last", replace(settings, ema_steps=0))
     _, mean = trained(examples, tmp_path / "mean", settings)
     _, one = trained(examples, tmp_path / "one", replace(settings, ema_steps=1))

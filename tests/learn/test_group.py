@@ -1,6 +1,7 @@
 """Processes that are started here; what they train is in tests/stages/test_train.py."""
 
 import importlib
+import multiprocessing
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -16,8 +17,14 @@ from dmrl.learn.group import Group, in_group
 
 @pytest.fixture
 def work(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Functions that another process can import."""
+    """Functions that another process can import.
+
+    Those processes come of one that has loaded torch, as each of them would take seconds to.
+    """
     monkeypatch.syspath_prepend(Path(__file__).parent)
+    forked = multiprocessing.get_context("forkserver")
+    forked.set_forkserver_preload(["dmrl.learn.group"])
+    monkeypatch.setattr(group, "SPAWN", forked)
     return importlib.import_module("group_work")
 
 

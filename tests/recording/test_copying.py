@@ -26,7 +26,7 @@ from dmrl.recording import (
 )
 
 MADE = Provenance("test")
-MOMENTS = 6000
+MOMENTS = 4000
 
 
 @pytest.fixture(scope="module")
@@ -101,16 +101,16 @@ def test_what_is_left_out_leaves_the_rest_bit_for_bit(flight: Path, tmp_path: Pa
 
 def test_a_stretch_is_trimmed_out_of_its_chunks(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    assert trim(flight, out, start_ns=1000, end_ns=5000) == 4000 * 4 + 400
-    ours = [r for r in read_raw(flight) if 1000 <= r.time_ns < 5000]
+    assert trim(flight, out, start_ns=1000, end_ns=3000) == 2000 * 4 + 200
+    ours = [r for r in read_raw(flight) if 1000 <= r.time_ns < 3000]
     assert list(read_raw(out))[1:] == ours
-    assert len(set(packed(flight)) & set(packed(out))) >= 4
+    assert len(set(packed(flight)) & set(packed(out))) >= 2
 
 
 def test_a_stretch_that_begins_with_a_chunk_defines_what_it_holds(
     flight: Path, tmp_path: Path
 ) -> None:
-    for k, chunk in enumerate(chunks(flight)[2:6]):
+    for k, chunk in enumerate(chunks(flight)[2:4]):
         out, start_ns = tmp_path / f"{k}.mcap", chunk.message_start_time
         trim(flight, out, start_ns=start_ns, topics=["/*/attitude", "/*/height"])
         ours = [r for r in read_raw(flight, "/*/attitude", "/*/height") if r.time_ns >= start_ns]
@@ -166,13 +166,13 @@ def test_chunks_of_other_writers_are_copied_in_their_compression(
             writer.register_schema("foxglove.CompressedImage", "protobuf", image),
         )
         heights = writer.register_channel("/cf1/height", "protobuf", schema)
-        for k in range(30_000):
+        for k in range(8_000):
             writer.add_message(heights, k, message("Height")(height_m=k).SerializeToString(), k)
         for k in range(40):  # a chunk of both, then of pictures alone
-            data = message("CompressedImage")(data=rng.bytes(20_000)).SerializeToString()
+            data = message("CompressedImage")(data=rng.bytes(5_000)).SerializeToString()
             writer.add_message(pictures, k, data, k)
 
-    path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=200_000)
+    path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=50_000)
     out = tmp_path / "out.mcap"
     rewrite(path, out, MADE, without=(), fresh=())
     unchanged(path, out, ["/cf1/height", "/cam"])
@@ -191,7 +191,7 @@ def _channels(path: Path) -> dict[int, str]:
 def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied_as_it_is(tmp_path: Path) -> None:
     def fill(writer: Writer, schema: int) -> None:
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
-        for k in range(20_000):
+        for k in range(5_000):
             writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
 
     path = foreign(tmp_path / "a.mcap", fill, compression=CompressionType.NONE, enable_crcs=False)

@@ -74,7 +74,8 @@ def test_colours_of_a_photo_are_exchanged(tmp_path: Path) -> None:
 
 def test_places_stay_in_their_part_of_the_image(tmp_path: Path) -> None:
     settings = Settings(place_u=(0.25, 0.5), place_v=(0.5, 1.0), empty_share=0.0)
-    robots = [draw_scene(world(settings, tmp_path, SMALL), k).robots[0] for k in range(200)]
+    scenes = world(settings, tmp_path, SMALL)
+    robots = [draw_scene(scenes, k).robots[0] for k in range(200)]
     xyz = np.array([robot.pose.xyz_camera for robot in robots])
     u, v = project(xyz, SMALL.image_from_optical)[0].T
     assert [u.min(), u.max(), v.min(), v.max()] == pytest.approx([10, 20, 14, 28], abs=0.375)
@@ -86,7 +87,8 @@ def test_robots_turn_about_their_axes_in_the_order_asked_for(
 ) -> None:
     """Roll last, about the horizontal's x axis, leaves that axis' elevation to the pitch."""
     settings = Settings(robot_turns=order, camera_tilt_max_deg=0, empty_share=0.0)
-    robots = [draw_scene(world(settings, tmp_path, SMALL), k).robots[0] for k in range(300)]
+    scenes = world(settings, tmp_path, SMALL)
+    robots = [draw_scene(scenes, k).robots[0] for k in range(300)]
     up = np.array([robot.pose.camera_from_body[:, 2] for robot in robots])
     ahead, aside = up[:, 0].std(), up[:, 1].std()
     assert ahead / aside == pytest.approx((0.57, 1.0)[level], abs=0.12)
@@ -96,7 +98,8 @@ def test_depths_are_spread_by_factor_or_by_metre(tmp_path: Path) -> None:
     shares = []
     for spacing in ("log", "linear"):
         settings = Settings(depth_spacing=spacing, depth_m=(0.2, 2.0), empty_share=0.0)
-        scenes = (draw_scene(world(settings, tmp_path, SMALL), k) for k in range(300))
-        depths = np.array([scene.robots[0].pose.xyz_camera[0] for scene in scenes])
+        scenes = world(settings, tmp_path, SMALL)
+        robots = [draw_scene(scenes, k).robots[0] for k in range(300)]
+        depths = np.array([robot.pose.xyz_camera[0] for robot in robots])
         shares.append(np.mean(depths < 1.1))
     assert shares == pytest.approx([np.log(5.5) / np.log(10), 0.5], abs=0.08)

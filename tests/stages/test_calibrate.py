@@ -43,7 +43,7 @@ def calibrated(seen: Path) -> tuple[Path, calibrate.Result]:
 def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("boards")
     rng = np.random.default_rng(0)
-    for k in range(14):
+    for k in range(9):
         grey = picture(*pose(rng))
         (folder / f"{k}.png").write_bytes(encode_png(np.repeat(grey[..., None], 3, axis=2)))
     return folder
@@ -115,9 +115,12 @@ def test_a_folder_needs_a_board(
 
 
 def test_pictures_without_that_board_are_counted(boards: Path, tmp_path: Path) -> None:
-    out = tmp_path / "camera.toml"
-    with pytest.raises(SourceError, match="in 0 of 14 pictures"):
-        calibrate.run([boards], out, Settings(board="6x9"))
+    out, two = tmp_path / "camera.toml", tmp_path / "two"
+    two.mkdir()
+    for name in ("0.png", "1.png"):
+        (two / name).write_bytes((boards / name).read_bytes())
+    with pytest.raises(SourceError, match="in 0 of 2 pictures"):
+        calibrate.run([two], out, Settings(board="6x9"))
     assert not out.exists()
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import topics
+from dmrl import card, topics
 from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
@@ -24,10 +24,10 @@ OFF_PX = (3.0, 30.0, 1.0, 10.0)
 """How far off the model is in each image with a peer; the last image shows nobody."""
 
 
-@pytest.fixture
-def pictures(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five labelled images; nobody is in the last."""
-    path = tmp_path / "pictures.mcap"
+    path = tmp_path_factory.mktemp("browse") / "pictures.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(5):
             rgb = np.full((48, 64, 3), 40 * k, np.uint8)
@@ -39,18 +39,20 @@ def pictures(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def folder(pictures: Path, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def folder(pictures: Path) -> Path:
     """The five images as a dataset."""
-    out = tmp_path / "set"
-    dataset_stage.run([pictures], out, dataset_stage.Settings(split="none"))
+    out = pictures.with_name("set")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(card, "plots", None)
+        dataset_stage.run([pictures], out, dataset_stage.Settings(split="none"))
     return out
 
 
-@pytest.fixture
-def found(pictures: Path, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def found(pictures: Path) -> Path:
     """What a model found in them, each time that far off."""
-    path = tmp_path / "found.mcap"
+    path = pictures.with_name("found.mcap")
     with RecordingWriter(path, made_by("predict", Settings(), (pictures,))) as sink:
         for k, off_px in enumerate((*OFF_PX, 0.0)):
             seen = {"u_px": 20 + off_px, "v_px": 12, "depth_m": 1.5, "confidence": 0.9}
@@ -138,4 +140,4 @@ def test_what_is_no_dataset_is_named(tmp_path: Path, folder: Path, rrd: Path) ->
     with pytest.raises(SettingError, match=r"leave --layout flight out"):
         save([folder], rrd, Settings(layout="flight"))
     with pytest.raises(SettingError, match=r"layout dataset is for datasets"):
-        save([tmp_path / "pictures.mcap"], rrd, Settings(layout="dataset"))
+        save([folder.with_name("pictures.mcap")], rrd, Settings(layout="dataset"))

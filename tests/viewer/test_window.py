@@ -154,8 +154,15 @@ def test_an_address_that_is_none_is_named(make: Make) -> None:
         Page([make()], Settings(), Web(bind="192.0.2.1"))
 
 
-def test_a_pipeline_writes_by_suffix(make: Make, tmp_path: Path, vulkan: None) -> None:
+def test_a_pipeline_writes_by_suffix(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drawn(paths: list[Path], out: Path, settings: Settings) -> None:
+        assert (paths, settings) == ([recording], Settings())
+        out.write_bytes(bytes(2000))
+
     recording = make()
+    monkeypatch.setattr(stage, "screenshot", drawn)  # what it draws is looked at above
     for name in ("seen.rrd", "seen.png"):
         stage.run([recording], tmp_path / name, Settings())
         assert (tmp_path / name).stat().st_size > 1000
