@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -69,27 +68,19 @@ def estimate_pairs(
         A position that is off by more than this is a bad one, metres.
     """
     problems = [problem(pair, KEY_HZ) for pair in pairs]
-    parts: list[list[tuple[Estimate, Estimate]]] = [[] for _ in pairs]
-    if method == "batch":
-        solve = partial(estimate_pairs, noise=noise, gate_m=gate_m)
-        parts = [solve(cut) if (cut := stretches(pair)) else [] for pair in pairs]
-    out: dict[int, tuple[Estimate, Estimate]] = {}
-    lengths = np.array([len(p.key_s) for p in problems], int)
-    for length in np.unique(lengths):
-        numbers = np.flatnonzero(lengths == length)
-        scores, states, covariances = _smoothed([problems[n] for n in numbers], noise or Noise())
-        for column, number in enumerate(numbers.tolist()):
-            mine = slice(column * KEPT, (column + 1) * KEPT)
-            flight, starts = problems[number], (scores[mine], states[:, mine])
-            if method == "smoother":
-                made = _from_smoother(flight, noise or Noise(), *starts, covariances[:, mine])
-            else:
-                pieced = (
-                    [joined(flight, [here for here, _ in parts[number]])] if parts[number] else []
-                )
-                made = _from_batch(flight, noise, *starts, pieced)
-            out[number] = mended(_both(flight, made, gate_m), parts[number])
-    return [out[number] for number in range(len(pairs))]
+    made = []
+    for pair, flight, starts in zip(pairs, problems, _starts(problems, noise), strict=True):
+        if method == "smoother":
+            made.append(_both(flight, _from_smoother(flight, noise or Noise(), *starts), gate_m))
+            continue
+        # Where a flight has gaps, each stretch between them is solved first, as a flight of its
+        # own. Put together they are one more start for the whole.
+        cut = stretches(pair)
+        parts = estimate_pairs(cut, noise=noise, gate_m=gate_m) if cut else []
+        pieced = [joined(flight, [here for here, _ in parts])] if parts else []
+        whole = _from_batch(flight, noise, starts.score, starts.tracks, pieced)
+        made.append(mended(_both(flight, whole, gate_m), parts))
+    return made
 
 
 def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:
@@ -170,8 +161,32 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
     return [out[n] for n in range(len(pairs))]
 
 
+class _Starts(NamedTuple):
+    """Where a solve of a flight of K keyframes may start: what the smoother makes of guesses."""
+
+    score: Array
+    """(KEPT,) log likelihoods."""
+    tracks: Array
+    """(K, KEPT, ...) states."""
+    covariances: Array
+    """(K, KEPT, ...)."""
+
+
+def _starts(problems: list[Problem], noise: Noise | None) -> list[_Starts]:
+    """Likely starts of each flight. Flights of equal length are smoothed side by side."""
+    found: dict[int, _Starts] = {}
+    lengths = np.array([len(p.key_s) for p in problems], int)
+    for length in np.unique(lengths):
+        numbers = np.flatnonzero(lengths == length).tolist()
+        scores, states, covariances = _smoothed([problems[n] for n in numbers], noise or Noise())
+        for column, number in enumerate(numbers):
+            mine = slice(column * KEPT, (column + 1) * KEPT)
+            found[number] = _Starts(scores[mine], states[:, mine], covariances[:, mine])
+    return [found[number] for number in range(len(problems))]
+
+
 def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Array]:
-    """Scores (P KEPT,), states and covariances (K, P KEPT, ...) of the likely starts."""
+    """Scores (P KEPT,), states and covariances (K, P KEPT, ...) of P flights of one length."""
     inputs = keyframe_filter.inputs_of(problems, noise)
     start = candidates(inputs, KEY_HZ).reshape(-1, 3)
     count = len(problems[0].key_s)

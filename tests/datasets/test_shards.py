@@ -1,5 +1,6 @@
 """Shards of strangers: what is not laid out as a dataset is refused before it is looked at."""
 
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -9,21 +10,33 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from dmrl import card
 from dmrl.datasets import open_dataset
 from dmrl.datasets.layout import schema
 from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import HEIGHT_PX, WIDTH_PX, Record, peer
+from .conftest import HEIGHT_PX, WIDTH_PX, Record, peer, recorder
 
 SHARD = "train/data-00000-of-00001.arrow"
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of four images. To be read only."""
+    folder = tmp_path_factory.mktemp("shards")
+    flight = recorder(folder)(peers=[[peer()] * k for k in (1, 2, 3, 1)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(card, "plots", None)
+        run([flight], folder / "set", Settings())
+    return folder / "set"
+
+
 @pytest.fixture
-def shard(record: Record, tmp_path: Path) -> Path:
-    run([record(peers=[[peer()] * k for k in (1, 2, 3, 1)])], tmp_path / "set", Settings())
-    return tmp_path / "set" / SHARD
+def shard(made: Path, tmp_path: Path) -> Path:
+    """A shard of it, to be changed."""
+    return shutil.copytree(made, tmp_path / "set") / SHARD
 
 
 def rewritten(path: Path, table: pa.Table, compression: str | None = None, times: int = 1) -> None:

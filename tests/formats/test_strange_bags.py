@@ -88,14 +88,14 @@ def ros1_bag(path: Path, chunk: bytes, size: int, kind: str, compression: str) -
 
 @pytest.fixture
 def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bombs of megabytes are too large already: those of hundreds take seconds."""
-    monkeypatch.setattr(limits, "UNPACKED_BYTES", 8 << 20)
+    """A smaller bomb is too large already: one of the true size takes seconds."""
+    monkeypatch.setattr(limits, "MEMORY_BYTES", 64 << 20)
 
 
 @pytest.mark.usefixtures("small_limit")
 def test_a_chunk_of_ros_1_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:
-    zeros = bz2.compress(bytes(1 << 20)) * 50  # bz2 takes one stream after the other
-    path = ros1_bag(tmp_path / "a.bag", zeros, 50 << 20, "nav_msgs/Odometry", "bz2")
+    zeros = bz2.compress(bytes(1 << 20)) * 200  # bz2 takes one stream after the other
+    path = ros1_bag(tmp_path / "a.bag", zeros, 200 << 20, "nav_msgs/Odometry", "bz2")
     assert path.stat().st_size < 100_000
     with pytest.raises(SourceError, match="unpacks to much more than its size explains"):
         read(path)
@@ -103,7 +103,7 @@ def test_a_chunk_of_ros_1_that_unpacks_to_much_is_refused(tmp_path: Path) -> Non
 
 @pytest.mark.usefixtures("small_limit")
 def test_a_compressed_file_of_a_bag_does_not_fill_the_disk(tmp_path: Path) -> None:
-    frame = zstandard.compress(bytes(1 << 22))
+    frame = zstandard.compress(bytes(1 << 24))
     (tmp_path / "a.db3.zstd").write_bytes(frame * 10)
     (tmp_path / "metadata.yaml").write_text(FOLDER)
     with pytest.raises(SourceError, match="unpacks to much more than its size explains"):

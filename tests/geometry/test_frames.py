@@ -116,6 +116,11 @@ def test_a_turn_keeps_lengths_and_hands(roll_rad: float, pitch_rad: float) -> No
     assert np.linalg.det(turn) == pytest.approx(1)
 
 
+def test_a_point_at_the_optical_centre_has_no_pixel() -> None:
+    with pytest.raises(ValueError, match=r"row 0 with x = 0\.000 m"):
+        project(np.array([[0.0, 1.0, 0.0]]), np.eye(3))
+
+
 def test_points_behind_the_camera_are_refused_by_row() -> None:
     with pytest.raises(ValueError, match=r"1 of 2 points lie behind .* row 1 with x = -0\.500 m"):
         project(np.array([[1.0, 0, 0], [-0.5, 0, 0]]), K)

@@ -17,9 +17,14 @@ START_NS = 7_000_000_000
 Write = Callable[[float, str, Any], None]
 
 
-def flight(write: Write, robots: tuple[str, ...] = ("cf1", "cf2"), until_s: float = 8.0) -> None:
+def flight(
+    write: Write,
+    robots: tuple[str, ...] = ("cf1", "cf2"),
+    until_s: float = 8.0,
+    from_s: float = 0.0,
+) -> None:
     """Sensors of robots at 20 Hz; every value tells the time."""
-    for time_s in np.arange(0, until_s, 0.05).tolist():
+    for time_s in np.arange(from_s, until_s, 0.05).tolist():
         for robot in robots:
             turn = {"roll_rad": 0.01 * time_s, "pitch_rad": 0.02, "yaw_rate_radps": 0.03 * time_s}
             write(time_s, topics.attitude(robot), message("Attitude")(**turn))
@@ -118,16 +123,43 @@ def without(kind: str) -> Callable[[Write], None]:
             ["cf1-cf2: their logs share 4.9 s, under 5 s; left out. Do their clocks agree?"],
         ),
         (
+            [lambda w: flight(w, from_s=3.0, until_s=7.33), ranges],
+            ["cf1-cf2: their logs share 4.3 s, under 5 s; left out. Do their clocks agree?"],
+        ),
+        (
             [flight, lambda w: ranges(w, count=LEAST_RANGES - 1)],
             [f"cf1-cf2: {LEAST_RANGES - 1} usable ranges, under {LEAST_RANGES}; left out"],
         ),
     ],
-    ids=["no velocity", "short", "few ranges"],
+    ids=["no velocity", "short", "late and short", "few ranges"],
 )
 def test_what_is_left_out_is_said(tmp_path: Path, parts: list[Any], said: list[str]) -> None:
     found = logs(tmp_path / "a.mcap", *parts)
     assert not found.pairs
     assert found.warnings == said
+
+
+def test_a_grid_is_of_the_time_that_both_logs_share(tmp_path: Path) -> None:
+    early = lambda write: flight(write, ("cf1",))  # noqa: E731
+    late = lambda write: flight(write, ("cf2",), until_s=9.0, from_s=2.0)  # noqa: E731
+    found = logs(tmp_path / "a.mcap", early, late, ranges)
+    time_s = found.pairs["cf1", "cf2"].time_s
+    assert (time_s[0], time_s[-1]) == pytest.approx((2.0, 7.95), abs=1.01 / RATE_HZ)
+
+
+@pytest.mark.parametrize("kind", ["attitude", "velocity", "height"])
+def test_a_sensor_that_only_says_nan_is_none(tmp_path: Path, kind: str) -> None:
+    def spoilt(write: Write) -> None:
+        def one(t: float, topic: str, m: Any) -> None:
+            for field in m.DESCRIPTOR.fields if topic == f"/cf2/{kind}" else ():
+                setattr(m, field.name, float("nan"))
+            write(t, topic, m)
+
+        flight(one)
+
+    found = logs(tmp_path / "a.mcap", spoilt, ranges)
+    assert not found.pairs and set(found.robots) == {"cf1"}
+    assert f"/cf2/{kind}: nothing to use; its pairs are left out" in found.warnings
 
 
 def test_enough_ranges_are_just_enough(tmp_path: Path) -> None:
