@@ -44,7 +44,7 @@ def test_the_statuses_are_those_of_the_schema() -> None:
 
 
 def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
-    seeds = (1000, 1001)
+    seeds = (1000, 1001, 1002, 1003)
     pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
     published = [
         rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)

@@ -26,7 +26,7 @@ from dmrl.recording import (
 )
 
 MADE = Provenance("test")
-MOMENTS = 4000
+MOMENTS = 6000
 
 
 @pytest.fixture(scope="module")
@@ -166,13 +166,13 @@ def test_chunks_of_other_writers_are_copied_in_their_compression(
             writer.register_schema("foxglove.CompressedImage", "protobuf", image),
         )
         heights = writer.register_channel("/cf1/height", "protobuf", schema)
-        for k in range(8_000):
+        for k in range(16_000):
             writer.add_message(heights, k, message("Height")(height_m=k).SerializeToString(), k)
         for k in range(40):  # a chunk of both, then of pictures alone
-            data = message("CompressedImage")(data=rng.bytes(5_000)).SerializeToString()
+            data = message("CompressedImage")(data=rng.bytes(20_000)).SerializeToString()
             writer.add_message(pictures, k, data, k)
 
-    path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=50_000)
+    path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=200_000)
     out = tmp_path / "out.mcap"
     rewrite(path, out, MADE, without=(), fresh=())
     unchanged(path, out, ["/cf1/height", "/cam"])

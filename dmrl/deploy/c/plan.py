@@ -282,16 +282,9 @@ def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
         channels=channels,
         rows=rows,
         cols=cols,
-        gap=max((max(c.padding, _columns_beyond(c, cols)) for c in convs), default=0),
+        gap=max((conv.padding for conv in convs), default=0),
         pad_value=convs[0].pad_value if convs else 0,
         above=any(c.padding for c in convs),
         ring=ring,
         signed=bool(index) and steps[index - 1].layer.signed,
     )
-
-
-def _columns_beyond(conv: Conv, cols: int) -> int:
-    """Columns right of the image that a convolution reads."""
-    outs = conv.shape(((1, 1 << 20, cols),))[2]
-    last = (outs - 1) * conv.stride - conv.padding + conv.dilation * (conv.kernel - 1)
-    return max(0, last - cols + 1)
