@@ -2,6 +2,7 @@
 
 import ast
 import random
+import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
@@ -187,6 +188,26 @@ def named(rooms: tuple[str, ...] = ()) -> tuple[list[tuple[Mutant, tuple[str, ..
             end, line = start + len(before.encode()), source[:start].count(b"\n") + 1
             found.append((Mutant(where, line, what, start, end, before, after), tuple(tests)))
     return found, gone
+
+
+def files_of(room: str) -> list[Path]:
+    """The files of a room's tests."""
+    return sorted((REPOSITORY / "tests" / room).rglob("test_*.py"))
+
+
+def near(mutant: Mutant) -> list[str]:
+    """Files of tests that may notice, where nobody measured which tests run a line.
+
+    The module's own, then those that name it, small ones first; of a module that none names, all
+    of the room. Fewer than those that run the line: what they let pass, another may notice.
+    """
+    path = Path(mutant.path)
+    module = re.escape(".".join(path.with_suffix("").parts))
+    names = re.compile(rf"\b({module}|{path.stem})\b")
+    files = sorted(files_of(room_of(mutant.path)), key=lambda file: file.stat().st_size)
+    own = [file for file in files if file.stem == f"test_{path.stem}"]
+    others = [file for file in files if file not in own and names.search(file.read_text())]
+    return [str(file.relative_to(REPOSITORY)) for file in (own + others) or files]
 
 
 def room_of(path: str) -> str:

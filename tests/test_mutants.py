@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from . import mutations
-from .mutations import Mutant, drawn, mutants_of, named
+from .mutations import Mutant, drawn, files_of, mutants_of, named, near
 
 SOURCE = '''"""Words of 1 + 1."""
 from pathlib import Path
@@ -49,6 +49,17 @@ def test_every_kind_of_change_is_made_once_per_place(found: list[Mutant]) -> Non
         (12, "sign", "-a", "(a)"),
         (12, "sign", "-a * b[1:2]", "(-(-a * b[1:2]))"),
     ]
+
+
+def test_tests_near_a_change_are_the_module_s_own_then_those_that_name_it_or_all() -> None:
+    def of(path: str) -> list[str]:
+        return near(Mutant(path, 1, "term", 0, 0, "", ""))
+
+    found = of("dmrl/recording/recover.py")
+    assert found[0] == "tests/recording/test_recover.py"
+    assert "tests/recording/test_flips.py" in found
+    assert "tests/recording/test_inputs.py" not in found
+    assert len(of("dmrl/recording/nobody_names_this.py")) == len(files_of("recording"))
 
 
 def test_every_change_can_be_compiled(found: list[Mutant]) -> None:

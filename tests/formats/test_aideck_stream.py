@@ -10,6 +10,7 @@ from dmrl.formats.cpx_pack import pack_image
 from dmrl.formats.cpx_state import State
 from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
+from dmrl.geometry.frames import AIDECK
 from dmrl.images.bayer import rgb_of
 from dmrl.images.codec import decode, encode_jpeg
 from dmrl.samples.sample import Sample
@@ -34,6 +35,15 @@ def test_raw_pictures_get_their_colours_and_nominal_times(tmp_path: Path) -> Non
     for sample, pixels in zip(found, raw, strict=True):
         np.testing.assert_array_equal(decode(sample.fields["data"]), rgb_of(pixels))
     assert format_of(tmp_path / "a.cpx").name == "aideck-stream"
+
+
+def test_a_camera_that_is_given_comes_once_before_the_pictures(tmp_path: Path) -> None:
+    raw = foreign.pictures(3)
+    data = b"".join(pack_image(Image(32, 24, "raw", p.tobytes())) for p in raw)
+    found = samples(tmp_path / "a.cpx", data, Options(rate_hz=20, camera=AIDECK))
+    (calibration,) = found["/cf1/camera/calibration"]
+    assert calibration.time_ns == 0
+    assert len(found["/cf1/camera/image"]) == 3
 
 
 def test_jpegs_keep_their_bytes(tmp_path: Path) -> None:
