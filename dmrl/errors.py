@@ -2,6 +2,7 @@
 
 * DmrlError
   - OutputError       the output exists, cannot be written, or is another process's
+    + BusyOutput, FullDisk
   - UnsafeName        a name from a file cannot become a path
   - RecordingError    the file cannot be read, or lacks what was asked of it
     + MissingTopic
@@ -12,6 +13,7 @@
   - SettingError      a setting cannot be met by this input
   - BlenderError      Blender cannot be set up, does not start, or cannot use a model
   - ToolError         a compiler or an emulator is missing, or fails
+  - ClusterError      a cluster does not answer, or its nodes are not alike
   - MissingExtra      a package that an optional room needs is not installed
   - PluginError       what another package adds to dmrl does not work
 """
@@ -26,6 +28,14 @@ class DmrlError(Exception):
 
 class OutputError(DmrlError):
     """An output exists already, cannot be written, or is being written by another process."""
+
+
+class BusyOutput(OutputError):
+    """Another process is writing the output just now."""
+
+
+class FullDisk(OutputError):
+    """There is no space left where the output was to be written."""
 
 
 class UnsafeName(DmrlError):
@@ -81,6 +91,10 @@ class BlenderError(DmrlError):
 
 class ToolError(DmrlError):
     """A compiler or an emulator is not installed, or cannot do its work."""
+
+
+class ClusterError(DmrlError):
+    """A cluster does not answer, or its nodes have another version of dmrl."""
 
 
 class MissingExtra(DmrlError):

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dmrl.border.locking import UNSUPPORTED, is_held, refuse_locked, take_file, take_folder
-from dmrl.errors import OutputError
+from dmrl.errors import FullDisk, OutputError
 
 SUFFIX = ".partial"
 MOST_NAME_BYTES = 255 - len(SUFFIX)
@@ -85,7 +85,7 @@ def _name_too_long(path: Path) -> OutputError:
 def as_output_error(path: Path, error: OSError) -> OutputError:
     """The one-line error for a write to ``path`` that the system refused."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return OutputError(f"no space left for {path}. Free some, or write to another disk")
+        return FullDisk(f"no space left for {path}. Free some, or write to another disk")
     if error.errno == errno.ENAMETOOLONG:
         return _name_too_long(path)
     return OutputError(f"cannot write {path}: {error.strerror or error}. Choose another place")

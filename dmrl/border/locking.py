@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from dmrl.errors import OutputError
+from dmrl.errors import BusyOutput, OutputError
 
 PATIENCE_S = 0.25
 """How long a lock is waited for: another process may just be looking whether it is held."""
@@ -117,10 +117,10 @@ def _lock(held: int, partial: Path) -> None:
             return None
 
 
-def _busy(held: int, partial: Path) -> OutputError:
+def _busy(held: int, partial: Path) -> BusyOutput:
     owner = _owner(held)
     number = "" if owner is None else f", process {owner}"
-    return OutputError(
+    return BusyOutput(
         f"{partial.with_suffix('')} is being written by another dmrl{number}. Name another output"
     )
 

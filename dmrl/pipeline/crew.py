@@ -35,10 +35,11 @@ class Crew:
 
     def __init__(self, workers: int | None = None, *, bars: bool = True) -> None:
         self.workers = workers = workers or cores()
+        self.alone_blocks = True
         self._bars = bars and workers == 1
         self._threads = ThreadPoolExecutor(workers)
-        self._idle: list[_Process] = []
-        self._all: list[_Process] = []
+        self._idle: list[Process] = []
+        self._all: list[Process] = []
         self._lock = threading.Lock()
         self._over = False
 
@@ -53,7 +54,7 @@ class Crew:
     ) -> None:
         with self._lock:
             self._over, self._idle, found = True, [], self._all
-        _end(found, in_order=kind is not None)
+        end(found, in_order=kind is not None)
         self._threads.shutdown()
 
     def give(self, job: str, *, alone: bool) -> Future[Answer]:
@@ -74,8 +75,7 @@ class Crew:
             if self._idle and not alone:
                 process = self._idle.pop()
         if process is None:
-            more = {} if alone else ONE_THREAD | ({} if self._bars else NO_BARS)
-            process = self._new(os.environ | more)
+            process = self._new(environment(alone=alone, bars=self._bars))
         answer = process.answer(job)
         with self._lock:
             if self._over:
@@ -84,34 +84,46 @@ class Crew:
                 self._idle.append(process)  # one that failed may hold what it should not
                 return answer
             self._all.remove(process)
-        _end([process], in_order=False)
+        end([process], in_order=False)
         return answer
 
-    def _new(self, environment: dict[str, str]) -> "_Process":
+    def _new(self, environment: dict[str, str]) -> "Process":
         with self._lock:
             if self._over:
                 raise RuntimeError("no step begins any more")
-            process = _Process(environment)
+            process = Process(environment)
             self._all.append(process)
             return process
 
 
-class _Process:
+class Process:
+    """A process that does jobs, one after the other.
+
+    Parameters
+    ----------
+    environment
+        Of the process.
+    folder
+        That names are relative to. None: this one.
+    """
+
     ready = False
 
-    def __init__(self, environment: dict[str, str]) -> None:
+    def __init__(self, environment: dict[str, str], folder: str | None = None) -> None:
         # A group of its own: Ctrl-C reaches us alone, and we end what the stage has started.
         self.popen = subprocess.Popen(
             [sys.executable, "-P", "-c", START],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environment,
+            cwd=folder,
             text=True,
             encoding="utf-8",
             start_new_session=True,
         )
 
     def answer(self, job: str) -> Answer:
+        """What became of a job; that the process died is one of the answers."""
         assert self.popen.stdin is not None and self.popen.stdout is not None
         line = ""
         with suppress(BrokenPipeError):
@@ -124,10 +136,16 @@ class _Process:
             return answer
         number = self.popen.wait()
         how = f"was killed (signal {-number})" if number < 0 else f"ended with status {number}"
-        return {"error": f"its process {how}, for want of memory perhaps. Try fewer --workers"}
+        words = f"its process {how}, for want of memory perhaps. Try fewer --workers"
+        return {"error": words, "again": "elsewhere"}
 
 
-def _end(processes: list[_Process], *, in_order: bool) -> None:
+def environment(*, alone: bool, bars: bool = False) -> dict[str, str]:
+    """What a process that does jobs is given: threads for one core, unless it is to be alone."""
+    return os.environ | ({} if alone else ONE_THREAD | ({} if bars else NO_BARS))
+
+
+def end(processes: list[Process], *, in_order: bool) -> None:
     """End processes; in order, so that stages tidy up, or at once, where they do nothing."""
     told = [process for process in processes if in_order and process.ready]
     for process in told:

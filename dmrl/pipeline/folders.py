@@ -2,24 +2,25 @@
 
 What is to be done is a plan: a list of tasks, each an input, an output and a line of JSON. Any
 process that has dmrl and sees the files can do one. An executor takes the lines: `Crew`, whose
-processes are on this machine.
+processes are on this machine, or `cluster.Ray`; or an array job of Slurm does them.
 """
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from glob import has_magic
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
 from dmrl.output import note
-from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.array import array_job
+from dmrl.pipeline.executors import SLURM, Executor, executor
+from dmrl.pipeline.interface import interface_of
 from dmrl.pipeline.job import Answer, failed, job
 from dmrl.terminal.progress import say, track
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_line, print_table
 
 MOST_WORDS = 4
 """Of a result in the table."""
@@ -42,13 +43,6 @@ class Task:
     source: Path
     out: Path | None
     line: str
-
-
-class Executor(Protocol):
-    """Who does tasks."""
-
-    def give(self, job: str, *, alone: bool) -> Future[Answer]:
-        """The answer to a job, once it is there."""
 
 
 def is_many(source: Path) -> bool:
@@ -182,6 +176,44 @@ def _size(path: Path) -> int:
         return 0  # what it is about says so itself
 
 
+def done_on(
+    on: str, stage: str, out: Path, inputs: Mapping[str, Any], settings: Any = None
+) -> dict[str, Any] | None:
+    """Run a stage once, on a cluster.
+
+    Parameters
+    ----------
+    on
+        See `executor`.
+    stage, out
+        Command name, and what it writes.
+    inputs
+        Arguments of its ``run`` but for the settings, by name.
+    settings
+        Its settings.
+
+    Returns
+    -------
+    dict or None
+        What ``run`` gave back, as values of JSON. None: the output was there, made of the same.
+
+    Raises
+    ------
+    DmrlError
+        What the stage says.
+    """
+    line = job(stage, out, dict(inputs), _differing(settings), keep=True)
+    task = Task(out, out, line)
+    if on == SLURM:
+        raise SettingError("--on slurm is for a folder of recordings. Name one, or --on ray")
+    with executor(on, None) as crew:
+        answer = crew.give(line, alone=interface_of(stage).alone).result()
+    if failed(answer):
+        raise DmrlError(words_of(task, answer))
+    note(out)
+    return None if "there" in answer else answer["result"]
+
+
 def over_folder(
     stage: str,
     source: Path,
@@ -189,6 +221,7 @@ def over_folder(
     settings: Any = None,
     *,
     workers: int | None,
+    on: str | None = None,
     as_json: bool = False,
     role: str = "recording",
     inputs: Mapping[str, Path] | None = None,
@@ -207,6 +240,9 @@ def over_folder(
         that are there, made of the same inputs by the same settings, are left as they are.
     workers
         Processes, at most. None: as many as there are cores.
+    on
+        A cluster that does it in place of processes here; see `executor`. "slurm": a job for it is
+        written, and nothing is done yet.
     as_json
         Print one JSON document in place of the table.
     found
@@ -219,10 +255,13 @@ def over_folder(
     """
     if _same(source, out):
         raise SettingError(f"{out} is the folder that is read. Name another for what is made")
-    found = recordings_in(source, but=out) if found is None else found
+    found, out = _named(source, out) if found is None else (found, out)
     tasks = tasks_of(stage, role, found, out, settings, inputs)
     made = _make_folders(out, tasks)
-    with Crew(workers, bars=False) as crew:
+    if on == SLURM:
+        print_line(array_job(tasks, out))
+        return
+    with executor(on, workers) as crew:
         done = list(outcomes(tasks, crew, f"dmrl {stage}"))
     for folder in made:
         with suppress(OSError):  # it holds something
@@ -236,6 +275,13 @@ def over_folder(
         rows = [(task.out, came_of(answer), _brief(answer.get("result"))) for task, answer in done]
         print_table(str(out), ("recording", "", "holds"), rows)
     end(done, "; the others are there. Run it again when these are mended")
+
+
+def _named(source: Path, out: Path) -> tuple[Mapping[Path, Path], Path]:
+    """Inputs by the names of their outputs, and the folder of these."""
+    if is_many(source):
+        return recordings_in(source, but=out), out
+    return {Path(out.name): source}, out.parent
 
 
 def _make_folders(out: Path, tasks: Iterable[Task]) -> list[Path]:

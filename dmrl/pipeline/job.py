@@ -14,6 +14,8 @@ key         is there
 ``result``  in place of it, where the job asked: what ``run`` gave back
 ``there``   in place of both: the output was there, made of the same
 ``error``   what a user can mend
+``again``   beside it, "elsewhere": another machine may do it, as where a disk is full;
+            "later": another process is at it
 ``fault``   what only we can
 ==========  ==================================================================
 """

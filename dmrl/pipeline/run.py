@@ -14,7 +14,7 @@ from pathlib import Path
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.report import Done
 from dmrl.output import as_output_error, rewritten_file
-from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.executors import executor
 from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located
 from dmrl.pipeline.runner import Runner
@@ -24,7 +24,12 @@ __all__ = ["Done", "Plan", "Step", "load", "run"]
 
 
 def run(
-    name: str | Path, out: Path, data: Path | None = None, *, workers: int | None = None
+    name: str | Path,
+    out: Path,
+    data: Path | None = None,
+    *,
+    workers: int | None = None,
+    on: str | None = None,
 ) -> list[Done]:
     """Run the steps of a pipeline recipe whose outputs are not there, or not up to date.
 
@@ -39,6 +44,8 @@ def run(
     workers
         Steps that run at a time, at most. None: as many as there are cores. The bytes are the
         same with any number.
+    on
+        A cluster that does the steps in place of processes here; see `executor`.
 
     Returns
     -------
@@ -62,7 +69,7 @@ def run(
         memory = Memory.of(folder / STATE_FILE)
         memory.save()
         _keep_recipe(folder, plan)
-        with Crew(workers) as crew:
+        with executor(on, workers, bars=True) as crew:
             done = Runner(plan, folder, data, memory, crew).run()
         memory.forget_what_is_gone()
         memory.save()

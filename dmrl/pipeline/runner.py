@@ -12,7 +12,7 @@ from dmrl import recipe as recipes
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.report import Done
 from dmrl.output import note, partial_of
-from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.executors import Executor
 from dmrl.pipeline.interface import NO_CONTENT
 from dmrl.pipeline.job import Answer, job
 from dmrl.pipeline.memory import Memory, key_of
@@ -43,11 +43,11 @@ class Runner:
     memory
         Of the folder.
     crew
-        Processes to run steps in.
+        Who does the steps.
     """
 
     def __init__(
-        self, plan: Plan, folder: Path, data: Path | None, memory: Memory, crew: Crew
+        self, plan: Plan, folder: Path, data: Path | None, memory: Memory, crew: Executor
     ) -> None:
         self.folder, self.data, self.memory, self.crew = folder, data, memory, crew
         self.steps = {step.out: step for step in plan.steps}
@@ -125,9 +125,11 @@ class Runner:
         return located(name, self.outs, self.folder, self.data)
 
     def _has_room(self, step: Step) -> bool:
-        if any(one.step.interface.alone for one in self.running.values()):
+        blocks = self.crew.alone_blocks
+        if blocks and any(one.step.interface.alone for one in self.running.values()):
             return False
-        return len(self.running) < (1 if step.interface.alone else self.crew.workers)
+        alone = blocks and step.interface.alone
+        return len(self.running) < (1 if alone else self.crew.workers)
 
     def _start(self, step: Step, key: str) -> None:
         place = self.folder / UNFINISHED / step.out

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import DmrlError, OutputError
+from dmrl.errors import BusyOutput, DmrlError, FullDisk, MissingExtra, OutputError
 from dmrl.pipeline.interface import Interface, interface_of
 from dmrl.pipeline.job import Answer
 from dmrl.recording import Provenance, provenance
@@ -41,6 +41,10 @@ def perform(line: str) -> Answer:
         if told["keep"]:
             return {"result": _plain(result)}
         return {"sha256": sha256_of_folder(out) if out.is_dir() else sha256_of_file(out)}
+    except BusyOutput as e:
+        return {"error": str(e), "again": "later"}
+    except (FullDisk, MissingExtra) as e:
+        return {"error": str(e), "again": "elsewhere"}
     except DmrlError as e:
         return {"error": str(e)}
     except Exception as e:

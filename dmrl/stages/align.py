@@ -27,7 +27,7 @@ from dmrl.recording import (
     splits,
     summary,
 )
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
@@ -223,6 +223,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Set clocks by each other: from ranges of pairs, images, or motion capture.
@@ -240,8 +241,8 @@ def command(
     as_json
         Print one JSON document in place of the table.
     """
-    if is_many(recording):
-        over_folder("align", recording, out, settings, workers=workers, as_json=as_json)
+    if is_many(recording) or on is not None:
+        over_folder("align", recording, out, settings, workers=workers, on=on, as_json=as_json)
         return
     clocks = run(recording, out, settings)
     if as_json:

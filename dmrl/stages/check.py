@@ -8,12 +8,12 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.executors import Executor, executor
 from dmrl.pipeline.folders import Task, all_recordings, end, is_many, outcomes, tasks_of, words_of
 from dmrl.pipeline.job import Answer, failed
 from dmrl.recording import Finding, summary
 from dmrl.recording import check as findings_of
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.tables import print_json, print_line
 
 
@@ -42,6 +42,7 @@ def run(recording: Path) -> Checked:
 def command(
     *recordings: Annotated[Path, Parameter(name="IN")],
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> int:
     """Check a recording: schemas, times, gaps, calibration, labels.
@@ -59,8 +60,8 @@ def command(
     """
     if not recordings:
         raise SettingError("check wants a recording, or a folder of them. Name one")
-    if len(recordings) > 1 or is_many(recordings[0]):
-        return _check_many(recordings, workers, as_json=as_json)
+    if len(recordings) > 1 or is_many(recordings[0]) or on is not None:
+        return _check_many(recordings, executor(on, workers), as_json=as_json)
     found = run(recordings[0])
     errors = sum(f.level == "error" for f in found.findings)
     if as_json:
@@ -77,12 +78,12 @@ def command(
     return 1 if errors else 0
 
 
-def _check_many(named: Sequence[Path], workers: int | None, *, as_json: bool) -> int:
+def _check_many(named: Sequence[Path], crew: Executor, *, as_json: bool) -> int:
     """Check recordings side by side; 1 if one of them has an error or cannot be read."""
     found = {path: path for path in all_recordings(named)}
     tasks = tasks_of("check", "recording", found, None)
     done: list[tuple[Task, Answer]] = []
-    with Crew(workers, bars=False) as crew:
+    with crew:
         for task, answer in outcomes(tasks, crew, "Checking"):
             done.append((task, answer))
             if not (as_json or failed(answer)):

@@ -33,7 +33,7 @@ from dmrl.recording import (
     time_slices,
 )
 from dmrl.samples.sample import Sample
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -227,6 +227,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Convert a foreign file or folder into a recording, or a recording into files.
@@ -245,16 +246,18 @@ def command(
     as_json
         Print one JSON document in place of the table.
     """
-    if source.is_dir() and (settings.to is not None or out.suffix != ".mcap"):
+    many = source.is_dir() and (settings.to is not None or out.suffix != ".mcap")
+    if many or on is not None:
         over_folder(
             "convert",
             source,
-            out,
+            out if many else out.parent,
             settings,
             workers=workers,
+            on=on,
             as_json=as_json,
             role="source",
-            found=_sources(source, settings),
+            found=_sources(source, settings) if many else {Path(out.name): source},
         )
         return
     counts = run(source, out, settings)

@@ -31,7 +31,7 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.images.ahead import ahead
 from dmrl.output import partial_folder
 from dmrl.pipeline.crew import cores
-from dmrl.pipeline.folders import all_recordings
+from dmrl.pipeline.folders import all_recordings, done_on
 from dmrl.recording import (
     Contents,
     Provenance,
@@ -41,9 +41,9 @@ from dmrl.recording import (
     splits,
     summary,
 )
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say, track
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_line, print_table
 
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
@@ -318,6 +318,7 @@ def command(
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     from_index: str | None = None,
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Build an Arrow dataset and its card from recordings.
@@ -337,7 +338,12 @@ def command(
         Print one JSON document in place of the tables.
     """
     named = all_recordings(recordings) if from_index is None else _found(recordings, from_index)
-    result = run(named, out, settings, workers=workers)
+    result = run(named, out, settings, workers=workers) if on is None else None
+    if on is not None and (said := done_on(on, "dataset", out, {"recordings": named}, settings)):
+        result = Result(said["images"], said["sources"], Tally(**said["tally"]))
+    if result is None:
+        print_line(f"{out} was there, made of the same by the same settings")
+        return
     left_out = {why: count for why, count in result.tally.left_out().items() if count}
     if as_json:
         document = {"dataset": str(out), "images": result.images}

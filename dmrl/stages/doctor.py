@@ -35,6 +35,7 @@ EXTRAS = {
     "table": "dmrl convert --to csv",
     "record": "dmrl record; cflib: GPL-3.0",
     "deploy": "ONNX: dmrl export, predict",
+    "cluster": "dmrl --on ray",
     "index": "dmrl find, dataset --from-index",
 }
 """What each extra of pyproject.toml is for."""

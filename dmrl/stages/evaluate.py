@@ -19,8 +19,9 @@ from dmrl.evaluation.tables import by_band_table
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, curves, score
 from dmrl.learn.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.output import partial_folder, refuse_existing
-from dmrl.pipeline.folders import all_recordings
+from dmrl.pipeline.folders import all_recordings, done_on
 from dmrl.recording import input_of, summary
+from dmrl.terminal.arguments import On
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -314,6 +315,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     plots_to: Annotated[Path | None, Parameter(name="--plots")] = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Judge detections against labels; tracks and positions against the truth.
@@ -330,6 +332,12 @@ def command(
         Print one JSON document in place of the table.
     """
     recordings = all_recordings(recordings)
+    if on is not None:
+        if plots_to is None:
+            raise SettingError("--on wants a folder for the figures as well: --plots DIR")
+        done_on(on, "evaluate", plots_to, {"recordings": recordings}, settings)
+        print_line(f"{plots_to}: figures and their document")
+        return
     evaluation = run(recordings, plots_to, settings)
     if isinstance(evaluation, dict):
         if as_json:

@@ -19,6 +19,7 @@ from dmrl.geometry.frames import AIDECK_PINHOLE, Array
 from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
 from dmrl.output import refuse_existing
+from dmrl.pipeline.folders import done_on
 from dmrl.recording import Provenance, RecordingWriter, provenance
 from dmrl.rendering import aloft, renderer
 from dmrl.rendering.environment import ensure
@@ -28,7 +29,7 @@ from dmrl.rendering.sketch import Sketch
 from dmrl.samples import flight as samples
 from dmrl.samples.flight import Times, in_order, nanoseconds
 from dmrl.samples.sample import Sample, calibration, image, labels
-from dmrl.terminal.arguments import AsJson, Seed
+from dmrl.terminal.arguments import AsJson, On, Seed
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -301,6 +302,7 @@ def command(
     /,
     *,
     flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
+    on: On = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a flight of robots that measure themselves and each other.
@@ -314,8 +316,9 @@ def command(
     as_json
         Print one JSON document in place of the table.
     """
-    counts = run(out, flags.over(recipes.load(recipe, "fly", Settings)))
+    settings = flags.over(recipes.load(recipe, "fly", Settings))
+    counts = run(out, settings) if on is None else done_on(on, "fly", out, {}, settings)
     if as_json:
         print_json({"recording": str(out), "messages": counts})
         return
-    print_table(str(out), ("topics", "messages"), list(counts.items()))
+    print_table(str(out), ("topics", "messages"), list((counts or {}).items()))

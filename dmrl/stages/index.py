@@ -8,10 +8,10 @@ import pyarrow as pa
 
 from dmrl.catalogue import Row, describe, open_catalogue, unread
 from dmrl.catalogue.table import rows_table, stamp
-from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.executors import Executor, executor
 from dmrl.pipeline.folders import outcomes, recordings_in, tasks_of, words_of
 from dmrl.pipeline.job import failed
-from dmrl.terminal.arguments import AsJson, Workers
+from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line
 
@@ -56,7 +56,7 @@ def run(recording: Path) -> Row:
     return describe(recording)
 
 
-def update(folder: Path, workers: int | None = None) -> Result:
+def update(folder: Path, workers: int | None = None, on: str | None = None) -> Result:
     """Bring the catalogue of a folder up to date; if it is stopped, what was seen is kept.
 
     Parameters
@@ -65,6 +65,8 @@ def update(folder: Path, workers: int | None = None) -> Result:
         Of recordings.
     workers
         Recordings at a time, at most. None: as many as there are cores.
+    on
+        A cluster that looks at them in place of this machine.
 
     Raises
     ------
@@ -79,8 +81,10 @@ def update(folder: Path, workers: int | None = None) -> Result:
     stamps = {name: stamp(path) for name, path in found.items()}
     kept = before.unchanged(stamps)
     rows = _Rows()
+    new = {name: path for name, path in found.items() if name not in kept}
     try:
-        _look_at({n: path for n, path in found.items() if n not in kept}, stamps, rows, workers)
+        if new:
+            _look_at(new, stamps, rows, executor(on, workers))
     finally:
         fresh = rows.table()
         after = before.with_rows(kept, fresh)
@@ -92,14 +96,12 @@ def update(folder: Path, workers: int | None = None) -> Result:
 
 
 def _look_at(
-    new: Mapping[str, Path], stamps: Mapping[str, str], rows: _Rows, workers: int | None
+    new: Mapping[str, Path], stamps: Mapping[str, str], rows: _Rows, crew: Executor
 ) -> None:
     """Describe recordings side by side."""
-    if not new:
-        return
     names = {path: name for name, path in new.items()}
     tasks = tasks_of("index", "recording", {path: path for path in names}, None)
-    with Crew(workers, bars=False) as crew:
+    with crew:
         for task, answer in outcomes(tasks, crew, "Indexing"):
             row = unread(words_of(task, answer)) if failed(answer) else answer["result"]
             name = names[task.source]
@@ -107,7 +109,9 @@ def _look_at(
             rows.add({**row, "recording": name, "bytes": size, "stamp": stamps[name]})
 
 
-def command(folder: Path, /, *, workers: Workers = None, as_json: AsJson = False) -> None:
+def command(
+    folder: Path, /, *, workers: Workers = None, on: On = None, as_json: AsJson = False
+) -> None:
     """List what a folder's recordings hold in one table, catalogue.parquet, for dmrl find.
 
     Run it again when recordings came, went or changed: only those are looked at.
@@ -121,7 +125,7 @@ def command(folder: Path, /, *, workers: Workers = None, as_json: AsJson = False
     as_json
         Print one JSON document in place of the line.
     """
-    result = update(folder, workers)
+    result = update(folder, workers, on)
     catalogue = open_catalogue(folder)
     if as_json:
         print_json({"catalogue": str(catalogue.file), **asdict(result)})

@@ -14,7 +14,7 @@ from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.output import refuse_existing
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -253,6 +253,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Find every robot's peers from ranges and odometry, and label the images with them.
@@ -270,8 +271,8 @@ def command(
     as_json
         Print one JSON document in place of the table.
     """
-    if is_many(recording):
-        over_folder("label", recording, out, settings, workers=workers, as_json=as_json)
+    if is_many(recording) or on is not None:
+        over_folder("label", recording, out, settings, workers=workers, on=on, as_json=as_json)
         return
     result = run(recording, out, settings)
     for warning in result.warnings:

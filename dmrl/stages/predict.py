@@ -37,7 +37,7 @@ from dmrl.recording import (
     summary,
 )
 from dmrl.recording.inputs import sha256_of_file
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -268,6 +268,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Run a network on every image of a recording.
@@ -288,10 +289,17 @@ def command(
     as_json
         Print one JSON document in place of the table.
     """
-    if is_many(recording):
+    if is_many(recording) or on is not None:
         given = {"model": model}
         over_folder(
-            "predict", recording, out, settings, workers=workers, as_json=as_json, inputs=given
+            "predict",
+            recording,
+            out,
+            settings,
+            workers=workers,
+            on=on,
+            as_json=as_json,
+            inputs=given,
         )
         return
     result = run(model, recording, out, settings)

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Recovery, recover
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.tables import print_json, print_line
 
 
@@ -23,6 +23,7 @@ def command(
     /,
     *,
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Bring back the messages of a recording that was cut short.
@@ -43,8 +44,8 @@ def command(
     as_json
         Print one JSON document instead of a line.
     """
-    if is_many(recording):
-        over_folder("recover", recording, out, workers=workers, as_json=as_json)
+    if is_many(recording) or on is not None:
+        over_folder("recover", recording, out, workers=workers, on=on, as_json=as_json)
         return
     result = run(recording, out)
     if as_json:

@@ -19,6 +19,7 @@ from dmrl.geometry.camera_file import KNOWN, camera_named
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
+from dmrl.pipeline.folders import done_on
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,
@@ -38,6 +39,7 @@ from dmrl.rendering.randomise import Drawn, World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer, Scene
 from dmrl.rendering.settings import PRESETS, Settings
 from dmrl.samples.sample import Sample, calibration, intervals
+from dmrl.terminal.arguments import On
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -262,6 +264,7 @@ def command(
     scale: float | None = None,
     resume: Annotated[bool, Parameter(negative=())] = False,
     setup: Annotated[bool, Parameter(negative=())] = False,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Render images of robots with exact labels, as a recipe says, into a recording.
@@ -310,8 +313,11 @@ def command(
         model=model,
         scale=scale,
     )
-    result = run(out, settings, resume=resume)
-    rows = {name.replace("_", " "): value for name, value in asdict(result).items()}
+    if on is None:
+        result = asdict(run(out, settings, resume=resume))
+    else:
+        result = done_on(on, "render", out, {}, settings) or {}
+    rows = {name.replace("_", " "): value for name, value in result.items()}
     if as_json:
         return print_json({"recording": str(out), **rows})
     return print_table(str(out), ("what", "count"), list(rows.items()))

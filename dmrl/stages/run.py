@@ -7,6 +7,7 @@ from cyclopts import Parameter, validators
 
 from dmrl.evaluation.report import report
 from dmrl.pipeline import run as pipeline
+from dmrl.terminal.arguments import On
 from dmrl.terminal.tables import print_line
 
 
@@ -17,6 +18,7 @@ def command(
     out: Path | None = None,
     data: Path | None = None,
     workers: Annotated[int | None, Parameter(validator=validators.Number(gte=1))] = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Run the steps of a pipeline recipe whose outputs are not up to date, side by side.
@@ -35,6 +37,6 @@ def command(
         Print one JSON document in place of the tables.
     """
     folder = Path(Path(recipe).stem) if out is None else out
-    report(pipeline.run(recipe, folder, data, workers=workers), as_json=as_json)
+    report(pipeline.run(recipe, folder, data, workers=workers, on=on), as_json=as_json)
     if not as_json:
         print_line(f"On one page: dmrl report {folder}")

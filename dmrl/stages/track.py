@@ -15,7 +15,7 @@ from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite, summary
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -184,6 +184,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     workers: Workers = None,
+    on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Follow detected peers over time: 3D tracks with covariance.
@@ -201,8 +202,8 @@ def command(
     as_json
         Print one JSON document in place of the table.
     """
-    if is_many(recording):
-        over_folder("track", recording, out, settings, workers=workers, as_json=as_json)
+    if is_many(recording) or on is not None:
+        over_folder("track", recording, out, settings, workers=workers, on=on, as_json=as_json)
         return
     reports = run(recording, out, settings)
     if as_json:

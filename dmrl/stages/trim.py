@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from dmrl.errors import SettingError
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Provenance, provenance, summary, trim
-from dmrl.terminal.arguments import Workers
+from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.tables import print_line
 
 LONGEST_S = 9e9
@@ -93,6 +93,7 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     workers: Workers = None,
+    on: On = None,
 ) -> None:
     """Keep a stretch of a recording, or some of its topics.
 
@@ -109,7 +110,7 @@ def command(
         Of a folder: recordings at a time, at most. Without it, as many as there are cores.
         Changes no byte.
     """
-    if is_many(recording):
-        over_folder("trim", recording, out, settings, workers=workers)
+    if is_many(recording) or on is not None:
+        over_folder("trim", recording, out, settings, workers=workers, on=on)
         return
     print_line(f"{out}: {run(recording, out, settings)} messages")

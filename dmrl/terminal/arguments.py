@@ -9,5 +9,13 @@ AsJson = Annotated[bool, Parameter(name="--json", negative=())]
 Seed = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 """Of everything drawn at random."""
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
+On = Annotated[
+    str | None,
+    Parameter(
+        help="Do it on a cluster: ray for the Ray cluster that this machine is part of (or this "
+        "machine alone), ray://HOST:PORT for another, slurm to write an array job. Changes no byte."
+    ),
+]
+"""Where it is done, if not here."""
 Workers = Annotated[int | None, Parameter(validator=validators.Number(gte=1))]
 """How many processes work side by side."""

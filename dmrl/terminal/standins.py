@@ -29,7 +29,17 @@ PACKAGES = frozenset(
             "matplotlib",
             "mcap",
         ),
-        *("numpy", "onnx", "onnxruntime", "packaging", "pandas", "pyarrow", "pydantic", "rerun"),
+        *(
+            "numpy",
+            "onnx",
+            "onnxruntime",
+            "packaging",
+            "pandas",
+            "pyarrow",
+            "pydantic",
+            "ray",
+            "rerun",
+        ),
         *("rerun_cli", "rosbags", "safetensors", "scipy", "tensorboard", "tomli_w", "torch"),
         *("zstandard",),
     }

@@ -1,0 +1,64 @@
+"""A plan as an array job: every element does its part, and the same command then finds it done."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import SettingError
+from dmrl.pipeline import array
+from dmrl.pipeline.folders import done_on, over_folder
+from dmrl.stages import trim
+
+from .test_folders import bytes_in, record
+
+KEPT = trim.Settings(to_s=1.5)
+
+
+@pytest.fixture
+def flights(tmp_path: Path) -> Path:
+    for k in range(3):
+        record(tmp_path / "flights with spaces" / f"{k}.mcap", roll_rad=k)
+    return tmp_path / "flights with spaces"
+
+
+def run(script: Path, element: int) -> subprocess.CompletedProcess[str]:
+    """An element, as Slurm runs it."""
+    own = os.environ | {"SLURM_ARRAY_TASK_ID": str(element)}
+    return subprocess.run(["sh", str(script)], env=own, capture_output=True, text=True, check=False)
+
+
+def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
+    flights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(array, "MOST", 2)
+    out = tmp_path / "out"
+    over_folder("trim", flights, out, KEPT, workers=None, on="slurm")
+    said = capsys.readouterr().out
+    script = out / ".dmrl-job.sh"
+    assert said == f"3 tasks in 2 elements. Now: sbatch {script}\n"
+    assert "#SBATCH --array=0-1\n" in script.read_text()
+    assert not list(out.glob("*.mcap"))
+    first = run(script, 0)
+    assert first.returncode == 0 and len(first.stdout.splitlines()) == 2
+    assert [p.name for p in sorted(out.glob("*.mcap"))] == ["0.mcap", "2.mcap"]
+    (flights / "1.mcap").rename(flights / "gone")
+    bad = run(script, 1)
+    assert bad.returncode == 1 and "error" in json.loads(bad.stdout)
+    (flights / "gone").rename(flights / "1.mcap")
+    assert run(script, 1).returncode == 0
+    over_folder("trim", flights, out, KEPT, workers=1)
+    assert capsys.readouterr().out.count("was there") == 3
+    over_folder("trim", flights, tmp_path / "here", KEPT, workers=1)
+    made = {name: data for name, data in bytes_in(out).items() if name.endswith(".mcap")}
+    assert made == bytes_in(tmp_path / "here")
+
+
+def test_one_output_is_no_array(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="--on slurm is for a folder"):
+        done_on("slurm", "fly", tmp_path / "a.mcap", {}, None)

@@ -1,0 +1,193 @@
+"""Recordings on two Ray nodes of this machine: the bytes are those of one process, whoever dies.
+
+Ray is told to stay on loopback, and has no dashboard.
+"""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dmrl.errors import ClusterError, DmrlError, SettingError
+from dmrl.pipeline.executors import executor
+from dmrl.pipeline.folders import over_folder
+from dmrl.pipeline.job import job
+from dmrl.stages import trim
+
+from .test_folders import bytes_in, record
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
+SETTINGS = {
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # else it advertises the machine's own address
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_enable_metrics_collection": "0",
+}
+NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "node_ip_address": "127.0.0.1"}
+NODE |= {"include_dashboard": False, "include_log_monitor": False, "no_monitor": True}
+KEPT = trim.Settings(to_s=1.5)
+COUNT = 40
+
+
+class Nodes:
+    """A head and another node, which can die."""
+
+    def __init__(self) -> None:
+        from ray.cluster_utils import Cluster  # noqa: PLC0415 - reads the environment
+
+        self.cluster = Cluster(initialize_head=True, head_node_args=dict(NODE))
+        self.other: Any = self.cluster.add_node(**NODE)
+
+    def die(self) -> None:
+        """Kill the other node, at once."""
+        self.cluster.remove_node(self.other, allow_graceful=False)
+        self.other = None
+
+    def whole(self) -> None:
+        """Bring it back."""
+        if self.other is None:
+            self.other = self.cluster.add_node(**NODE)
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[Nodes]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in SETTINGS.items():
+            patch.setenv(name, value)
+        found = Nodes()
+        patch.setenv("RAY_ADDRESS", found.cluster.address)
+        yield found
+        found.cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cluster") / "flights"
+    for k in range(COUNT):
+        record(folder / f"{k % 4}" / f"{k:02d}.mcap", messages=20 + k, roll_rad=k)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def alone(flights: Path) -> dict[str, bytes]:
+    """What one process here makes of them."""
+    out = flights.parent / "alone"
+    over_folder("trim", flights, out, KEPT, workers=1)
+    return bytes_in(out)
+
+
+def test_the_bytes_are_those_of_this_machine_and_each_node_is_told_of(
+    nodes: Nodes, flights: Path, alone: dict[str, bytes], tmp_path: Path, capfd: Any
+) -> None:
+    over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
+    assert bytes_in(tmp_path / "out") == alone
+    told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("node ")]
+    assert len(told) == 2 and all(" 0 failed" in line for line in told)
+    (tmp_path / "out" / "0" / "00.mcap").unlink()
+    over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
+    assert bytes_in(tmp_path / "out") == alone
+    assert capfd.readouterr().out.count("was there") == COUNT - 1
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_node_that_dies_at_any_moment_loses_nothing(
+    seed: int, nodes: Nodes, flights: Path, alone: dict[str, bytes], tmp_path: Path
+) -> None:
+    nodes.whole()
+    out = tmp_path / "out"
+    after = random.Random(seed).randrange(COUNT - 10)
+
+    def kill() -> None:
+        while len(list(out.rglob("*.mcap"))) <= after:
+            time.sleep(0.01)
+        nodes.die()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    over_folder("trim", flights, out, KEPT, workers=None, on="ray")
+    killer.join()
+    assert nodes.other is None
+    assert bytes_in(out) == alone
+
+
+def test_what_fails_on_one_node_is_tried_on_the_other(nodes: Nodes, tmp_path: Path) -> None:
+    """A full disk is one node's: the answer says that another may do it."""
+    nodes.whole()
+    with executor("ray", None) as crew:
+        again = crew._again  # type: ignore[attr-defined]
+        seen = []
+
+        def watched(given: Any, answer: Any) -> bool:
+            if not seen:
+                seen.append(answer["node"])
+                answer = {"error": "no space left", "again": "elsewhere", "node": answer["node"]}
+            else:
+                seen.append(answer["node"])
+            return bool(again(given, answer))
+
+        crew._again = watched  # type: ignore[attr-defined]
+        source = record(tmp_path / "a.mcap")
+        line = job("trim", tmp_path / "b.mcap", {"recording": source}, {"to_s": 1.0}, keep=True)
+        answer = crew.give(line, alone=False).result()
+    assert "error" not in answer
+    assert len(seen) == 2 and seen[0] != seen[1]
+
+
+def test_one_that_fails_stops_no_other(nodes: Nodes, flights: Path, tmp_path: Path) -> None:
+    few = tmp_path / "few"
+    shutil.copytree(flights / "0", few)
+    (few / "torn.mcap").write_bytes(b"no recording")
+    with pytest.raises(DmrlError, match="1 of 11 recordings failed"):
+        over_folder("trim", few, tmp_path / "out", KEPT, workers=None, on="ray")
+    assert len(bytes_in(tmp_path / "out")) == 10
+
+
+def test_other_versions_and_wrong_addresses_are_one_line(
+    nodes: Nodes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dmrl.pipeline.cluster.__version__", "9.9.9")
+    with pytest.raises(ClusterError, match=r"has dmrl \S+, not 9\.9\.9\. Install the same"):
+        executor("ray", None)
+    monkeypatch.undo()
+    with pytest.raises(ClusterError, match=r"no Ray cluster answers at 127\.0\.0\.1:1 "):
+        executor("ray://127.0.0.1:1", None)
+
+
+def test_ctrl_c_ends_the_tasks(nodes: Nodes, flights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["trim", str(flights), str(out), "--to-s", "1.5", "--on", "ray"]
+    code = f"from dmrl.cli import main; import sys; sys.argv = ['dmrl', *{words}]; main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | SETTINGS,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    while not list(out.rglob("*.mcap")) and process.poll() is None:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 130 and "stopped." in said
+    made = bytes_in(out)
+    time.sleep(2.0)
+    assert bytes_in(out) == made
+    assert not [name for name in made if name.endswith(".partial")]
+
+
+def test_what_on_does_not_take_is_one_line() -> None:
+    for on in ("spark", "ray://", "raytrace://host:1"):
+        with pytest.raises(SettingError, match="this takes ray"):
+            executor(on, None)
+    with pytest.raises(SettingError, match="Leave out --workers"):
+        executor("ray", 2)
+    with pytest.raises(ClusterError, match=r"is not ray://HOST:PORT"):
+        executor("ray://nowhere", None)
