@@ -7,6 +7,7 @@ act on become one line and exit status 1.
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, NoReturn, get_args, get_origin
 
 from cyclopts import (
@@ -16,6 +17,7 @@ from cyclopts import (
     Parameter,
     Token,
     UnknownCommandError,
+    _convert,
     convert,
 )
 from rich.console import Console
@@ -23,7 +25,10 @@ from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
 from dmrl.border.names import without_middle
+from dmrl.storage.names import path_of
 from dmrl.terminal import standins
+
+_convert._converters[Path] = path_of  # so that every argument may be s3://bucket/key
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).

@@ -13,6 +13,7 @@
   - SettingError      a setting cannot be met by this input
   - BlenderError      Blender cannot be set up, does not start, or cannot use a model
   - ToolError         a compiler or an emulator is missing, or fails
+  - StorageError      a bucket or its server cannot be reached, or refuses
   - ClusterError      a cluster does not answer, or its nodes are not alike
   - MissingExtra      a package that an optional room needs is not installed
   - PluginError       what another package adds to dmrl does not work
@@ -91,6 +92,10 @@ class BlenderError(DmrlError):
 
 class ToolError(DmrlError):
     """A compiler or an emulator is not installed, or cannot do its work."""
+
+
+class StorageError(DmrlError):
+    """A bucket, or the server that has it, cannot be reached, or refuses."""
 
 
 class ClusterError(DmrlError):

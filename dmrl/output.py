@@ -15,6 +15,8 @@ from pathlib import Path
 
 from dmrl.border.locking import UNSUPPORTED, is_held, refuse_locked, take_file, take_folder
 from dmrl.errors import FullDisk, OutputError
+from dmrl.storage import Remote, uploaded_file, uploaded_folder
+from dmrl.storage.whole import require_bucket
 
 SUFFIX = ".partial"
 MOST_NAME_BYTES = 255 - len(SUFFIX)
@@ -55,15 +57,18 @@ def refuse_existing(path: Path) -> None:
         process is writing it.
     """
     _refuse_taken(path)
-    refuse_locked(partial_of(path))
+    if not isinstance(path, Remote):
+        refuse_locked(partial_of(path))
 
 
 def _refuse_taken(path: Path) -> None:
     if len(os.fsencode(path.name)) > MOST_NAME_BYTES:
         raise _name_too_long(path)
     try:
+        if isinstance(path, Remote):
+            require_bucket(path)
         taken = path.exists() or path.is_symlink()
-        homeless = not path.parent.is_dir()
+        homeless = not isinstance(path, Remote) and not path.parent.is_dir()
     except OSError as e:
         raise as_output_error(path, e) from e
     if taken:
@@ -108,6 +113,10 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
         If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
+    if isinstance(path, Remote):
+        with _noted(path), uploaded_file(path) as here:
+            yield here
+        return
     partial = partial_of(path)
     with _refusals(path, partial):
         held, kept = None, keep_on_error
@@ -140,6 +149,10 @@ def rewritten_file(path: Path) -> Iterator[Path]:
     OutputError
         If another process is writing it, or the system refuses a write.
     """
+    if isinstance(path, Remote):
+        with uploaded_file(path) as here:
+            yield here
+        return
     partial = partial_of(path)
     with _refusals(path, partial):
         held = take_file(partial)
@@ -175,6 +188,10 @@ def partial_folder(
         If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
+    if isinstance(path, Remote):
+        with _noted(path), uploaded_folder(path) as here:
+            yield here
+        return
     partial = partial_of(path)
     with _refusals(path, partial):
         held, kept = take_folder(partial), keep_on_error
@@ -193,6 +210,16 @@ def partial_folder(
                 shutil.rmtree(partial, ignore_errors=True)
             os.close(held)
             _ended.append(path)
+
+
+@contextmanager
+def _noted(path: Path) -> Iterator[None]:
+    """An output in a bucket, which is begun here and done with when the block ends."""
+    _begun.append(path)
+    try:
+        yield
+    finally:
+        _ended.append(path)
 
 
 def _remove(path: Path) -> None:

@@ -4,6 +4,7 @@ Arrow's own reader believes a file: an offset beyond a buffer is read all the sa
 shard is validated, and what is not laid out as `dmrl.datasets.layout` says is refused.
 """
 
+import os
 from pathlib import Path
 
 import pyarrow as pa
@@ -61,8 +62,8 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
 
 def _mapped(path: Path) -> pa.Table:
     if path.suffix == ".parquet":
-        return pq.ParquetFile(path, memory_map=True).read()
-    return pa.ipc.open_stream(pa.memory_map(str(path))).read_all()
+        return pq.ParquetFile(os.fspath(path), memory_map=True).read()
+    return pa.ipc.open_stream(pa.memory_map(os.fspath(path))).read_all()
 
 
 def _not_laid_out(table: pa.Table) -> str:

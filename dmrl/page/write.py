@@ -1,5 +1,6 @@
 """The page as a file, in the folder that it tells of."""
 
+import os
 from pathlib import Path
 
 from dmrl.errors import OutputError
@@ -36,7 +37,7 @@ def write(folder: Path, out: Path | None = None) -> Path:
     again = path.is_file() and not path.is_symlink()
     if again and not path.read_bytes()[:200].decode(errors="replace").count(MARK):
         raise OutputError(f"{path} exists and is no report of dmrl's. Choose another name")
-    text = page(gather(folder))
+    text = page(gather(Path(os.fspath(folder))))  # of a bucket, a copy here
     with rewritten_file(path) if again else partial_file(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     return path

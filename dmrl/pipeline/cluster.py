@@ -25,7 +25,7 @@ from dmrl.terminal.progress import say
 
 try:
     import ray
-    from ray._private import services
+    from ray._private import ray_constants, services
     from ray.exceptions import RayError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 except ModuleNotFoundError as e:
@@ -269,7 +269,11 @@ def _connect(address: str) -> None:
         If that cannot be done.
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
-    quiet = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": True}
+    quiet: dict[str, Any] = {
+        "log_to_driver": False,
+        "logging_level": "ERROR",
+        "configure_logging": True,
+    }
     try:
         if address:
             _require_answer(address)
@@ -294,6 +298,9 @@ def _of_this_machine(quiet: dict[str, Any]) -> None:
     except ConnectionError:
         if "RAY_ADDRESS" in os.environ:
             raise
+        # Ray advertises the machine's own address unless it is told that it is alone.
+        os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
+        ray_constants.ENABLE_RAY_CLUSTER = False
         ray.init("local", include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
 
 

@@ -17,8 +17,8 @@ from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
 from dmrl.output import note
 from dmrl.pipeline.array import array_job
 from dmrl.pipeline.executors import SLURM, Executor, executor
-from dmrl.pipeline.interface import interface_of
 from dmrl.pipeline.job import Answer, failed, job
+from dmrl.storage import Remote
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -81,18 +81,36 @@ def recordings_in(source: Path, *, but: Path | None = None) -> dict[Path, Path]:
     return {path.relative_to(base): path for path in found}
 
 
-def all_recordings(named: Iterable[Path]) -> list[Path]:
+def all_recordings(named: Iterable[Path], query: str | None = None) -> list[Path]:
     """Recordings that are named, and all in the folders that are named.
+
+    Parameters
+    ----------
+    named
+        Recordings and folders; with a query, folders that were indexed.
+    query
+        Only those that this is true of; see `dmrl.catalogue.query`.
 
     Raises
     ------
     RecordingError
-        If a folder has none.
+        If a folder has none, or no catalogue, or one of them has changed since it was indexed.
+    SettingError
+        If the query is wrong, or true of none.
     """
+    if query is not None:
+        from dmrl.catalogue.query import found_in  # noqa: PLC0415 - an extra
+
+        found = [path for folder in named for path in found_in(folder, query)]
+        if not found:
+            raise SettingError(f"--from-index {query!r} is true of no recording. Ask: dmrl find")
+        return found
     return [path for one in named for path in recordings_in(one).values()]
 
 
 def _below(folder: Path, but: Path | None) -> list[Path]:
+    if isinstance(folder, Remote):
+        return list(_remote(folder, but))
     found = []
     for where, folders, names in os.walk(folder):
         left_out = [n for n in folders if n.startswith(".") or _same(Path(where, n), but)]
@@ -100,6 +118,13 @@ def _below(folder: Path, but: Path | None) -> list[Path]:
         whole = (n for n in sorted(names) if n.endswith(".mcap") and not n.startswith("."))
         found += [Path(where, name) for name in whole]
     return found
+
+
+def _remote(folder: Remote, but: Path | None) -> Iterator[Path]:
+    for path in folder.rglob("*.mcap"):
+        hidden = any(part.startswith(".") for part in path.parts[len(folder.parts) :])
+        if not (hidden or (but is not None and path.is_relative_to(but))):
+            yield path
 
 
 def _same(path: Path, other: Path | None) -> bool:
@@ -136,7 +161,7 @@ def tasks_of(
     inputs
         What all of them read besides.
     """
-    own = _differing(settings)
+    own = differing(settings)
     made = []
     for name, source in found.items():
         place = None if out is None else out / name
@@ -145,8 +170,8 @@ def tasks_of(
     return made
 
 
-def _differing(settings: Any) -> dict[str, Any]:
-    """Settings that are not the default ones."""
+def differing(settings: Any) -> dict[str, Any]:
+    """Settings that are not the default ones, by name."""
     if settings is None:
         return {}
     default = type(settings)()
@@ -170,48 +195,12 @@ def outcomes(tasks: Sequence[Task], executor: Executor, what: str) -> Iterator[t
 
 
 def _size(path: Path) -> int:
+    if isinstance(path, Remote):
+        return 0  # to ask would cost a request for each
     try:
         return path.stat().st_size
     except OSError:
         return 0  # what it is about says so itself
-
-
-def done_on(
-    on: str, stage: str, out: Path, inputs: Mapping[str, Any], settings: Any = None
-) -> dict[str, Any] | None:
-    """Run a stage once, on a cluster.
-
-    Parameters
-    ----------
-    on
-        See `executor`.
-    stage, out
-        Command name, and what it writes.
-    inputs
-        Arguments of its ``run`` but for the settings, by name.
-    settings
-        Its settings.
-
-    Returns
-    -------
-    dict or None
-        What ``run`` gave back, as values of JSON. None: the output was there, made of the same.
-
-    Raises
-    ------
-    DmrlError
-        What the stage says.
-    """
-    line = job(stage, out, dict(inputs), _differing(settings), keep=True)
-    task = Task(out, out, line)
-    if on == SLURM:
-        raise SettingError("--on slurm is for a folder of recordings. Name one, or --on ray")
-    with executor(on, None) as crew:
-        answer = crew.give(line, alone=interface_of(stage).alone).result()
-    if failed(answer):
-        raise DmrlError(words_of(task, answer))
-    note(out)
-    return None if "there" in answer else answer["result"]
 
 
 def over_folder(
@@ -288,6 +277,8 @@ def _make_folders(out: Path, tasks: Iterable[Task]) -> list[Path]:
     """Make the folders of all outputs; those that were not there, the deepest first."""
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Many recordings go into a folder: name one")
+    if isinstance(out, Remote):
+        return []  # a bucket has no folders
     if not out.parent.is_dir():
         raise OutputError(f"no folder {out.parent} to make {out.name} in. Try: mkdir -p {out}")
     wanted = dict.fromkeys(task.out.parent for task in tasks if task.out)

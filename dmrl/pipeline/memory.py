@@ -16,6 +16,7 @@ from dmrl.border.documents import parse_json
 from dmrl.errors import OutputError
 from dmrl.output import rewritten_file
 from dmrl.recording.inputs import sha256_of_file, sha256_of_folder
+from dmrl.storage import Remote
 
 
 @dataclass(slots=True)
@@ -122,6 +123,10 @@ def _looks(path: Path) -> str:
 
 
 def _files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
+    if isinstance(folder, Remote):
+        for one in folder.below():
+            yield str(one.relative_to(folder)), one.stat()
+        return
     for where, _, names in os.walk(folder):
         for name in names:
             path = Path(where, name)

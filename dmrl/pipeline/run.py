@@ -18,6 +18,8 @@ from dmrl.pipeline.executors import executor
 from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located
 from dmrl.pipeline.runner import Runner
+from dmrl.storage import Remote
+from dmrl.storage.whole import require_bucket
 from dmrl.terminal.progress import say
 
 __all__ = ["Done", "Plan", "Step", "load", "run"]
@@ -97,7 +99,13 @@ def _check_data(name: str | Path, plan: Plan, data: Path | None) -> None:
 
 @contextmanager
 def _owned(out: Path) -> Iterator[Path]:
-    """The folder of outputs, for this process alone."""
+    """The folder of outputs, for this process alone; in a bucket nothing can be locked."""
+    if isinstance(out, Remote):
+        if not (out / STATE_FILE).exists() and any(p.name != UNFINISHED for p in out.iterdir()):
+            raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
+        require_bucket(out)
+        yield out
+        return
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Name a folder: --out DIR")
     try:

@@ -17,6 +17,7 @@ from dmrl.pipeline.interface import NO_CONTENT
 from dmrl.pipeline.job import Answer, job
 from dmrl.pipeline.memory import Memory, key_of
 from dmrl.pipeline.plan import UNFINISHED, Plan, Step, located, makers, mapped
+from dmrl.storage import Remote
 from dmrl.terminal.progress import say
 
 
@@ -170,7 +171,9 @@ class Runner:
     def _adopt(self, one: Running, sha256: str) -> None:
         """Give a whole output its name, in place of the one before."""
         out, new = self.folder / one.step.out, self.folder / UNFINISHED / one.step.out
-        if out.is_dir() or (out.exists() and new.is_dir()):
+        if isinstance(out, Remote):
+            new.replace(out)
+        elif out.is_dir() or (out.exists() and new.is_dir()):
             old = new.with_name(f"{new.name}.old")
             _remove(old)
             out.rename(old)
@@ -200,7 +203,9 @@ class Runner:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
+    if isinstance(path, Remote):
+        path.remove_all()
+    elif path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)

@@ -23,12 +23,13 @@ from dmrl.pipeline.interface import Interface, interface_of
 from dmrl.pipeline.job import Answer
 from dmrl.recording import Provenance, provenance
 from dmrl.recording.inputs import input_of, sha256_of_file, sha256_of_folder
+from dmrl.storage import path_of
 
 
 def perform(line: str) -> Answer:
     """Run a step: what came of it, what a user can mend, or that dmrl has a fault."""
     told = json.loads(line)
-    out = Path(told["out"]) if told["out"] else None
+    out = path_of(told["out"]) if told["out"] else None
     try:
         takes = interface_of(told["stage"], writes=out is not None)
         given = _arguments(told, takes)
@@ -54,7 +55,7 @@ def perform(line: str) -> Answer:
 
 def _arguments(told: dict[str, Any], takes: Interface) -> dict[str, Any]:
     found: dict[str, Any] = {
-        role: [Path(one) for one in given] if isinstance(given, list) else Path(given)
+        role: [path_of(one) for one in given] if isinstance(given, list) else path_of(given)
         for role, given in told["inputs"].items()
     }
     given = dict(told["settings"])

@@ -121,7 +121,9 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
             return
         channels = {n: channel_of(n, summary.channels, summary.schemas) for n in summary.channels}
         found: Counter[int] = Counter()
-        for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
+        chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
+        stream.expect([place_of(chunk) for chunk in chunks])
+        for chunk in chunks:
             block = in_chunk(path, stream, chunk, channels, summary.channels)
             tally(found, block)
             yield block, channels
@@ -139,6 +141,7 @@ def _in_time_order(
     chunks = chunks_between(summary, channels.keys(), low, high)
     last = _pictured(channels)
     held: Block | None = None
+    stream.expect([place_of(chunk) for chunk in chunks])
     for k, chunk in enumerate(chunks):
         block = in_chunk(path, stream, chunk, channels, summary.channels)
         block = block.take((block.time_ns >= low) & (block.time_ns < high))
@@ -179,6 +182,11 @@ def chunks_between(
     )
 
 
+def place_of(chunk: ChunkIndex) -> tuple[int, int]:
+    """Where a chunk and its message indexes start, and how long they are together, bytes."""
+    return chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length
+
+
 def in_chunk(
     path: Path,
     stream: Bounded,
@@ -215,9 +223,9 @@ def whole_chunk(
     known: Collection[int],
 ) -> tuple[Chunk, Block]:
     """The same, with the chunk that they stand in, still compressed."""
-    at = said.chunk_start_offset
+    at, size = place_of(said)
     stream.seek(at)
-    raw = stream.read(said.chunk_length + said.message_index_length)
+    raw = stream.read(size)
     record = _chunk_record(path, raw, said)
     data = unpacked(path, record, at)
     if not said.message_index_offsets:

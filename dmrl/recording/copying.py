@@ -16,7 +16,7 @@ from mcap.summary import Summary as McapSummary
 from numpy.typing import NDArray
 
 from dmrl.recording.block import Block
-from dmrl.recording.blocks import chunks_between, compare, tally, whole_chunk
+from dmrl.recording.blocks import chunks_between, compare, place_of, tally, whole_chunk
 from dmrl.recording.channel import Channel
 from dmrl.recording.index import mcap_summary
 from dmrl.recording.opening import opened
@@ -142,7 +142,9 @@ def pieces(path: Path, wanted: Wanted) -> Iterator[Piece]:
             return
         channels = _channels(summary)
         found: Counter[int] = Counter()
-        for index in _chunks(summary, channels, wanted):
+        chunks = _chunks(summary, channels, wanted)
+        stream.expect([place_of(index) for index in chunks])
+        for index in chunks:
             chunk, block = whole_chunk(path, stream, index, channels, channels)
             tally(found, block)
             yield Piece(block, channels, chunk)

@@ -1,6 +1,5 @@
 """What a recording holds, from its summary, without reading its messages."""
 
-import os
 import time
 import zlib
 from collections.abc import Callable
@@ -87,7 +86,7 @@ def _remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made]
     A file that was written in the last second is read again: its time stamp might not tell
     it from one that is written after it.
     """
-    status = os.fstat(stream.fileno())
+    status = stream.status
     stamp = status.st_ino, status.st_size, status.st_mtime_ns
     key = path, what
     if key in _MADE and _MADE[key][0] == stamp:

@@ -13,6 +13,7 @@ from dmrl.errors import RecordingError
 from dmrl.recording.index import summary
 from dmrl.recording.opening import expect_unchanged
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
+from dmrl.storage import Remote
 
 NO_CONTENT = ("README.md", "figures", "tensorboard")
 
@@ -97,6 +98,8 @@ def input_of(path: Path) -> Input:
 
 def sha256_of_file(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
+    if isinstance(path, Remote):
+        return path.sha256()
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

@@ -3,7 +3,7 @@
 import io
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from mcap.stream_reader import CRCValidationError
 
 from dmrl.errors import RecordingError
 from dmrl.output import outputs_done
+from dmrl.storage import Remote
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")  # opcode, length
@@ -32,9 +33,22 @@ class Bounded(io.BufferedReader):
     """A file that refuses to read beyond its end, so that a damaged length reserves no memory."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path, "r"))
+        self.ranged = path.ranged() if isinstance(path, Remote) else None
+        super().__init__(self.ranged or io.FileIO(path, "r"))
+        self.status = os.fstat(self.fileno()) if self.ranged is None else path.stat()
         self.size = self.seek(0, io.SEEK_END)
         self.seek(0)
+
+    def expect(self, places: Sequence[tuple[int, int]]) -> None:
+        """Say which places will be read, in that order; a remote file fetches many at a time.
+
+        Parameters
+        ----------
+        places
+            Start and size of each, bytes.
+        """
+        if self.ranged is not None:
+            self.ranged.expect(places)
 
     def read(self, size: int | None = -1, /) -> bytes:
         """As a file reads, but all that was asked for.
@@ -46,6 +60,10 @@ class Bounded(io.BufferedReader):
         """
         if size is not None and size > self.size - self.tell():
             raise McapError(f"a record at byte {self.tell()} runs beyond the end")
+        if self.ranged is not None and size is not None and size > io.DEFAULT_BUFFER_SIZE:
+            data = self.ranged.fetch(self.tell(), size)
+            self.seek(len(data), io.SEEK_CUR)
+            return data
         return super().read(size)
 
 
@@ -80,7 +98,7 @@ _HASHED: dict[Path, tuple[int, Stamp]] = {}
 
 
 def _stamp(stream: Bounded) -> Stamp:
-    status = os.fstat(stream.fileno())
+    status = stream.status
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 

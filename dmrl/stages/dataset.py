@@ -31,7 +31,8 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.images.ahead import ahead
 from dmrl.output import partial_folder
 from dmrl.pipeline.crew import cores
-from dmrl.pipeline.folders import all_recordings, done_on
+from dmrl.pipeline.folders import all_recordings
+from dmrl.pipeline.once import done_on
 from dmrl.recording import (
     Contents,
     Provenance,
@@ -289,24 +290,6 @@ def _explain(
         )
 
 
-def _found(folders: Iterable[Path], query: str) -> list[Path]:
-    """Recordings of indexed folders that a query is true of.
-
-    Raises
-    ------
-    RecordingError
-        If a folder has no catalogue, or one of them has changed since.
-    SettingError
-        If the query is wrong, or true of none.
-    """
-    from dmrl.catalogue.query import found_in  # noqa: PLC0415 - an extra
-
-    paths = [path for folder in folders for path in found_in(folder, query)]
-    if not paths:
-        raise SettingError(f"--from-index {query!r} is true of no recording. Ask: dmrl find")
-    return paths
-
-
 DEFAULTS = Settings()
 
 
@@ -337,7 +320,7 @@ def command(
     as_json
         Print one JSON document in place of the tables.
     """
-    named = all_recordings(recordings) if from_index is None else _found(recordings, from_index)
+    named = all_recordings(recordings, from_index)
     result = run(named, out, settings, workers=workers) if on is None else None
     if on is not None and (said := done_on(on, "dataset", out, {"recordings": named}, settings)):
         result = Result(said["images"], said["sources"], Tally(**said["tally"]))

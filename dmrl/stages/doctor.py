@@ -36,6 +36,7 @@ EXTRAS = {
     "record": "dmrl record; cflib: GPL-3.0",
     "deploy": "ONNX: dmrl export, predict",
     "cluster": "dmrl --on ray",
+    "storage": "s3://bucket/..., in and out",
     "index": "dmrl find, dataset --from-index",
 }
 """What each extra of pyproject.toml is for."""

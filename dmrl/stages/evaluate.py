@@ -19,7 +19,8 @@ from dmrl.evaluation.tables import by_band_table
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, curves, score
 from dmrl.learn.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.output import partial_folder, refuse_existing
-from dmrl.pipeline.folders import all_recordings, done_on
+from dmrl.pipeline.folders import all_recordings
+from dmrl.pipeline.once import done_on
 from dmrl.recording import input_of, summary
 from dmrl.terminal.arguments import On
 from dmrl.terminal.progress import say

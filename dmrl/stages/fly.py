@@ -19,7 +19,7 @@ from dmrl.geometry.frames import AIDECK_PINHOLE, Array
 from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.pipeline.folders import done_on
+from dmrl.pipeline.once import done_on
 from dmrl.recording import Provenance, RecordingWriter, provenance
 from dmrl.rendering import aloft, renderer
 from dmrl.rendering.environment import ensure

@@ -19,7 +19,7 @@ from dmrl.geometry.camera_file import KNOWN, camera_named
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.output import refuse_existing
-from dmrl.pipeline.folders import done_on
+from dmrl.pipeline.once import done_on
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,

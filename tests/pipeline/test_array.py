@@ -9,7 +9,8 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.pipeline import array
-from dmrl.pipeline.folders import done_on, over_folder
+from dmrl.pipeline.folders import over_folder
+from dmrl.pipeline.once import done_on
 from dmrl.stages import trim
 
 from .test_folders import bytes_in, record

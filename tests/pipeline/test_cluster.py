@@ -31,6 +31,7 @@ SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_enable_metrics_collection": "0",
 }
+os.environ.update(SETTINGS)  # Ray reads them when it is loaded
 NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "node_ip_address": "127.0.0.1"}
 NODE |= {"include_dashboard": False, "include_log_monitor": False, "no_monitor": True}
 KEPT = trim.Settings(to_s=1.5)
@@ -60,8 +61,6 @@ class Nodes:
 @pytest.fixture(scope="module")
 def nodes() -> Iterator[Nodes]:
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in SETTINGS.items():
-            patch.setenv(name, value)
         found = Nodes()
         patch.setenv("RAY_ADDRESS", found.cluster.address)
         yield found

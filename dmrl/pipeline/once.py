@@ -1,0 +1,50 @@
+"""One run of a stage on a cluster, for one output."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dmrl.errors import DmrlError, SettingError
+from dmrl.output import note
+from dmrl.pipeline.executors import SLURM, executor
+from dmrl.pipeline.folders import Task, differing, words_of
+from dmrl.pipeline.interface import interface_of
+from dmrl.pipeline.job import failed, job
+
+
+def done_on(
+    on: str, stage: str, out: Path, inputs: Mapping[str, Any], settings: Any = None
+) -> dict[str, Any] | None:
+    """Run a stage once, on a cluster.
+
+    Parameters
+    ----------
+    on
+        See `executor`.
+    stage, out
+        Command name, and what it writes.
+    inputs
+        Arguments of its ``run`` but for the settings, by name.
+    settings
+        Its settings.
+
+    Returns
+    -------
+    dict or None
+        What ``run`` gave back, as values of JSON. None: the output was there, made of the same.
+
+    Raises
+    ------
+    DmrlError
+        What the stage says.
+    """
+    line = job(stage, out, dict(inputs), differing(settings), keep=True)
+    task = Task(out, out, line)
+    if on == SLURM:
+        raise SettingError("--on slurm is for a folder of recordings. Name one, or --on ray")
+    with executor(on, None) as crew:
+        answer = crew.give(line, alone=interface_of(stage).alone).result()
+    if failed(answer):
+        raise DmrlError(words_of(task, answer))
+    note(out)
+    return None if "there" in answer else answer["result"]

@@ -1,0 +1,11 @@
+"""Files that lie in a bucket: read by ranges, written whole or not at all.
+
+`path_of` makes a path of what a user names: of ``s3://bucket/a.mcap`` a `Remote`, which answers
+as a path does. Who opens one by its name, as a library does, gets a copy on this machine.
+"""
+
+from dmrl.storage.names import SCHEMES, path_of
+from dmrl.storage.remote import Remote
+from dmrl.storage.whole import uploaded_file, uploaded_folder
+
+__all__ = ["SCHEMES", "Remote", "path_of", "uploaded_file", "uploaded_folder"]

@@ -1,0 +1,93 @@
+"""A remote file as a stream: of what is not read, nothing is fetched."""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+from dmrl.storage.system import told
+
+TOGETHER_BYTES, TOGETHER = 16 << 20, 64
+"""Of places that will be read, how much is fetched at a time, side by side."""
+STEP_BYTES = 8 << 20
+"""Of a file that is read as a whole."""
+
+Place = tuple[int, int]
+"""Start and size, bytes."""
+
+
+class Ranged(io.RawIOBase):
+    """A file read by ranges.
+
+    Parameters
+    ----------
+    system
+        fsspec's.
+    name
+        In the system.
+    url
+        For errors.
+    size
+        Of the file, bytes.
+    """
+
+    def __init__(self, system: Any, name: str, url: str, size: int) -> None:
+        super().__init__()
+        self._system, self._name, self._url, self._size = system, name, url, size
+        self._at = 0
+        self._expected: list[Place] = []
+        self._held: dict[Place, bytes] = {}
+
+    def expect(self, places: Sequence[Place]) -> None:
+        """Say what will be read, in that order: then it is fetched some at a time."""
+        self._expected, self._held = list(reversed(places)), {}
+
+    def fetch(self, start: int, size: int) -> bytes:
+        """Bytes from a place on; fewer at the end of the file."""
+        size = max(0, min(size, self._size - start))
+        if not size:
+            return b""
+        place = start, size
+        if place not in self._held and self._expected and self._expected[-1] == place:
+            self._fetch_some()
+        if place in self._held:
+            return self._held.pop(place)
+        with told(self._url):
+            return bytes(self._system.cat_file(self._name, start=start, end=start + size))
+
+    def _fetch_some(self) -> None:
+        """Fetch the next places that are expected, side by side."""
+        some: list[Place] = []
+        while self._expected and len(some) < TOGETHER:
+            if some and sum(size for _, size in some) + self._expected[-1][1] > TOGETHER_BYTES:
+                break
+            some.append(self._expected.pop())
+        starts, ends = [s for s, _ in some], [s + n for s, n in some]
+        with told(self._url):
+            found = self._system.cat_ranges(
+                [self._name] * len(some), starts, ends, on_error="raise"
+            )
+        self._held = dict(zip(some, map(bytes, found), strict=True))
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def seekable(self) -> bool:
+        """It is."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Go to a place."""
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """Where it stands."""
+        return self._at
+
+    def readinto(self, buffer: Any, /) -> int:
+        """Read into a buffer; how many bytes."""
+        data = self.fetch(self._at, len(buffer))
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)

@@ -1,0 +1,64 @@
+"""fsspec, and what it says when something is wrong: one line with the name and the way out."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+from dmrl.errors import MissingExtra, StorageError
+
+PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
+PACKAGES |= {"http": "aiohttp", "https": "aiohttp"}
+
+
+@cache
+def system(scheme: str) -> Any:
+    """The file system of a scheme, which remembers no listings.
+
+    Raises
+    ------
+    MissingExtra
+        If the package that knows the scheme is not installed.
+    """
+    try:
+        import fsspec  # noqa: PLC0415 - an extra
+
+        return fsspec.filesystem(scheme, use_listings_cache=False)
+    except ImportError as e:
+        raise MissingExtra(PACKAGES[scheme], "storage", f"{scheme}://") from e
+
+
+@contextmanager
+def told(name: str) -> Iterator[None]:
+    """What a server or its library says, as one line; that a file is not there passes.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be reached, refuses, or has no such bucket.
+    FileNotFoundError
+        If there is no such file in the bucket.
+    """
+    try:
+        yield
+    except (StorageError, MissingExtra):
+        raise
+    except FileNotFoundError as e:
+        if "bucket" in str(e).lower():
+            raise StorageError(f"{name}: there is no such bucket. Check the name") from None
+        raise FileNotFoundError(2, "No such file", name) from None
+    except PermissionError:
+        raise StorageError(
+            f"{name}: the server refuses these credentials. Check them, and the name"
+        ) from None
+    except Exception as e:  # botocore, aiohttp and google have their own
+        raise StorageError(_words(name, e)) from e
+
+
+def _words(name: str, error: Exception) -> str:
+    kind, text = type(error).__name__, " ".join(str(error).split())[:160]
+    if "Credential" in kind or "credential" in text:
+        return f"{name}: there are no credentials ({text}). Set AWS_ACCESS_KEY_ID and its secret"
+    if "Connect" in kind or "Endpoint" in kind or isinstance(error, TimeoutError):
+        return f"{name}: no server answers ({text}). Check the address: AWS_ENDPOINT_URL"
+    return f"{name}: {kind}: {text}. Check the name, and the server"

@@ -1,0 +1,59 @@
+"""A server of buckets on this machine, and how much is read from it."""
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from dmrl.storage.system import system
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """Its address."""
+    moto = pytest.importorskip("moto.server")
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    running = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    running.start()
+    host, port = running.get_host_and_port()
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            patch.setenv(name, "test")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        _forget()
+        yield f"http://{host}:{port}"
+    _forget()
+    running.stop()
+
+
+def _forget() -> None:
+    """File systems keep the address that they were made with."""
+    from s3fs import S3FileSystem  # noqa: PLC0415 - in tests of it alone
+
+    system.cache_clear()
+    S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture(scope="module")
+def lab(server: str) -> Any:
+    """fsspec's file system, with an empty bucket called lab."""
+    system("s3").mkdir("lab")
+    return system("s3")
+
+
+@pytest.fixture
+def fetched(lab: Any, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Bytes of every object that is got, in whole or in part."""
+    sizes: list[int] = []
+    real = lab._call_s3
+
+    async def counted(method: str, *given: Any, **named: Any) -> Any:
+        found = await real(method, *given, **named)
+        if method == "get_object":
+            sizes.append(int(found["ContentLength"]))
+        return found
+
+    monkeypatch.setattr(lab, "_call_s3", counted)
+    return sizes

@@ -1,0 +1,237 @@
+"""Inputs and outputs in a bucket: the bytes are those of files here, whole or not there at all."""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl import boundary, topics
+from dmrl.cli import app
+from dmrl.datasets import open_dataset
+from dmrl.errors import OutputError, StorageError
+from dmrl.images.codec import encode_png
+from dmrl.messages import message
+from dmrl.output import partial_file, partial_folder, rewritten_file
+from dmrl.pipeline import run as pipeline
+from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
+from dmrl.recording.inputs import input_of, sha256_of_file
+from dmrl.storage import Remote, path_of
+from dmrl.storage.remote import UNFINISHED
+
+from ..pipeline.test_folders import record
+from .conftest import _forget
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of botocore and aiohttp
+
+
+def said(capsys: pytest.CaptureFixture[str], status: int, *words: object) -> Any:
+    """What a command prints, if it ends as it should."""
+    given = [str(word) for word in words]
+    found = boundary.status_of(lambda: app(given, result_action="return_value"))
+    printed = capsys.readouterr()
+    assert found == status, printed.err
+    return printed
+
+
+def pictured(path: Path) -> Path:
+    """Numbers of two robots, and pictures that are ten times as much."""
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(3000):
+            at = 1_000_000_000 + k * 10_000_000
+            for robot in ("cf1", "cf2"):
+                roll, pitch = rng.normal(0, 0.1, 2).tolist()
+                one = message("Attitude")(roll_rad=roll, pitch_rad=pitch)
+                sink.write(at, topics.attitude(robot), one)
+            if k % 10 == 0:
+                data = encode_png(rng.integers(0, 255, (48, 64, 3), np.uint8))
+                image = message("CompressedImage")(data=data, format="png")
+                sink.write(at, topics.camera_image("cf1"), image)
+                peer = {"peer": "cf2", "u_px": 20, "v_px": 20, "depth_m": 1.0, "source": "truth"}
+                sink.write(at, topics.labels("cf1"), message("PeerLabels")(peers=[peer]))
+    return path
+
+
+def test_names_of_buckets_are_paths_and_others_are_as_ever() -> None:
+    path = path_of("s3://lab/a/b.mcap")
+    assert isinstance(path, Remote) and str(path) == "s3://lab/a/b.mcap"
+    assert str(path.parent / "c.mcap") == "s3://lab/a/c.mcap" and path.suffix == ".mcap"
+    assert str(path.with_suffix("")) == "s3://lab/a/b" and path.key == "lab/a/b.mcap"
+    assert str(path.relative_to(path_of("s3://lab"))) == "a/b.mcap"
+    assert str(pickle.loads(pickle.dumps(path))) == str(path)
+    for plain in ("a.mcap", "/tmp/s3:/a", "s3:/lab/a", "c://a", "s3"):
+        assert type(path_of(plain)) is type(Path())
+
+
+def test_a_command_from_bucket_to_bucket_makes_the_bytes_of_here(
+    lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = record(tmp_path / "a.mcap")
+    lab.put_file(str(source), "lab/one/a.mcap")
+    said(capsys, 0, "trim", source, tmp_path / "b.mcap", "--to-s", 1)
+    said(capsys, 0, "trim", "s3://lab/one/a.mcap", "s3://lab/one/b.mcap", "--to-s", 1)
+    assert lab.cat_file("lab/one/b.mcap") == (tmp_path / "b.mcap").read_bytes()
+    again = said(capsys, 1, "trim", source, "s3://lab/one/b.mcap", "--to-s", 1)
+    assert again.err.startswith("dmrl: s3://lab/one/b.mcap exists.")
+    assert sorted(lab.find("lab/one")) == ["lab/one/a.mcap", "lab/one/b.mcap"]
+    assert "10 messages" in said(capsys, 0, "info", "s3://lab/one/b.mcap").out
+
+
+def test_a_folder_in_a_bucket_is_done_and_indexed(
+    lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.mcap", "b/c.mcap", ".hidden/d.mcap"):
+        lab.put_file(str(record(tmp_path / name)), f"lab/many/{name}")
+    words = ("trim", "s3://lab/many", "s3://lab/cut", "--to-s", 1, "--workers", 1)
+    assert said(capsys, 0, *words).out.count("made") == 2
+    assert sorted(lab.find("lab/cut")) == ["lab/cut/a.mcap", "lab/cut/b/c.mcap"]
+    assert said(capsys, 0, *words).out.count("was there") == 2
+    said(capsys, 0, "index", "s3://lab/many", "--workers", 1)
+    assert "2 known" in said(capsys, 0, "index", "s3://lab/many").out
+    found = said(capsys, 0, "find", "messages = 20", "s3://lab/many", "--paths").out.splitlines()
+    assert found == ["s3://lab/many/a.mcap", "s3://lab/many/b/c.mcap"]
+    assert said(capsys, 0, "check", "s3://lab/many/*.mcap").out.count("20 messages") == 1
+
+
+def test_numbers_are_read_without_the_pictures(
+    lab: Any, tmp_path: Path, fetched: list[int]
+) -> None:
+    source = pictured(tmp_path / "a.mcap")
+    path = path_of("s3://lab/pictured.mcap")
+    with partial_file(path) as here:
+        here.write_bytes(source.read_bytes())
+    size = source.stat().st_size
+    topic = topics.attitude("cf1")
+    held = Contents(path, topics.ATTITUDE)
+    assert held.table(topic).equals(Contents(source, topics.ATTITUDE).table(topic))
+    numbers = sum(len(block.data) for block, _ in held._held.values())
+    assert sum(fetched) < 0.3 * size
+    assert numbers
+    fetched.clear()
+    assert sum(batch.num_rows for batch in columns(path, topics.camera_image("cf1"))) == 300
+    assert 0.6 * size < sum(fetched) < 1.1 * size
+    fetched.clear()
+    assert input_of(path).sha256 == sha256_of_file(source)  # as the object says of itself
+    assert sum(fetched) < 0.1 * size
+    assert summary(path).count == summary(source).count
+
+
+def test_what_is_not_whole_is_not_there(lab: Any, tmp_path: Path) -> None:
+    file, folder = path_of("s3://lab/whole/a.bin"), path_of("s3://lab/whole/set")
+    with pytest.raises(RuntimeError), partial_file(file) as here:
+        here.write_bytes(b"half")
+        raise RuntimeError
+    with pytest.raises(RuntimeError), partial_folder(folder) as here:
+        (here / "a").write_bytes(b"half")
+        raise RuntimeError
+    assert lab.find("lab/whole") == []
+    # A process that was killed while it uploaded leaves the mark: the folder is not there.
+    lab.pipe_file(f"lab/whole/set/{UNFINISHED}", b"")
+    lab.pipe_file("lab/whole/set/old", b"x")
+    assert not folder.exists() and not folder.is_dir()
+    with partial_folder(folder) as here:
+        (here / "in").mkdir()
+        (here / "in" / "a").write_bytes(b"whole")
+    assert folder.is_dir() and lab.find("lab/whole/set") == ["lab/whole/set/in/a"]
+    with pytest.raises(OutputError, match="exists"), partial_folder(folder):
+        pass
+    with rewritten_file(folder / "in" / "a") as here:
+        here.write_bytes(b"again")
+    assert (folder / "in" / "a").read_text() == "again"
+
+
+def test_an_upload_that_fails_leaves_nothing(
+    lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = path_of("s3://lab/torn")
+    real, count = lab.put_file, []
+
+    def torn(*given: Any, **named: Any) -> None:
+        count.append(given)
+        if len(count) == 2:
+            raise OSError("the line is cut")
+        real(*given, **named)
+
+    monkeypatch.setattr(lab, "put_file", torn)
+    with pytest.raises(StorageError, match="the line is cut"), partial_folder(folder) as here:
+        (here / "a").write_bytes(b"1")
+        (here / "b").write_bytes(b"2")
+    assert lab.find("lab/torn") == []
+
+
+def test_a_dataset_is_made_and_opened_in_a_bucket(
+    lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], empty_figures: None
+) -> None:
+    source = pictured(tmp_path / "a.mcap")
+    lab.put_file(str(source), "lab/sets/a.mcap")
+    words = ("--split", "none", "--workers", 1)
+    said(capsys, 0, "dataset", source, tmp_path / "set", *words)
+    said(capsys, 0, "dataset", "s3://lab/sets/a.mcap", "s3://lab/sets/set", *words)
+    here = open_dataset(tmp_path / "set").split("train")
+    there = open_dataset(path_of("s3://lab/sets/set")).split("train")
+    assert there.table.equals(here.table)
+    made = (tmp_path / "set" / "train").glob("*.arrow")
+    name = next(made)
+    assert lab.cat_file(f"lab/sets/set/train/{name.name}") == name.read_bytes()
+
+
+CHAIN = """
+kind = "pipeline"
+[[step]]
+stage = "sketch"
+out = "pictures"
+images = 2
+[[step]]
+stage = "convert"
+source = "pictures"
+out = "pictures.mcap"
+[[step]]
+stage = "trim"
+recording = "pictures.mcap"
+to_s = 5.0
+out = "short.mcap"
+"""
+
+
+def test_a_pipeline_keeps_its_folder_in_a_bucket(lab: Any, tmp_path: Path) -> None:
+    recipe = tmp_path / "chain.toml"
+    recipe.write_text(CHAIN)
+    pipeline.run(recipe, tmp_path / "here", workers=1)
+    made = pipeline.run(recipe, path_of("s3://lab/chain"), workers=1)
+    assert not any(one.skipped for one in made)
+    for name in ("pictures.mcap", "short.mcap"):
+        assert lab.cat_file(f"lab/chain/{name}") == (tmp_path / "here" / name).read_bytes()
+    assert all(one.skipped for one in pipeline.run(recipe, path_of("s3://lab/chain"), workers=1))
+    assert not [name for name in lab.find("lab/chain") if "unfinished" in name]
+
+
+def test_what_is_wrong_with_a_bucket_is_one_line(
+    lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab.put_file(str(record(tmp_path / "good.mcap")), "lab/wrong/good.mcap")
+    lab.pipe_file("lab/wrong/text.mcap", b"no recording")
+    for words, why in (
+        (("info", "s3://nobody/a.mcap"), "there is no such bucket"),
+        (("info", "s3://lab/nothing.mcap"), "no recording s3://lab/nothing.mcap"),
+        (("info", "s3://lab/wrong/text.mcap"), "is not an MCAP file"),
+        (("trim", "s3://lab/wrong/good.mcap", "s3://nobody/a.mcap"), "there is no such bucket"),
+        (("trim", "s3://lab/wrong/good.mcap", "https://host/a.mcap"), "web servers are read only"),
+    ):
+        line = said(capsys, 1, *words).err
+        assert why in line and line.startswith("dmrl: ") and line.count("\n") == 1
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nowhere")
+    _forget()
+    assert "there are no credentials" in said(capsys, 1, "info", "s3://lab/a.mcap").err
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:1")
+    monkeypatch.setattr("s3fs.core.S3FileSystem.retries", 1)
+    _forget()
+    assert "no server answers" in said(capsys, 1, "info", "s3://lab/a.mcap").err
+    monkeypatch.undo()
+    _forget()
