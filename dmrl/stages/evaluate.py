@@ -337,8 +337,7 @@ def command(
         if plots_to is None:
             raise SettingError("--on wants a folder for the figures as well: --plots DIR")
         done_on(on, "evaluate", plots_to, {"recordings": recordings}, settings)
-        print_line(f"{plots_to}: figures and their document")
-        return
+        return print_line(f"{plots_to}: figures and their document")
     evaluation = run(recordings, plots_to, settings)
     if isinstance(evaluation, dict):
         if as_json:
