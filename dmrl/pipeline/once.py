@@ -13,7 +13,7 @@ from dmrl.pipeline.job import failed, job
 
 
 def done_on(
-    on: str, stage: str, out: Path, inputs: Mapping[str, Any], settings: Any = None
+    on: str, stage: str, out: Path | None, inputs: Mapping[str, Any], settings: Any = None
 ) -> dict[str, Any] | None:
     """Run a stage once, on a cluster.
 
@@ -38,6 +38,10 @@ def done_on(
     DmrlError
         What the stage says.
     """
+    if out is None:
+        raise SettingError(
+            f"dmrl {stage} --on wants an output, a folder for its figures: --plots DIR"
+        )
     line = job(stage, out, dict(inputs), differing(settings), keep=True)
     task = Task(out, out, line)
     if on == SLURM:

@@ -334,10 +334,9 @@ def command(
     """
     recordings = all_recordings(recordings)
     if on is not None:
-        if plots_to is None:
-            raise SettingError("--on wants a folder for the figures as well: --plots DIR")
         done_on(on, "evaluate", plots_to, {"recordings": recordings}, settings)
-        return print_line(f"{plots_to}: figures and their document")
+        print_line(f"{plots_to}: figures and their document")
+        return
     evaluation = run(recordings, plots_to, settings)
     if isinstance(evaluation, dict):
         if as_json:
