@@ -80,7 +80,7 @@ def bad_command_line(error: CycloptsError) -> Text:
     return Text(f"dmrl: no command {word}. {hint}")
 
 
-def exact(kind: Any, tokens: Sequence[Token | str]) -> Any:
+def exact(kind: Any, tokens: Sequence[Token] | Sequence[str]) -> Any:
     """A value as its type says; no number with a fraction where a whole one is asked for.
 
     Raises
