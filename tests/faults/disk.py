@@ -46,6 +46,18 @@ class Orders(ctypes.Structure):
         ("failed", ctypes.c_char * 1024),
     )
 
+    def order(self, folder: Path, fault: "Fault | None") -> None:
+        """From now on operations below a folder count, and one fails."""
+        self.count, self.failed = 0, b""
+        self.fail_at = -1 if fault is None else fault.at
+        self.error = 0 if fault is None else fault.error
+        self.stays = fault is not None and fault.stays
+        self.folder = os.fsencode(folder) + b"/"
+
+    def rest(self) -> None:
+        """Nothing counts, nothing fails."""
+        self.folder, self.fail_at = b"", -1
+
 
 @dataclass(frozen=True, slots=True)
 class Fault:
@@ -94,7 +106,7 @@ class Disk:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.inputs = folder, folder / "inputs"
         library = folder / "disk.so"
         compiler = shutil.which("cc") or shutil.which("gcc") or "cc"
         source = Path(__file__).with_name("disk.c")
@@ -150,13 +162,9 @@ class Disk:
             If it ended with a traceback, with more than a line of error, or not at all.
         """
         given = {"work": work, "out": str(folder / out), "most_bytes": most_bytes}
-        self.orders.count, self.orders.failed = 0, b""
-        self.orders.fail_at = -1 if fault is None else fault.at
-        self.orders.error = 0 if fault is None else fault.error
-        self.orders.stays = fault is not None and fault.stays
-        self.orders.folder = os.fsencode(folder) + b"/"
+        self.orders.order(folder, fault)
         answer = self.ask("server:run_work", kill_s=kill_s, **given)
-        self.orders.folder, self.orders.fail_at = b"", -1
+        self.orders.rest()
         failed = os.fsdecode(self.orders.failed).replace(str(folder), "")
         assert "fault" not in answer, f"{work}, {fault}: {failed}: {answer['fault']}"
         status, said = answer["value"] or (-signal.SIGKILL, "")

@@ -110,9 +110,9 @@ def prepare_work(inputs: Inputs, work: str, out: str) -> None:
 
 
 def _load(names: list[str]) -> None:
-    """Load what a child had to, so that the next need not."""
+    """Load what a child had to, so that the next need not; rerun's threads would not be there."""
     for name in names:
-        if name not in sys.modules:
+        if name not in sys.modules and not name.startswith("rerun"):
             with warnings.catch_warnings(), suppress(Exception):
                 warnings.simplefilter("ignore")
                 importlib.import_module(name)

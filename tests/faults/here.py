@@ -1,0 +1,78 @@
+"""Works broken in one process, one after the other: a child of the process of server.py."""
+
+import mmap
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+from .broken import Broken
+from .disk import Ending, Fault, Orders, small_files
+from .ending import ended
+from .works import Inputs, work_named
+
+HANG_S = 300
+
+
+class Here:
+    """The disk of disk.c, and works that are run in this very process.
+
+    Parameters
+    ----------
+    inputs
+        What the works are given.
+    """
+
+    def __init__(self, inputs: Inputs) -> None:
+        self.inputs = inputs
+        with Path(os.environ["DMRL_TEST_DISK"]).open("r+b") as stream:
+            self._map = mmap.mmap(stream.fileno(), 0)
+        self.orders = Orders.from_buffer(self._map)
+
+    def run(
+        self,
+        work: str,
+        folder: Path,
+        out: str,
+        fault: Fault | None = None,
+        *,
+        kill_s: float | None = None,
+        most_bytes: int | None = None,
+    ) -> Ending:
+        """As `Disk.run`, but that nothing is killed here."""
+        assert kill_s is None
+        begun_s = time.monotonic()
+        signal.alarm(HANG_S)  # ends this process
+        run = work_named(work).run
+        self.orders.order(folder, fault)
+        try:
+            with small_files(most_bytes):
+                status, said = ended(lambda: run(self.inputs, folder / out))
+        except AssertionError as e:
+            raise AssertionError(f"{work}, {fault}: {e}") from e
+        finally:
+            self.orders.rest()
+        failed = os.fsdecode(self.orders.failed).replace(str(folder), "")
+        return Ending(status, said, self.orders.count, failed, time.monotonic() - begun_s)
+
+    def prepare(self, work: str, folder: Path, out: str) -> None:
+        """Make what has to be there before a work."""
+        before = work_named(work).before
+        if before is not None:
+            before(self.inputs, folder / out)
+
+
+def break_at(
+    inputs: Inputs, work: str, folder: str, first: int, last: int, quick: bool
+) -> dict[str, Any]:
+    """Let each of these operations of a work fail: what came of it, for `Broken.add`."""
+    broken = Broken(work_named(work), Here(inputs), Path(folder), inputs.folder, times=1)
+    broken.break_at(range(first, last), quick=quick)
+    return {
+        "cases": broken.cases,
+        "refused": broken.refused,
+        "right": broken.right,
+        "again": broken.again,
+        "wrong": broken.wrong,
+    }
