@@ -6,7 +6,7 @@ in it, its times and where its payload starts and ends. Decoders work on whole b
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Set
+from collections.abc import Iterator, Set
 from io import BytesIO
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from dmrl.recording.chunks import (
 from dmrl.recording.index import mcap_summary
 from dmrl.recording.message_index import as_pairs, index_entries
 from dmrl.recording.opening import RECORD, Bounded, damaged, opened
+from dmrl.recording.section import Section
 from dmrl.recording.walk import channel_of, walked
 
 
@@ -124,7 +125,7 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
         chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
         stream.expect([place_of(chunk) for chunk in chunks])
         for chunk in chunks:
-            block = in_chunk(path, stream, chunk, channels, summary.channels)
+            block = in_chunk(path, stream, chunk, channels, summary)
             tally(found, block)
             yield block, channels
         compare(path, summary, channels, found)
@@ -133,7 +134,7 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
 def _in_time_order(
     path: Path,
     stream: Bounded,
-    summary: McapSummary,
+    summary: Section,
     channels: dict[int, Channel],
     low: int,
     high: int,
@@ -143,7 +144,7 @@ def _in_time_order(
     held: Block | None = None
     stream.expect([place_of(chunk) for chunk in chunks])
     for k, chunk in enumerate(chunks):
-        block = in_chunk(path, stream, chunk, channels, summary.channels)
+        block = in_chunk(path, stream, chunk, channels, summary)
         block = block.take((block.time_ns >= low) & (block.time_ns < high))
         held = concatenate(held, block).sorted(last)
         if k + 1 == len(chunks):
@@ -192,7 +193,7 @@ def in_chunk(
     stream: Bounded,
     said: ChunkIndex,
     channels: dict[int, Channel],
-    known: Collection[int],
+    summary: Section,
 ) -> Block:
     """The messages of a chunk that are of some channels, in the order of the chunk.
 
@@ -204,15 +205,15 @@ def in_chunk(
         What its summary says of the chunk.
     channels
         Those that are wanted.
-    known
-        Numbers of all channels of the recording.
+    summary
+        Of the recording.
 
     Raises
     ------
     RecordingError
         If the chunk is not what its summary and its message indexes say.
     """
-    return whole_chunk(path, stream, said, channels, known)[1]
+    return whole_chunk(path, stream, said, channels, summary)[1]
 
 
 def whole_chunk(
@@ -220,7 +221,7 @@ def whole_chunk(
     stream: Bounded,
     said: ChunkIndex,
     channels: dict[int, Channel],
-    known: Collection[int],
+    summary: Section,
 ) -> tuple[Chunk, Block]:
     """The same, with the chunk that they stand in, still compressed."""
     at, size = place_of(said)
@@ -228,8 +229,11 @@ def whole_chunk(
     raw = stream.read(size)
     record = _chunk_record(path, raw, said)
     data = unpacked(path, record, at)
+    if not summary.proven:
+        summary.confirm(path, scanned(data).definitions())
     if not said.message_index_offsets:
-        return record, _within(path, said, of_channels(scanned(data).block, channels, known))
+        block = of_channels(scanned(data).block, channels, summary.channels)
+        return record, _within(path, said, block)
     places = {n: place - at for n, place in said.message_index_offsets.items() if n in channels}
     entries = as_pairs(b"".join(index_entries(path, raw, at, n) for n, at in places.items()))
     entries = entries[np.argsort(entries[:, 1])]

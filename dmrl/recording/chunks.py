@@ -17,7 +17,7 @@ from mcap.records import Channel, Chunk, Message, Schema
 from dmrl.border import limits
 from dmrl.recording.block import HEAD_BYTES, Block, Bytes, Ints
 from dmrl.recording.container import laid_out
-from dmrl.recording.opening import RECORD, damaged, too_large
+from dmrl.recording.opening import DEFINITIONS, RECORD, damaged, too_large
 
 RECORD_HEADER = 1 + 8  # opcode, length
 MESSAGE = int(Opcode.MESSAGE)
@@ -139,14 +139,10 @@ class Scan:
 
     def definitions(self) -> Iterator[Schema | Channel]:
         """The schemas and channels that it defines."""
-        kinds: dict[int, type[Schema] | type[Channel]] = {
-            Opcode.SCHEMA: Schema,
-            Opcode.CHANNEL: Channel,
-        }
         for opcode, at, end in self.others:
-            if opcode in kinds:
+            if opcode in DEFINITIONS:
                 body = BytesIO(self.data[at + RECORD_HEADER : end].tobytes())
-                yield kinds[opcode].read(ReadDataStream(body))
+                yield DEFINITIONS[opcode].read(ReadDataStream(body))
 
 
 def scanned(data: Bytes) -> Scan:

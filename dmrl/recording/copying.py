@@ -145,7 +145,7 @@ def pieces(path: Path, wanted: Wanted) -> Iterator[Piece]:
         chunks = _chunks(summary, channels, wanted)
         stream.expect([place_of(index) for index in chunks])
         for index in chunks:
-            chunk, block = whole_chunk(path, stream, index, channels, channels)
+            chunk, block = whole_chunk(path, stream, index, channels, summary)
             tally(found, block)
             yield Piece(block, channels, chunk)
         if (wanted.low_ns, wanted.high_ns) == (0, EVER_NS):

@@ -79,7 +79,7 @@ def _spread(
         }
         held = []
         for chunk in _chosen(index, channels, start_ns, end_ns):
-            block = in_chunk(path, stream, chunk, channels, index.channels)
+            block = in_chunk(path, stream, chunk, channels, index)
             block = block.take((block.time_ns >= start_ns) & (block.time_ns < end_ns))
             held.append(block.compact())
     return [block for block in held if len(block)], channels

@@ -19,7 +19,7 @@ from dmrl.recording import sums
 from dmrl.recording.channel import Channel
 from dmrl.recording.opening import RECORD, Bounded, damaged, opened
 from dmrl.recording.provenance import METADATA_NAME, Provenance
-from dmrl.recording.section import section
+from dmrl.recording.section import Section, section
 from dmrl.recording.walk import channel_of, walked
 
 SPLIT_METADATA = "dmrl.split"
@@ -69,7 +69,7 @@ _MADE: dict[tuple[Path, str], tuple[tuple[int, int, int], Any]] = {}
 Made = TypeVar("Made")
 
 
-def mcap_summary(path: Path, stream: Bounded) -> McapSummary | None:
+def mcap_summary(path: Path, stream: Bounded) -> Section | None:
     """The verified summary section of a recording; None where messages are not found with it.
 
     Raises

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 from mcap.stream_reader import CRCValidationError
 
 from dmrl.errors import RecordingError
@@ -16,6 +18,10 @@ from dmrl.storage import Remote
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")  # opcode, length
+DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+}
 # What mcap leaks on damaged lengths and strings.
 DAMAGE = (
     McapError,

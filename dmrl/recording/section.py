@@ -6,11 +6,12 @@ holds: the statistics, the chunk indexes and the places between them are compare
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -25,12 +26,38 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.border import limits
-from dmrl.recording.opening import MAGIC, RECORD, Bounded, damaged, too_large
+from dmrl.recording.opening import DEFINITIONS, MAGIC, RECORD, Bounded, damaged, too_large
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC
 
 
-def section(path: Path, stream: Bounded) -> McapSummary | None:
+class Section(McapSummary):
+    """The summary section of a recording.
+
+    Attributes
+    ----------
+    proven
+        Whether it has a CRC. Without one it is held against what it repeats, where that is read.
+    """
+
+    proven: bool = False
+
+    def confirm(self, path: Path, definitions: Iterable[Schema | Channel]) -> None:
+        """Nothing, if schemas and channels are defined among the messages as they are here.
+
+        Raises
+        ------
+        RecordingError
+            If one is another.
+        """
+        for one in definitions:
+            known = self.schemas if isinstance(one, Schema) else self.channels
+            if known.get(one.id, one) != one:
+                name = one.name if isinstance(one, Schema) else one.topic
+                raise damaged(path, f"{name} is not what its summary repeats of it")
+
+
+def section(path: Path, stream: Bounded) -> Section | None:
     """The summary section, verified; None where it is none that messages can be found with.
 
     Parameters
@@ -55,7 +82,7 @@ def section(path: Path, stream: Bounded) -> McapSummary | None:
     return found
 
 
-def stated(path: Path, stream: Bounded, start: int | None = None) -> tuple[McapSummary | None, int]:
+def stated(path: Path, stream: Bounded, start: int | None = None) -> tuple[Section | None, int]:
     """The summary section as it stands there, its CRC checked, and where it starts.
 
     Parameters
@@ -89,11 +116,13 @@ def stated(path: Path, stream: Bounded, start: int | None = None) -> tuple[McapS
     # The CRC ends before itself, the last four bytes.
     if crc and zlib.crc32(footer[:-4], zlib.crc32(body)) != crc:
         raise damaged(path, "its summary fails its CRC")
-    return _parsed(body + footer + MAGIC), start
+    found = _parsed(body + footer + MAGIC)
+    found.proven = crc != 0
+    return found, start
 
 
-def _parsed(body: bytes) -> McapSummary:
-    found = McapSummary()
+def _parsed(body: bytes) -> Section:
+    found = Section()
     for record in StreamReader(BytesIO(body), skip_magic=True, record_size_limit=len(body)).records:
         match record:
             case Statistics():
@@ -162,7 +191,7 @@ def _counted(path: Path, found: McapSummary) -> None:
             raise damaged(path, f"its summary lists {len(indexes)} of {number} {what}")
 
 
-def _placed(path: Path, stream: Bounded, found: McapSummary, end: int) -> bool:
+def _placed(path: Path, stream: Bounded, found: Section, end: int) -> bool:
     """Whether all messages lie in the chunks that are listed, and these in the file.
 
     Raises
@@ -174,12 +203,12 @@ def _placed(path: Path, stream: Bounded, found: McapSummary, end: int) -> bool:
     for start, length in sorted(places(found)):
         if start < at:
             raise damaged(path, f"two things are said to stand at byte {start}")
-        if not _between(path, stream, at, start):
+        if not _between(path, stream, found, at, start):
             return False
         at = start + length
     if at > end:
         raise damaged(path, "its summary points beyond its messages")
-    return _between(path, stream, at, end)
+    return _between(path, stream, found, at, end)
 
 
 def places(found: McapSummary) -> Iterator[tuple[int, int]]:
@@ -192,7 +221,7 @@ def places(found: McapSummary) -> Iterator[tuple[int, int]]:
         yield attachment.offset, attachment.length
 
 
-def _between(path: Path, stream: Bounded, at: int, end: int) -> bool:
+def _between(path: Path, stream: Bounded, found: Section, at: int, end: int) -> bool:
     """Whether there is no message among the records from ``at`` to ``end``."""
     while at < end:
         stream.seek(at)
@@ -201,6 +230,9 @@ def _between(path: Path, stream: Bounded, at: int, end: int) -> bool:
             raise damaged(path, f"its summary lacks the chunk at byte {at}")
         if opcode == Opcode.MESSAGE:
             return False
+        if opcode in DEFINITIONS and not found.proven:
+            body = ReadDataStream(BytesIO(stream.read(length)))
+            found.confirm(path, [DEFINITIONS[opcode].read(body)])
         at += RECORD.size + length
     if at > end:
         raise damaged(path, f"a record ends at byte {at}, where none can")

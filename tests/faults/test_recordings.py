@@ -191,6 +191,7 @@ def _hunt(folder: Path, cases: int, seed: int, count: Count) -> None:
     first, begun = len(reach.steps), len(corpus)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refused = compared = 0
+    wrong: list[str] = []
     for k in range(cases):
         chosen = int(rng.integers(len(corpus)))
         within = rng.random(1 + int(rng.geometric(0.7)) // 2) < 0.8
@@ -202,13 +203,15 @@ def _hunt(folder: Path, cases: int, seed: int, count: Count) -> None:
         try:
             good = survived(path) if k % TRACED else reach.of(lambda: survived(path))
             compared += good and nothing_is_lost(path, sound if not chosen + within.any() else None)
-        except BaseException as e:
-            kept = folder / "found.mcap"
+        except Exception as e:
+            kept = folder / f"found-{k}.mcap"
             kept.write_bytes(data)
-            raise AssertionError(f"case {k}, {kept}: {type(e).__name__}: {e}") from e
+            wrong.append(f"case {k}, {kept}: {type(e).__name__}: {str(e)[:300]}")
+            good = False
         refused += not good
         if len(reach.steps) > known and len(data) < 20_000:
             corpus.append(data)
+    assert not wrong, "\n".join(wrong)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
     assert grown < MEMORY_BYTES, f"{grown / 1e6:.0f} MB"
     assert len(reach.steps) > first

@@ -274,6 +274,24 @@ def test_a_record_that_is_there_twice_is_noticed_without_any_crc(
         list(read_raw(path))
 
 
+def test_a_summary_without_crc_that_renames_a_topic_is_noticed(tmp_path: Path) -> None:
+    """The chunks say what the topic is called, as every other reader would."""
+    path = foreign(tmp_path / "a.mcap", enable_crcs=False, compression=CompressionType.NONE)
+    data = path.read_bytes()
+    end = next(start for opcode, start, _ in records(data) if opcode == Opcode.DATA_END)
+    assert data[:end].count(b"/cf1/height") == data[end:].count(b"/cf1/height") == 1
+    path.write_bytes(data[:end] + data[end:].replace(b"/cf1/height", b"/cf1/heigst"))
+    complaint = "/cf1/height is not what its summary repeats of it"
+    for read in (
+        lambda: list(read_raw(path)),
+        lambda: trim(path, tmp_path / "b.mcap"),
+        lambda: read_table(path, "/cf1/heigst"),
+        lambda: glance(path, {"/cf1/heigst": None}, start_ns=0, end_ns=10),
+    ):
+        with pytest.raises(RecordingError, match=complaint):
+            read()
+
+
 def test_recover_does_not_call_whole_what_has_messages_too_many(tmp_path: Path) -> None:
     path = small(tmp_path / "a.mcap")
     data = path.read_bytes()
