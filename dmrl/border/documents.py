@@ -20,10 +20,10 @@ def parse_json(text: str | bytes) -> Any:
     Raises
     ------
     ValueError
-        If it is no JSON, or nests deeper than the budget.
+        If it is no JSON, nests deeper than the budget, or holds a whole number of over 64 bits.
     """
     try:
-        return _shallow(json.loads(text))
+        return _modest(json.loads(text))
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
 
@@ -34,12 +34,13 @@ def parse_toml(text: str) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If it is no TOML, is longer than a recipe, or nests deeper than the budget.
+        If it is no TOML, is longer than a recipe, nests deeper than the budget, or holds a whole
+        number of over 64 bits.
     """
     if len(text) > limits.TOML_CHARACTERS:
         raise ValueError(f"it has {len(text)} characters, more than {limits.TOML_CHARACTERS}")
     try:
-        table: dict[str, Any] = _shallow(tomllib.loads(text))
+        table: dict[str, Any] = _modest(tomllib.loads(text))
         return table
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
@@ -48,10 +49,15 @@ def parse_toml(text: str) -> dict[str, Any]:
 _TOO_DEEP = f"it nests deeper than {limits.DEPTH}"
 
 
-def _shallow(value: Any) -> Any:
-    """The value, if it nests no deeper than the budget. Later code recurses into it."""
+def _modest(value: Any) -> Any:
+    """The value, if it nests no deeper than the budget and its numbers are those of a machine.
+
+    Later code recurses into it, and makes arrays of it.
+    """
     level = [value]
     for _ in range(limits.DEPTH):
+        if huge := [one for one in level if type(one) is int and one.bit_length() > 64]:
+            raise ValueError(f"it holds a whole number of {huge[0].bit_length()} bits")
         containers = [one for one in level if isinstance(one, dict | list)]
         if not containers:
             return value

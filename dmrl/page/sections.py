@@ -22,7 +22,7 @@ from dmrl.topics import robots
 
 MOST_SHOWN = 12
 """Evaluations, models or pairs that are drawn; tables have them all."""
-WRONG = (KeyError, TypeError, ValueError, AttributeError, IndexError)
+WRONG = (KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError)
 """What a document that is not as it should be leads to."""
 FIGURES = {
     "median_px": ("median, px", ".1f"),
@@ -107,15 +107,24 @@ def _detections(found: Found, pictures: Pictures) -> str:
     for key, words in (("median_px", "median error, px"), ("depth_mae_m", "depth MAE, m")):
         bands = {name: rows for name, rows in _kept(few, _bands(key)).items() if rows}
         if bands:
-            drawn.append(chart(charts.by_distance(bands, words), f"{words} by distance"))
+            drawn.append(_drawn(charts.by_distance, bands, words, caption=f"{words} by distance"))
     if curves := _kept(few, _curve):
-        drawn.append(chart(charts.precision_recall(curves), "precision over recall, within 16 px"))
+        words = "precision over recall, within 16 px"
+        drawn.append(_drawn(charts.precision_recall, curves, caption=words))
     if bins := _kept(few, _bins):
         words = "share of detections that are right, over their confidence: honest is the diagonal"
-        drawn.append(chart(charts.reliability(bins), words))
+        drawn.append(_drawn(charts.reliability, bins, caption=words))
     parts.append(row(drawn))
     parts.append(_each(few, lambda name, said: _evaluation(found, name, said, pictures)))
     return "".join(parts)
+
+
+def _drawn(draw: Callable[..., str], *given: Any, caption: str) -> str:
+    """A chart; or a line, where what it should show cannot be drawn."""
+    try:
+        return chart(draw(*given), caption)
+    except WRONG as e:
+        return f"<p>{text(caption)}: cannot be drawn ({text(repr(e))}).</p>"
 
 
 def _cells(overall: Mapping[str, Any]) -> list[str]:
@@ -201,8 +210,9 @@ def _from_above(found: Found) -> list[str]:
             continue
         for (robot, peer), path in list(known.items())[:2]:
             if path.kept.any():
-                drawn = charts.positions(path.true_m, path.estimate_m, path.covariance, path.kept)
-                out.append(chart(drawn, f"{name}: {peer}, seen from {robot}; 95 % ellipses"))
+                words = f"{name}: {peer}, seen from {robot}; 95 % ellipses"
+                places = path.true_m, path.estimate_m, path.covariance, path.kept
+                out.append(_drawn(charts.positions, *places, caption=words))
     return out
 
 
@@ -227,7 +237,8 @@ def _training(found: Found) -> str:
         for name, losses in _kept(dict(list(models.items())[:MOST_SHOWN]), _losses).items()
         if len(losses) > 1
     }
-    drawn = [chart(charts.losses(histories), "loss over the epochs")] if histories else []
+    words = "loss over the epochs"
+    drawn = [_drawn(charts.losses, histories, caption=words)] if histories else []
     return table(heads, [[name, *cells] for name, cells in rows.items()]) + row(drawn)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dmrl.errors import RecordingError
 from dmrl.recording.block import Ints
 from dmrl.recording.check_clocks import clocks
 from dmrl.recording.check_labels import labels
@@ -68,8 +69,15 @@ def label_findings(contents: Contents) -> list[str]:
 
 
 def say_findings(path: Path) -> None:
-    """Say on stderr, in a line or two, what is odd in a recording that was just written."""
-    findings = check(path, quick=True)
+    """Say on stderr, in a line or two, what is odd in a recording that was just written.
+
+    It stands, and is whole: what cannot be judged in it is no error of the work.
+    """
+    try:
+        findings = check(path, quick=True)
+    except RecordingError as e:
+        say(f"warning: {e}")
+        return
     for finding in findings[:SAID]:
         say(f"{finding.level}: {finding.topic}: {finding.text}")
     if len(findings) > SAID:

@@ -26,6 +26,17 @@ def test_as_deep_as_may_be_is_read() -> None:
     assert parse_json("[" * 199 + "]" * 199) is not None
 
 
+@pytest.mark.parametrize("number", [2**64, -(2**64), 10**400])
+def test_whole_numbers_have_64_bits(number: int) -> None:
+    """`float` and NumPy fail on larger ones, in their own ways."""
+    for text in (f"[{number}]", f'{{"a": {{"b": [1, {number}]}}}}'):
+        with pytest.raises(ValueError, match="a whole number of"):
+            parse_json(text)
+    with pytest.raises(ValueError, match="a whole number of"):
+        parse_toml(f"a.b = {number}")
+    assert parse_json("[18446744073709551615, true, 1e300]") == [2**64 - 1, True, 1e300]
+
+
 def test_arrays_come_back(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, one=np.arange(5), two=np.zeros((2, 3)))

@@ -78,6 +78,10 @@ def test_documents_that_are_not_as_they_should_be_leave_the_rest(
         evaluation(threshold="high"),
         {},
         [1],
+        evaluation(threshold=10**400),
+        evaluation(curves={"recall": [0.0, 0.5], "precision": [1.0]}),
+        evaluation(curves={"recall": [[0.0]], "precision": [[[1.0]]]}),
+        evaluation(curves={"bin_confidence": [0.1], "bin_right": [0.1, 0.2], "bin_count": [1]}),
     ]
     for k, document in enumerate(odd):
         (outputs / f"odd{k}").mkdir()

@@ -261,6 +261,23 @@ def test_what_was_just_written_is_looked_at_without_its_images(
     assert said[-1] == f"1 more: dmrl check {path}"
 
 
+@pytest.mark.parametrize("topic", ["height", "camera/calibration", "labels", "camera/image"])
+def test_what_cannot_be_judged_in_what_was_just_written_is_no_error(
+    topic: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The work is done, and stands."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Velocity", "protobuf", schema_bytes("Velocity"))
+        channel = writer.register_channel(f"/cf2/{topic}", "protobuf", schema)
+        writer.add_message(channel, 0, b"", 0)
+        writer.finish()
+    say_findings(path)
+    assert f"/cf2/{topic}" in capsys.readouterr().err
+
+
 def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> None:
     def fill(write: Write, left_px: float, right_px: float) -> None:
         write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
