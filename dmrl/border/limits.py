@@ -39,6 +39,9 @@ VARIABLES = 1_000
 PIXELS = 64 * MB
 """Of a picture: 8,000 x 8,000. With its copies in other orders that is 0.7 GB."""
 
+SIDE_PX = 65_535
+"""Of a picture's width or height, a JPEG's largest; decoders keep a place for every row."""
+
 DECODED_PIXELS = 1_000 * MB
 """Of a picture, each of its scans counted: a progressive JPEG of a few kB can have thousands."""
 

@@ -63,6 +63,8 @@ def _decodable(image: Image.Image, data: bytes, what: object) -> None:
     scans = data.count(b"\xff\xda") if image.format == "JPEG" else 1
     if pixels > limits.PIXELS or pixels * scans > limits.DECODED_PIXELS:
         raise _too_many(what)
+    if max(image.size) > limits.SIDE_PX:
+        raise SourceError(f"{what} is {max(image.size)} px long. Cut it into pieces")
     global _spent
     excess = max(0, pixels - limits.UNPACKED_TIMES * len(data))
     if pixels > limits.LARGE_PIXELS and excess:

@@ -1,7 +1,11 @@
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from dmrl.estimation import board
 from dmrl.estimation.board import Intrinsics, corners, intrinsics
 from dmrl.geometry.frames import AIDECK, Array, Camera
 
@@ -62,6 +66,32 @@ def test_corners_are_found_to_a_twentieth_of_a_pixel() -> None:
     errors = np.concatenate([found - true for found, true in pairs])
     assert np.sqrt((errors**2).mean()) < 0.06
     assert np.abs(errors).max() < 0.4
+
+
+def test_a_large_picture_is_looked_at_smaller_and_measured_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(1)
+    at = pose(rng)
+    grey = picture(*at)
+    whole = corners(grey, COLUMNS, ROWS)
+    monkeypatch.setattr(board, "LARGE_PIXELS", grey.size // 3)
+    monkeypatch.setattr(board.cv2, "findChessboardCornersSB", _only(grey.size // 4 + 1))
+    found = corners(grey, COLUMNS, ROWS)
+    assert whole is not None and found is not None
+    assert np.abs(found - whole).max() < 0.05
+    assert corners(grey[:1], COLUMNS, ROWS) is None
+
+
+def _only(pixels: int) -> Callable[..., Any]:
+    """OpenCV's detector, for small pictures."""
+    detect = board.cv2.findChessboardCornersSB
+
+    def detect_small(grey: Any, *given: Any, **named: Any) -> Any:
+        assert grey.size <= pixels
+        return detect(grey, *given, **named)
+
+    return detect_small
 
 
 @pytest.mark.slow

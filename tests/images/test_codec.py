@@ -127,6 +127,13 @@ def test_a_ppm_whose_header_does_not_end_is_refused() -> None:
             codec.decode(head + bytes(12))
 
 
+@pytest.mark.parametrize("shape", [(65_536, 1), (1, 65_536)])
+def test_a_picture_has_sides_of_a_jpeg_at_most(shape: tuple[int, int]) -> None:
+    """A column of sixty million pixels, 61 kB, took 1.8 GB."""
+    with pytest.raises(SourceError, match=r"a\.png is 65536 px long"):
+        codec.decode(codec.encode_png(np.zeros(shape, np.uint8)), "a.png")
+
+
 def test_large_blank_pictures_have_a_budget_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of them takes a second for each 7 kB."""
     monkeypatch.setattr(codec, "_spent", 0)
