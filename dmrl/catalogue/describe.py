@@ -1,6 +1,7 @@
 """What one recording comes to, as a row of the catalogue."""
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -74,7 +75,8 @@ def _cameras(held: Contents) -> Iterator[Row]:
             for one in islice(held.messages(topics.calibration(camera)), 1):
                 said = one.message
                 row |= {"width_px": said.width, "height_px": said.height}
-                row["focal_px"] = said.K[0] if len(said.K) == 9 else None
+                known = len(said.K) == 9 and math.isfinite(said.K[0])
+                row["focal_px"] = said.K[0] if known else None
         yield row
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from dmrl.border import limits
 from dmrl.border.names import inside
 from dmrl.catalogue.table import NAME, Catalogue, open_catalogue, stamp
 from dmrl.errors import MissingExtra, RecordingError, SettingError
@@ -57,6 +58,10 @@ def find(catalogue: Catalogue, query: str) -> pa.Table:
         If the query cannot be answered: says what DuckDB says.
     """
     own = {"enable_external_access": False, "python_enable_replacements": False}
+    own |= {
+        "memory_limit": f"{limits.MEMORY_BYTES}B",
+        "temp_directory": "",
+    }  # nor is a file written
     with duckdb.connect(config={**own, "lock_configuration": True}) as asked:
         flat = asked.from_arrow(catalogue.table).query("held", FLAT)
         try:

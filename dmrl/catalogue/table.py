@@ -6,9 +6,10 @@ and times are the same. So to index a folder again costs a look at each file's n
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from dmrl.border.memory import Bounded
@@ -80,6 +81,11 @@ COLUMNS = pa.schema(
     metadata=MARK,
 )
 """A row for each recording; lists of structs for what it has several of."""
+
+ALWAYS = ("recording", "bytes", "stamp")
+"""Columns that every row has a value in."""
+PERHAPS = ("width_px", "height_px", "focal_px")
+"""Of a camera, where they are known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +176,7 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
         with Bounded(file.stat().st_size):
             table = pq.read_table(file)
             table.validate(full=True)
+        _refuse_odd(table)
     except (pa.ArrowException, OSError, ValueError, MemoryError) as e:
         why = " ".join(str(e).split())
         raise RecordingError(
@@ -181,3 +188,33 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
             f"dmrl index {folder}"
         )
     return Catalogue(folder, table)
+
+
+def _refuse_odd(table: pa.Table) -> None:
+    """Nothing, if what every row has is there, and names lead to files of the folder.
+
+    Raises
+    ------
+    ValueError
+        If it is not as `Catalogue.save` writes it.
+    """
+    if not table.schema.equals(COLUMNS):
+        return  # another version's
+    for name in (*ALWAYS, *table.column_names):
+        column = table[name].combine_chunks()
+        parts = [column] if name in ALWAYS else []
+        if pa.types.is_list(column.type):
+            inner = column.flatten()
+            structs = pa.types.is_struct(inner.type)
+            fields = [f for f in inner.type if f.name not in PERHAPS] if structs else []
+            parts += [inner, *(inner.field(f.name) for f in fields)]
+        if any(part.null_count for part in parts):
+            raise ValueError(f"{name} lacks values")
+    focal_px = table["cameras"].combine_chunks().flatten().field("focal_px")
+    for name, numbers in (("duration_s", table["duration_s"]), ("focal_px", focal_px)):
+        if not pc.all(pc.is_finite(numbers), min_count=0).as_py():
+            raise ValueError(f"{name} is no number")
+    for recording in table["recording"].to_pylist():
+        parts = PurePosixPath(recording).parts
+        if not parts or ".." in parts or recording.startswith("/"):
+            raise ValueError(f"the name {recording!r} leads out of the folder")

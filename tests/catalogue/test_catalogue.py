@@ -4,14 +4,18 @@ import json
 import os
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from dmrl import boundary, topics
+from dmrl.border import limits
 from dmrl.catalogue import NAME, open_catalogue
 from dmrl.catalogue.query import find
+from dmrl.catalogue.table import COLUMNS, Catalogue, rows_table
 from dmrl.cli import app
 from dmrl.errors import RecordingError, SettingError
 from dmrl.images.codec import encode_png
@@ -207,3 +211,60 @@ def test_the_page_tells_of_a_catalogue_and_opens_no_thousand_recordings(
     monkeypatch.setattr(module, "MANY", 3)
     monkeypatch.setattr(module, "summary", None)
     assert "<h2>Recordings</h2>" not in page(gather(flights))
+
+
+def _edited(folder: Path, **values: Any) -> None:
+    """Put values into the first row, as a stranger would."""
+    rows = pq.read_table(folder / NAME).to_pylist()
+    rows[0].update(values)
+    pq.write_table(pa.Table.from_pylist(rows, schema=COLUMNS), folder / NAME)
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"recording": "../../etc/passwd"}, "leads out of the folder"),
+        ({"recording": "/etc/passwd"}, "leads out of the folder"),
+        ({"recording": ""}, "leads out of the folder"),
+        ({"recording": None}, "recording lacks values"),
+        ({"bytes": None}, "bytes lacks values"),
+        ({"cameras": [None]}, "cameras lacks values"),
+        ({"cameras": [{}]}, "cameras lacks values"),
+        ({"labels": [{"source": "truth"}]}, "labels lacks values"),
+        ({"duration_s": float("nan")}, "duration_s is no number"),
+        ({"cameras": [{"camera": "x", "images": 1, "focal_px": float("inf")}]}, "focal_px"),
+    ],
+)
+def test_a_stranger_s_catalogue_is_one_line(
+    tmp_path: Path, values: dict[str, Any], complaint: str
+) -> None:
+    table = rows_table([{"recording": "a.mcap", "bytes": 1, "stamp": "1 2 3"}])
+    Catalogue(tmp_path, table).save()
+    assert open_catalogue(tmp_path).table.num_rows == 1
+    _edited(tmp_path, **values)
+    with pytest.raises(RecordingError, match=complaint):
+        open_catalogue(tmp_path)
+
+
+def test_a_query_takes_no_disk_and_little_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """DuckDB would spill into the folder that it is called in."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(limits, "MEMORY_BYTES", 20_000_000)
+    many = "(select count(distinct range) from range(5_000_000)) > 1"
+    with pytest.raises(SettingError, match="Out of Memory"):
+        find(Catalogue(tmp_path, rows_table([])), many)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_focal_length_that_is_no_number_is_not_known(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
+        said = message("CameraCalibration")(width=64, height=48, K=[float("nan")] * 9)
+        sink.write(0, topics.calibration("cf1"), said)
+        picture = encode_png(np.zeros((48, 64, 3), np.uint8))
+        sink.write(0, topics.camera_image("cf1"), message("CompressedImage")(data=picture))
+    index.update(tmp_path, 1)
+    (row,) = open_catalogue(tmp_path).table.to_pylist()
+    assert row["cameras"][0]["images"] == 1
+    assert row["cameras"][0]["focal_px"] is None
