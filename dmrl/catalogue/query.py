@@ -57,12 +57,15 @@ def find(catalogue: Catalogue, query: str) -> pa.Table:
     SettingError
         If the query cannot be answered: says what DuckDB says.
     """
-    own = {"enable_external_access": False, "python_enable_replacements": False}
-    own |= {
+    own: dict[str, bool | str] = {
+        "enable_external_access": False,
+        "python_enable_replacements": False,
+        # Else it takes most of the memory, then writes into the folder that it is called in.
         "memory_limit": f"{limits.MEMORY_BYTES}B",
         "temp_directory": "",
-    }  # nor is a file written
-    with duckdb.connect(config={**own, "lock_configuration": True}) as asked:
+        "lock_configuration": True,
+    }
+    with duckdb.connect(config=own) as asked:
         flat = asked.from_arrow(catalogue.table).query("held", FLAT)
         try:
             chosen = flat.filter(_quoted(query, flat.columns)).project("recording").distinct()

@@ -215,6 +215,6 @@ def _refuse_odd(table: pa.Table) -> None:
         if not pc.all(pc.is_finite(numbers), min_count=0).as_py():
             raise ValueError(f"{name} is no number")
     for recording in table["recording"].to_pylist():
-        parts = PurePosixPath(recording).parts
-        if not parts or ".." in parts or recording.startswith("/"):
+        steps = PurePosixPath(recording).parts
+        if not steps or ".." in steps or recording.startswith("/"):
             raise ValueError(f"the name {recording!r} leads out of the folder")
