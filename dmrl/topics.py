@@ -150,7 +150,7 @@ TOPICS = (
     Topic(MASKS, "foxglove.CompressedImage", "image", "number of the peer", "per image", "render"),
     Topic(DEPTHS, "foxglove.CompressedImage", "image", "png, mm", "per image", "render"),
     Topic(DETECTIONS, "dmrl.v1.Detections", "image", "px, m", "per image", "predict"),
-    Topic(GRID, "dmrl.v1.GridMap", "image grid", "0..1, m", "per image", "predict"),
+    Topic(GRID, "dmrl.v1.GridMap", "image grid", "0..1, m", "per image", "predict, convert"),
     Topic(TRACKS, "dmrl.v1.Tracks", "<robot>/horizontal", "m, m/s", "per image", "track"),
     Topic(
         ATTITUDE,

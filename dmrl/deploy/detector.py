@@ -18,6 +18,7 @@ from dmrl.border.documents import parse_json
 from dmrl.deploy.backends import Backend, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
 from dmrl.deploy.compiled import Compiled
+from dmrl.deploy.emulated import RISCV32, Emulated
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError, SettingError
@@ -25,7 +26,7 @@ from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 
 Images = NDArray[np.uint8]
-BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c"]
+BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"]
 
 FLOAT_ONNX_NAME = "model.onnx"
 INT8_ONNX_NAME = "model.int8.onnx"
@@ -38,6 +39,7 @@ LIBRARIES: dict[BackendName, tuple[str, ...]] = {
     "onnx-int8": ("onnxruntime", "numpy"),
     "integer": ("numpy",),
     "c": ("numpy",),
+    "riscv32": ("numpy",),
 }
 """Packages whose version can change what a backend gives."""
 
@@ -98,8 +100,8 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
     model
         Run folder, .safetensors, Keras .h5, quantised model or export folder.
     backend
-        "torch" and "onnx" are float; "integer" (NumPy), "onnx-int8" and "c" are int8, and need
-        a quantised model or an export folder.
+        "torch" and "onnx" are float; "integer" (NumPy), "onnx-int8", "c" and "riscv32" (the C,
+        emulated) are int8, and need a quantised model or an export folder.
 
     Raises
     ------
@@ -187,7 +189,8 @@ def _c(model: Path, backend: BackendName) -> Detector:
     network = _network(model, backend)
     source = model / f"{c_name(network)}.c"
     exported = source.is_file()
-    runs = OnLevels(network, Compiled(network, model if exported else None).run)
+    kind = Emulated if backend == RISCV32 else Compiled
+    runs = OnLevels(network, kind(network, model if exported else None).run)
     return _of_network(model, network, runs, source if exported else _integer_file(model))
 
 
@@ -237,4 +240,5 @@ OPENS: dict[BackendName, Callable[[Path, BackendName], Detector]] = {
     "onnx-int8": _onnx_int8,
     "integer": _integer,
     "c": _c,
+    "riscv32": _c,
 }

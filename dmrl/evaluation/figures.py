@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from dmrl import plots, topics
 from dmrl.border.names import inside
 from dmrl.estimation.score import ErrorTrace
-from dmrl.evaluation.detections import Pairs
+from dmrl.evaluation.detections import At, Pairs
 from dmrl.images.codec import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored
-from dmrl.plots import Example
+from dmrl.plots import Circled, Example
 from dmrl.recording import read, summary
 
 Array = NDArray[np.float64]
@@ -24,6 +24,8 @@ SHARES = (0.2, 0.5, 0.8, 0.95)
 
 
 PLOTTED = 12
+GALLERY = 6
+"""Images with circles."""
 
 
 class HasErrors(Protocol):
@@ -48,7 +50,7 @@ def draw(folder: Path, pairs: Pairs, scored: Scored, source: str, threshold: flo
     Parameters
     ----------
     folder
-        Gets error-violins, error-by-distance and examples, as PNG and SVG.
+        Gets error-violins, error-by-distance, examples and circles, as PNG and SVG.
     pairs
         The judged images.
     scored
@@ -63,6 +65,34 @@ def draw(folder: Path, pairs: Pairs, scored: Scored, source: str, threshold: flo
     plots.error_by_distance(depth_m, error.norm_px, error.depth_m, folder / "error-by-distance")
     if shown := _examples(pairs, error.norm_px, source, threshold):
         plots.examples(shown, folder / "examples")
+    if pairs.images:
+        plots.gallery(_spread(pairs, threshold), folder / "circles")
+
+
+def _spread(pairs: Pairs, threshold: float) -> list[Circled]:
+    """Images evenly spread over all, whatever was found in them, with what is believed."""
+    places = np.unique(np.linspace(0, pairs.images - 1, GALLERY + 2)[1:-1].astype(int)).tolist()
+    mine = pairs.detections.select(pairs.detections.confidence >= threshold)
+    shown = []
+    for image in places:
+        found = mine.select(mine.image == image)
+        at = pairs.at[image]
+        shown.append(
+            Circled(
+                f"{at.recording.stem}, {at.time_ns / 1e9:.2f} s",
+                _picture(at),
+                np.column_stack([found.u_px, found.v_px]),
+                found.depth_m,
+            )
+        )
+    return shown
+
+
+def _picture(at: At) -> NDArray[np.uint8]:
+    recording, robot, time_ns = at
+    topic = topics.camera_image(robot)
+    taken = next(read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1))
+    return decode(taken.message.data, what=f"{recording}: {topic} at {time_ns} ns")
 
 
 def _examples(pairs: Pairs, error_px: Array, source: str, threshold: float) -> list[Example]:
@@ -79,9 +109,7 @@ def _examples(pairs: Pairs, error_px: Array, source: str, threshold: float) -> l
 
 def _example(pairs: Pairs, image: int, worst_px: float, source: str, threshold: float) -> Example:
     recording, robot, time_ns = pairs.at[image]
-    topic = topics.camera_image(robot)
-    taken = next(read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1))
-    rgb = decode(taken.message.data, what=f"{recording}: {topic} at {time_ns} ns")
+    rgb = _picture(pairs.at[image])
     maps = _maps(recording, robot, time_ns)
     labels = pairs.labels.select(pairs.labels.image == image)
     labels_px = np.column_stack([labels.u_px, labels.v_px])

@@ -12,7 +12,7 @@ with an empty peer says that no peer is in view. A picture without a row is not 
   sigma_v_px, sigma_depth_m`` may be. ``source`` is "hand" where it is empty.
 
 Or ``label.txt`` as the published firmware's tools write it, ``imgNNNNN.ppm roll pitch x y z d``
-a line: see ``aideck``. Labels of it need a camera.
+a line: see ``aideck``. Labels of it need a camera. Maps of a chip: see ``chip_maps``.
 
 Pixels are those of the stored picture, pixel-edge coordinates. ``calibration.toml`` in the
 folder is the camera that took the pictures as they are stored (keys: see ``Camera``). Pictures of
@@ -26,6 +26,7 @@ from pathlib import Path
 
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import aideck
+from dmrl.formats.chip_maps import chip_maps
 from dmrl.formats.crop import Crop
 from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.label_table import LabelRow, read_labels
@@ -162,6 +163,8 @@ def _samples(
         if options.camera is not None and k == 0:
             yield calibration(time_ns, options.robot, _camera_after(crop, options.camera))
         yield image(time_ns, options.robot, data, kind)
+        if (maps := chip_maps(path, time_ns, options.robot)) is not None and not crop.changes:
+            yield maps
         if path.name in rows:
             peers = [crop.label(row) for row in rows[path.name] if row.peer]
             sources = {row.source for row in rows[path.name]}

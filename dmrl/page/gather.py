@@ -8,11 +8,14 @@ from typing import Any
 
 import pyarrow as pa
 
+from dmrl import recipe as recipes
 from dmrl.border.documents import parse_json
 from dmrl.catalogue import NAME as CATALOGUE
 from dmrl.catalogue import open_catalogue
 from dmrl.datasets import is_dataset
 from dmrl.errors import DmrlError, SettingError
+from dmrl.evaluation import story
+from dmrl.evaluation.story import Shown
 from dmrl.recording import Provenance, Summary, summary
 from dmrl.recording.inputs import provenance_of
 
@@ -27,6 +30,8 @@ DOCUMENTS = {
 MOST_FILES, MOST_BYTES, DEEPEST = 20_000, 16 << 20, 6
 MANY = 100
 """Recordings of a catalogue from which on they are told of together, and not opened."""
+RECIPE = "recipe.toml"
+"""What `dmrl.pipeline` leaves beside its outputs."""
 PICTURE_KINDS = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -52,6 +57,10 @@ class Found:
         How each output was made, where it says so.
     unread
         What could not be read, and why.
+    story
+        Figures that the recipe of the folder wants shown first.
+    title
+        What that recipe calls them.
     """
 
     folder: Path
@@ -62,6 +71,8 @@ class Found:
     catalogues: dict[str, pa.Table] = field(default_factory=dict)
     made: dict[str, Provenance] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
+    story: list[Shown] = field(default_factory=list)
+    title: str = "The recipe's figures"
 
     def of(self, kind: str) -> dict[str, Mapping[str, Any]]:
         """Documents of one kind."""
@@ -78,7 +89,7 @@ def gather(folder: Path) -> Found:
     """
     if not folder.is_dir():
         raise SettingError(f"{folder} is no folder. Name one with recordings, models, evaluations")
-    found = Found(folder)
+    found = _told(folder)
     files = list(_files(folder))
     together: set[Path] = set()
     for path in sorted(files, key=lambda path: path.name != CATALOGUE):
@@ -94,6 +105,19 @@ def gather(folder: Path) -> Found:
             f"{folder} holds no recording, dataset, model or evaluation. Try: dmrl demo"
         )
     return found
+
+
+def _told(folder: Path) -> Found:
+    """A folder, with what its recipe wants shown."""
+    recipe = folder / RECIPE
+    if not recipe.is_file() or recipe.is_symlink():
+        return Found(folder)
+    try:
+        keys = recipes.read(recipe)
+        title = str(keys.get(story.TITLE, Found.__dataclass_fields__["title"].default))
+        return Found(folder, story=story.told(recipe, keys), title=title)
+    except DmrlError as e:
+        return Found(folder, unread={RECIPE: str(e)})
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -17,6 +17,7 @@ from dmrl.page.ancestry import ancestry
 from dmrl.page.document import Pictures, chart, row, table, text
 from dmrl.page.gather import Found
 from dmrl.page.listed import listed
+from dmrl.page.story import story
 from dmrl.plots import charts
 from dmrl.topics import robots
 
@@ -43,6 +44,7 @@ def page(found: Found) -> str:
     """The page of a folder, HTML."""
     pictures = Pictures()
     bodies: list[tuple[str, str]] = [
+        (found.title, story(found, pictures)),
         ("Detections", _detections(found, pictures)),
         ("Positions", _positions(found, pictures)),
         ("Tracks", _tracks(found, pictures)),

@@ -14,12 +14,13 @@ from typing import Any
 from dmrl import recipe as recipes
 from dmrl.border.names import file_name
 from dmrl.errors import RecipeError, UnsafeName
+from dmrl.evaluation import story
 from dmrl.geometry.camera_file import KNOWN
 from dmrl.learn import pretrained
 from dmrl.pipeline.interface import Interface, interface_of
 from dmrl.pipeline.language import expanded
 
-KEYS = ("kind", "each", "defaults", "step")
+KEYS = ("kind", "each", "defaults", "step", story.TITLE, story.KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
@@ -70,10 +71,11 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Steps, and the text of the recipe they were read from."""
+    """Steps, the text of the recipe they were read from, and whether it has figures."""
 
     steps: tuple[Step, ...]
     text: str
+    pictured: bool = False
 
     @property
     def needs_data(self) -> bool:
@@ -136,8 +138,8 @@ def load(name: str | Path) -> Plan:
     MissingExtra
         If a package that a stage needs is not installed.
     """
-    text = recipes.text(name)
-    return Plan(tuple(_steps(name, recipes.read(name))), text)
+    text, keys = recipes.text(name), recipes.read(name)
+    return Plan(tuple(_steps(name, keys)), text, story.KEY in keys)
 
 
 def _steps(name: str | Path, recipe: Table) -> list[Step]:
@@ -150,6 +152,7 @@ def _steps(name: str | Path, recipe: Table) -> list[Step]:
         faults += [f"step.{number}.{fault}" for fault in wrong]
         found.append((number, step))
     faults += _name_faults(found)
+    faults += story.faults(recipe, {step.out for _, step in found})
     if faults:
         raise recipes.faulty(name, dict.fromkeys(faults))
     steps = [step for _, step in found]

@@ -83,14 +83,15 @@ def run(
 
 
 def _check_data(name: str | Path, plan: Plan, data: Path | None) -> None:
-    """Refuse a recipe whose data is not there."""
+    """Refuse a recipe whose data is not there; optional steps are left out then."""
     if not plan.needs_data:
         return
     if data is None:
         raise SettingError(f"{name} reads data that does not ship with dmrl. Say where: --data DIR")
     if not data.is_dir():
         raise SettingError(f"no folder {data}. Say where the data is: --data DIR")
-    names = dict.fromkeys(n for step in plan.steps for n in step.names if n.startswith(DATA))
+    needed = (step for step in plan.steps if not step.optional)
+    names = dict.fromkeys(n for step in needed for n in step.names if n.startswith(DATA))
     missing = [path for n in names if not (path := located(n, set(), data, data)).exists()]
     if missing:
         more = f" and {len(missing) - 1} more that {name} reads" * (len(missing) > 1)

@@ -2,10 +2,11 @@
 
 from dmrl.plots.datasets import depth_histogram, peers_per_image, position_heat
 from dmrl.plots.errors import error_by_distance, error_trace, error_violins, trade_offs
-from dmrl.plots.pictures import Example, MapPair, examples, map_pairs
+from dmrl.plots.pictures import Circled, Example, MapPair, examples, gallery, map_pairs
 from dmrl.plots.style import save
 
 __all__ = [
+    "Circled",
     "Example",
     "MapPair",
     "depth_histogram",
@@ -13,6 +14,7 @@ __all__ = [
     "error_trace",
     "error_violins",
     "examples",
+    "gallery",
     "map_pairs",
     "peers_per_image",
     "position_heat",

@@ -51,13 +51,13 @@ def _legend(axes: Any) -> None:
         axes.legend(fontsize=8, frameon=False)
 
 
-def losses(histories: Mapping[str, Sequence[float]]) -> str:
+def losses(histories: Mapping[str, Sequence[float]], words: str = "loss") -> str:
     """Loss over the epochs of a training, one line per model."""
     with _chart() as (figure, made):
         axes = figure.subplots()
         for name, values in histories.items():
             axes.plot(range(1, len(values) + 1), values, label=name)
-        axes.set(xlabel="epoch", ylabel="loss", yscale="log")
+        axes.set(xlabel="epoch", ylabel=words, yscale="log")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.25)
         _legend(axes)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.plots.style import STYLE, Figure, mpl, save
+from dmrl.plots.style import STYLE, Figure, mpl, save, withStroke
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +97,78 @@ def _mark(axes: Any, example: Example) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class Circled:
+    """One image and what was found in it.
+
+    Parameters
+    ----------
+    title
+        Line above it.
+    rgb
+        (H, W, 3) uint8.
+    uv_px
+        (N, 2) pixels of the detections, u right and v down.
+    depth_m
+        (N,) their depths, metres.
+    """
+
+    title: str
+    rgb: NDArray[np.uint8]
+    uv_px: NDArray[np.float64]
+    depth_m: NDArray[np.float64]
+
+
+def gallery(shown: Sequence[Circled], stem: Path, *, columns: int = 3) -> None:
+    """Images with a white circle around every detection and its depth, as in the paper.
+
+    Parameters
+    ----------
+    shown
+        At least one.
+    stem
+        Path without suffix.
+    columns
+        Images in a row, at most.
+    """
+    columns = min(columns, len(shown))
+    rows = -(-len(shown) // columns)
+    with mpl.rc_context(STYLE):
+        figure = Figure((3.4 * columns, 2.6 * rows), layout="constrained")
+        places = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes in places:
+            axes.axis("off")
+        for axes, example in zip(places, shown, strict=False):
+            height, width = example.rgb.shape[:2]
+            axes.imshow(example.rgb, extent=(0, width, height, 0))
+            axes.set_title(example.title, fontsize=8, loc="left")
+            _circles(axes, example, width, height)
+            axes.set(xlim=(0, width), ylim=(height, 0))
+    save(figure, stem)
+
+
+def _circles(axes: Any, example: Circled, width: int, height: int) -> None:
+    """White circles with a black rim; depths to the side where there is room."""
+    for (u, v), depth_m in zip(example.uv_px.tolist(), example.depth_m.tolist(), strict=True):
+        for colour, points in (("black", 4.0), ("white", 2.0)):
+            at = {"markeredgecolor": colour, "markeredgewidth": points}
+            axes.plot(u, v, "o", markersize=16, markerfacecolor="none", **at)
+        right = u < 0.75 * width
+        axes.annotate(
+            f"{depth_m:.2f} m",
+            (u, min(max(v, 8.0), height - 8.0)),
+            (13 if right else -13, 0),
+            textcoords="offset points",
+            ha="left" if right else "right",
+            va="center",
+            color="white",
+            fontsize=9,
+            path_effects=[withStroke(linewidth=2.5, foreground="black")],
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class MapPair:
-    """One image, and the maps of two networks.
+    """One image, and the maps of networks, or of one network computed in several ways.
 
     Parameters
     ----------
@@ -107,7 +177,7 @@ class MapPair:
     rgb
         (H, W, 3) uint8.
     maps
-        What computed them, to its (rows, cols) confidence and depth; two of them.
+        What computed them, to its (rows, cols) confidence and depth.
     """
 
     title: str
@@ -116,25 +186,26 @@ class MapPair:
 
 
 def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
-    """A row per image: the image, then confidence and depth, each by one and by the other.
+    """A row per image: the image, then confidence, then depth, each by all that computed it.
 
-    Colours run from 0 to the largest value of a column's pair over all rows.
+    Colours run from 0 to the largest confidence, and to the largest depth, of all rows.
 
     Parameters
     ----------
     shown
-        At least one, all computed by the same two.
+        At least one, all computed by the same.
     stem
         Path without suffix.
     """
     names = list(shown[0].maps)
     words = ("confidence", "depth, m")
     with mpl.rc_context(STYLE):
-        figure = Figure((13.0, 2.1 * len(shown) + 1.1), layout="constrained")
+        across = 1 + 2 * len(names)
+        figure = Figure((2.6 * across, 2.1 * len(shown) + 1.1), layout="constrained")
         figure.get_layout_engine().set(h_pad=0.12)  # type: ignore[call-arg, union-attr]
-        grid = figure.subplots(len(shown), 5, squeeze=False)
+        grid = figure.subplots(len(shown), across, squeeze=False)
         for channel, (name, colours) in enumerate(zip(words, ("inferno", "turbo"), strict=True)):
-            columns = slice(1 + 2 * channel, 3 + 2 * channel)
+            columns = slice(1 + channel * len(names), 1 + (channel + 1) * len(names))
             most = max(pair.maps[who][channel].max() for pair in shown for who in names)
             for row, pair in zip(grid, shown, strict=True):
                 for axes, who in zip(row[columns], names, strict=True):

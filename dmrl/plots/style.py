@@ -32,11 +32,12 @@ try:
     with _any_backend():
         import matplotlib as mpl
         from matplotlib.figure import Figure
+        from matplotlib.patheffects import withStroke
         from matplotlib.ticker import MaxNLocator
 except ImportError as e:
     raise MissingExtra("matplotlib", "plot", "a figure") from e
 
-__all__ = ["SIZE_INCHES", "STYLE", "Figure", "MaxNLocator", "mpl", "save"]
+__all__ = ["SIZE_INCHES", "STYLE", "Figure", "MaxNLocator", "mpl", "save", "withStroke"]
 
 # Equal input gives equal bytes: no date, no version, no random ids.
 STYLE: dict[Any, Any] = {

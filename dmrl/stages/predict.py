@@ -55,9 +55,10 @@ class Settings:
     Parameters
     ----------
     backend
-        What computes. torch and onnx are float; onnx-int8, integer (NumPy) and c are int8, and
-        need a quantised model or an export folder. Without it, onnx where it is installed and
-        gives all that the network says, else torch.
+        What computes. torch and onnx are float; onnx-int8, integer (NumPy), c and riscv32 (the C
+        in an emulator, seconds an image) are int8, and need a quantised model or an export
+        folder. Without it, onnx where it is installed and gives all that the network says, else
+        torch.
     threshold
         Confidence from which detections are to be believed, written beside them, 0 to 1.
         Without it, the model's.

@@ -1,14 +1,23 @@
 """``dmrl run``: the steps of a pipeline recipe."""
 
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated
 
 from cyclopts import Parameter, validators
 
+from dmrl.errors import MissingExtra
 from dmrl.evaluation.report import report
 from dmrl.pipeline import run as pipeline
 from dmrl.terminal.arguments import On
+from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_line
+
+pages: ModuleType | None
+try:
+    from dmrl import page as pages
+except MissingExtra:
+    pages = None
 
 
 def command(
@@ -22,6 +31,8 @@ def command(
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Run the steps of a pipeline recipe whose outputs are not up to date, side by side.
+
+    A recipe with figures, such as paper, ends with report.html in its folder.
 
     Parameters
     ----------
@@ -38,5 +49,17 @@ def command(
     """
     folder = Path(Path(recipe).stem) if out is None else out
     report(pipeline.run(recipe, folder, data, workers=workers, on=on), as_json=as_json)
+    page = _page(folder) if pipeline.load(recipe).pictured else None
     if not as_json:
-        print_line(f"On one page: dmrl report {folder}")
+        print_line(
+            f"{page}: open it in a browser" if page else f"On one page: dmrl report {folder}"
+        )
+
+
+def _page(folder: Path) -> Path | None:
+    """The page of a recipe with figures, written; None where they cannot be drawn."""
+    if pages is None:
+        say("no page: that needs matplotlib. pip install 'dmrl[plot]', then dmrl report")
+        return None
+    written: Path = pages.write(folder)
+    return written

@@ -13,14 +13,19 @@ from dmrl.deploy.detector import Detector, open_detector
 from dmrl.deploy.float_onnx import float_onnx_of
 from dmrl.deploy.graph import grey_of
 from dmrl.deploy.store import INTEGER_NAME, save
-from dmrl.errors import ModelError, SettingError
+from dmrl.deploy.toolchain import EMULATOR, RISCV, missing
+from dmrl.errors import ModelError, SettingError, ToolError
 from dmrl.learn.model import Model, load_model, save_model
 from dmrl.learn.network import build
 
 from .graphs import quantised_network
 
+needs_riscv = pytest.mark.skipif(bool(missing(RISCV, EMULATOR)), reason="no RISC-V tools")
 
-@pytest.mark.parametrize("backend", ["integer", "onnx-int8", "c"])
+
+@pytest.mark.parametrize(
+    "backend", ["integer", "onnx-int8", "c", pytest.param("riscv32", marks=needs_riscv)]
+)
 def test_an_int8_network_says_the_same_by_every_backend(backend: str, tmp_path: Path) -> None:
     network = replace(quantised_network(0), threshold=0.37)
     save(network, tmp_path / INTEGER_NAME)
@@ -75,7 +80,7 @@ def test_a_float_model_says_the_same_by_torch_and_onnx_and_as_an_export(tmp_path
     assert [d.file for d in found.values()] == [weights, weights, onnx]
     with pytest.raises(ModelError, match=r"is an export folder, which torch cannot run"):
         open_detector(export, "torch")
-    for backend in ("integer", "onnx-int8", "c"):
+    for backend in ("integer", "onnx-int8", "c", "riscv32"):
         with pytest.raises(ModelError, match=f"as --backend {backend} needs"):
             open_detector(run, backend)  # type: ignore[arg-type]
         with pytest.raises(ModelError, match=f"--backend {backend} is int8"):
@@ -129,3 +134,12 @@ def test_logits_far_out_overflow_nothing() -> None:
     assert (grids.offset[:, 0] == far).all()
     assert (grids.offset[:, 1] == 2 * far).all()
     assert grids_of({"confidence": far, "log_depth": far, "offset_u": far}).offset is None
+
+
+def test_without_risc_v_tools_the_line_to_type_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(quantised_network(0), tmp_path / INTEGER_NAME)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ToolError, match="apt-get install gcc-riscv64-unknown-elf"):
+        open_detector(tmp_path, "riscv32")

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dmrl import plugins, recipe
-from dmrl.errors import RecipeError
+from dmrl.errors import RecipeError, SettingError
 from dmrl.pipeline import run as pipeline
 from dmrl.pipeline.interface import interface_of
 from dmrl.pipeline.plan import Step
@@ -235,3 +235,26 @@ def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
 def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
     if recipe.read(name)["kind"] == "pipeline":
         assert pipeline.load(name).steps
+
+
+@pytest.mark.parametrize("name", ["paper", "published"])
+def test_recipes_of_the_paper_have_figures_that_name_their_steps(name: str) -> None:
+    assert pipeline.load(name).pictured
+
+
+def test_a_figure_of_what_no_step_writes_is_a_fault_of_the_recipe(tmp_path: Path) -> None:
+    figure = '[[figure]]\ntitle = "Losses"\nshows = "losses"\nof = ["model"]\n'
+    with pytest.raises(RecipeError, match=r"figure\.1\.of: no step writes model"):
+        load(tmp_path, SMALL + figure)
+
+
+def test_data_of_optional_steps_need_not_be_there(tmp_path: Path) -> None:
+    step = '[[step]]\nstage = "convert"\nsource = "{data}/none"\nout = "a.mcap"\n'
+    text = HEAD + '[[step]]\nstage = "sketch"\nimages = 1\nout = "pictures"\n' + step
+    (tmp_path / "data").mkdir()
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(SettingError, match=r"no .*none\. Check --data"):
+        pipeline.run(tmp_path / "mine.toml", tmp_path / "out", tmp_path / "data")
+    (tmp_path / "mine.toml").write_text(text + "optional = true\n")
+    done = pipeline.run(tmp_path / "mine.toml", tmp_path / "out", tmp_path / "data")
+    assert [one.left_out for one in done] == [False, True]

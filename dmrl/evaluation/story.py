@@ -1,0 +1,163 @@
+"""What a recipe wants its page to begin with: figures and numbers, beside published ones.
+
+``[[figure]]`` tables of a pipeline recipe. They name outputs of steps; `dmrl.page` draws them.
+"""
+
+from collections.abc import Iterator, Mapping, Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from dmrl import recipe as recipes
+
+KEY, TITLE = "figure", "title"
+MOST = 40
+"""Figures of one recipe."""
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A figure of ours beside a published one.
+
+    Parameters
+    ----------
+    what
+        What is measured, in words.
+    published
+        As it was published, in words; empty: it was not.
+    of
+        A JSON document: an output of a step, and a file in it where it is a folder.
+    at
+        Where it stands there: keys and places with dots between, such as
+        overall.median_px.value. In a list, a word finds the table that has it as a value.
+    form
+        Python's format of it, such as .1%.
+    """
+
+    what: str
+    of: str
+    at: str
+    published: str = ""
+    form: str = ".3g"
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A figure of a recipe's page.
+
+    Parameters
+    ----------
+    title
+        Its heading.
+    shows
+        losses: curves of trainings. images: images with what was found. errors: violins.
+        maps: maps of confidence and depth, computed in several ways. numbers: a table.
+    of
+        Outputs of steps: of train for losses, of evaluate for images and errors; recordings of
+        the same images, by predict, for maps.
+    named
+        Words for each of them. Without: their names.
+    words
+        What was published, or what to see in it.
+    rows
+        Of numbers.
+    """
+
+    title: str
+    shows: Literal["losses", "images", "errors", "maps", "numbers"]
+    of: tuple[str, ...] = ()
+    named: tuple[str, ...] = ()
+    words: str = ""
+    rows: tuple[Number, ...] = ()
+
+    @property
+    def outputs(self) -> list[str]:
+        """What it reads."""
+        return [*self.of, *(row.of for row in self.rows)]
+
+    def label(self, place: int) -> str:
+        """Words for one of its outputs."""
+        return self.named[place] if place < len(self.named) else self.of[place]
+
+
+def told(name: str | Path, recipe: Mapping[str, Any]) -> list[Shown]:
+    """The figures of a recipe; none where it names none.
+
+    Raises
+    ------
+    RecipeError
+        If a table is not as it should be.
+    """
+    tables = recipe.get(KEY, [])
+    return [recipes.check(name, table, Shown) for table in tables]
+
+
+def faults(recipe: Mapping[str, Any], outs: Set[str]) -> Iterator[str]:
+    """What is wrong with the figures of a recipe.
+
+    Parameters
+    ----------
+    recipe
+        Its keys.
+    outs
+        What its steps write.
+    """
+    if not isinstance(recipe.get(TITLE, ""), str):
+        yield f"{TITLE}: must be a text"
+    tables = recipe.get(KEY, [])
+    if not isinstance(tables, list) or len(tables) > MOST:
+        yield f"{KEY}: must be [[{KEY}]] tables, {MOST} at most"
+        return
+    for number, table in enumerate(tables, start=1):
+        where = f"{KEY}.{number}"
+        wrong = (
+            list(recipes.faults(table, Shown)) if isinstance(table, dict) else ["must be a table"]
+        )
+        yield from (f"{where}.{fault}" for fault in wrong)
+        if not wrong:
+            yield from (f"{where}.{fault}" for fault in _slips(told("", {KEY: [table]})[0], outs))
+
+
+def _slips(shown: Shown, outs: Set[str]) -> Iterator[str]:
+    needs, unused = ("rows", "of") if shown.shows == "numbers" else ("of", "rows")
+    if not getattr(shown, needs) or getattr(shown, unused):
+        yield f"{needs}: {shown.shows} needs {needs}, and no {unused}"
+    if len(shown.named) > len(shown.of):
+        yield "named: has more words than there are outputs"
+    for name in shown.outputs:
+        if name.split("/")[0] not in outs or ".." in name.split("/"):
+            yield f"of: no step writes {name}. Name a step's out"
+    for row in shown.rows:
+        try:
+            format(1.0, row.form)
+        except ValueError:
+            yield f"rows: {row.form} is no format of a number. Try: .2f, .1%"
+
+
+def value_at(document: Any, at: str) -> float | int | str | None:
+    """What stands at a place of a JSON document; None where it has no such place.
+
+    Parameters
+    ----------
+    document
+        A document.
+    at
+        See `Number`.
+    """
+    for part in at.split("."):
+        try:
+            inside = _of_list if isinstance(document, list) else _of_table
+            document = inside(document, part)
+        except (KeyError, IndexError, TypeError, StopIteration):
+            return None
+    return document if isinstance(document, float | int | str) else None
+
+
+def _of_table(table: Any, part: str) -> Any:
+    return table[part]
+
+
+def _of_list(rows: list[Any], part: str) -> Any:
+    if part.lstrip("-").isdecimal():
+        return rows[int(part)]
+    return next(row for row in rows if isinstance(row, dict) and part in row.values())

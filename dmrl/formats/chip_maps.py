@@ -1,0 +1,64 @@
+"""Maps that a chip computed of pictures, in a folder beside them.
+
+``gap8-maps/posNNNNN.ppm`` and ``depNNNNN.ppm`` beside ``imgNNNNN.ppm``: binary PGM, a byte a cell
+of 8 x 8 pixels, 128 is 0. One scale for all of the network's output: a level is `STEP`, in the
+logit of the confidence and in the logarithm of the depth (metres).
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.errors import SourceError
+from dmrl.geometry.frames import STRIDE_PX
+from dmrl.images import codec
+from dmrl.samples.sample import Sample
+
+FOLDER = "gap8-maps"
+STEP = 0.211
+"""Of the published network on the GAP8."""
+NAMES = ("pos", "dep")
+
+
+def chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
+    """The maps of a picture as a GridMap at its time; None where there are none.
+
+    Parameters
+    ----------
+    picture
+        Path of the picture.
+    time_ns, robot
+        Its log time, and whose camera took it.
+
+    Raises
+    ------
+    SourceError
+        If one of the two is missing, cannot be read, or is of another size than the other.
+    """
+    number = picture.stem.removeprefix("img")
+    files = [picture.parent / FOLDER / f"{name}{number}.ppm" for name in NAMES]
+    if not any(file.is_file() for file in files):
+        return None
+    logit, log_depth = (STEP * _levels(file) for file in files)
+    if logit.shape != log_depth.shape:
+        raise SourceError(f"{files[1]} is of another size than {files[0].name}. Remove both")
+    maps = np.stack((1 / (1 + np.exp(-logit)), np.exp(log_depth)))
+    fields = {
+        "rows": logit.shape[0],
+        "cols": logit.shape[1],
+        "channels": ("confidence", "depth_m"),
+        "data": maps.astype("<f4").tobytes(),
+        "stride_px": STRIDE_PX,
+    }
+    return Sample(time_ns, topics.grid(robot), "GridMap", fields)
+
+
+def _levels(file: Path) -> NDArray[np.float64]:
+    """(rows, cols) levels of a map, -128 to 127."""
+    try:
+        data = file.read_bytes()
+    except OSError:
+        raise SourceError(f"no {file}: its other half is there. Add it, or remove both") from None
+    return codec.decode(data, file)[..., 0].astype(float) - 128.0

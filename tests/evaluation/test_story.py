@@ -1,0 +1,71 @@
+"""What a recipe wants its page to begin with: checked with the recipe, and read from documents."""
+
+from typing import Any
+
+import pytest
+
+from dmrl.evaluation.story import faults, told, value_at
+
+OUTS = {"model", "judged", "a.mcap"}
+GOOD = {"title": "Losses", "shows": "losses", "of": ["model"]}
+
+
+def wrong(table: Any) -> str:
+    return "; ".join(faults({"figure": [table]}, OUTS))
+
+
+def test_a_good_figure_has_no_fault_and_is_read() -> None:
+    rows = [{"what": "px", "of": "judged/evaluation.json", "at": "overall.median_px.value"}]
+    numbers = {"title": "Numbers", "shows": "numbers", "rows": rows}
+    recipe = {"title": "Mine", "figure": [GOOD, numbers]}
+    assert not list(faults(recipe, OUTS))
+    first, second = told("mine", recipe)
+    assert first.of == ("model",) and first.label(0) == "model"
+    assert second.rows[0].at == "overall.median_px.value" and second.rows[0].form == ".3g"
+    assert second.outputs == ["judged/evaluation.json"]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"shows": "pies"}, "figure.1.shows"),
+        ({"of": []}, "losses needs of"),
+        ({"of": ["elsewhere"]}, "no step writes elsewhere"),
+        ({"of": ["model/../../etc"]}, "no step writes model/../../etc"),
+        ({"of": [], "rows": []}, "losses needs of, and no rows"),
+        ({"named": ["a", "b"]}, "more words than there are outputs"),
+        ({"colour": "red"}, "figure.1.colour"),
+    ],
+)
+def test_a_wrong_figure_is_a_fault_of_the_recipe(change: dict[str, Any], says: str) -> None:
+    assert says in wrong(GOOD | change)
+
+
+def test_a_format_that_is_none_is_a_fault() -> None:
+    row = {"what": "px", "of": "judged", "at": "x", "form": "{}"}
+    assert "is no format" in wrong({"title": "N", "shows": "numbers", "rows": [row]})
+
+
+def test_tables_that_are_none_are_faults() -> None:
+    assert "must be [[figure]] tables" in "".join(faults({"figure": 3}, OUTS))
+    assert "must be a table" in wrong("losses")
+    assert "title: must be a text" in "".join(faults({"title": 3}, OUTS))
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [
+        ("a.b", 3),
+        ("rows.1.x", 6),
+        ("rows.-1.x", 6),
+        ("rows.gcc.x", 5),
+        ("rows.7.x", None),
+        ("rows.clang.x", None),
+        ("a", None),
+        ("a.b.c", None),
+        ("none", None),
+    ],
+)
+def test_a_place_of_a_document_is_found_or_is_none(at: str, value: int | None) -> None:
+    document = {"a": {"b": 3}, "rows": [{"name": "gcc", "x": 5}, {"name": "riscv32", "x": 6}]}
+    assert value_at(document, at) == value

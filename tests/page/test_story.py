@@ -1,0 +1,113 @@
+"""The figures of a recipe come first on its page, drawn from what its steps wrote."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.images.codec import encode_png
+from dmrl.messages import message
+from dmrl.page import gather, page
+from dmrl.recording import Provenance, RecordingWriter
+
+RECIPE = """
+kind = "pipeline"
+title = "The paper, again"
+
+[[figure]]
+title = "In numbers"
+shows = "numbers"
+rows = [
+  { what = "px", published = "4.3", of = "JUDGED", at = "overall.median_px.value", form = ".1f" },
+  { what = "not there", of = "JUDGED", at = "overall.nothing" },
+]
+
+[[figure]]
+title = "Both losses"
+shows = "losses"
+of = ["model"]
+named = ["<b>ours</b>"]
+words = "published: lower"
+
+[[figure]]
+title = "Circles"
+shows = "images"
+of = ["judged"]
+
+[[figure]]
+title = "Chip"
+shows = "maps"
+of = ["float.mcap", "chip.mcap", "absent.mcap"]
+named = ["float", "chip", "absent"]
+""".replace("JUDGED", "judged/evaluation.json")
+
+
+def maps(path: Path, factor: float) -> None:
+    grid = np.linspace(0.1, 0.9, 12, dtype="<f4").reshape(3, 4) * factor
+    picture = encode_png(np.zeros((24, 32, 3), np.uint8))
+    with RecordingWriter(path, Provenance("test", {})) as sink:
+        sink.write(5, "/cf1/camera/image", message("CompressedImage")(data=picture, format="png"))
+        fields = {"rows": 3, "cols": 4, "channels": ("confidence", "depth_m"), "stride_px": 8}
+        data = np.stack((grid, 2 * grid)).tobytes()
+        sink.write(5, "/cf1/detections/grid", message("GridMap")(data=data, **fields))
+
+
+@pytest.fixture
+def pipeline(outputs: Path) -> Path:
+    (outputs / "recipe.toml").write_text(RECIPE)
+    about = json.loads((outputs / "model/model.json").read_text())
+    about["training"] = {
+        "history": [{"loss": 2.0, "confidence_loss": 1.0, "depth_loss": 1.0 / k} for k in (1, 2)]
+    }
+    (outputs / "model/model.json").write_text(json.dumps(about))
+    picture = encode_png(np.full((20, 30, 3), 90, np.uint8))
+    (outputs / "judged/circles.png").write_bytes(picture)
+    maps(outputs / "float.mcap", 1.0)
+    maps(outputs / "chip.mcap", 0.5)
+    return outputs
+
+
+def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
+    html = page(gather(pipeline))
+    story = html[html.index("The paper, again</h2>") : html.index("Detections</h2>")]
+    places = [story.index(f"<h3>{t}") for t in ("In numbers", "Both losses", "Circles", "Chip")]
+    assert places == sorted(places)
+    assert "cannot be drawn" not in story
+    assert ">4.3<" in story and ">0.5<" in story and ">-<" in story
+    assert story.count("<svg") == 2 and "<b>ours" not in story and "published: lower" in story
+    assert story.count("data:image/") == 2
+
+
+def test_maps_say_how_far_they_are_from_the_first(pipeline: Path) -> None:
+    html = page(gather(pipeline))
+    grid = np.linspace(0.1, 0.9, 12)
+    assert "against float" in html and ">1.000<" in html
+    assert f"{np.abs(grid - 0.5 * grid).mean():.4f}" in html
+    assert f"{2 * np.abs(grid - 0.5 * grid).mean():.4f}" in html
+    assert ">absent<" not in html  # an optional step, left out
+
+
+def test_a_figure_that_cannot_be_drawn_says_why_and_the_rest_is_shown(pipeline: Path) -> None:
+    (pipeline / "model/model.json").write_text("{")
+    (pipeline / "judged/circles.png").write_bytes(b"no picture")
+    (pipeline / "chip.mcap").write_bytes(b"no recording")
+    html = page(gather(pipeline))
+    story = html[html.index("The paper, again</h2>") :]
+    assert story.count("cannot be drawn") == 2 and "circles.png" in story
+    assert ">0.5<" in story
+
+
+def test_what_leads_out_of_the_folder_is_not_shown(pipeline: Path, tmp_path: Path) -> None:
+    secret = tmp_path / "secret.json"
+    secret.write_text('{"overall": "hidden words"}')
+    recipe = RECIPE.replace("judged/evaluation.json", str(secret)).replace(".nothing", "")
+    (pipeline / "recipe.toml").write_text(recipe)
+    assert "hidden words" not in page(gather(pipeline))
+
+
+def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> None:
+    (pipeline / "recipe.toml").write_text("[[figure]]\nshows = 3\n")
+    html = page(gather(pipeline))
+    assert "recipe.toml" in html[html.index("Not read</h2>") :]
+    assert "Detections</h2>" in html
