@@ -64,6 +64,7 @@ COMMANDS = {
     "merge": "Merge recordings into one, by time.",
     "trim": "Keep a stretch of a recording, or some of its topics.",
 }
+COMPLETION = "--install-completion"
 
 
 def bad_command_line(error: CycloptsError) -> Text:
@@ -105,6 +106,9 @@ app = App(
     error_console=Console(stderr=True, soft_wrap=True),  # one line, however narrow a pipe is
     suppress_keyboard_interrupt=False,  # main says what stands
 )
+app.register_install_completion_command(
+    name=COMPLETION, help="Have the shell (bash, zsh, fish) complete commands, flags and choices."
+)
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
     _module = _name.replace("-", "_")
     app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help, sort_key=_order)
@@ -120,6 +124,8 @@ def main() -> NoReturn:
     boundary.end_by_signals()
     name, *words = sys.argv[1:] or [""]
     wants_help = name in COMMANDS and not set(app.help_flags).isdisjoint(words)
+    if name == COMPLETION:
+        standins.install()  # every command is looked at, none is run
     raise SystemExit(boundary.status_of((lambda: help_of(name)) if wants_help else app))
 
 

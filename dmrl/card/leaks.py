@@ -1,0 +1,91 @@
+"""What a test split shares with train, counted from the columns: recordings, moments, poses."""
+
+from collections.abc import Iterator, Mapping
+from itertools import product
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from dmrl.border.names import code, markdown
+from dmrl.datasets import Split
+
+NEAR_S = 1.0
+"""Images of one camera that are closer than this look alike."""
+POSE = (1.0, 1.0, 0.01)
+"""Pixels, pixels and metres that make a pose the same."""
+
+
+def leaks(splits: Mapping[str, Split]) -> Iterator[str]:
+    """Lines of Markdown: for each split but train, what of it train has seen."""
+    train = splits.get("train")
+    for name, split in splits.items():
+        if name == "train" or train is None or not len(split):
+            continue
+        shared = sorted(set(_texts(split, "source")) & set(_texts(train, "source")))
+        place = ", ".join(map(code, shared)) or "no recording"
+        yield (
+            f"- {markdown(name)} and train share {place}: places, light and backgrounds of one "
+            "recording are alike."
+        )
+        yield (
+            f"- {near_in_time(split, train)} of {len(split)} images of {markdown(name)} were taken "
+            f"within {NEAR_S:g} s of one in train, by the same camera."
+        )
+        shared_poses, poses = same_poses(split, train)
+        yield (
+            f"- {shared_poses} of {poses} labels of {markdown(name)} are within 1 px and 1 cm of "
+            "one in train."
+        )
+
+
+def _texts(split: Split, column: str) -> list[str]:
+    return list(pc.unique(split.table[column]).to_pylist())
+
+
+def near_in_time(split: Split, train: Split) -> int:
+    """Images of a split within a second of one in train, of the same recording and robot."""
+    count = 0
+    known = _times(train)
+    for who, times in _times(split).items():
+        others = known.get(who)
+        if others is not None:
+            at = np.searchsorted(others, times)
+            before = np.abs(times - others[np.maximum(at - 1, 0)])
+            after = np.abs(times - others[np.minimum(at, len(others) - 1)])
+            count += int((np.minimum(before, after) <= NEAR_S * 1e9).sum())
+    return count
+
+
+def _times(split: Split) -> dict[tuple[str, str], NDArray[np.int64]]:
+    """Ascending times by recording and robot."""
+    names = list(zip(*(split.table[c].to_pylist() for c in ("source", "robot")), strict=True))
+    times = split.table["log_time"].to_numpy()
+    rows: dict[tuple[str, str], list[int]] = {}
+    for row, who in enumerate(names):
+        rows.setdefault(who, []).append(row)
+    return {who: np.sort(times[mine]) for who, mine in rows.items()}
+
+
+def same_poses(split: Split, train: Split) -> tuple[int, int]:
+    """Labels of a split whose pixel and depth one in train has too, and all of its labels."""
+    mine, theirs = _values(split), _values(train)
+    seen = np.zeros(len(mine), bool)
+    # Two of a pose may fall on two sides of an edge: edges half a step away are looked at, too.
+    for shift in product((0.0, 0.5), repeat=3):
+        known, asked = (_boxes(values, shift) for values in (theirs, mine))
+        seen |= np.isin(asked, known)
+    return int(seen.sum()), len(mine)
+
+
+def _boxes(values: NDArray[np.float64], shift: tuple[float, ...]) -> NDArray[np.str_]:
+    """Names of the boxes of a grid of poses that values lie in."""
+    boxes = np.floor(values / POSE + shift).astype(np.int64)
+    return np.array([f"{u} {v} {depth}" for u, v, depth in boxes.tolist()], np.str_)
+
+
+def _values(split: Split) -> NDArray[np.float64]:
+    """(M, 3) u, v and depth of all labels."""
+    flat = pa.chunked_array(split.table["peers"]).combine_chunks().flatten()
+    return np.column_stack([pc.struct_field(flat, n) for n in ("u_px", "v_px", "depth_m")])

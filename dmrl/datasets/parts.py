@@ -1,0 +1,57 @@
+"""Recordings as the parts of a dataset: of which split each is."""
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from dmrl.datasets.inputs import refuse_twins
+from dmrl.datasets.splits import SplitOf, held_out, of_source
+from dmrl.errors import SettingError
+from dmrl.recording import Provenance, splits, summary
+
+
+def splits_of(
+    recordings: Sequence[Path],
+    made: Provenance,
+    *,
+    split: str,
+    val: str,
+    test_share: float,
+    seed: int,
+) -> dict[Path, SplitOf]:
+    """Split of every log time of each recording.
+
+    Parameters
+    ----------
+    recordings
+        Those of a dataset.
+    made
+        Its provenance, whose first inputs they are.
+    split, val, test_share, seed
+        As ``dmrl dataset`` has them.
+
+    Raises
+    ------
+    SettingError
+        If two share a name or their content, one is made from another, or none is named ``val``.
+    RecordingError
+        If what a recording says of its split cannot be understood.
+    """
+    hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=False)}
+    refuse_twins(recordings, made)
+    watched = [path for path in recordings if fnmatchcase(path.name, val)]
+    if val and not watched:
+        names = ", ".join(path.name for path in recordings)
+        raise SettingError(f"--val {val} fits none of {names}. Give another pattern")
+    learnt = [path for path in recordings if path not in watched]
+    own = {path: splits(path, summary(path)) for path in learnt if split == "auto"}
+    by_source = {path: parts for path, parts in own.items() if parts}
+    whole = {path: hashes[path] for path in learnt if path not in by_source}
+    test = held_out(whole, 0.0 if split == "none" else test_share, seed)
+    named = {path: _constant("test" if path in test else "train") for path in whole}
+    named |= {path: of_source(path, parts) for path, parts in by_source.items()}
+    return named | {path: _constant("val") for path in watched}
+
+
+def _constant(name: str) -> SplitOf:
+    return lambda time_ns: name

@@ -1,0 +1,56 @@
+"""Flags: a CSV file of images that are left out."""
+
+from pathlib import Path
+
+import pytest
+
+from dmrl.datasets.flags import read_flags
+from dmrl.errors import SettingError
+from dmrl.stages.dataset import Settings, run
+
+from .conftest import Record
+
+HEAD = "source,robot,log_time\n"
+
+
+def flags(folder: Path, text: str) -> Path:
+    path = folder / "flags.csv"
+    path.write_text(text)
+    return path
+
+
+def test_flags_are_read_with_reasons_or_without(tmp_path: Path) -> None:
+    text = "log_time,reason,robot,source\n5,blurred,cf1,a.mcap\n5,,cf1,a.mcap\n"
+    assert read_flags(flags(tmp_path, text)) == {("a.mcap", "cf1", 5)}
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("source,robot\n", "flags.csv:1: no column log_time"),
+        (HEAD.replace("robot", "robot,colour"), "flags.csv:1: column 'colour'"),
+        (HEAD + "a.mcap,cf1,1.5\n", "flags.csv:2: '1.5' is no time"),
+        (HEAD + "a.mcap,,1\n", "flags.csv:2: not a source, robot, log_time"),
+        (HEAD + "a.mcap,cf1,1,2\n", "flags.csv:2: not a source, robot, log_time"),
+        (HEAD + '"a.mcap,cf1', "flags.csv is not a CSV file"),
+        ("", "flags.csv:1: no column source"),
+    ],
+)
+def test_what_is_no_flag_is_named_by_its_line(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(SettingError, match=says):
+        read_flags(flags(tmp_path, text))
+
+
+def test_a_file_that_is_not_there_is_one_line(record: Record, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"no file .*none\.csv"):
+        run([record()], tmp_path / "out", Settings(without=tmp_path / "none.csv"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_flags_that_name_no_image_are_said(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = flags(tmp_path, HEAD + "flight.mcap,cf1,0\nflight.mcap,cf9,0\n")
+    made = run([record()], tmp_path / "out", Settings(split="none", without=path))
+    assert made.images == {"train": 5}
+    assert "1 of 2 flags name no image here" in capsys.readouterr().err

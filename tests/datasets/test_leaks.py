@@ -1,0 +1,77 @@
+"""What a test split shares with train: pictures that look alike, moments, poses, recordings."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageFilter
+
+from dmrl.card.leaks import near_in_time, same_poses
+from dmrl.datasets import open_dataset
+from dmrl.datasets.twins import NEAR_BITS, perceptual_hash
+from dmrl.stages.dataset import Settings, run
+
+from .conftest import Record, peer
+
+
+def scene(seed: int) -> Image.Image:
+    """A photo's kind of picture: large smooth patches."""
+    rough = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), np.uint8)
+    return Image.fromarray(rough).resize((320, 224), Image.Resampling.BICUBIC)
+
+
+def apart(a: Image.Image, b: Image.Image) -> int:
+    return (perceptual_hash(np.asarray(a)) ^ perceptual_hash(np.asarray(b))).bit_count()
+
+
+def test_the_same_picture_brighter_noisier_or_smaller_looks_the_same() -> None:
+    for seed in range(20):
+        picture = scene(seed)
+        noise = np.random.default_rng(seed).normal(0, 4, (224, 320, 3))
+        noisy = Image.fromarray(np.clip(np.asarray(picture) * 0.8 + noise, 0, 255).astype(np.uint8))
+        assert apart(picture, noisy) <= NEAR_BITS
+        assert apart(picture, picture.filter(ImageFilter.GaussianBlur(2))) <= NEAR_BITS
+        assert apart(picture, picture.resize((160, 112))) <= NEAR_BITS
+
+
+def test_a_small_drone_before_the_same_background_looks_the_same_and_another_place_does_not() -> (
+    None
+):
+    for seed in range(20):
+        picture, moved = scene(seed), np.asarray(scene(seed)).copy()
+        moved[100:112, 200:216] = 10
+        assert apart(picture, Image.fromarray(moved)) <= NEAR_BITS
+        assert apart(picture, scene(seed + 100)) > 2 * NEAR_BITS
+
+
+def test_test_images_that_look_like_one_in_train_are_counted(
+    record: Record, tmp_path: Path
+) -> None:
+    path = record(split={"train": "[[0, 250000000]]", "test": "[[300000000, 600000000]]"}, seed=3)
+    twin = record("twin.mcap", split={"test": "[[0, 600000000]]"}, seed=3)
+    run([path, twin], tmp_path / "out", Settings())
+    text = (tmp_path / "out" / "README.md").read_text()
+    assert "3 images of a test split have the pixels of one in train, 3 look" in text
+
+
+def test_moments_and_poses_that_train_has_too_are_counted(record: Record, tmp_path: Path) -> None:
+    spans = {"train": "[[0, 50000000]]", "test": "[[100000000, 600000000]]"}
+    poses = [[peer(u_px=20.49)], [peer(u_px=20.51)], [peer(u_px=22.0)], [peer(depth_m=1.7)]]
+    path = record(peers=poses, split=spans)
+    run([path], tmp_path / "out", Settings())
+    opened = open_dataset(tmp_path / "out")
+    train, test = opened.split("train"), opened.split("test")
+    assert near_in_time(test, train) == 3
+    assert same_poses(test, train) == (1, 3)
+    text = (tmp_path / "out" / "README.md").read_text()
+    assert "test and train share `flight.mcap`" in text
+    assert "3 of 3 images of test were taken within 1 s" in text
+    assert "1 of 3 labels of test are within 1 px and 1 cm" in text
+
+
+def test_recordings_apart_share_nothing(record: Record, tmp_path: Path) -> None:
+    one = record(split={"train": "[[0, 900000000]]"})
+    other = record("other.mcap", [[peer(u_px=50.0)]], seed=1, split={"test": "[[0, 900000000]]"})
+    run([one, other], tmp_path / "out", Settings())
+    text = (tmp_path / "out" / "README.md").read_text()
+    assert "test and train share no recording" in text
+    assert "0 of 1 images of test were taken" in text and "0 of 1 labels of test are" in text
