@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help bench demo test test-all test-faults mutants check format lint types imports spell schemas docs site examples layout clean
+.PHONY: help bench demo test test-all test-faults mutants check format lint types imports spell schemas docs site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -68,6 +68,9 @@ site: $(VENV)/.dev ## Build the pages of docs/ as a site: build/site/index.html.
 
 examples: $(VENV)/.dev ## Run the examples, scripts and notebooks.
 	$(PYTEST) -m "slow or not slow" --timeout 900 tests/test_examples.py $(ARGS)
+
+wheels: $(VENV)/.dev ## Build wheel and sdist, check them, install them clean, work with them.
+	.ci/wheels
 
 clean: ## Remove what was built, .venv and demo/ as well.
 	rm -rf $(VENV) build demo *.egg-info

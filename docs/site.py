@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = {
     "README.md": "readme.md",
     "SECURITY.md": "security.md",
+    "CONTRIBUTING.md": "contributing.md",
     "examples/README.md": "examples.md",
     "dmrl/learn/pretrained/dmrl-nano/README.md": "networks/dmrl-nano.md",
 }

@@ -12,7 +12,12 @@ from dmrl.cli import COMMANDS, app
 from dmrl.estimation.gate import EXPECTED_SHARE
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted(ROOT.glob("docs/*.md")),
+]
 HAND_WRITTEN = [page for page in PAGES if page.name != "commands.md"]
 RECIPES = sorted(ROOT.glob("recipes/*.toml"))
 
@@ -137,6 +142,63 @@ def test_the_page_on_python_runs_as_it_stands(
     assert "/cf1/labels dmrl.v1.PeerLabels 20\n" in said
     assert "16 (16, 28, 40)\n" in said
     assert "torch.Size([8, 3, 224, 320]) torch.Size([8, 28, 40])" in said
+
+
+STOP = re.compile(r"dmrl (view|render|train dataset model$)")
+"""Needs a window, Blender, or long; a test of its own runs each."""
+
+
+def blocks(page: Path, until: str | None) -> list[tuple[str, str]]:
+    """Shell and Python blocks of a page, in order; until a heading."""
+    text = page.read_text(encoding="utf-8")
+    text = text if until is None else text[: text.index(until)]
+    return re.findall(r"```(sh|python)\n(.*?)```", text, re.DOTALL)
+
+
+def walk(page: Path, until: str | None = None) -> None:
+    """Do what a page says, word for word, in the folder we are in."""
+    names: dict[str, object] = {}
+    for kind, block in blocks(page, until):
+        if kind == "python":
+            exec(block, names)
+            continue
+        for line in re.findall(r"^(dmrl .*)", block.replace("\\\n", " "), re.MULTILINE):
+            if not STOP.match(line):
+                app(shlex.split(line, comments=True)[1:], result_action="return_value")
+
+
+@pytest.mark.parametrize(
+    ("name", "until", "said"),
+    [
+        ("own_network.md", None, "seen.mcap"),
+        ("own_robot.md", None, "AMBIGUOUS"),
+        ("own_camera.md", "## 4.", "focal_px"),
+    ],
+)
+def test_a_page_can_be_walked_word_for_word(
+    name: str,
+    until: str | None,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name == "own_camera.md":  # the folder of pictures that the page says how to draw
+        app(["sketch", "shots", "--images", "12"], result_action="return_value")
+    walk(ROOT / "docs" / name, until)
+    assert said in capsys.readouterr().out
+
+
+def test_the_page_on_errors_has_words_of_the_errors() -> None:
+    page = (ROOT / "docs/faq.md").read_text(encoding="utf-8")
+    quoted = [h for h in re.findall(r"^## (.*)", page, re.MULTILINE) if h[0].islower()]
+    sources = "".join(p.read_text(encoding="utf-8") for p in ROOT.glob("dmrl/**/*.py"))
+    sources += "".join(p.read_text(encoding="utf-8") for p in ROOT.glob("viewer/*.py"))
+    joined = re.sub(r'"\s*f?"', "", sources)
+    parts = {part.strip() for heading in quoted for part in heading.split("...") if part.strip()}
+    assert len(quoted) >= 8
+    assert [part for part in parts if part.replace("'", "'") not in joined] == []
 
 
 def test_the_two_set_up_commands_are_targets_of_make() -> None:

@@ -97,7 +97,7 @@ def page(name: str, ranked: Ranked) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{_text(name)}</title><style>{STYLE}</style></head><body><header>"
         f"<b>{_text(name)}</b>: {len(ranked.rows)}{more} rows. Click those that are bad, "
-        "<output>0</output> marked: <button>save flags.csv</button> then "
+        "<output></output> marked: <button>save flags.csv</button> then "
         f"<code>dmrl dataset ... --without flags.csv</code></header><main>{cells}</main>"
         f"<script>{SCRIPT}</script></body></html>\n"
     )

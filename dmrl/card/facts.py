@@ -8,6 +8,7 @@ from typing import Any
 
 from dmrl.border.documents import parse_json
 from dmrl.border.names import code, markdown
+from dmrl.datasets.twins import NEAR_BITS
 from dmrl.errors import DatasetError
 
 FILE = "facts.json"
@@ -136,7 +137,7 @@ def told(facts: Facts) -> Iterator[str]:
     yield (
         f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train, "
         f"{facts.near or 'none'} look like one in train: their perceptual hashes (64 bits) differ "
-        "in 4 at most, as those of pictures before one background do."
+        f"in {NEAR_BITS} at most, as those of pictures before one background do."
     )
     for name, licence in sorted(facts.licences.items()):
         yield f"- Licence beside {code(name)}: {markdown(licence)}."

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dmrl.datasets.write import Row
 
-NEAR_BITS = 4
+NEAR_BITS = 6
 """Of the 64 of a perceptual hash: pictures that differ in no more look the same to people."""
 AT_ONCE = 64
 

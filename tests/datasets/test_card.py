@@ -274,7 +274,7 @@ def test_the_hub_reads_the_front_matter(built: Path) -> None:
 
 def test_it_says_what_limits_it_and_what_it_was_taken_with(built: Path, tmp_path: Path) -> None:
     text = (built / "README.md").read_text()
-    assert "- 1 of 5 images show nobody" in text and "No image shows more than 2." in text
+    assert "- 2 of 5 images show nobody" in text and "No image shows more than 2." in text
     assert "- Labels by status: OK 5." in text
     assert "- No recording has the calibration of a camera." in text
     flight = dmrl.fly(tmp_path / "f.mcap", duration_s=4.0, camera=True, camera_rate_hz=1.0)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.datasets.flags import read_flags
-from dmrl.errors import SettingError
+from dmrl.errors import DmrlError, SettingError
 from dmrl.stages.dataset import Settings, run
 
 from .conftest import Record
@@ -42,7 +42,7 @@ def test_what_is_no_flag_is_named_by_its_line(tmp_path: Path, text: str, says: s
 
 
 def test_a_file_that_is_not_there_is_one_line(record: Record, tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=r"no file .*none\.csv"):
+    with pytest.raises(DmrlError, match=r"no file .*none\.csv"):
         run([record()], tmp_path / "out", Settings(without=tmp_path / "none.csv"))
     assert not (tmp_path / "out").exists()
 
