@@ -171,7 +171,7 @@ def walk(page: Path, until: str | None = None) -> None:
     ("name", "until", "said"),
     [
         ("own_network.md", None, "seen.mcap"),
-        ("own_robot.md", None, "AMBIGUOUS"),
+        ("own_robot.md", None, "positions are OK"),
         ("own_camera.md", "## 4.", "focal_px"),
     ],
 )

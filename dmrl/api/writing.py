@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,24 @@ from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance
 from dmrl.samples import sample
+
+
+@runtime_checkable
+class HasFields(Protocol):
+    """A message, as recordings give them."""
+
+    DESCRIPTOR: Any
+
+    def SerializeToString(self) -> bytes:  # noqa: N802 - protobuf's name
+        """Its bytes."""
+
+
+def _as_it_is(given: HasFields, kind: str) -> Any:
+    """The same message; TypeError if it is of another kind."""
+    wanted = message(kind)
+    if given.DESCRIPTOR.full_name != wanted.DESCRIPTOR.full_name:
+        raise TypeError(f"not a {given.DESCRIPTOR.full_name}")
+    return wanted.FromString(given.SerializeToString())
 
 
 class Writer:
@@ -39,7 +57,7 @@ class Writer:
         self.path = Path(path)
         self._sink = RecordingWriter(self.path, provenance("python", dict(settings)))
 
-    def write(self, topic: str, time_s: float, fields: Mapping[str, Any]) -> None:
+    def write(self, topic: str, time_s: float, fields: Mapping[str, Any] | HasFields) -> None:
         """Append a message. Times need not increase.
 
         Parameters
@@ -50,7 +68,7 @@ class Writer:
             The sensor's time, seconds.
         fields
             Of the message, as in its schema: ``{"height_m": 0.4}``. A message within is a
-            mapping, a repeated one a list of mappings.
+            mapping, a repeated one a list of mappings. Or a message of another recording, as it is.
 
         Raises
         ------
@@ -59,7 +77,10 @@ class Writer:
         """
         kind = _message_of(topic)
         try:
-            made = message(kind)(**fields)
+            if isinstance(fields, HasFields):
+                made = _as_it_is(fields, kind)
+            else:
+                made = message(kind)(**fields)
         except (TypeError, ValueError) as e:
             raise RecordingError(
                 f"{self.path}: {topic} carries {kind}: {e}. Mend its fields"

@@ -53,3 +53,16 @@ def test_wrong_topics_fields_and_lengths_are_said(tmp_path: Path) -> None:
             out.image("a", 0.0, np.zeros((4, 4, 4), np.uint8))
     with pytest.raises(OutputError, match="exists"):
         dmrl.writer(tmp_path / "own.mcap")
+
+
+def test_a_message_of_another_recording_is_written_as_it_is(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "a.mcap") as out:
+        peers = [{"peer": "cf2", "u_px": 3.5, "source": "truth"}]
+        out.write("/cf1/labels", 0.5, {"peers": peers})
+    (first,) = dmrl.open(tmp_path / "a.mcap").messages("/cf1/labels")
+    with dmrl.writer(tmp_path / "b.mcap") as out:
+        out.write("/cf1/labels", 0.5, first.message)
+        with pytest.raises(RecordingError, match=r"not a dmrl\.v1\.PeerLabels"):
+            out.write("/cf1/height", 0.5, first.message)
+    (again,) = dmrl.open(tmp_path / "b.mcap").messages("/cf1/labels")
+    assert again.message.SerializeToString() == first.message.SerializeToString()
