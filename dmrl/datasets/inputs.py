@@ -1,10 +1,16 @@
-"""Recordings that may not be put into one dataset: an image in train would be in test too."""
+"""Recordings that should not be put into one dataset: for their images, or for their lenses."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
+from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.recording import Input, Provenance
+from dmrl.recording import Contents, Input, Provenance
+from dmrl.terminal.progress import say
+
+SAME_LENS = 1.05
+"""Most that the focal lengths of one dataset may differ by without a word, a ratio."""
 
 
 def refuse_twins(recordings: Sequence[Path], made: Provenance) -> None:
@@ -48,3 +54,19 @@ def _shown_by(recording: Input) -> Iterator[str]:
         for source in made.inputs:
             yield source.sha256
             yield from _shown_by(source)
+
+
+def warn_of_lenses(held: Iterable[Contents]) -> None:
+    """Say so if the cameras differ: from the size of a drone alone its depth is not known then."""
+    focal_px = []
+    for one in held:
+        for topic in one.topics:
+            if topics.names(topics.CALIBRATION, topic):
+                first = (stamped.message.K for stamped in islice(one.messages(topic), 1))
+                focal_px += [k[0] for k in first if len(k) == 9 and k[0] > 0]
+    if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
+        say(
+            f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "
+            "a drone looks larger through the longer one, and a network takes it for nearer. Make "
+            "one dataset for each"
+        )

@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,6 +15,7 @@ from dmrl.card.facts import Facts
 from dmrl.card.front import check_license
 from dmrl.card.sensors import cameras_of, sensors_of
 from dmrl.datasets.flags import read_flags
+from dmrl.datasets.inputs import warn_of_lenses
 from dmrl.datasets.parts import splits_of
 from dmrl.datasets.rows import (
     Tally,
@@ -48,10 +48,6 @@ from dmrl.terminal.tables import print_json, print_line, print_table
 
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
 Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
-
-
-SAME_LENS = 1.05
-"""Most that the focal lengths of one dataset may differ by without a word, a ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +159,7 @@ def run(
             test_share=settings.test_share,
             seed=settings.seed,
         )
-        _warn_of_lenses(held.values())
+        warn_of_lenses(held.values())
         tally = Tally()
         twins = Twins()
         images = write_dataset(
@@ -227,22 +223,6 @@ def _beside(held: Mapping[Path, Contents], sources: Mapping[Path, str]) -> dict[
             other = "estimate" if used == "truth" else "truth"
             say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
     return {name: others for name, others in found.items() if others}
-
-
-def _warn_of_lenses(held: Iterable[Contents]) -> None:
-    """Say so if the cameras differ: from the size of a drone alone its depth is not known then."""
-    focal_px = []
-    for one in held:
-        for topic in one.topics:
-            if topics.names(topics.CALIBRATION, topic):
-                first = (stamped.message.K for stamped in islice(one.messages(topic), 1))
-                focal_px += [k[0] for k in first if len(k) == 9 and k[0] > 0]
-    if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
-        say(
-            f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "
-            "a drone looks larger through the longer one, and a network takes it for nearer. Make "
-            "one dataset for each"
-        )
 
 
 def _rows(
