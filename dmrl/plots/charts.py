@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.plots.style import STYLE, Figure, MaxNLocator, mpl
+from dmrl.plots.style import STYLE, Figure, MaxNLocator, mpl, plain_numbers
 
 Array = NDArray[np.float64]
 
@@ -28,6 +28,8 @@ THEME = STYLE | {
     "axes.prop_cycle": f"cycler(color={LINES})",
 }
 SIZE_INCHES = (4.8, 3.6)
+SHORT = 28
+"""Letters of names that stand two in a row."""
 
 
 @contextmanager
@@ -47,8 +49,12 @@ def _chart(size: tuple[float, float] = SIZE_INCHES) -> Iterator[tuple[Figure, li
 
 
 def _legend(axes: Any) -> None:
-    if len(axes.get_legend_handles_labels()[1]) > 1:
-        axes.legend(fontsize=8, frameon=False)
+    """Below the axes, where it covers no curve; nothing for a single one."""
+    handles, names = axes.get_legend_handles_labels()
+    if len(names) > 1:
+        columns = 2 if max(map(len, names)) < SHORT else 1
+        how = {"fontsize": 8, "frameon": False, "ncols": columns}
+        axes.figure.legend(handles, names, loc="outside lower left", **how)
 
 
 def losses(histories: Mapping[str, Sequence[float]], words: str = "loss") -> str:
@@ -58,6 +64,7 @@ def losses(histories: Mapping[str, Sequence[float]], words: str = "loss") -> str
         for name, values in histories.items():
             axes.plot(range(1, len(values) + 1), values, label=name)
         axes.set(xlabel="epoch", ylabel=words, yscale="log")
+        plain_numbers(axes.yaxis)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.25)
         _legend(axes)

@@ -27,6 +27,7 @@ def depth_histogram(depth_m: Mapping[str, NDArray[np.float64]], stem: Path) -> N
         names = [f"{split} ({len(values)})" for split, values in depth_m.items()]
         axes.hist(list(depth_m.values()), edges, stacked=True, label=names)
         axes.set(xlabel="depth along the optical axis, m", ylabel="peers")
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_title("Depth of the peers")
         axes.grid(axis="y", alpha=0.3)
         figure.legend(title="split (peers)", loc="outside right upper")
@@ -84,6 +85,7 @@ def peers_per_image(counts: Mapping[str, NDArray[np.int64]], stem: Path) -> None
             axes.bar(np.arange(most + 1), images, bottom=bottom, label=f"{split} ({values.size})")
             bottom += images
         axes.set(xlabel="peers inside the image", ylabel="images", xticks=range(most + 1))
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_title("Peers per image")
         axes.grid(axis="y", alpha=0.3)
         figure.legend(title="split (images)", loc="outside right upper")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, mpl, save
+from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, mpl, plain_numbers, save
 
 
 def error_violins(
@@ -94,7 +94,9 @@ def error_trace(
         axes.set_ylim(-1.2 * max(0.3, float(limit)), 1.2 * max(0.3, float(limit)))
         axes.set_xlabel("time, s")
         figure.axes[0].set_title(title)
-        figure.axes[0].legend(loc="upper right", fontsize=8, markerscale=4)
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        how = {"fontsize": 8, "markerscale": 4, "frameon": False, "ncols": 4}
+        figure.legend(handles, names, loc="outside lower center", **how)
     save(figure, stem)
 
 
@@ -133,6 +135,7 @@ def error_by_distance(
             axes.stairs(medians, edges, color="black", baseline=None, linewidth=2, label="median")
             axes.grid(alpha=0.3)
         pixels.set(yscale="log", ylabel="pixel error, px", title=f"{found.sum()} labels")
+        plain_numbers(pixels.yaxis)
         for radius_px in (8, 20):
             pixels.axhline(radius_px, color="grey", linestyle=":", linewidth=1)
             pixels.annotate(
@@ -141,7 +144,9 @@ def error_by_distance(
         metres.axhline(0, color="grey", linewidth=0.8)
         metres.set(ylabel="depth error, m\n(label minus detection)", xlabel="depth of the label, m")
         metres.set_xlim(left=0)
-        metres.legend(loc="best", fontsize=9)
+        handles, names = metres.get_legend_handles_labels()
+        how = {"fontsize": 9, "frameon": False, "ncols": 2}
+        figure.legend(handles, names, loc="outside lower center", **how)
     save(figure, stem)
 
 

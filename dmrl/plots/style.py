@@ -33,11 +33,20 @@ try:
         import matplotlib as mpl
         from matplotlib.figure import Figure
         from matplotlib.patheffects import withStroke
-        from matplotlib.ticker import MaxNLocator
+        from matplotlib.ticker import LogFormatter, MaxNLocator
 except ImportError as e:
     raise MissingExtra("matplotlib", "plot", "a figure") from e
 
-__all__ = ["SIZE_INCHES", "STYLE", "Figure", "MaxNLocator", "mpl", "save", "withStroke"]
+__all__ = [
+    "SIZE_INCHES",
+    "STYLE",
+    "Figure",
+    "MaxNLocator",
+    "mpl",
+    "plain_numbers",
+    "save",
+    "withStroke",
+]
 
 # Equal input gives equal bytes: no date, no version, no random ids.
 STYLE: dict[Any, Any] = {
@@ -50,6 +59,19 @@ STYLE: dict[Any, Any] = {
 }
 METADATA = {".png": {"Software": None}, ".svg": {"Date": None, "Creator": None}}
 SIZE_INCHES = (6.0, 3.6)
+
+
+class _Plain(LogFormatter):  # type: ignore[misc]
+    """The same choice of numbers, each as a person writes it."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
+def plain_numbers(axis: Any) -> None:
+    """Numbers of a logarithmic axis as plain text: formulas are not drawn, see `STYLE`."""
+    axis.set_major_formatter(_Plain())
+    axis.set_minor_formatter(_Plain(minor_thresholds=(1.5, 0.5)))
 
 
 def save(figure: Figure, stem: Path) -> None:

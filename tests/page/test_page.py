@@ -13,6 +13,7 @@ import pytest
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.page import gather, page, write
+from dmrl.plots import charts
 
 Evaluation = Callable[..., dict[str, Any]]
 
@@ -130,3 +131,10 @@ def test_a_folder_with_nothing_to_tell_of_is_an_error(tmp_path: Path) -> None:
         write(tmp_path)
     with pytest.raises(SettingError, match="no folder"):
         write(tmp_path / "none")
+
+
+def test_numbers_of_logarithmic_axes_are_no_formulas_and_legends_cover_no_curve() -> None:
+    svg = charts.losses({"one": [2.0, 0.5, 0.05], "two": [1.0, 0.1, 0.02]})
+    assert "mathdefault" not in svg and ">0.1<" in svg and ">1<" in svg
+    legend = svg.index('id="legend_1"')
+    assert svg.rindex('id="axes_1"') < legend and svg.count('id="legend_') == 1
