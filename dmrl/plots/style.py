@@ -61,7 +61,7 @@ METADATA = {".png": {"Software": None}, ".svg": {"Date": None, "Creator": None}}
 SIZE_INCHES = (6.0, 3.6)
 
 
-class _Plain(LogFormatter):  # type: ignore[misc]
+class _Plain(LogFormatter):
     """The same choice of numbers, each as a person writes it."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
