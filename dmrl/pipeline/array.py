@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Protocol
 
 from dmrl.border.names import one_line
+from dmrl.errors import SettingError
 from dmrl.output import rewritten_file
 from dmrl.pipeline.crew import ONE_THREAD
 from dmrl.pipeline.job import failed
 from dmrl.pipeline.work import perform
+from dmrl.storage import Remote
 
 MOST = 1000
 """Elements of an array: Slurm takes 1,001 unless told. With more tasks, each does some."""
@@ -52,7 +54,11 @@ def array_job(tasks: Sequence[Line], out: Path) -> str:
     ------
     OutputError
         If the job cannot be written.
+    SettingError
+        If the outputs go into a bucket.
     """
+    if isinstance(out, Remote):
+        raise SettingError(f"Slurm's nodes read their tasks beside {out}. Name a folder they share")
     lines, script = out / ".dmrl-tasks.jsonl", out / ".dmrl-job.sh"
     elements = min(len(tasks), MOST)
     text = SCRIPT.format(

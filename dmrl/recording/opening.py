@@ -66,7 +66,7 @@ class Bounded(io.BufferedReader):
         """
         if size is not None and size > self.size - self.tell():
             raise McapError(f"a record at byte {self.tell()} runs beyond the end")
-        if self.ranged is not None and size is not None and size > io.DEFAULT_BUFFER_SIZE:
+        if self.ranged is not None and size and self.ranged.suits(self.tell(), size):
             data = self.ranged.fetch(self.tell(), size)
             self.seek(len(data), io.SEEK_CUR)
             return data

@@ -79,8 +79,10 @@ def _times_in_indexes(
     """Topic and log times of every message index, chunk by chunk; at last their CRC."""
     said = metadata_of(path, stream, summary).get(sums.METADATA_NAME)
     crc = 0
-    for chunk in sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset):
-        first = chunk.chunk_start_offset + chunk.chunk_length
+    chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
+    firsts = [chunk.chunk_start_offset + chunk.chunk_length for chunk in chunks]
+    stream.expect([(k, c.message_index_length) for k, c in zip(firsts, chunks, strict=True)])
+    for first, chunk in zip(firsts, chunks, strict=True):
         stream.seek(first)
         raw = stream.read(chunk.message_index_length)
         crc = zlib.crc32(raw, crc)

@@ -1,6 +1,6 @@
 """``dmrl label``: where every robot's peers are, from ranges and odometry, as labels."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
+from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite
@@ -72,6 +73,9 @@ class Settings:
         Known offset of every range, subtracted first: an antenna delay, 0.35 m for some.
     undistorted
         The images have no lens distortion any more, whatever the calibration says.
+    copy
+        With all that IN holds. --no-copy: the labels and positions alone, for which no picture is
+        read; dmrl merge puts them to the others.
     camera
         A robot's camera, with mount and delay, as dmrl calibrate wrote it: --camera.cf1 FILE.
     """
@@ -84,6 +88,7 @@ class Settings:
     pixel_std_px: Positive = 6.0
     range_offset_m: Annotated[float, Parameter(validator=validators.Number(gt=-60, lt=60))] = 0.0
     undistorted: bool = False
+    copy: bool = True
     camera: dict[str, Path] = field(default_factory=dict)
 
 
@@ -138,9 +143,12 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
         robot: list(label_messages(held, logs, robot, _of(positions, robot), look))
         for robot in filming
     }
+    if not settings.copy:
+        made = {robot: list(_own(messages)) for robot, messages in made.items()}
     series = [position_series(*pair, found) for pair, found in positions.items()]
     replaced = [topics.labels(robot) for robot in filming]
     replaced += [topic for topic in held.topics if topics.names(topics.POSITION, topic)]
+    replaced = replaced if settings.copy else list(held.topics)
     inputs = [recording, *settings.camera.values()]
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     rewrite(recording, out, origin, without=replaced, fresh=made.values(), series=series)
@@ -174,6 +182,14 @@ def _blind(held: Contents, filming: Iterable[str], cameras: Collection[str]) -> 
         for robot in filming
         if robot not in cameras and topics.calibration(robot) not in held.topics
     ]
+
+
+def _own(made: Iterable[Timed]) -> Iterator[Timed]:
+    """The labels made here, without those of other sources: these stay where they are."""
+    for labels in made:
+        if SOURCE in labels.message.sources:
+            found = [peer for peer in labels.message.peers if peer.source == SOURCE]
+            yield labels._replace(message=message("PeerLabels")(peers=found, sources=[SOURCE]))
 
 
 def _count(made: Iterable[Iterable[Timed]]) -> int:

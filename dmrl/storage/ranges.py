@@ -41,6 +41,12 @@ class Ranged(io.RawIOBase):
         """Say what will be read, in that order: then it is fetched some at a time."""
         self._expected, self._held = list(reversed(places)), {}
 
+    def suits(self, start: int, size: int) -> bool:
+        """Whether a place is best fetched as it is: it is large, or expected."""
+        place = start, size
+        expected = bool(self._expected) and self._expected[-1] == place
+        return size > io.DEFAULT_BUFFER_SIZE or place in self._held or expected
+
     def fetch(self, start: int, size: int) -> bytes:
         """Bytes from a place on; fewer at the end of the file."""
         size = max(0, min(size, self._size - start))

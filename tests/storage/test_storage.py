@@ -16,7 +16,10 @@ from dmrl.messages import message
 from dmrl.output import partial_file, partial_folder, rewritten_file
 from dmrl.pipeline import run as pipeline
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
+from dmrl.recording.blocks import place_of
 from dmrl.recording.inputs import input_of, sha256_of_file
+from dmrl.recording.opening import opened
+from dmrl.recording.section import section
 from dmrl.storage import Remote, path_of
 from dmrl.storage.remote import UNFINISHED
 
@@ -235,3 +238,44 @@ def test_what_is_wrong_with_a_bucket_is_one_line(
     assert "no server answers" in said(capsys, 1, "info", "s3://lab/a.mcap").err
     monkeypatch.undo()
     _forget()
+
+
+@pytest.mark.slow
+def test_label_reads_little_more_than_the_numbers(
+    lab: Any, tmp_path: Path, fetched: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "flight.mcap"
+    words = ("--duration-s", 30, "--seed", 1, "--camera")
+    said(capsys, 0, "fly", "fly_in_view", source, *words)
+    said(capsys, 0, "trim", source, "s3://lab/flight.mcap")  # an object that knows its hash
+    path = path_of("s3://lab/flight.mcap")
+    numbers, pictures = _sizes(path)
+    assert pictures > 3 * numbers
+    fetched.clear()
+    made = tmp_path / "labels.mcap"
+    said(capsys, 0, "label", path, made, "--no-copy")
+    assert sum(fetched) <= 1.2 * numbers, (sum(fetched), numbers, pictures)
+    said(capsys, 0, "label", path, tmp_path / "all.mcap")
+    topic = topics.labels("cf1")
+    ours = [m.peers for m in _estimates(tmp_path / "all.mcap", topic)]
+    assert ours == [m.peers for m in _estimates(made, topic)]
+
+
+def _estimates(path: Path, topic: str) -> Any:
+    for stamped in Contents(path, topics.LABELS).messages(topic):
+        others = [k for k, p in enumerate(stamped.message.peers) if p.source != "estimate"]
+        for k in reversed(others):
+            del stamped.message.peers[k]
+        yield stamped.message
+
+
+def _sizes(path: Path) -> tuple[int, int]:
+    """Bytes of the chunks of numbers and of those of pictures, as they lie in the file."""
+    sizes = [0, 0]
+    with opened(path) as stream:
+        found = section(path, stream)
+        assert found is not None
+        pictured = {n for n, c in found.channels.items() if "camera/image" in c.topic}
+        for chunk in found.chunk_indexes:
+            sizes[bool(pictured & chunk.message_index_offsets.keys())] += place_of(chunk)[1]
+    return sizes[0], sizes[1]
