@@ -2,7 +2,8 @@
 
 * DmrlError
   - OutputError       the output exists, cannot be written, or is another process's
-    + BusyOutput, FullDisk
+    + BusyOutput
+    + FullDisk
   - UnsafeName        a name from a file cannot become a path
   - RecordingError    the file cannot be read, or lacks what was asked of it
     + MissingTopic
