@@ -172,6 +172,14 @@ def test_events_that_come_together_are_told_apart(
     same(cfusdlog.decode(raw), raw)
 
 
+def test_events_that_always_follow_one_another_are_gathered_as_one() -> None:
+    events = [mixed_records.Event(k, "abc"[k], (("x", "H"),), "<u4") for k in range(3)]
+    order = [0, 1, 2] * mixed_records.SAMPLE
+    data = b"header" + b"".join(struct.pack("<HIH", k, 0, 0) for k in order)
+    (group,) = mixed_records._together(data, len(b"header"), events)
+    assert [event.number for event in group] == [0, 1, 2]
+
+
 def test_milliseconds_that_wrap_go_on() -> None:
     rows = [(1, (2**32 - 2 + k) % 2**32, (k,)) for k in range(5)]
     (block,) = cfusdlog.decode(plain_usd.encode({1: ("a", [("x", "H")])}, rows, 1)).blocks

@@ -78,6 +78,7 @@ def test_streamer_metadata_is_148_bytes_and_its_length_leaves_the_routing_out() 
     assert cpx.METADATA.size == 148
     data = pack_image(raw(10, 10, time_us=5, frame_id=1), "streamer")
     assert struct.unpack_from("<HBB", data) == (12 + 148 + 100, 0x63, 6)
+    assert struct.unpack_from("<BBI", data, 4) == (0x10, 1, 148 + 100)  # begins, an image
 
 
 def test_a_changed_byte_of_a_streamer_image_breaks_it_and_no_other() -> None:

@@ -171,6 +171,19 @@ def test_a_column_that_is_not_there_is_named(table: Path) -> None:
         samples(table.with_name("log.csv"), Options(columns=table))
 
 
+def test_ranges_that_cannot_be_are_counted_and_empty_cells_are_none(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = table.with_name("log.csv")
+    rows = [
+        f"{1020 + 10 * k};0;0;0;0;0;0;500;{range_mm};x" for k, range_mm in enumerate(["0", "9", ""])
+    ]
+    log.write_text(log.read_text() + "\n".join([*rows, "1050;0;0;0;0;0;0;500;70000;x"]) + "\n")
+    found = samples(log, Options(columns=table))["/cf1/range/cf2"]
+    assert [s.fields["range_m"] for s in found] == pytest.approx([1.5, 0.009])
+    assert "2 ranges to cf2 left out: not over 0 and under 60 m" in capsys.readouterr().err
+
+
 def test_units_that_cannot_be_are_doubted(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table.write_text(TABLE.replace('unit = "deg"', 'unit = "rad"'))
     samples(table.with_name("log.csv"), Options(columns=table))

@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.learn.batches import FIELDS
-from dmrl.learn.windows import Window, facing, flat, moved, sample, turned
+from dmrl.learn.windows import Window, facing, flat, moved, sample, through, turned
 
 CAMERA = (120.0, 118.0, 160.0, 100.0)
 WHOLE = (0, 0, 320, 224)
@@ -61,6 +61,12 @@ def test_what_is_behind_a_turned_camera_is_nowhere() -> None:
     matrix = turned(CAMERA, np.eye(2), np.array([318.0, 100]), np.array([0.0, 100]), np.zeros(2))
     got = moved(robots_at(away), Window(matrix, 1.0, CAMERA), WHOLE)
     assert np.isnan(got[0, :2]).all()
+
+
+def test_what_is_beside_the_camera_is_nowhere() -> None:
+    with np.errstate(all="raise"):
+        got = through(np.eye(3)[[0, 1, 0]], np.array([[0.0, 1.0], [2.0, 1.0]]))
+    assert np.isnan(got[0]).all() and got[1].tolist() == [1.0, 0.5]
 
 
 def test_pixels_go_where_labels_go() -> None:
