@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.formats.crazyflie_log import attitude_of, streams, yaw_rate_of
+from dmrl.formats.crazyflie_log import _pose, attitude_of, streams, yaw_rate_of
 from dmrl.formats.log_block import Block, Series, unpacked_quaternion
 from dmrl.geometry.frames import Array, camera_from_horizontal
 from dmrl.geometry.turns import euler_zyx, quaternion_zyx
@@ -117,4 +117,16 @@ def test_ranges_are_metres_and_fresh() -> None:
         ("/cf1/range/cf2", 20 * MS, 2.5),
         ("/cf1/range/anchor", 0, 1.5),
         ("/cf1/range/anchor", 20 * MS, 1.2),
+    ]
+
+
+def test_a_place_without_a_turn_is_level_and_looks_along_x() -> None:
+    place = Series(np.arange(3), np.arange(9.0).reshape(3, 3))
+    found = _pose(place, None)
+    assert found is not None and _pose(None, place) is None
+    assert found[0].tolist() == [0, 1, 2]
+    assert found[1].tolist() == [
+        [0, 1, 2, 0, 0, 0, 1],
+        [3, 4, 5, 0, 0, 0, 1],
+        [6, 7, 8, 0, 0, 0, 1],
     ]

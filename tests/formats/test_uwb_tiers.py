@@ -81,5 +81,6 @@ def test_arrays_of_strange_shapes_and_numbers_are_one_line(
 ) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, **arrays)
-    with pytest.raises(SourceError):
+    strange = np.ndim(arrays["uwb_range_1_2_np"]) != 1
+    with pytest.raises(SourceError, match="arrays of other shapes" if strange else None):
         uwb_tiers.content(path)
