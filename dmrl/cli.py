@@ -36,6 +36,7 @@ COMMANDS = {
     "demo": "Run the whole pipeline, small, on pictures that dmrl draws itself.",
     "run": "Run the steps of a pipeline recipe whose outputs are not up to date, side by side.",
     "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
+    "likeness": "Fit a render recipe to one's own frames, and show both beside each other.",
     "sketch": "Draw a folder of pictures of small drones, with exact labels.",
     "fly": "Simulate a flight of robots that measure themselves and each other.",
     "convert": "Convert a foreign file or folder into a recording, or a recording into files.",

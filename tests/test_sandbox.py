@@ -204,6 +204,7 @@ HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
     "demo": (("--out", "IN/bad.mcap"), ("--out", "IN/link")),
     "run": (("IN/each.toml", "--out", "OUT/run"), ("IN/link.toml", "--out", "OUT/run")),
     "render": (("IN/each.toml", "OUT/render.mcap"), ("IN/link", "OUT/render.mcap")),
+    "likeness": (("IN/pictures", "OUT/like.toml"), ("IN/bad.mcap", "OUT/like.toml")),
     "sketch": (("IN/link", "--images", "1"), ("OUT/sketch", "--images", "1")),
     "fly": (("IN/each.toml", "OUT/fly.mcap"),),
     "convert": (

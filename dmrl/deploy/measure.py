@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c import c_name
+from dmrl.deploy.c import L1_FOR_STATE, c_name
 from dmrl.deploy.c.text import fill
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.targets import RISCV_FLAGS, Build
@@ -121,7 +121,12 @@ def _instructions(
     return counts[1] - counts[0]
 
 
-def rates(network: IntegerNetwork, found: Cost | None) -> list[tuple[float, str]]:
+def fits_l1(state: int) -> bool:
+    """Whether a state of so many bytes fits a GAP8's L1, the cores' stacks beside it."""
+    return state <= L1_FOR_STATE
+
+
+def rates(network: IntegerNetwork, found: Cost | None, state: int) -> list[tuple[float, str]]:
     """Estimated images a second on a GAP8, each with what it assumes.
 
     Parameters
@@ -130,21 +135,26 @@ def rates(network: IntegerNetwork, found: Cost | None) -> list[tuple[float, str]
         The network.
     found
         Its cost, if known.
+    state
+        Bytes of RAM that the C keeps.
     """
     out = []
+    memory = "no waiting for memory"
+    if not fits_l1(state):
+        memory += f", though {state:,} bytes of state do not fit the L1 and lie in L2"
     if found and found.instructions:
         out.append(
             (
                 CLUSTER_HZ / found.instructions,
                 f"this C on one of the cluster's 8 cores at {CLUSTER_HZ / 1e6:.0f} MHz, one "
-                "rv32imc instruction a cycle, no waiting for memory",
+                f"rv32imc instruction a cycle, {memory}",
             )
         )
     out.append(
         (
             CLUSTER_HZ * KERNEL_MACS / network.macs,
             f"hand-written 8-bit SIMD kernels (not exported) on all 8 cores at "
-            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS} multiply-accumulates a cycle",
+            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS} multiply-accumulates a cycle, {memory}",
         )
     )
     return out

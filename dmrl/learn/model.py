@@ -130,6 +130,24 @@ def weights_of(network: Network) -> dict[str, Tensor]:
     }
 
 
+def mixed(network: Network, first: dict[str, Tensor], share: float) -> None:
+    """Bring a network's weights towards others by a share of the way, in place.
+
+    Parameters
+    ----------
+    network
+        Changed in place.
+    first
+        By the names of ``weights_of``, of the same shapes.
+    share
+        0: nothing changes; 1: the others.
+    """
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if name in first and value.is_floating_point():
+                value.lerp_(first[name].to(value.device), share)
+
+
 def with_channels(known: Network, network: Network) -> dict[str, Tensor]:
     """Weights of a known network for one that may have other channels on top of the same body.
 

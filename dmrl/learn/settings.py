@@ -58,6 +58,9 @@ class FitSettings(LossSettings):
     false_alarms
         Detections at or above the threshold in an image without a robot, on average, at most:
         of the images held out, where at least 20 of them have none.
+    init_share
+        Share of the weights that a training starts from in those that are kept, 0 to 1: what was
+        known before is forgotten less (Wortsman et al. 2022). 0: the trained ones alone.
     hard_share
         Share of an epoch that is images without a robot, those first that the network believes
         to hold one: each as often as the square of its greatest confidence. They are looked at
@@ -118,6 +121,7 @@ class FitSettings(LossSettings):
     validation_share: float = 0.1
     threshold: float | None = None
     false_alarms: float = 0.05
+    init_share: float = 0.0
     hard_share: float = 0.0
     flip_share: float = 0.5
     zoom: tuple[float, float] = (0.6, 1.6)
@@ -183,6 +187,7 @@ class FitSettings(LossSettings):
 SHARES = (
     *("validation_share", "threshold", "flip_share", "mosaic_share"),
     *("blur_share", "colour", "noise", "distill_share", "grey_share", "hard_share"),
+    "init_share",
 )
 AT_LEAST_ONE = ("epochs", "batch_size", "processes")
 NOT_NEGATIVE = (

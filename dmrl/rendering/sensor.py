@@ -26,7 +26,8 @@ class Sensor:
     balance
         Red, green and blue gains.
     saturation
-        1: colours as they are; 0: grey. Small sensors' filters let other colours through.
+        1: colours as they are; 0: grey, and without a mosaic a grey camera: its three channels
+        are one. Small sensors' filters let other colours through.
     vignetting
         Light lost in the farthest corner, 0 to 1.
     defocus_px
@@ -75,9 +76,12 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
     if sensor.vignetting > 0:
         falloff = 1 - np.float32(sensor.vignetting) * _radius2(height, width)
         values *= falloff if sensor.bayer else falloff[..., None]
-    values = _noisy(values, sensor, rng)
+    grey = sensor.saturation == 0 and not sensor.bayer  # one value a pixel, and one noise
+    values = _noisy(values[..., :1].copy() if grey else values, sensor, rng)
     if sensor.bayer:
         values = demosaic(values)
+    elif grey:
+        values = values.repeat(3, axis=2)
     if sensor.contrast_gamma != 1:
         values = np.power(values, np.float32(1 / sensor.contrast_gamma))
     return np.asarray(np.clip(values * 255 + 0.5, 0, 255), np.uint8)

@@ -1,8 +1,11 @@
 """What a run of renders may look like: every range that poses and looks are drawn from."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
+
+from dmrl.errors import RecipeError
 
 Range = tuple[float, float]
 
@@ -294,3 +297,18 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "plain": {},
 }
+
+
+def filled(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of a recipe over those of its preset.
+
+    Raises
+    ------
+    RecipeError
+        If there is no such preset.
+    """
+    own = dict(keys)
+    preset = own.pop("preset", "plain")
+    if not isinstance(preset, str) or preset not in PRESETS:
+        raise RecipeError(f"no preset {preset!r}. There are: {', '.join(PRESETS)}")
+    return PRESETS[preset] | own

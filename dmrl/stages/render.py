@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -37,7 +37,7 @@ from dmrl.rendering.lens import canvas_of
 from dmrl.rendering.messages import ROBOT, samples
 from dmrl.rendering.randomise import Drawn, World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer, Scene
-from dmrl.rendering.settings import PRESETS, Settings
+from dmrl.rendering.settings import Settings, filled
 from dmrl.samples.sample import Sample, calibration, intervals
 from dmrl.terminal.arguments import On
 from dmrl.terminal.progress import say, track
@@ -79,21 +79,6 @@ def settings_of(name: str, **changes: Any) -> Settings:
         raise RecipeError(f'{name} is of kind {kind!r}. This command wants: kind = "render"')
     given = {key: value for key, value in changes.items() if value is not None}
     return recipes.check(name, filled({**keys, **given}), Settings)
-
-
-def filled(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of a recipe over those of its preset.
-
-    Raises
-    ------
-    RecipeError
-        If there is no such preset.
-    """
-    own = dict(keys)
-    preset = own.pop("preset", "plain")
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise RecipeError(f"no preset {preset!r}. There are: {', '.join(PRESETS)}")
-    return PRESETS[preset] | own
 
 
 def camera_of(settings: Settings) -> Camera:

@@ -30,8 +30,10 @@ try:
         PUBLISHED_THRESHOLD,
         Model,
         load_model,
+        mixed,
         save_model,
         set_weights,
+        weights_of,
         with_channels,
     )
     from dmrl.learn.network import Network
@@ -97,6 +99,8 @@ def run(
         If the network cannot take the images, its grid is not the teacher's, or the loss is no
         longer a number.
     """
+    if settings.init_share and init is None:
+        raise SettingError("init_share: there is nothing to keep a share of. Give --init MODEL")
     given = Given(init and resolved(init), teacher and resolved(teacher))
     processes = settings.processes if device_of(settings.device).type == "cpu" else 1
     return in_group(processes, partial(_run, dataset, out, settings, given, resume=resume))
@@ -120,6 +124,7 @@ def _run(
     train = data.split("train")
     examples, held_out, shares = material(data, settings)
     network = _first_network(settings, examples, given.init)
+    first = {name: value.clone() for name, value in weights_of(network).items()}
     teacher = _teacher(given.teacher, network) if given.teacher else None
     inputs = [dataset, *filter(None, given)]
     made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
@@ -142,6 +147,7 @@ def _run(
             made.write(folder)
         result = _train(training, settings, len(examples), group)
         if group.leads:
+            mixed(training.network, first, settings.init_share)
             judged = _judged(training.network, held_out, settings)
             save_model(_model(training, settings, train, len(examples), judged), folder)
             remove_checkpoint(folder)

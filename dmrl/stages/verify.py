@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from dmrl.datasets import open_dataset
 from dmrl.deploy.backends import seen_by
+from dmrl.deploy.c import L1_FOR_STATE
 from dmrl.deploy.compiled import require_c
 from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.measure import Cost, cost, rates, state_bytes
+from dmrl.deploy.measure import Cost, cost, fits_l1, rates, state_bytes
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import load
 from dmrl.deploy.targets import targets
@@ -215,6 +216,7 @@ def document(result: Result) -> dict[str, Any]:
         ],
         "macs": network.macs,
         "state_bytes": result.state_bytes,
+        "fits_gap8_l1": fits_l1(result.state_bytes),
         "stack_bytes": stack_bytes(result.targets),
         "code_bytes": found.code_bytes if found else None,
         "constant_bytes": found.constant_bytes if found else None,
@@ -222,7 +224,7 @@ def document(result: Result) -> dict[str, Any]:
         "instructions_per_mac": executed / network.macs if executed else None,
         "gap8_estimates": [
             {"images_per_s": rate, "assuming": assumption}
-            for rate, assumption in rates(network, found)
+            for rate, assumption in rates(network, found, result.state_bytes)
         ],
     }
 
@@ -245,13 +247,18 @@ def print_result(folder: Path, result: Result) -> None:
     tried = f"{result.pictures} images and {result.noise} of noise"
     print_table(f"{folder}: the C against the integer reference, {tried}", columns, rows)
     print_table("Cost of the C", ("what", "", "how"), _cost_rows(result))
-    for rate, assumption in rates(result.network, result.cost):
+    for rate, assumption in rates(result.network, result.cost, result.state_bytes):
         print(f"estimated {rate:.2f} images/s on a GAP8: {assumption}")
 
 
 def _cost_rows(result: Result) -> list[tuple[object, ...]]:
     rows: list[tuple[object, ...]] = [
-        ("RAM, bytes", f"{result.state_bytes:,}", "state, RGB or grey")
+        ("RAM, bytes", f"{result.state_bytes:,}", "state, RGB or grey"),
+        (
+            "fits a GAP8's L1",
+            "yes" if fits_l1(result.state_bytes) else "no",
+            f"{L1_FOR_STATE:,} bytes, beside stacks",
+        ),
     ]
     if (stack := stack_bytes(result.targets)) is not None:
         rows.append(("stack, bytes", f"{stack:,}", "the most of rv32imc's builds, measured"))

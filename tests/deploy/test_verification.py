@@ -82,11 +82,14 @@ def test_a_build_answers_every_image_within_its_stack(
 
 def test_rates_are_images_a_second() -> None:
     network = random_network(1)
-    both = rates(network, Cost(1, 2, round(CLUSTER_HZ / 25)))
+    both = rates(network, Cost(1, 2, round(CLUSTER_HZ / 25)), 49_152)
     assert [rate for rate, _ in both] == pytest.approx(
         [25, CLUSTER_HZ * KERNEL_MACS / network.macs]
     )
-    assert len(rates(network, Cost(1, 2, None))) == len(rates(network, None)) == 1
+    assert len(rates(network, Cost(1, 2, None), 1)) == len(rates(network, None, 1)) == 1
+    assert not any("L1" in assumed for _, assumed in both)
+    over = rates(network, Cost(1, 2, 3), 125_512)
+    assert all("125,512 bytes of state do not fit the L1 and lie in L2" in said for _, said in over)
 
 
 def test_the_header_states_the_bytes_of_the_state(tmp_path: Path) -> None:

@@ -149,7 +149,17 @@ def test_a_wrong_step_is_one_line(tmp_path: Path, old: str, new: str, words: str
     "stage",
     [
         *("align", "calibrate", "card", "convert", "dataset", "evaluate", "export", "fly", "label"),
-        *("merge", "predict", "quantize", "record", "recover", "render", "sketch", "track"),
+        *(
+            "likeness",
+            "merge",
+            "predict",
+            "quantize",
+            "record",
+            "recover",
+            "render",
+            "sketch",
+            "track",
+        ),
         *("train", "trim", "verify", "view"),
     ],
 )

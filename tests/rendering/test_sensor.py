@@ -58,3 +58,11 @@ def test_the_same_noise_comes_from_the_same_seed() -> None:
     light = rng().random((20, 20, 3), np.float32)
     sensor = Sensor(bayer=True, shot_noise=0.01, saturation=0.5)
     assert np.array_equal(expose(light, sensor, rng()), expose(light, sensor, rng()))
+
+
+def test_a_grey_camera_has_one_value_a_pixel() -> None:
+    light = np.random.default_rng(0).random((16, 24, 3), np.float32)
+    sensor = Sensor(saturation=0.0, shot_noise=0.01, read_noise=0.02)
+    rgb = expose(light, sensor, np.random.default_rng(1))
+    assert (rgb == rgb[..., :1]).all()
+    assert len(np.unique(rgb)) > 20

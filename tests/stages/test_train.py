@@ -58,6 +58,22 @@ def test_same_inputs_same_weights(dataset: Path, tmp_path: Path) -> None:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
+def test_a_share_of_the_first_weights_is_kept(dataset: Path, tmp_path: Path) -> None:
+    run(dataset, tmp_path / "a", SETTINGS)
+    for share in (0.0, 0.25, 1.0):
+        more = replace(SETTINGS, init_share=share, seed=1)
+        run(dataset, tmp_path / f"b{share}", more, init=tmp_path / "a")
+    first, trained, mixed, back = (
+        load_model(tmp_path / name).network.state_dict()["body.0.0.weight"]
+        for name in ("a", "b0.0", "b0.25", "b1.0")
+    )
+    assert (trained != first).any()
+    np.testing.assert_allclose(back, first, atol=1e-6)
+    np.testing.assert_allclose(mixed, 0.25 * first + 0.75 * trained, atol=1e-6)
+    with pytest.raises(SettingError, match="Give --init"):
+        run(dataset, tmp_path / "c", replace(SETTINGS, init_share=0.5))
+
+
 def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) -> None:
     slow = replace(SETTINGS, learning_rate=1e-9, final_learning_rate=0.0)
     run(dataset, tmp_path / "a", SETTINGS)

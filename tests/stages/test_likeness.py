@@ -1,0 +1,109 @@
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import recipe as recipes
+from dmrl.cli import app
+from dmrl.errors import OutputError, RecipeError, RecordingError, SettingError, SourceError
+from dmrl.images.codec import decode, encode_png
+from dmrl.rendering import settings as looks
+from dmrl.rendering.fitting import pictures
+from dmrl.rendering.interiors import rooms
+from dmrl.rendering.likeness import FIGURES, Likeness
+from dmrl.stages.likeness import Settings, run
+from dmrl.stages.render import settings_of
+
+SIZE_PX = (128, 96)
+CAMERAS = {
+    "colour": {"warmth": [2.0, 2.6], "brightness": [0.4, 0.5], "defocus_px": [0.9, 1.1]},
+    "grey": {"saturation": [0.0, 0.0], "warmth": [1.0, 1.0], "bayer": False, "image_format": "png"},
+}
+
+
+def frames(folder: Path, camera: str) -> Path:
+    """Frames of a camera that is not the preset's, of rooms that nobody else sees."""
+    folder.mkdir()
+    own = {"preset": "himax", "read_noise": [0.006, 0.007], **CAMERAS[camera]}
+    settings = recipes.check(camera, looks.filled(own), looks.Settings)
+    for k, rgb in enumerate(pictures(settings, rooms(), SIZE_PX, seed=1234)):
+        (folder / f"{k:02d}.png").write_bytes(encode_png(rgb))
+    return folder
+
+
+def off(found: Likeness, real: Likeness) -> float:
+    """The greatest relative error of a figure; what is nearly nothing has no per cent."""
+    there = [name for name in FIGURES if getattr(real, name) > 0.1]
+    return max(abs(getattr(found, name) / getattr(real, name) - 1) for name in there)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_figures_of_the_fitted_preset_are_those_of_the_frames(camera: str, tmp_path: Path) -> None:
+    result = run(frames(tmp_path / "own", camera), tmp_path / "own.toml", Settings())
+    assert result.frames == 32
+    assert off(result.fitted, result.real) < 0.2
+    assert off(result.preset, result.real) > 0.2
+    settings = settings_of(str(tmp_path / "own.toml"))
+    assert settings.bayer == (camera == "colour")
+    assert (settings.saturation[1] == 0) == (camera == "grey")
+    sheet = decode((tmp_path / "own.png").read_bytes())
+    assert sheet.shape[0] > 6 * 144
+
+
+def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
+    own = frames(tmp_path / "own", "grey")
+    for name in ("a", "b"):
+        run(own, tmp_path / f"{name}.toml", Settings(frames=4))
+    for end in (".toml", ".png"):
+        assert (tmp_path / f"a{end}").read_bytes() == (tmp_path / f"b{end}").read_bytes()
+
+
+def test_a_recording_will_do_and_json_says_it_all(
+    dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "dots.toml"
+    app(["likeness", str(dots), str(out), "--frames", "5", "--json"], result_action="return_value")
+    said = capsys.readouterr()
+    assert "5 frames: few" in said.err
+    made = json.loads(said.out)
+    assert made["frames"] == 5 and set(made["fitted"]) == set(FIGURES)
+    assert tomllib.loads(out.read_text())["preset"] == "himax"
+
+
+def test_what_cannot_be_measured_is_one_line(tmp_path: Path, dots: Path) -> None:
+    (tmp_path / "none").mkdir()
+    with pytest.raises(SourceError, match="no picture"):
+        run(tmp_path / "none", tmp_path / "a.toml", Settings())
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for name, width in (("a", 64), ("b", 96)):
+        pixels = np.zeros((64, width, 3), np.uint8)
+        (mixed / f"{name}.png").write_bytes(encode_png(pixels))
+    with pytest.raises(SettingError, match="64x64, 96x64 px"):
+        run(mixed, tmp_path / "a.toml", Settings())
+    (mixed / "b.png").write_bytes(encode_png(np.zeros((20, 20, 3), np.uint8)))
+    (mixed / "a.png").unlink()
+    with pytest.raises(SettingError, match="too small"):
+        run(mixed, tmp_path / "a.toml", Settings())
+    with pytest.raises(RecipeError, match="no preset"):
+        run(dots, tmp_path / "a.toml", Settings(preset="mine"))
+    with pytest.raises(RecordingError):
+        run(tmp_path / "none.mcap", tmp_path / "a.toml", Settings())
+    with pytest.raises(SettingError, match=r"OUT\.toml"):
+        run(dots, tmp_path / "a.png", Settings())
+    (tmp_path / "a.png").write_bytes(b"mine")
+    with pytest.raises(OutputError):
+        run(dots, tmp_path / "a.toml", Settings())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "mixed", "none"]
+
+
+def test_black_frames_have_no_grain_and_no_edges(tmp_path: Path) -> None:
+    (tmp_path / "own").mkdir()
+    for k in range(3):
+        path = tmp_path / "own" / f"{k}.png"
+        path.write_bytes(encode_png(np.zeros((64, 64, 3), np.uint8)))
+    result = run(tmp_path / "own", tmp_path / "own.toml", Settings())
+    assert np.isfinite(list(result.keys.get("brightness", [0.0]))).all()  # type: ignore[call-overload]
+    settings_of(str(tmp_path / "own.toml"))
