@@ -48,16 +48,21 @@ def command(
         Print one JSON document in place of the tables.
     """
     folder = Path(Path(recipe).stem) if out is None else out
-    report(pipeline.run(recipe, folder, data, workers=workers, on=on), as_json=as_json)
-    page = _page(folder) if pipeline.load(recipe).pictured else None
+    done = pipeline.run(recipe, folder, data, workers=workers, on=on)
+    report(done, as_json=as_json)
+    changed = not all(one.skipped for one in done)
+    page = _page(folder, changed=changed) if pipeline.load(recipe).pictured else None
     if not as_json:
         print_line(
             f"{page}: open it in a browser" if page else f"On one page: dmrl report {folder}"
         )
 
 
-def _page(folder: Path) -> Path | None:
-    """The page of a recipe with figures, written; None where they cannot be drawn."""
+def _page(folder: Path, *, changed: bool) -> Path | None:
+    """The page of a recipe with figures, drawn if anything changed; None where it cannot be."""
+    there = folder / "report.html"
+    if there.is_file() and not changed:
+        return there
     if pages is None:
         say("no page: that needs matplotlib. pip install 'dmrl[plot]', then dmrl report")
         return None

@@ -16,6 +16,7 @@ from dmrl.errors import RecipeError, SettingError
 from dmrl.pipeline import run as pipeline
 from dmrl.pipeline.interface import interface_of
 from dmrl.pipeline.plan import Step
+from dmrl.stages.run import command as run_command
 
 HEAD = 'kind = "pipeline"\n'
 SMALL = f"""{HEAD}
@@ -268,3 +269,23 @@ def test_data_of_optional_steps_need_not_be_there(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(text + "optional = true\n")
     done = pipeline.run(tmp_path / "mine.toml", tmp_path / "out", tmp_path / "data")
     assert [one.left_out for one in done] == [False, True]
+
+
+def test_a_recipe_with_figures_ends_with_its_page_drawn_again_where_something_changed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sketch = '[[step]]\nstage = "sketch"\nimages = 3\nout = "pictures"\n'
+    convert = '[[step]]\nstage = "convert"\nsource = "pictures"\nout = "a.mcap"\n'
+    shown = '[[figure]]\ntitle = "Three"\nshows = "numbers"\n'
+    rows = 'rows = [{ what = "x", of = "pictures/labels.csv", at = "y" }]\n'
+    (tmp_path / "mine.toml").write_text(HEAD + sketch + convert + shown + rows)
+    page = tmp_path / "out" / "report.html"
+    run_command(str(tmp_path / "mine.toml"), out=tmp_path / "out")
+    first = page.stat().st_mtime_ns
+    assert "Three</h3>" in page.read_text() and str(page) in capsys.readouterr().out
+    run_command(str(tmp_path / "mine.toml"), out=tmp_path / "out")
+    assert page.stat().st_mtime_ns == first
+    text = (HEAD + sketch + convert + shown + rows).replace("images = 3", "images = 4")
+    (tmp_path / "mine.toml").write_text(text)
+    run_command(str(tmp_path / "mine.toml"), out=tmp_path / "out")
+    assert page.stat().st_mtime_ns > first
