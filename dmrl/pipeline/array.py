@@ -5,6 +5,7 @@ Lines and the script are written beside the outputs. When the job has run, the s
 """
 
 import json
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -12,13 +13,15 @@ from pathlib import Path
 from typing import Protocol
 
 from dmrl.border.names import one_line
-from dmrl.errors import SettingError
+from dmrl.errors import OutputError, SettingError
 from dmrl.output import rewritten_file
 from dmrl.pipeline.crew import ONE_THREAD
 from dmrl.pipeline.job import failed
 from dmrl.pipeline.work import perform
 from dmrl.storage import Remote
 
+PLAIN = re.compile(r"[\w/.+@=-]+")
+"""Of a line for Slurm: a space would end the path, and a line end would begin a command."""
 MOST = 1000
 """Elements of an array: Slurm takes 1,001 unless told. With more tasks, each does some."""
 SCRIPT = """#!/bin/sh
@@ -53,12 +56,17 @@ def array_job(tasks: Sequence[Line], out: Path) -> str:
     Raises
     ------
     OutputError
-        If the job cannot be written.
+        If the job cannot be written, or the folder's path cannot stand in a line of Slurm's.
     SettingError
         If the outputs go into a bucket.
     """
     if isinstance(out, Remote):
         raise SettingError(f"Slurm's nodes read their tasks beside {out}. Name a folder they share")
+    if not PLAIN.fullmatch(str(out.absolute())):
+        raise OutputError(
+            f"{out.absolute()}: Slurm takes paths of letters, digits and /._+@=- alone. "
+            "Name another folder"
+        )
     lines, script = out / ".dmrl-tasks.jsonl", out / ".dmrl-job.sh"
     elements = min(len(tasks), MOST)
     text = SCRIPT.format(

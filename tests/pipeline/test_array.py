@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.errors import SettingError
+from dmrl.errors import OutputError, SettingError
 from dmrl.pipeline import array
 from dmrl.pipeline.folders import over_folder
 from dmrl.pipeline.once import done_on
@@ -63,3 +63,14 @@ def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
 def test_one_output_is_no_array(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--on slurm is for a folder"):
         done_on("slurm", "fly", tmp_path / "a.mcap", {}, None)
+
+
+@pytest.mark.parametrize("name", ["a b", "a\ntouch victim", "a%j", "a;b", "$(a)"])
+def test_a_folder_whose_name_slurm_would_read_otherwise_is_refused(
+    name: str, tmp_path: Path
+) -> None:
+    """What stands behind a line end in the script would be run."""
+    (tmp_path / name).mkdir()
+    with pytest.raises(OutputError, match="Name another folder"):
+        array.array_job([], tmp_path / name)
+    assert list((tmp_path / name).iterdir()) == []
