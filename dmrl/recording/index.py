@@ -93,7 +93,8 @@ def _remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made]
         made: Made = _MADE[key][1]
         return made
     made = make()
-    if time.time_ns() - status.st_mtime_ns > SETTLED_NS:
+    # What is in a bucket has a tag of its content, so its time does not matter.
+    if stream.ranged is not None or time.time_ns() - status.st_mtime_ns > SETTLED_NS:
         while len(_MADE) >= MOST_REMEMBERED:
             del _MADE[next(iter(_MADE))]
         _MADE[key] = stamp, made

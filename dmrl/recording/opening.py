@@ -15,6 +15,7 @@ from mcap.stream_reader import CRCValidationError
 from dmrl.errors import RecordingError
 from dmrl.output import outputs_done
 from dmrl.storage import Remote
+from dmrl.storage.ranges import LEAST_BYTES
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")  # opcode, length
@@ -40,7 +41,10 @@ class Bounded(io.BufferedReader):
 
     def __init__(self, path: Path) -> None:
         self.ranged = path.ranged() if isinstance(path, Remote) else None
-        super().__init__(self.ranged or io.FileIO(path, "r"))
+        if self.ranged is None:
+            super().__init__(io.FileIO(path, "r"))
+        else:
+            super().__init__(self.ranged, LEAST_BYTES)
         self.status = os.fstat(self.fileno()) if self.ranged is None else path.stat()
         self.size = self.seek(0, io.SEEK_END)
         self.seek(0)

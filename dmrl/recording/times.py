@@ -63,7 +63,7 @@ def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
         if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
-            for topic, times in _times_in_indexes(path, stream, summary):
+            for topic, times in _times_in_indexes(path, stream, summary, topics):
                 if topic in parts:
                     parts[topic].append(times)
             return {topic: np.concatenate(times) for topic, times in parts.items()}
@@ -74,12 +74,18 @@ def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
 
 
 def _times_in_indexes(
-    path: Path, stream: Bounded, summary: McapSummary
+    path: Path, stream: Bounded, summary: McapSummary, topics: frozenset[str]
 ) -> Iterator[tuple[str, Ints]]:
-    """Topic and log times of every message index, chunk by chunk; at last their CRC."""
+    """Topic and log times of every message index, chunk by chunk; at last their CRC.
+
+    Of a recording in a bucket, the indexes of chunks that hold the topics, without that CRC.
+    """
     said = metadata_of(path, stream, summary).get(sums.METADATA_NAME)
     crc = 0
     chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
+    if stream.ranged is not None:
+        said, wanted = None, {n for n, c in summary.channels.items() if c.topic in topics}
+        chunks = [chunk for chunk in chunks if wanted & chunk.message_index_offsets.keys()]
     firsts = [chunk.chunk_start_offset + chunk.chunk_length for chunk in chunks]
     stream.expect([(k, c.message_index_length) for k, c in zip(firsts, chunks, strict=True)])
     for first, chunk in zip(firsts, chunks, strict=True):

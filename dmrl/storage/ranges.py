@@ -8,6 +8,8 @@ from dmrl.storage.system import told
 
 TOGETHER_BYTES, TOGETHER = 16 << 20, 64
 """Of places that will be read, how much is fetched at a time, side by side."""
+LEAST_BYTES = 512
+"""Of a file, that are fetched at a time."""
 STEP_BYTES = 8 << 20
 """Of a file that is read as a whole."""
 
@@ -45,7 +47,7 @@ class Ranged(io.RawIOBase):
         """Whether a place is best fetched as it is: it is large, or expected."""
         place = start, size
         expected = bool(self._expected) and self._expected[-1] == place
-        return size > io.DEFAULT_BUFFER_SIZE or place in self._held or expected
+        return size > LEAST_BYTES or place in self._held or expected
 
     def fetch(self, start: int, size: int) -> bytes:
         """Bytes from a place on; fewer at the end of the file."""

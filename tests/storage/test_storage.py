@@ -245,7 +245,7 @@ def test_label_reads_little_more_than_the_numbers(
     lab: Any, tmp_path: Path, fetched: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = tmp_path / "flight.mcap"
-    words = ("--duration-s", 30, "--seed", 1, "--camera")
+    words = ("--duration-s", 12, "--seed", 1, "--camera")
     said(capsys, 0, "fly", "fly_in_view", source, *words)
     said(capsys, 0, "trim", source, "s3://lab/flight.mcap")  # an object that knows its hash
     path = path_of("s3://lab/flight.mcap")
