@@ -11,6 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from dmrl.geometry.frames import Array
 from dmrl.images.codec import Rgb
 from dmrl.rendering.lens import Picture
 
@@ -63,10 +64,11 @@ class Likeness:
 
 
 FIGURES = tuple(field.name for field in fields(Likeness))
+RATIOS = ("contrast", "cast", "corners", "grain", "edge_px")
 
 
 def likeness(pictures: Sequence[Rgb]) -> Likeness:
-    """Figures of a set of pictures: means over pictures, of ratios the geometric mean.
+    """Figures of a set of pictures: means over pictures, of ratios the geometric mean; 0 for none.
 
     Parameters
     ----------
@@ -74,11 +76,17 @@ def likeness(pictures: Sequence[Rgb]) -> Likeness:
         (H, W, 3) uint8 each, of any size over 16 px.
     """
     rows = np.array([of_one(picture) for picture in pictures])
-    with np.errstate(all="ignore"):
-        middle = np.nanmean(rows, axis=0)
-        ratio = np.exp(np.nanmean(np.log(np.maximum(rows, 1e-3)), axis=0))
-    ratios = [name in ("contrast", "cast", "corners", "grain", "edge_px") for name in FIGURES]
-    return Likeness(*(float(value) for value in np.where(ratios, ratio, middle)))
+    return Likeness(*(_mean(name, column) for name, column in zip(FIGURES, rows.T, strict=True)))
+
+
+def _mean(figure: str, values: Array) -> float:
+    """Of the values that could be measured, geometric for ratios; 0 without any."""
+    found = values[np.isfinite(values)]
+    if not len(found):
+        return 0.0
+    if figure in RATIOS:
+        return float(np.exp(np.log(np.maximum(found, 1e-3)).mean()))
+    return float(found.mean())
 
 
 def of_one(picture: Rgb) -> list[float]:
