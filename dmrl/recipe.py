@@ -5,6 +5,7 @@ recipe with faults is refused whole, every fault named.
 """
 
 import json
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from difflib import get_close_matches
@@ -163,7 +164,10 @@ def _model(schema: type[Any]) -> type[BaseModel]:
     required = {f.name for f in fields(schema) if f.default is f.default_factory is MISSING}
     keys = {n: (t, ... if n in required else None) for n, t in hints.items()}
     config = ConfigDict(strict=True, extra="forbid", frozen=True)
-    model: type[BaseModel] = create_model(schema.__name__, __config__=config, **keys)  # type: ignore[call-overload]
+    with warnings.catch_warnings():
+        # A setting may be called as a method of pydantic's is: only fields are asked for.
+        warnings.filterwarnings("ignore", "Field name .* shadows an attribute")
+        model: type[BaseModel] = create_model(schema.__name__, __config__=config, **keys)  # type: ignore[call-overload]
     return model
 
 

@@ -177,3 +177,12 @@ def test_depth_and_length_of_a_recipe_have_a_budget(
 ) -> None:
     with pytest.raises(RecipeError, match=complaint):
         recipe.read(write(text))
+
+
+def test_a_setting_may_be_called_as_a_method_of_pydantic(write: Write) -> None:
+    @dataclass(frozen=True)
+    class Copied:
+        copy: bool = True
+
+    path = write('kind = "draw"\ncopy = false\n')
+    assert recipe.load(path, "draw", Copied) == Copied(copy=False)
