@@ -64,7 +64,10 @@ REASONS = {
     "stages/card.py: card.name": OURS,
     "stages/evaluate.py: name": OURS,
     "stages/export.py: name": OURS,
+    "stages/find.py: name": "validated as part of the catalogue, and only printed",
     "stages/sketch.py: name": OURS,
+    "storage/remote.py: *one.parts[len(self.parts):]": "a name in the same bucket",
+    "storage/remote.py: hashlib.sha256(version.encode()).hexdigest()[:16]": OURS,
 }
 PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
 MAY_PARSE = {

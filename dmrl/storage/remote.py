@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path, PosixPath
 from typing import Any
 
+from dmrl.border.names import inside
 from dmrl.storage.names import SCHEMES
 from dmrl.storage.ranges import STEP_BYTES, Ranged
 from dmrl.storage.system import system, told
@@ -210,12 +211,15 @@ def _copy(path: Remote) -> str:
     """Where a copy of a file, or of a folder with all in it, lies on this machine."""
     info = path._info()
     version = f"{path} {info.get('ETag')} {info.get('size')}"
-    place = Path(_kept().name) / hashlib.sha256(version.encode()).hexdigest()[:16] / path.name
+    place = Path(_kept().name) / hashlib.sha256(version.encode()).hexdigest()[:16]
+    place = inside(place, path.name, f"{path}: its name")
     is_file = info["type"] == "file"
     if is_file and place.exists():
         return str(place)
     for one in [path] if is_file else path.below():
-        to = place if is_file else place.joinpath(*one.parts[len(path.parts) :])
+        to = place
+        for part in () if is_file else one.parts[len(path.parts) :]:
+            to = inside(to, part, f"{path}: a file")
         to.parent.mkdir(parents=True, exist_ok=True)
         with told(str(one)):
             system(path.scheme).get_file(one.key, str(to))

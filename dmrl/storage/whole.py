@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from dmrl.border.names import inside
 from dmrl.errors import StorageError
 from dmrl.storage.remote import METADATA, UNFINISHED, Remote
 from dmrl.storage.system import system, told
@@ -42,7 +43,7 @@ def uploaded_file(path: Remote) -> Iterator[Path]:
         If the server cannot be reached, or refuses.
     """
     with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        here = Path(folder) / path.name
+        here = inside(Path(folder), path.name, f"{path}: its name")
         yield here
         _put(here, path)
 
@@ -59,7 +60,7 @@ def uploaded_folder(path: Remote) -> Iterator[Path]:
         If the server cannot be reached, or refuses; then nothing is left there.
     """
     with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        here = Path(folder) / path.name
+        here = inside(Path(folder), path.name, f"{path}: its name")
         here.mkdir()
         yield here
         mark = path / UNFINISHED

@@ -369,7 +369,7 @@ WORKS = (
         lambda i, out: cli("calibrate", i.boards, out, "--board", "7x5"),
         "camera.toml",
     ),
-    Work("likeness", lambda i, out: cli("likeness", i.dots, out), "like.toml", slow=True),
+    Work("likeness", lambda i, out: cli("likeness", i.dots, out), "like.toml"),
     Work("dataset", lambda i, out: cli("dataset", i.dots, out), "set"),
     Work("dataset to parquet", lambda i, out: cli("dataset", i.dots, out, "--parquet"), "set"),
     Work("card", _card, "set", before=_copied, pieces=True),

@@ -377,7 +377,7 @@ def test_gradients_of_one_step_are_gone_before_the_next(examples: Examples) -> N
 
 def test_every_epoch_has_an_order_of_its_own(examples: Examples, tmp_path: Path) -> None:
     training = Training(new_network(SETTINGS, examples), examples, SETTINGS, tmp_path)
-    seen = [torch.cat([b.images for b in training._batches(epoch)]) for epoch in (0, 0, 1)]
+    seen = [torch.cat([b.images for b in training._batches(epoch, None)]) for epoch in (0, 0, 1)]
     assert torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[0], seen[2])
 

@@ -306,7 +306,7 @@ def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: P
     for name in ("a", "b"):
         run([tmp_path / "out.mcap"], tmp_path / name, FAST)
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
-    plots = ("error-by-distance", "error-violins", "examples")
+    plots = ("circles", "error-by-distance", "error-violins", "examples")
     assert names == sorted(
         [*(f"{p}.{s}" for p in plots for s in ("png", "svg")), "evaluation.json"]
     )

@@ -1,5 +1,6 @@
 """Inputs and outputs in a bucket: the bytes are those of files here, whole or not there at all."""
 
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import pytest
 from dmrl import boundary, topics
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
-from dmrl.errors import OutputError, StorageError
+from dmrl.errors import OutputError, StorageError, UnsafeName
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.output import partial_file, partial_folder, rewritten_file
@@ -279,3 +280,14 @@ def _sizes(path: Path) -> tuple[int, int]:
         for chunk in found.chunk_indexes:
             sizes[bool(pictured & chunk.message_index_offsets.keys())] += place_of(chunk)[1]
     return sizes[0], sizes[1]
+
+
+def test_a_name_in_a_bucket_leads_nowhere_else_on_this_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Keys may be any text; a copy of a folder must stay in its own."""
+    folder, hostile = Remote("s3://lab/set"), Remote("s3://lab/set/../../../victim")
+    monkeypatch.setattr(Remote, "_info", lambda self: {"type": "directory"})
+    monkeypatch.setattr(Remote, "below", lambda self: [hostile])
+    with pytest.raises(UnsafeName, match="s3://lab/set: a file"):
+        os.fspath(folder)
