@@ -76,7 +76,9 @@ class Settings:
     split: str | None = None
     partial: Annotated[bool, Parameter(negative=())] = False
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
-    false_alarms: Annotated[float | None, Parameter(validator=validators.Number(gte=0))] = None
+    false_alarms: Annotated[
+        float | None, Parameter(validator=validators.Number(gte=0, lte=1e6))
+    ] = None
     draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
     seed: int = 0
     settle_s: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))] = None

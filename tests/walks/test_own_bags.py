@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmrl.errors import SourceError
 from dmrl.flight.arrays import Flight
 from dmrl.flight.noise import NOISE
 from dmrl.flight.simulate import Scenario, simulate
@@ -78,9 +79,10 @@ def test_wednesday_robots_count_from_their_own_boot(
     held = Contents(tmp_path / "aligned.mcap")
     born = {**born_s, "mocap": 1_772_000_000.0}
     for robot in set(clocks) & set(ROBOTS):
-        assert abs(clocks[robot].offset_s - (born[reference] - born_s[robot])) < 0.02, robot
+        error_s = clocks[robot].offset_s - (born[reference] - born_s[robot])
+        assert abs(error_s) <= min(4 * clocks[robot].sigma_s, 0.05), robot
     starts = {r: held.times(f"/{r}/attitude")[0] for r in ROBOTS}
-    assert max(starts.values()) - min(starts.values()) < 20_000_000
+    assert max(starts.values()) - min(starts.values()) < 50_000_000
     if reference == "mocap":
         label.run(tmp_path / "aligned.mcap", tmp_path / "labelled.mcap", label.Settings())
         judged = evaluate.positions.judge(tmp_path / "labelled.mcap")
@@ -99,6 +101,6 @@ def test_thursday_times_before_zero(flight: Flight, tmp_path: Path) -> None:
         rows = np.column_stack([values[0] - 5.0, *values[1:], there])
         text = "\n".join(",".join(f"{v:.6f}" for v in row) for row in rows)
         (folder / f"{robot}.csv").write_text(f"{columns},range_{peer}_m\n{text}\n")
-    with pytest.raises(Exception, match=r"before 0|negative"):
+    with pytest.raises(SourceError, match="begins before time 0"):
         convert.run(folder, tmp_path / "flight.mcap", convert.Settings())
     assert not (tmp_path / "flight.mcap").exists()
