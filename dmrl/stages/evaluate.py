@@ -38,6 +38,7 @@ KINDS = {"positions": positions, "tracks": tracks}
 SETTLE_S, SHORT_S = 20.0, 30.0
 """Time to settle; of what is shorter than this, the first half is."""
 FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
+Finite = Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +77,10 @@ class Settings:
     split: str | None = None
     partial: Annotated[bool, Parameter(negative=())] = False
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
-    false_alarms: Annotated[
-        float | None, Parameter(validator=validators.Number(gte=0, lte=1e6))
-    ] = None
+    false_alarms: Finite = None
     draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
     seed: int = 0
-    settle_s: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))] = None
+    settle_s: Finite = None
 
 
 @dataclass(frozen=True, slots=True)
