@@ -161,7 +161,7 @@ class Container:
 
     def finish(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
         """Write the sums and the summary, with what defines every message."""
-        self.add_metadata(sums.METADATA_NAME, self._sums.to_metadata())
+        self.add_metadata(sums.METADATA_NAME, self._sums.to_metadata(self._at))
         self._put(laid_out(DataEnd(self._crc)))
         said, schemas, channels = self._said, list(schemas), list(channels)
         said.schema_count, said.channel_count = len(schemas), len(channels)

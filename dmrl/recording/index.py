@@ -148,7 +148,7 @@ def _summary(path: Path, stream: Bounded) -> Summary:
 
 
 def metadata_of(path: Path, stream: Bounded, found: McapSummary) -> dict[str, list[dict[str, str]]]:
-    """Metadata by name, held against its sum where the recording has one.
+    """Metadata by name, held against its sum where the recording has one of its own.
 
     Raises
     ------
@@ -162,7 +162,8 @@ def metadata_of(path: Path, stream: Bounded, found: McapSummary) -> dict[str, li
         record = McapMetadata.read(ReadDataStream(BytesIO(body[RECORD.size :])))
         if record.name != place.name:
             raise damaged(path, f"metadata {place.name} has another name")
-        metadata.setdefault(record.name, []).append(dict(record.metadata))
+        if record.name != sums.METADATA_NAME or sums.of_this_file(record.metadata, place.offset):
+            metadata.setdefault(record.name, []).append(dict(record.metadata))
         before, crc = crc, zlib.crc32(body, crc)
     said = metadata.get(sums.METADATA_NAME)
     if said and said[-1].get("metadata") != sums.text(before):

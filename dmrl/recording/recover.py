@@ -157,8 +157,16 @@ def _pieces(stream: Bounded, walk: _Walk) -> Iterator[Piece]:
                 walk.skipped[record.channel] += record.messages
         elif isinstance(record, Message):
             yield from _named(walk, loose([record]), None)
-        else:
+        elif not _copied_sums(record, at):
             _define(walk, record)
+        else:
+            walk.extras += 1
+
+
+def _copied_sums(record: McapRecord, at: int) -> bool:
+    """Whether this record holds sums of another file."""
+    sums_of = isinstance(record, Metadata) and record.name == sums.METADATA_NAME
+    return sums_of and not sums.of_this_file(record.metadata, at)
 
 
 def _unpacked(stream: Bounded, walk: _Walk, chunk: Chunk, at: int) -> Block | None:

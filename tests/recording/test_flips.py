@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Metadata
 from mcap.writer import CompressionType, IndexType, Writer
 
 from dmrl.errors import RecordingError
@@ -221,6 +223,26 @@ def test_what_other_writers_leave_out_is_not_missed(
     assert summary(path).topics["/cf1/height"].count == 7
     assert log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(7))
     assert not [finding for finding in check(path) if finding.level == "error"]
+
+
+def test_sums_that_another_program_copied_say_nothing_of_its_file(tmp_path: Path) -> None:
+    """As `mcap filter --include-metadata` does."""
+    path, copy = small(tmp_path / "a.mcap"), tmp_path / "b.mcap"
+    with path.open("rb") as source, copy.open("wb") as stream:
+        reader, writer = make_reader(source), Writer(stream, chunk_size=90)
+        writer.start()
+        for schema, channel, raw in reader.iter_messages():
+            assert schema
+            number = writer.register_schema(schema.name, schema.encoding, schema.data)
+            topic = writer.register_channel(channel.topic, channel.message_encoding, number)
+            writer.add_message(topic, raw.log_time, raw.data, raw.publish_time)
+        for record in (*reader.iter_metadata(), Metadata("mine", {"a": "1"})):
+            writer.add_metadata(record.name, record.metadata)
+        writer.finish()
+    assert summary(copy).metadata["mine"] == [{"a": "1"}]
+    assert log_times(copy, ["/cf1/height"]).keys() == {"/cf1/height"}
+    assert not [finding for finding in check(copy) if finding.level == "error"]
+    assert recover(copy, tmp_path / "c.mcap").whole
 
 
 def test_a_lost_channel_is_noticed_without_any_crc(tmp_path: Path) -> None:
