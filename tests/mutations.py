@@ -24,6 +24,8 @@ OTHER: dict[type, tuple[type, ...]] = {
     **{ast.BitOr: (ast.BitAnd,), ast.LShift: (ast.RShift,), ast.RShift: (ast.LShift,)},
 }
 """What takes the place of an operator."""
+IN_ANY_ORDER = ("min", "max", "minimum", "maximum", "hypot", "logical_and", "logical_or")
+"""Functions that give the same whichever argument comes first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,8 @@ def _of_arithmetic(node: ast.BinOp) -> Iterator[tuple[str, ast.expr, ast.AST]]:
 def _swapped(node: ast.AST) -> Iterator[tuple[str, ast.expr, ast.AST]]:
     """Calls, and lists of values, with two neighbours swapped."""
     if isinstance(node, ast.Call):
+        if getattr(node.func, "id", getattr(node.func, "attr", "")) in IN_ANY_ORDER:
+            return
         field = "args"
     elif isinstance(node, ast.Tuple | ast.List) and isinstance(node.ctx, ast.Load):
         field = "elts"

@@ -18,7 +18,7 @@ def far(a: int, b: float = 0.5) -> bool:
         raise ValueError(f"{a + 1} is", a - 1)
     a += 4
     zip(a, b, strict=True)
-    return -a * b[1:2]
+    return -a * b[1:2] if max(a, b) else np.minimum(a, b)
 '''
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.formats.counters import SteadySender, Unwrapped, dejitter, unwrap
+from dmrl.formats.counters import SteadySender, Unwrapped, _lower_hull, _numbered, dejitter, unwrap
 
 MS = 1_000_000
 
@@ -74,3 +74,68 @@ def test_after_a_pause_arrivals_stand_as_they_are() -> None:
         sender(50 * MS * k)
     assert sender(5000 * MS) == 5000 * MS
     assert sender(5050 * MS) == 5050 * MS
+
+
+def test_half_of_a_counter_s_range_is_a_step_back_and_less_is_one_ahead() -> None:
+    assert unwrap([3, 131, 3], 8).tolist() == [3, -125, -253]
+    assert unwrap([3, 130], 8).tolist() == [3, 130]
+    ahead = Unwrapped(8)
+    assert [ahead(value) for value in (3, 130, 2, 129)] == [3, 130, 2, 129]
+    assert ahead(1) == 1 and ahead(129) == -127
+
+
+def test_a_hole_is_seen_from_seven_tenths_of_a_period_beyond_what_is_due() -> None:
+    steady = [100 * k for k in range(10)]
+    for last, number in ((1069, 10), (1072, 11), (1169, 11), (1172, 12), (2500, 25)):
+        assert _numbered(np.array([*steady, last])).tolist() == [*range(10), number]
+
+
+def test_what_is_due_follows_early_arrivals_by_three_tenths() -> None:
+    # Early by 20 of 100, then late by 6: due at 994, then 1094.06.
+    steady = [*(100 * k for k in range(10)), 980, 1100]
+    for last, number in ((1263, 12), (1265, 13)):
+        assert _numbered(np.array([*steady, last]))[-1] == number
+
+
+def test_the_lower_hull_bends_upwards_and_takes_the_lowest_of_one_place() -> None:
+    x = np.array([0.0, 1, 1, 2, 3, 3, 4])
+    assert _lower_hull(x, np.array([5.0, 2, 1, 3, 0, 4, 4])) == [0, 2, 4, 6]
+    assert _lower_hull(x[:3], np.array([0.0, 1, 2])) == [0, 1]
+    assert _lower_hull(np.arange(3.0), np.array([0.0, 1, 2])) == [0, 2]  # no corner on a line
+
+
+@pytest.mark.parametrize("count", [None, [7, 8, 9, 11, 12, 13]])
+def test_times_lie_on_the_line_under_all_arrivals(count: list[int] | None) -> None:
+    sent = np.array([0, 100, 200, 400, 500, 600]) * MS
+    arrival = sent + np.array([3, 0, 4, 0, 3, 1]) * MS
+    assert dejitter(10**18 + arrival, count).tolist() == (10**18 + sent).tolist()
+
+
+def test_seven_arrivals_stand_and_the_eighth_is_where_their_pace_has_it() -> None:
+    sender = SteadySender()
+    arrivals = [0, 60, 90, 160, 195, 260, 300]
+    assert [sender(a * MS) for a in arrivals] == [a * MS for a in arrivals]
+    # At a pace of 352 / 7 it is due 50.3 ms after the seventh, and a fiftieth of the rest later.
+    pace = 352 / 7
+    assert sender(352 * MS) == pytest.approx((300 + pace + 0.02 * (52 - pace)) * MS, abs=1)
+
+
+def test_the_pace_is_that_of_the_last_64_arrivals() -> None:
+    sender, now = SteadySender(), 0
+    for step in [50] * 100 + [40] * 64:
+        now += step * MS
+        assert sender(now) == now  # early arrivals are followed at once
+    pace = (62 * 40 + 50) / 63
+    assert sender(now + 50 * MS) == pytest.approx(now + (pace + 0.02 * (50 - pace)) * MS, abs=1)
+
+
+@pytest.mark.parametrize(("late", "stands"), [(3.7, False), (4.6, True)])
+def test_a_pause_is_of_more_than_four_paces(late: float, stands: bool) -> None:
+    sender = SteadySender()
+    for k in range(64):
+        sender(50 * MS * k)
+    # The pace itself grows a little: (62 + 1 + late) / 63 of what it was.
+    after = round(50 * MS * (64 + late))
+    assert (sender(after) == after) == stands
+    again = [after + step * MS for step in (30, 90, 170, 200, 270, 310)]
+    assert ([sender(moment) for moment in again] == again) == stands

@@ -10,11 +10,13 @@ from dmrl.formats.cpx_packets import (
     APP,
     GAP8,
     HOST,
+    PACKET_MAX_BYTES,
+    STREAMER,
     Packet,
     PacketReader,
     pack_packet,
 )
-from dmrl.formats.cpx_state import State, compressed, quaternion
+from dmrl.formats.cpx_state import State, compressed, pack_state, quaternion, unpack_state
 
 RNG = np.random.default_rng(8)
 JPEG = b"\xff\xd8" + RNG.bytes(3000) + b"\xff\xd9"
@@ -135,3 +137,121 @@ def test_quaternions_come_back_to_a_quarter_of_a_degree() -> None:
         back = np.array(quaternion(compressed(tuple(xyzw))))
         angle_rad = 2 * np.arccos(min(abs(float(back @ xyzw)), 1.0))
         assert angle_rad < np.deg2rad(0.25)
+
+
+def test_every_part_of_a_state_has_its_place_and_unit() -> None:
+    level, packed = (0.0, 0.0, 0.0, 1.0), compressed((0.0, 0.0, 0.0, 1.0))
+    state = State(
+        2**32 + 7, 8, (0.001, -0.002, 0.0034), (4, 5, 6), (7, 8, 9), level, (0.01, -0.011, 0.012)
+    )
+    values = (7, 1, -2, 3, 4000, 5000, 6000, 7000, 8000, 9000, packed, 10, -11, 12)
+    assert pack_state(state) == values
+    back = unpack_state(values, 2**32 + 7, 8)
+    assert (back.robot_ms, back.received_us) == (2**32 + 7, 8)
+    assert (back.position_m, back.velocity_mps) == ((0.001, -0.002, 0.003), (4, 5, 6))
+    assert (back.acceleration_mps2, back.turning_radps) == ((7, 8, 9), (0.01, -0.011, 0.012))
+    assert back.quaternion_xyzw == level
+    assert pack_state(State(0, 0, (32.766, -32.768, 99.0)))[1:4] == (32766, -32768, 32767)
+    assert pack_state(State(0, 0, (-99.0, 0.0006, 0.0004)))[1:4] == (-32768, 1, 0)
+
+
+def test_compressed_quaternions_are_bits_of_the_firmware_s() -> None:
+    half = 0.5**0.5
+    assert compressed((0.0, 0.0, 0.0, 1.0)) == (3 << 30) - (1 << 32)
+    assert compressed((1.0, 0.0, 0.0, 0.0)) == 0
+    assert compressed((0.0, 0.0, -1.0, 0.0)) == (2 << 30 | 1 << 29 | 1 << 19 | 1 << 9) - (1 << 32)
+    # The largest part is positive, so the others change their signs with it.
+    near = compressed((-half - 1e-9, half, 0.0, 0.0))
+    assert near == 1 << 29 | 511 << 20 | 1 << 19 | 1 << 9
+    assert quaternion(1 << 29 | 511 << 20) == pytest.approx((half, -half, 0, 0))
+    assert quaternion(3 << 20 | 5 << 10 | 512 + 7) == pytest.approx(
+        ((1 - (3**2 + 5**2 + 7**2) * 0.5 / 511**2) ** 0.5, *(n * half / 511 for n in (3, 5, -7)))
+    )
+
+
+def test_what_a_camera_does_not_tell_is_sent_as_nothing() -> None:
+    bare = raw(8, 8)
+    (streamed,), _ = read(pack_image(bare, "streamer"))
+    assert (streamed.frame_id, streamed.time_us, streamed.state) == (0, 0, None)
+    assert streamed.robot_time_us is None
+    stamped = pack_image(bare, "stamped")
+    assert cpx.STAMP.unpack_from(stamped, 4 + cpx.HEADER.size) == (0, 0, 0, 0, 0)
+    assert raw(8, 8, time_us=9).robot_time_us is None
+
+
+def test_a_stamp_tells_milliseconds_and_where_the_robot_is() -> None:
+    state = State(5, 6, (0.1, -0.2, 0.3), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
+    data = pack_image(raw(8, 8, time_us=(2**32 + 5) * 1000 + 999, state=state), "stamped")
+    assert cpx.STAMP.unpack_from(data, 4 + cpx.HEADER.size) == (5, 100, -200, 300, 0)
+
+
+def test_streamer_metadata_stands_where_the_firmware_has_it() -> None:
+    state = State(5, 2**32 + 6, (0.1, -0.2, 0.3))
+    image = raw(10, 12, time_us=2**32 + 9, frame_id=258, state=state)
+    data = pack_image(image, "streamer")[4 + cpx.BEGIN.size :]
+    assert struct.unpack_from("<BHHBBBIII3h", data) == (
+        *(10, 10, 12, 1, 0, 2, 9, 6),
+        *(5, 100, -200, 300),
+    )
+    assert data[52:148] == bytes(96)  # what is not known
+    assert data[148 : 148 + 120] == image.data
+
+
+def test_a_robot_s_time_is_the_camera_s_by_when_it_last_told_it() -> None:
+    image = raw(8, 8, time_us=10_000, state=State(7, 4_000))
+    assert image.robot_time_us == 7_000 + 6_000
+
+
+@pytest.mark.parametrize(
+    ("size", "whole"),
+    [((4096, 1), True), ((4097, 1), False), ((1, 4096), True), ((1, 4097), False)],
+)
+def test_a_picture_s_side_is_4096_pixels_at_most(size: tuple[int, int], whole: bool) -> None:
+    got, reader = read(pack_image(raw(*size)))
+    assert (len(got), reader.broken) == (whole, not whole)
+
+
+@pytest.mark.parametrize(("function", "counted"), [(APP, 2), (STREAMER, 0)])
+def test_a_packet_has_a_longest_length(function: int, counted: int) -> None:
+    most = PACKET_MAX_BYTES - counted
+    packet = Packet(GAP8, HOST, function, bytes(most), last=False)
+    data = pack_packet(packet)
+    assert struct.unpack_from("<HBB", data) == (PACKET_MAX_BYTES, 3 | 4 << 3, function)
+    follower = pack_packet(Packet(GAP8, HOST, function, b"x"))
+    assert next(PacketReader().feed(data + follower)) == packet
+    with pytest.raises(ValueError, match=f"a packet of {PACKET_MAX_BYTES + 1} bytes"):
+        pack_packet(Packet(GAP8, HOST, function, bytes(most + 1)))
+
+
+def test_bytes_between_packets_are_counted_and_the_rest_at_the_end() -> None:
+    packet = pack_packet(Packet(GAP8, HOST, APP, b"abc"))
+    reader = PacketReader()
+    got = list(reader.feed(packet + b"\0" * 7 + packet * 2))
+    assert (len(got), reader.skipped_bytes) == (3, 7)
+    assert list(reader.feed(packet[:-1])) == []
+    assert reader.finish() and reader.skipped_bytes == 7 + len(packet) - 1
+    assert not reader.finish()
+
+
+def test_an_image_cut_at_the_end_is_broken_once() -> None:
+    reader = ImageReader()
+    list(reader.feed(pack_image(raw(60, 50))[:1500]))
+    reader.finish()
+    assert reader.broken == 1
+    reader.finish()
+    assert reader.broken == 1
+
+
+def test_a_streamer_image_without_a_checksum_is_taken() -> None:
+    image = raw(10, 10, time_us=5, frame_id=1)
+    data = bytearray(pack_image(image, "streamer"))
+    data[10:14] = bytes(4)
+    assert [got.data for got in read(bytes(data))[0]] == [image.data]
+    data[10:14] = b"\1\0\0\0"
+    got, reader = read(bytes(data))
+    assert (got, reader.broken) == ([], 1)
+
+
+def test_a_jpeg_that_does_not_begin_as_one_is_broken() -> None:
+    got, reader = read(pack_image(Image(32, 24, "jpeg", b"\xff\xd9" + bytes(90))))
+    assert (got, reader.broken) == ([], 1)

@@ -6,9 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.formats.crazyflie_log import _pose, attitude_of, streams, yaw_rate_of
-from dmrl.formats.log_block import Block, Series, unpacked_quaternion
+from dmrl.formats.crazyflie_state import quaternions_of, scaled, turn_of
+from dmrl.formats.log_block import Block, Series, series, unpacked_quaternion
 from dmrl.geometry.frames import Array, camera_from_horizontal
 from dmrl.geometry.turns import euler_zyx, quaternion_zyx
+from dmrl.samples.sample import Sample
 
 MS = 1_000_000
 TIMES = np.arange(3) * 10 * MS
@@ -130,3 +132,146 @@ def test_a_place_without_a_turn_is_level_and_looks_along_x() -> None:
         [3, 4, 5, 0, 0, 0, 1],
         [6, 7, 8, 0, 0, 0, 1],
     ]
+
+
+def samples(*blocks: Block, **names: str) -> dict[str, list[Sample]]:
+    """Samples of cf1's log by topic; ``names`` are ``cf<number>``."""
+    found: dict[str, list[Sample]] = {}
+    numbers = {key.removeprefix("cf"): name for key, name in names.items()}
+    for stream in streams("cf1", blocks, numbers):
+        for sample in stream:
+            found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+def test_series_are_of_the_first_block_that_has_all_and_of_finite_rows() -> None:
+    one, two = block("a", x=[1, 2, 3]), block("b", x=[4, np.nan, 6], y=[7, 8, 9])
+    found = series([one, two], ["y", "x"])
+    assert found is not None
+    assert found.time_ns.tolist() == [0, 20 * MS]
+    assert found.values.tolist() == [[7, 4], [9, 6]]
+    assert found.part(1).values.tolist() == [[4], [6]]
+    assert found.at(np.array([-5, 5, 10, 99]) * MS).tolist() == [[7, 4], [7.5, 4.5], [8, 5], [9, 6]]
+    assert series([one, two], ["x", "z"]) is None
+    assert series([block("a", x=[np.nan])], ["x"]) is None
+
+
+def test_rows_out_of_order_are_put_in_order_with_all_their_columns() -> None:
+    times = np.array([30, 10, 20]) * MS
+    logged = Block("my block", times, {"a": np.array([3, 1, 2]), "b": np.array([30, 10, 20])})
+    (found,) = samples(logged).values()
+    assert {s.topic for s in found} == {"/cf1/log/my_block"}
+    assert [(s.time_ns, s.fields["a"], s.fields["b"]) for s in found] == [
+        (10 * MS, 1, 10),
+        (20 * MS, 2, 20),
+        (30 * MS, 3, 30),
+    ]
+
+
+@pytest.mark.parametrize(("norm", "kept"), [(0.91, 1), (0.89, 0), (1.09, 1), (1.11, 0)])
+def test_quaternions_a_tenth_from_unit_length_are_none(norm: float, kept: int) -> None:
+    rows = [[0.0, norm], [0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    names = ("stateEstimate__qx", "stateEstimate__qy", "stateEstimate__qz", "stateEstimate__qw")
+    found = quaternions_of([block("a", **dict(zip(names, rows, strict=True)))])
+    assert found is not None
+    assert found.values.tolist() == [[0, 0, 1, 0], [1, 0, 0, 0]][: 1 + kept]
+    assert found.time_ns.tolist() == [0, 10 * MS][: 1 + kept]
+    assert quaternions_of([block("a", **{name: [0.0] for name in names})]) is None
+
+
+def test_state_in_millimetres_is_taken_where_there_is_none_in_metres() -> None:
+    packed = block("z", stateEstimateZ__x=[1500.0], stateEstimateZ__y=[-20.0])
+    plain = block("p", stateEstimate__x=[3.0], stateEstimate__y=[4.0])
+    for blocks, wanted in (([packed, plain], [[3.0, 4.0]]), ([packed], [[1.5, -0.02]])):
+        found = scaled(blocks, "x y")
+        assert found is not None and found.values == pytest.approx(np.array(wanted))
+    assert scaled([packed, plain], "x y z") is None
+
+
+def test_a_turn_of_which_only_a_part_is_logged_is_level_else() -> None:
+    found = turn_of([block("a", stateEstimate__yaw=[90.0], stateEstimate__pitch=[20.0])])
+    wanted = quaternion_zyx(np.array([[0.0, np.radians(-20), np.pi / 2]]))
+    assert found is not None and found.values == pytest.approx(wanted)
+    assert turn_of([block("a", stateEstimate__x=[1.0])]) is None
+
+
+def test_angles_of_the_estimate_come_before_the_stabilizer_s() -> None:
+    both = block("a", stabilizer__roll=[10.0], stateEstimate__roll=[20.0])
+    found = turn_of([both])
+    assert found is not None
+    assert found.values == pytest.approx(quaternion_zyx(np.radians([[20.0, 0, 0]])), abs=1e-6)
+
+
+def test_ranges_end_at_60_m_and_nothing_heard_is_not_refused(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    # Alone, so that nothing else is logged.
+    metres = [59.99, 60.0, 61.0, 0.0, -1.0, np.nan, 0.01]
+    times = np.arange(7) * MS
+    found = samples(Block("r", times, {"ranging.distance2": np.array(metres)}))["/cf1/range/cf2"]
+    assert [(s.time_ns, s.fields["range_m"]) for s in found] == [(0, 59.99), (6 * MS, 0.01)]
+    assert "the log: 3 ranges to cf2 left out: not over 0 and under 60 m" in capsys.readouterr().err
+
+
+def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> None:
+    event = Block(
+        "estDistance",
+        TIMES,
+        {"id": np.array([2, 1, 2], np.uint8), "distance": np.array([1.5, 7, 2.5], np.float32)},
+    )
+    found = samples(event, cf2="anchor")
+    heard = found.pop("/cf1/range/anchor")
+    assert [(s.time_ns, s.fields["range_m"]) for s in heard] == [(0, 1.5), (20 * MS, 2.5)]
+    assert found.keys() == {"/cf1/log/estDistance"}
+
+
+@pytest.mark.parametrize(
+    ("values", "range_m", "said"),
+    [
+        (np.array([61.0, 1500.0]), [0.061, 1.5], "from 61 on: taken for millimetres"),
+        (np.array([59.0, 2.0]), [59.0, 2.0], ""),
+        (np.array([61.5, 2.0]), [2.0], "1 ranges to cf2 left out"),
+        (np.array([61, 1500]), [0.061, 1.5], ""),
+        (np.array([2, 59]), [0.002, 0.059], "but is 59 at most. Are they metres?"),
+    ],
+)
+def test_the_unit_of_a_distance_is_told_by_its_type_and_size(
+    values: np.ndarray, range_m: list[float], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = samples(Block("r", TIMES[:2], {"ranging.distance2": values}))["/cf1/range/cf2"]
+    assert [s.fields["range_m"] for s in found] == pytest.approx(range_m)
+    err = capsys.readouterr().err
+    assert said in err and ("millimetres" in err, "metres?" in err) == (
+        "millimetres" in said,
+        "metres?" in said,
+    )
+
+
+def test_poses_take_the_nearest_turn_and_true_ones_that_stand_come_once() -> None:
+    place = block("p", **{f"locSrv__{n}": [1.0, 1.0, 2.0] for n in "xyz"})
+    still = {"locSrv__qx": [0.0] * 3, "locSrv__qy": [0.0] * 3}
+    turn = block("q", **still, locSrv__qz=[0.0, 0.0, 1.0], locSrv__qw=[1.0, 1.0, 0.0])
+    found = samples(place, turn)
+    assert "/cf1/pose" not in found
+    poses = [(s.time_ns, s.fields["pose"]) for s in found["/cf1/pose/truth"]]
+    assert [(t, p["position"]["z"], p["orientation"]["z"]) for t, p in poses] == [
+        (0, 1.0, 0.0),
+        (20 * MS, 2.0, 1.0),
+    ]
+    stamp = found["/cf1/pose/truth"][1].fields["timestamp"]
+    assert (stamp["seconds"], stamp["nanos"]) == (0, 20 * MS)
+    event = Block("estPose", TIMES, place.columns)  # each comes when it is measured
+    assert len(samples(event, turn)["/cf1/pose/truth"]) == 3
+
+
+def test_frames_of_a_robot_are_told_every_50_ms() -> None:
+    times = np.arange(0, 200, 20) * MS
+    columns = {f"stateEstimate.{n}": np.arange(10.0) + k for k, n in enumerate("xyz")}
+    found = samples(Block("s", times, columns))["/tf"]
+    assert [s.time_ns // MS for s in found] == [0, 60, 100, 160]
+
+
+def test_a_beam_of_8_m_and_more_saw_no_floor() -> None:
+    found = samples(block("b", range__zrange=[7999.0, 8001.0, 1.0]))["/cf1/height"]
+    assert [s.time_ns for s in found] == [0, 20 * MS]
+    assert [s.fields["height_m"] for s in found] == pytest.approx([7.999, 0.001])

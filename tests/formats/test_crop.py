@@ -57,3 +57,19 @@ def test_pixels_are_those_of_the_part(crop: Crop) -> None:
     left, top = crop.corner_px
     wanted = ((left + 160 / crop.scale) / 4, (top + 120 / crop.scale) / 4)
     assert got[120, 160, :2].tolist() == pytest.approx(wanted, abs=2)
+
+
+def test_a_part_that_is_cut_out_is_not_scaled() -> None:
+    crop = Crop(324, 244, 320, 224, cut_px=(2, 10))
+    assert (crop.scale, crop.corner_px) == (1.0, (2, 10))
+    row = crop.label(LabelRow("a.png", "cf2", 52.0, 30.0, sigmas=(1.0, 2.0, 3.0)))
+    assert (row.u_px, row.v_px, row.sigmas) == (50.0, 20.0, (1.0, 2.0, 3.0))
+    v, u = np.mgrid[:244, :324]
+    rgb = np.stack([u // 2, v, 0 * u], axis=-1).astype(np.uint8)
+    assert (crop.pixels(rgb) == rgb[10:234, 2:322]).all()
+
+
+def test_a_box_that_only_touches_an_edge_is_gone() -> None:
+    left, _ = WIDE.corner_px
+    for box in ((left + 100, -9, left + 200, 0), (left + 100, 500, left + 200, 501)):
+        assert WIDE.label(LabelRow("a.png", "cf2", box_px=box)).box_px == ()

@@ -37,6 +37,9 @@ def test_ranges_odometry_and_truth_come_out(ranges: Path) -> None:
     seen = [s.fields for s in samples if s.topic == "/turtle1/peer/turtle3/truth"]
     assert (seen[0]["x"], seen[0]["y"]) == pytest.approx((2.0, 0.0))
     assert (seen[-1]["x"], seen[-1]["y"]) == pytest.approx((2.0, 0.9))
+    back = [s.fields for s in samples if s.topic == "/turtle3/peer/turtle1/truth"]
+    assert (back[-1]["x"], back[-1]["y"], back[-1]["z"]) == pytest.approx((0.9, -2.0, 0.0))
+    assert not [s for s in samples if s.topic == "/turtle1/peer/turtle1/truth"]
 
 
 def test_other_files_are_refused(ranges: Path, tmp_path: Path) -> None:
