@@ -294,3 +294,50 @@ def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> Non
             len(record(tmp_path / f"{k}.mcap", lambda w, a=left_px, b=right_px: fill(w, a, b)))
             == found
         )
+
+
+def test_topics_that_are_not_dmrl_s_are_left_alone(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        for k in range(3):
+            write(k, "/cf1/own", message("Height")())
+
+    assert record(tmp_path / "a.mcap", fill) == []
+
+
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [
+        ([(320, 224)], []),
+        ([(320, 224), (160, 112)], ["warning /cf1/camera/image images of 2 sizes: 160x112, "]),
+        ([(160, 112)], ["error /cf1/camera/image images of 160x112, but the calibration is for "]),
+    ],
+)
+def test_images_are_of_one_size_and_of_the_calibrated(
+    tmp_path: Path, sizes: list[tuple[int, int]], said: list[str]
+) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        for k, (width, height) in enumerate(sizes):
+            data = encode_png(np.zeros((height, width, 3), np.uint8))
+            write(k, "/cf1/camera/image", image(data))
+
+    found = record(tmp_path / "a.mcap", fill)
+    assert len(found) == len(said)
+    assert all(one.startswith(words) for one, words in zip(found, said, strict=True))
+    assert all("320x224" in one for one in found)
+
+
+def test_a_stamp_of_zero_counts_only_where_one_is_given_and_the_time_is_another(
+    tmp_path: Path,
+) -> None:
+    def fill(write: Write) -> None:
+        pose = message("PoseInFrame")
+        write(0, "/cf1/pose", pose(timestamp={}))
+        write(5, "/cf1/pose", pose())
+        write(6, "/cf1/pose", pose(timestamp={"nanos": 6}))
+        write(7, "/cf1/pose", pose(timestamp={"seconds": 1}))
+        write(8, "/cf1/pose", pose(timestamp={}))
+
+    assert record(tmp_path / "a.mcap", fill) == [
+        "warning /cf1/pose 1 messages have a time stamp of 0"
+    ]

@@ -54,3 +54,20 @@ def test_periods_of_sensors() -> None:
     ((_, often),) = periods({"/cf1/height": times // 1_000_000})
     assert "in s, ms or us" in often
     assert list(periods({"/cf1/labels": times * 1000, "/cf1/height": times[:19] * 1000})) == []
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "said"), [(4_900_000_000, 0), (5_100_000_000, 1), (9_000, 1), (11_000, 0), (0, 0)]
+)
+def test_periods_beyond_a_sensor_s(period_ns: int, said: int) -> None:
+    times = np.arange(20) * period_ns
+    assert len(list(periods({"/cf1/height": times}))) == said
+    assert list(periods({"/cf1/height": times[:19]})) == []
+
+
+def test_sizes_are_told_apart_to_a_fifth_of_their_limit() -> None:
+    assert _doubted("/cf1/height", "height_m", np.full(20, 30.0)) == []
+    assert len(_doubted("/cf1/height", "height_m", np.full(20, 36.0))) == 1
+    for tiny, huge in ((1e-80, 1e80), (-1e-300, -1e300)):
+        assert _doubted("/cf1/height", "height_m", np.full(20, tiny)) == []
+        assert len(_doubted("/cf1/height", "height_m", np.full(20, huge))) == 1

@@ -243,3 +243,28 @@ def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     rewrite(path, out, MADE, without=(), fresh=())
     assert list(read_raw(out)) == list(read_raw(path))
+
+
+def test_a_calibration_at_time_0_in_a_chunk_of_its_own_goes_along(tmp_path: Path) -> None:
+    def fill(writer: Writer, schema: int) -> None:
+        told = message("CameraCalibration")(width=320, distortion_model="x" * 500)
+        camera = writer.register_channel(
+            "/cf1/camera/calibration",
+            "protobuf",
+            writer.register_schema(
+                "foxglove.CameraCalibration", "protobuf", schema_bytes("CameraCalibration")
+            ),
+        )
+        writer.add_message(camera, 0, told.SerializeToString(), 0)
+        height = writer.register_channel("/cf1/height", "protobuf", schema)
+        for k in range(60):
+            writer.add_message(height, k, message("Height")(height_m=k).SerializeToString(), k)
+
+    path = foreign(tmp_path / "a.mcap", fill, chunk_size=400)
+    assert chunks(path)[0].message_end_time == 0
+    out = tmp_path / "out.mcap"
+    assert trim(path, out, start_ns=50, end_ns=55) == 5  # beside what is always kept
+    assert [(r.topic, r.time_ns) for r in read_raw(out)] == [
+        ("/cf1/camera/calibration", 0),
+        *(("/cf1/height", k) for k in range(50, 55)),
+    ]

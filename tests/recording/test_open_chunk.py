@@ -18,6 +18,7 @@ from dmrl.recording.block import HEAD_BYTES, Block
 from dmrl.recording.blocks import blocks
 from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import scanned
+from dmrl.recording.container import laid_out
 from dmrl.recording.defined import Defined, _free
 from dmrl.recording.open_chunk import OpenChunk
 
@@ -150,6 +151,46 @@ def test_channels_are_numbered_once_and_defined_once() -> None:
     ]
     schemas, channels = defined.all_begun()
     assert ([s.id for s in schemas], [c.id for c in channels]) == ([1], [1, 2, 3])
+
+
+def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> None:
+    """Channels 4 and 6 of schema 9, defined in the chunk in front of their messages."""
+    mine = {n: channel(topic) for n, topic in ((4, "/a"), (6, "/b"))}
+    records = {n: McapChannel(n, c.topic, "protobuf", {}, 9) for n, c in mine.items()}
+    schema = Schema(9, b"a", "protobuf", "a")
+
+    def chunk(*parts: McapChannel | Schema | int) -> Block:
+        held = OpenChunk()
+        for part in parts:
+            if isinstance(part, int):
+                held.add(part, 1, 2, b"x")
+            else:
+                held.define(laid_out(part))
+        return scanned(np.frombuffer(bytes(held.data), np.uint8)).block
+
+    def begun(*parts: McapChannel | Schema | int) -> tuple[Defined, bool]:
+        defined = Defined()
+        defined.adopt(mine, records)
+        return defined, defined.begin_in(chunk(*parts), mine)
+
+    defined, stands = begun(schema, records[4], 4, records[6], 6, 4)
+    assert stands and defined.begun == {4, 6}
+    assert [[one.id for one in kind] for kind in defined.all_begun()] == [[9], [4, 6]]
+    assert defined.begin(4) == defined.begin(6) == b""
+    assert defined.begin_in(chunk(6, 4), mine)  # known by now
+    for parts in (
+        (records[4], 4),  # without its schema
+        (schema, 4),  # not defined
+        (schema, records[4], 4, 6),
+        (schema, McapChannel(4, "/a", "protobuf", {"k": "v"}, 9), 4),  # in other words
+        (Schema(9, b"b", "protobuf", "a"), records[4], 4),
+        (schema, records[4], McapChannel(7, "/c", "protobuf", {}, 9), 4),
+    ):
+        defined, stands = begun(*parts)
+        assert not stands and not defined.begun
+    defined = Defined()
+    defined.number(mine[6])
+    assert not defined.begin_in(chunk(schema, records[6], 6), mine)  # has another number here
 
 
 def test_copies_keep_their_numbers_where_these_are_free() -> None:

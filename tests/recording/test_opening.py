@@ -58,6 +58,8 @@ def test_no_read_goes_beyond_the_end(tmp_path: Path) -> None:
     with opened(tmp_path / "a.mcap") as stream:
         assert (stream.tell(), stream.size) == (0, 18)
         assert stream.read(18) == MAGIC + b"12" + MAGIC
+        stream.seek(8)
+        assert stream.read(None) == b"12" + MAGIC  # all, as of any file
     beyond = pytest.raises(RecordingError, match="a record at byte 1 runs beyond the end")
     with beyond, opened(tmp_path / "a.mcap") as stream:
         stream.seek(1)
