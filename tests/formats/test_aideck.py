@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.formats.aideck import FARTHEST_M, is_plausible, samples
-from dmrl.geometry.frames import AIDECK, pixels_from_horizontal
+from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
 
 VALUES = (10.0, 20.0, 2.0, 0.3, -0.1, 2.5)
 
@@ -44,3 +44,24 @@ def test_who_is_out_of_view_has_no_label() -> None:
     for xyz in ((-2.0, 0.0, 0.0), (1.0, 5.0, 0.0), (1.0, 0.0, -5.0)):
         *_, labels = samples(7, "cf1", "cf2", (0.0, 0.0, *xyz, 0.0), AIDECK)
         assert labels.fields["peers"] == []
+
+
+def test_a_label_ends_at_the_picture_s_edges() -> None:
+    """Of a camera without distortion that stands level: u = cx - f y / x, v = cy - f z / x."""
+    camera = Camera(100, 80, 40.0, 50.0, 50.0, 40.0, ())
+
+    def seen(x: float, u: float, v: float) -> list[dict[str, float]]:
+        place = (x, (50.0 - u) * x / 40.0, (40.0 - v) * x / 50.0)
+        *_, labels = samples(7, "cf1", "cf2", (0.0, 0.0, *place, 0.0), camera)
+        found: list[dict[str, float]] = labels.fields["peers"]
+        return found
+
+    ((first),) = seen(2.0, 10.0, 20.0)
+    assert (first["u_px"], first["v_px"], first["depth_m"]) == pytest.approx((10, 20, 2))
+    for u, v, count in (
+        *((0.01, 40, 1), (-0.01, 40, 0), (99.99, 40, 1), (100.01, 40, 0)),
+        *((50, 0.01, 1), (50, -0.01, 0), (50, 79.99, 1), (50, 80.01, 0)),
+    ):
+        assert len(seen(2.0, u, v)) == count
+    assert len(seen(0.051, 50, 40)) == 1
+    assert len(seen(0.049, 50, 40)) == 0

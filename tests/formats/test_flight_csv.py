@@ -208,3 +208,48 @@ def test_odometry_from_poses_turns_with_the_robot() -> None:
 def test_logs_that_share_their_last_samples_are_taken(flight: Path) -> None:
     write(flight, "cf2", rows(1.18))
     assert list(flight_csv.content(flight).samples)
+
+
+def test_steps_of_a_second_are_no_gap_and_longer_ones_are(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(flight, "cf2", [*rows(), *rows(2.19)])
+    assert warned(flight, capsys) == []
+    write(flight, "cf2", [*rows(), *rows(2.21), *rows(4.0)])
+    (line,) = warned(flight, capsys)
+    assert line.endswith("cf2.csv: 2 gaps, the first of 1.0 s after 1.190 s")
+
+
+def test_clocks_that_touch_share_a_time_and_the_order_of_files_does_not_matter(
+    flight: Path,
+) -> None:
+    for robot in ("cf0", "cf2"):  # before and after cf1 by name
+        write(flight, robot, rows(1.20))
+        assert "share no time: 0 s lie between them" in refused(flight)
+        write(flight, robot, rows(1.19))
+        assert list(flight_csv.content(flight).samples)
+
+
+def test_a_range_under_60_m_is_one(flight: Path) -> None:
+    data: Rows = [[*row, 59.99 if k % 2 else 60.0] for k, row in enumerate(rows())]
+    write(flight, "cf1", data, [*HEADER, "range_cf2_m"])
+    samples = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/range/cf2"]
+    assert [s.fields["range_m"] for s in samples] == [59.99] * 10
+
+
+def test_where_a_peer_truly_is_needs_three_numbers(flight: Path) -> None:
+    cells = [["1", "2", ""], ["", "2", "3"], ["1", "2", "3"]]
+    data: Rows = [[*row, *cells[k % 3]] for k, row in enumerate(rows())]
+    write(flight, "cf1", data, [*HEADER, "cf2_x_m", "cf2_y_m", "cf2_z_m"])
+    found = [s for s in flight_csv.content(flight).samples if s.topic.endswith("truth")]
+    assert [s.time_ns for s in found] == [1_000_000_000 + 10_000_000 * k for k in range(2, 20, 3)]
+    write(flight, "cf1", [row[:-1] for row in data], [*HEADER, "cf2_x_m", "cf2_y_m"])
+    assert not [s for s in flight_csv.content(flight).samples if s.topic.endswith("truth")]
+
+
+def test_times_end_with_64_bits(flight: Path) -> None:
+    for robot in ("cf1", "cf2"):
+        write(flight, robot, [[8.9e9 + k, *row[1:]] for k, row in enumerate(rows())])
+    assert list(flight_csv.content(flight).samples)
+    write(flight, "cf2", [[9.1e9 + k, *row[1:]] for k, row in enumerate(rows())])
+    assert "time_s reaches 9.1e+09" in refused(flight)

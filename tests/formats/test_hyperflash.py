@@ -138,3 +138,27 @@ def test_real_frames_are_behind_the_filters_that_are_assumed(data: Path) -> None
         rgb = decode((data / "aideck-frames" / f"img{number}.ppm").read_bytes())
         again = rgb_of(mosaic(rgb))[2:-2, 2:-2].astype(int)
         assert np.abs(again - rgb[2:-2, 2:-2]).max() <= 1
+
+
+@pytest.mark.parametrize(("odd", "of", "taken"), [(1, 3, True), (1, 2, False), (2, 3, False)])
+def test_most_records_of_a_dump_are_plausible(odd: int, of: int, taken: bool, dump: Path) -> None:
+    values = [*[(1e9,) * 6] * odd, *[VALUES[0]] * (of - odd)]
+    dump.write_bytes(foreign.flash_dump([mosaic(p) for p in known_pictures()[:of]], values))
+    if taken:
+        assert len(samples(dump, "CompressedImage")) == of
+    else:
+        with pytest.raises(SourceError, match=f"{odd} of {of} records have numbers"):
+            hyperflash.content(dump, Options())
+
+
+def test_a_dump_is_whole_records_and_erased_flash_of_numbers_not_all_zero(dump: Path) -> None:
+    whole = dump.read_bytes()[:71_704]
+    for data, known in (
+        (whole, True),
+        (whole + b"\xff" * 100, True),
+        (whole + b"\0" * 100, False),
+        (whole[:-1], False),
+        (whole[:-24] + bytes(24), False),
+    ):
+        dump.write_bytes(data)
+        assert hyperflash.recognises(dump) == known

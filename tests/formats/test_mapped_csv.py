@@ -248,3 +248,81 @@ def test_units_are_what_they_are_called() -> None:
         "qw": {"1": 1},
     }.items():
         assert QUANTITIES[quantity] == pytest.approx(units)
+
+
+def turning(table: Path, told: float, slope: float, count: int = 50) -> None:
+    """A log whose gyroscope tells a turn, deg/s, and whose yaw turns, rad/s, at 100 Hz."""
+    rows = [f"{1000 + 10 * k};0;0;{slope * k / 100};{told};0;0;0;0;x" for k in range(count)]
+    table.with_name("log.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+    samples(table.with_name("log.csv"), Options(columns=table))
+
+
+@pytest.mark.parametrize(
+    ("told", "slope", "said"),
+    [
+        (9.9, 1.0, ""),
+        (10.1, 1.0, "turning rates are 10 times the slope of yaw. Are they deg/s?"),
+        (0.49, 0.01, ""),  # hardly any turn
+        (0.51, 0.01, "turning rates are 51 times"),
+        (1.0, 9.9, ""),
+        (1.0, 10.1, "turning rates are 1/10 of the slope of yaw. Are they rad/s?"),
+        (0.01, 0.49, ""),
+        (0.01, 0.51, "turning rates are 1/51"),
+    ],
+)
+def test_turning_rates_ten_times_off_are_doubted(
+    told: float, slope: float, said: str, table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turning(table, np.degrees(told), slope)
+    err = capsys.readouterr().err
+    assert said in err and bool(said) == ("turning rates" in err)
+    turning(table, np.degrees(told), slope, 2)
+    assert "turning rates" not in capsys.readouterr().err
+
+
+def test_a_tilt_of_half_a_turn_may_be(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table.write_text(TABLE.replace('name = "theta"\nunit = "deg"', 'name = "theta"\nunit = "rad"'))
+    for tilt, said in ((3.14, False), (3.15, True)):
+        rows = [f"{1000 + 10 * k};0;{-tilt};0;0;0;0;0;0;x" for k in range(3)]
+        table.with_name("log.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+        samples(table.with_name("log.csv"), Options(columns=table))
+        assert ("pitch reaches 3 rad" in capsys.readouterr().err) == said
+
+
+def test_lines_out_of_order_are_sorted_and_the_last_may_be_cut(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = table.with_name("log.csv")
+    log.write_text("\n".join([HEADER, ROWS[1], ROWS[0], "1020;1;2"]))
+    found = samples(log, Options(columns=table))["/cf1/height"]
+    assert [s.time_ns for s in found] == [1_000_000_000, 1_010_500_000]
+    assert [s.fields["height_m"] for s in found] == [0.5, 0.51]
+    err = capsys.readouterr().err
+    assert "its lines are not in order of time; sorted" in err
+    assert "its last line is cut short; left out" in err
+
+
+@pytest.mark.parametrize(
+    ("cell", "time_ns"),
+    [("0", 0), ("9223372036854.775807", 2**63 - 1), ("9223372036854.775808", None)],
+)
+def test_times_are_whole_nanoseconds_of_63_bits(
+    cell: str, time_ns: int | None, table: Path
+) -> None:
+    log = table.with_name("log.csv")
+    log.write_text(f"{HEADER}\n{ROWS[0].replace('1000', cell, 1)}\n")
+    if time_ns is None:
+        with pytest.raises(SourceError, match="before 1970 or after 2262"):
+            samples(log, Options(columns=table))
+    else:
+        assert samples(log, Options(columns=table))["/cf1/height"][0].time_ns == time_ns
+
+
+def test_a_folder_is_a_robot_per_file_by_its_name(table: Path) -> None:
+    folder = table.with_name("logs")
+    folder.mkdir()
+    for name in ("a.csv", "b.CSV"):
+        (folder / name).write_text(table.with_name("log.csv").read_text())
+    (folder / "notes.txt").write_text("x")
+    found = samples(folder, Options(columns=table, names={"a": "left"}))
+    assert {topic.split("/")[1] for topic in found} - {"tf"} == {"left", "b"}

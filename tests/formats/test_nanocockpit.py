@@ -79,3 +79,26 @@ def test_a_table_that_does_not_fit_is_one_line(folder: Path, old: str, new: str,
 
 def test_it_is_known_by_its_table(folder: Path) -> None:
     assert format_of(folder).name == "nanocockpit"
+
+
+def test_differences_of_counts_that_wrap_are_the_short_way() -> None:
+    ticks = np.array([5, -5, 2**31 - 1, 2**31, -(2**31), 2**32 - 3, 3 - 2**32])
+    short = [5, -5, 2**31 - 1, -(2**31), -(2**31), -3, 3]
+    assert nanocockpit._nearest(ticks).tolist() == short
+
+
+def test_a_state_that_stands_counts_once_and_none_before_the_first(folder: Path) -> None:
+    path = folder / "metadata.csv"
+    head, *lines = path.read_text().splitlines()
+    at = head.split(",").index("state_gap8_timestamp")
+    rows = [line.split(",") for line in lines]
+    for row, stamp in zip(rows, ("0", "0", rows[2][at], rows[2][at], *"xx"), strict=True):
+        row[at] = row[at] if stamp == "x" else stamp
+    path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
+    found = samples(folder)
+    images = [s.time_ns for s in found["/cf1/camera/image"]]
+    assert [s.time_ns for s in found["/cf1/attitude"]] == [images[k] - 5_000_000 for k in (2, 4, 5)]
+    for row in rows:
+        row[at] = "0"
+    path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
+    assert samples(folder).keys() == {"/cf1/camera/image"}
