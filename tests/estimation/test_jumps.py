@@ -40,3 +40,50 @@ def test_what_never_comes_back_is_no_level() -> None:
     values = np.zeros(800)
     values[300:] = 1.0
     assert not levels(values, 0.1, 0.45, 3).any()
+
+
+@pytest.mark.parametrize(("jump", "seen"), [(0.44, False), (0.46, True)])
+def test_a_jump_is_larger_than_the_least(jump: float, seen: bool) -> None:
+    values = np.zeros(400)
+    values[100:150] = jump
+    found = levels(values, 0.1, 0.45, 3)
+    assert found.any() == seen
+    if seen:
+        assert np.flatnonzero(found)[[0, -1]].tolist() == [100, 149]
+        assert found[100:150] == pytest.approx(np.full(50, jump))
+
+
+@pytest.mark.parametrize(("lasts", "level"), [(299, True), (301, False)])
+def test_a_level_lasts_30_s_at_most(lasts: int, level: bool) -> None:
+    values = np.zeros(800)
+    values[100 : 100 + lasts] = 1.0
+    assert levels(values, 0.1, 0.45, 3).any() == level
+    late = np.zeros(800)
+    late[800 - lasts :] = 1.0  # and has not come back when the signal ends
+    assert levels(late, 0.1, 0.45, 3).any() == level
+
+
+@pytest.mark.parametrize(("back", "left"), [(0.6, 0.4), (0.7, 0.0)])
+def test_less_than_half_of_a_jump_is_none_after_it(back: float, left: float) -> None:
+    values = np.zeros(400)
+    values[100:150] = 1.0
+    values[150:250] = 1.0 - back
+    found = levels(values, 0.1, 0.3, 3)
+    assert found[100:150] == pytest.approx(np.ones(50))
+    assert found[200] == pytest.approx(left)
+
+
+def test_what_climbs_does_not_jump_and_a_jump_on_the_way_is_no_larger() -> None:
+    climb = 0.4 * np.arange(400) * 0.1
+    assert not levels(climb, 0.1, 0.45, 3).any()
+    over = climb.copy()
+    over[100:150] += 0.8
+    assert levels(over, 0.1, 0.45, 3)[120] == pytest.approx(0.8, abs=1e-6)
+
+
+def test_few_samples_are_left_as_they_are() -> None:
+    for count, seen in ((11, False), (12, True)):
+        values = np.zeros(count)
+        values[5:] = 1.0
+        assert levels(values, 0.1, 0.45, 3).any() == seen
+    assert levelled_height(TIME_S[:2], np.ones(2)).tolist() == [1, 1]

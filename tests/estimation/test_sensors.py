@@ -65,3 +65,57 @@ def test_a_robot_that_spins_is_lost_for_a_second_around() -> None:
     assert GRID_S[found.gap].min() == pytest.approx(9.0, abs=0.12)
     assert GRID_S[found.gap].max() == pytest.approx(12.0, abs=0.12)
     assert not found.yaw_rate_radps[found.gap].any()
+
+
+@pytest.mark.parametrize(
+    ("speed", "lasts_s", "usual", "lost"),
+    [
+        (2.9, 1.0, 0.1, False),
+        (3.1, 1.0, 0.1, True),
+        (3.1, 0.09, 0.1, False),
+        (3.1, 0.12, 0.1, True),
+        (3.9, 1.0, 1.0, False),
+        (4.1, 1.0, 1.0, True),
+    ],
+)
+def test_what_runs_away_is_fast_and_four_times_the_usual_and_lasts(
+    speed: float, lasts_s: float, usual: float, lost: bool
+) -> None:
+    size = np.full(len(GRID_S), usual)
+    size[1000 : 1000 + round(100 * lasts_s)] = speed
+    found = wild(size, 3.0)
+    assert found.any() == lost
+    if lost and lasts_s == 1.0:  # and a second around
+        assert GRID_S[found][[0, -1]] == pytest.approx([9.0, 11.99], abs=0.02)
+
+
+@pytest.mark.parametrize(("lasts_s", "stuck"), [(0.49, False), (0.52, True)])
+def test_silence_is_longer_than_half_a_second(lasts_s: float, stuck: bool) -> None:
+    values = noisy()
+    values[500 : 500 + round(100 * lasts_s) + 1] = values[500]
+    found = frozen(GRID_S, values, GRID_S)
+    assert found.any() == stuck
+    if stuck:
+        assert GRID_S[found][[0, -1]] == pytest.approx([5.0, 5.0 + lasts_s])
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.48, True), (0.52, False)])
+def test_what_repeats_itself_more_often_than_not_is_written_so(share: float, told: bool) -> None:
+    values = noisy()
+    values[: round(share * len(values))] = 1.0
+    assert frozen(GRID_S, values, GRID_S).any() == told
+
+
+def test_heights_are_smoothed_by_parabolas_over_half_a_second() -> None:
+    high = 1 + 0.3 * GRID_S - 0.02 * GRID_S**2
+    still = np.zeros((len(GRID_S), 1))
+    logs = (GRID_S, still), (GRID_S, noisy())
+    inner = slice(30, -30)
+    found = track(*logs, (GRID_S, high[:, None]), GRID_S).height_m
+    assert found[inner] == pytest.approx(high[inner])
+    spike = np.ones(len(GRID_S))
+    spike[1000] += 0.01
+    reach = np.flatnonzero(
+        np.abs(track(*logs, (GRID_S, spike[:, None]), GRID_S).height_m - 1) > 1e-9
+    )
+    assert (reach.min(), reach.max()) == (975, 1025)
