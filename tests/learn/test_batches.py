@@ -83,3 +83,27 @@ def test_robots_that_do_not_match_the_images_are_refused() -> None:
             good.robots[:2],
         )
     assert len(FIELDS) == good.robots.shape[-1]
+
+
+def test_a_mask_is_of_a_robot_whose_centre_it_shows() -> None:
+    robots = np.full((2, 3, len(FIELDS)), np.nan, np.float32)
+    robots[1, :, :2] = (2.5, 1.5), (7.0, 3.0), (-1.0, 1.0)
+    masks = np.zeros((2, 4, 8), np.uint8)
+    masks[1, 1, 2], masks[1, 3, 6], masks[1, 1, 7] = 1, 2, 3
+    examples = Examples([np.zeros((2, 4, 8, 3), np.uint8)], robots, [masks])
+    mine = examples.mask(1, 0)
+    assert mine is not None and np.argwhere(mine).tolist() == [[1, 2]]
+    assert examples.mask(1, 1) is None  # something else stands at its centre
+    assert examples.mask(1, 2) is None  # it is outside
+    assert examples.mask(0, 0) is None  # there is none
+    assert Examples(examples.pixels, robots).mask(1, 0) is None
+    chosen = examples.select(np.array([False, True]))
+    assert chosen.mask(0, 0) is not None
+    with pytest.raises(ValueError, match="masks that do not fit"):
+        Examples(examples.pixels, robots, [masks[:, :3]])
+
+
+def test_a_batch_is_no_longer_than_the_images_and_counts_are_rounded_up() -> None:
+    assert [batch_count(count, 4) for count in (0, 1, 4, 5, 8)] == [0, 1, 1, 2, 2]
+    assert numbered(5).image_shape == (8, 16, 3)
+    assert len(numbered(5, 2)) == 7

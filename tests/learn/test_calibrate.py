@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.learn.calibrate import Calibration, calibrate, calibration
+from dmrl.learn.calibrate import FAINTEST, LEAST, Calibration, _fitted, calibrate, calibration
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Curves, Scored, curves, score
 from dmrl.learn.network import build
@@ -66,3 +66,53 @@ def test_a_network_with_another_last_layer_is_left_as_it_is() -> None:
     network = build("locanet")
     network.head = torch.nn.Identity()  # type: ignore[assignment]
     assert not calibrate(network, Calibration(2.0, 0.0))
+
+
+def told(confidence: list[float], right: list[bool]) -> Scored:
+    """One detection an image, of which it is known whether it is right."""
+    image, u = np.arange(len(right)), np.full(len(right), 50.0)
+    truth = Points(image, np.where(right, u, 150.0), u, np.ones(len(u)), np.ones(len(u)))
+    return score(len(u), truth, Points(image, u, u, np.ones(len(u)), np.array(confidence)))
+
+
+def test_thirty_of_each_are_needed_and_faint_ones_do_not_count() -> None:
+    for right, wrong, known in ((LEAST, LEAST, True), (LEAST - 1, 99, False), (99, 29, False)):
+        # Three in four of the sure ones are right.
+        sure = [True] * (right * 3 // 4) + [False] * (wrong // 4)
+        weak = [True] * (right - right * 3 // 4) + [False] * (wrong - wrong // 4)
+        confidence = [0.8] * len(sure) + [0.3] * len(weak)
+        assert (calibration(told(confidence, sure + weak)) is not None) == known
+        below = [FAINTEST - 1e-3] * 200
+        faint = told(confidence + below, sure + weak + [False] * 200)
+        assert calibration(faint) == calibration(told(confidence, sure + weak))
+
+
+def test_two_confidences_become_the_shares_that_are_right() -> None:
+    confidence = [0.8] * 100 + [0.3] * 100
+    right = [True] * 90 + [False] * 10 + [True] * 40 + [False] * 60
+    found = calibration(told(confidence, right))
+    assert found is not None
+    said = [found.slope * np.log(p / (1 - p)) + found.offset for p in (0.8, 0.3)]
+    assert said == pytest.approx([np.log(9), np.log(2 / 3)], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("slope", "known"), [(0.15, False), (0.25, True), (9.5, True), (11, False)]
+)
+def test_a_slope_of_nothing_or_of_a_cliff_is_none(slope: float, known: bool) -> None:
+    logit, share = 0.2, 1 / (1 + np.exp(-0.2 * slope))
+    count = 20_000
+    right = [True] * round(share * count) + [False] * round((1 - share) * count)
+    mirrored = [not one for one in right]
+    confidence = [1 / (1 + np.exp(-logit))] * len(right) + [1 / (1 + np.exp(logit))] * len(right)
+    found = calibration(told(confidence, right + mirrored))
+    assert (found is not None) == known
+    assert found is None or found == pytest.approx((slope, 0.0), abs=0.05)
+
+
+def test_a_fit_is_where_the_likelihood_is_flat() -> None:
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([rng.normal(size=500), np.ones(500)])
+    right = (rng.random(500) < 1 / (1 + np.exp(-3 * rows[:, 0] + 1))).astype(float)
+    said = 1 / (1 + np.exp(-rows @ _fitted(rows, right)))
+    assert rows.T @ (said - right) == pytest.approx(np.zeros(2), abs=1e-4)

@@ -72,3 +72,40 @@ def test_figures_are_of_robots_inside_the_images() -> None:
     found = validation_figures(build("dmrl-nano").eval(), examples, FitSettings())
     assert found.keys() == {"validation_loss", *(f"validation_{name}" for name in WATCHED)}
     assert np.isfinite(list(found.values())).all()
+
+
+def test_ten_labels_are_enough_for_a_threshold() -> None:
+    for count, known in ((9, False), (10, True)):
+        truth = points(list(range(count)), [50.0] * count, [1.0] * count)
+        found = best_threshold(score(count, truth, truth))
+        assert (found is not None) == known
+        assert found is None or found == 0.5  # between the last, of 1, and nothing
+
+
+def test_twenty_empty_images_tell_a_rate() -> None:
+    truth = points(list(range(12)), [50.0] * 12, [1.0] * 12)
+    found = points([*range(12), 12], [50.0] * 12 + [80.0], [0.9] * 12 + [0.8])
+    for images, threshold in ((12 + 19, 0.85), (12 + 20, 0.85)):
+        assert best_threshold(score(images, truth, found), 0.0) == pytest.approx(threshold)
+    # One that is surer than all: with 19 it is no matter, with 20 none may be let through.
+    sure = points([*range(12), 12], [50.0] * 12 + [80.0], [0.9] * 12 + [0.94])
+    for images, threshold in ((12 + 19, 0.45), (12 + 20, 0.97)):
+        assert best_threshold(score(images, truth, sure), 0.0) == pytest.approx(threshold)
+    # A rate of one in twenty is kept by one in twenty.
+    assert best_threshold(score(32, truth, sure), 0.05) == pytest.approx(0.45)
+
+
+def test_a_robot_on_the_upper_and_left_rim_is_inside_and_on_the_others_not() -> None:
+    robots = np.full((8, 1, len(FIELDS)), np.nan, np.float32)
+    at = [(0, 10), (20, 0), (48, 10), (20, 32), (47.9, 31.9), (-0.1, 10), (20, -0.1)]
+    for row, (u, v) in zip(robots, at, strict=False):
+        row[0, :3] = u, v, 2.0
+    found = labels(Examples([np.zeros((8, 32, 48, 3), np.uint8)], robots))
+    assert found.image.tolist() == [0, 1, 4]
+    assert found.depth_m.tolist() == [2, 2, 2] and found.confidence.tolist() == [1, 1, 1]
+    assert found.v_px.tolist() == pytest.approx([10, 0, 31.9])
+
+
+def test_alarms_count_from_the_threshold_itself() -> None:
+    truth, found = points([0], [50.0], [1.0]), points([1, 2], [60.0, 60.0], [0.5, 0.49])
+    assert alarms(score(3, truth, found), 0.5).alarmed_images == 1

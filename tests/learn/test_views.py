@@ -82,3 +82,38 @@ def test_views_cover_the_cell_evenly() -> None:
     quarters = [(v.right, v.down) for v in VIEWS if (v.right, v.down) not in halves]
     assert np.sum(quarters, axis=0).tolist() == [0, 0]  # what one shifts right another shifts left
     assert {abs(part) for both in quarters for part in both} == {0.25}
+
+
+@pytest.mark.parametrize(("apart", "count"), [(15.9, 1), (16.0, 1), (16.1, 2)])
+def test_detections_16_px_apart_are_of_one_robot(apart: float, count: int) -> None:
+    both = agreed([found([(10, 20, 1, 0.8)]), found([(10, 20 + apart, 1, 0.6)])])
+    assert both.count.tolist() == [count]
+    assert both.confidence[0].tolist() == pytest.approx([0.7] if count == 1 else [0.4, 0.3])
+
+
+def test_of_two_near_ones_of_a_view_the_nearer_is_the_same_robot() -> None:
+    both = agreed([found([(10, 20, 1, 0.8)]), found([(14, 20, 3, 0.7), (12, 20, 2, 0.6)])])
+    assert both.u_px[0].tolist() == pytest.approx([11, 14])
+    assert both.depth_m[0].tolist() == pytest.approx([1.5, 3])
+    assert both.confidence[0].tolist() == pytest.approx([0.7, 0.35])
+
+
+@pytest.mark.parametrize(("confidence", "count"), [(0.01, 2), (0.009, 1)])
+def test_the_least_confidence_itself_is_enough(confidence: float, count: int) -> None:
+    assert agreed([found([(10, 20, 1, 0.5), (50, 20, 1, confidence)])]).count.tolist() == [count]
+
+
+def test_a_class_is_the_surest_s_and_a_sigma_the_median() -> None:
+    views = [found([(10, 20, 1, confidence)]) for confidence in (0.5, 0.9, 0.7)]
+    for k, view in enumerate(views):
+        view.class_id[:], view.sigma_depth_m[:] = k, (0.1, 0.4, 0.2)[k]
+    both = agreed(views)
+    assert (both.class_id[0, 0], both.sigma_depth_m[0, 0]) == (1, 0.2)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_what_a_view_puts_outside_is_at_the_rim(view: View) -> None:
+    corners = found([(-50.0, -50.0, 1, 0.9), (150.0, 150.0, 1, 0.8)])
+    back = returned(corners, view, STRIDE_PX, (48, 64))
+    assert sorted(back.u_px[0].tolist()) == [0, 64]
+    assert back.v_px[0].tolist() == [0, 48]
