@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,11 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
 
+
+# A shell that starts the tests in the background has them and all they start ignore Ctrl-C, which
+# some of them send.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # On a machine that is busy an example may take long; a test that hangs ends by pytest-timeout.
 # The same few examples every time: a failure is one that everybody sees, and costs little.

@@ -15,7 +15,6 @@ from scipy.optimize import least_squares
 
 from dmrl.errors import SettingError
 from dmrl.estimation.camera_views import (
-    FINER,
     Flight,
     Matched,
     Noise,
@@ -46,7 +45,7 @@ LIKELY = 4.0
 """Two delays are not told apart if their log-likelihoods differ by less: one in fifty."""
 ASIDE, LEAST_WORSE = (-4.0, -2.0, 2.0, 4.0), 0.1
 """Standard errors aside at which the likelihood is asked how wide it is."""
-SAMPLED = 0.07
+SAMPLED = 0.25
 """Share of the time between two samples of attitude that no delay is better known than."""
 LEAST = 50
 """Fewest matched detections that are worth a calibration."""
@@ -230,7 +229,7 @@ def _delay_std_s(
         worse = max(cost - found.cost, LEAST_WORSE)
         widest_s = max(widest_s, abs(apart) * std_s / float(np.sqrt(2 * worse)))
     sample_s = max(float(np.median(np.diff(flight.attitude_s))) for flight, _ in views)
-    return float(np.hypot(widest_s, SAMPLED * FINER * sample_s))
+    return float(np.hypot(widest_s, SAMPLED * sample_s))
 
 
 def _refuse_alike(ends: Sequence[Mount]) -> None:

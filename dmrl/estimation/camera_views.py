@@ -4,18 +4,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import median_filter
 
 from dmrl.geometry.frames import Array, Camera, inside, pixels_from_horizontal
 
 LONGEST_GAP_S = 0.25
 """Positions are not interpolated over longer gaps."""
-WIDTHS, FINER = (0.8, 1.2, 2.0, 3.0, 5.0), 4
-"""Standard deviations, in samples, of the windows that attitude may be smoothed over, and the steps
-that a sample is cut into. At 100 Hz its noise moves a peer in the image further from sample to
-sample than the flight does. Without a window, or on samples alone, there is less of it between two
-samples than on one, and a delay settles where there is least."""
+WIDTH, APART, TIMES = 2.0, 3.0, 3
+"""Of the smoothing of attitude: standard deviation of its window in samples; how many standard
+deviations of the noise values differ by that hardly count; rounds. At 100 Hz the noise moves a peer
+in the image further from sample to sample than the flight does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,15 +78,12 @@ class Flight:
     peers: Mapping[str, PeerPath]
 
     def smoothed(self) -> "Flight":
-        """The flight with its attitude smoothed: by the window that best foretells a sample.
+        """The flight with its attitude smoothed, over what changes at once too.
 
-        One as wide as the noise asks for would round off what is quick: a drone tilts at once and
-        comes back slowly, so that its tilts would seem to be late, or early.
+        A window alone would round that off: a drone tilts at once and comes back slowly, so its
+        tilts would seem to be late, or early.
         """
-        step_s = max(float(np.median(np.diff(self.attitude_s))), 1e-3)
-        fine_s = np.arange(self.attitude_s[0], self.attitude_s[-1], step_s / FINER)
-        ways = [_foretold(self.attitude_s, self.attitude_rad, fine_s, width) for width in WIDTHS]
-        return replace(self, attitude_s=fine_s, attitude_rad=min(ways, key=lambda way: way[0])[1])
+        return replace(self, attitude_rad=_smoothed(self.attitude_rad))
 
     def thinned(self, most: int) -> "Flight":
         """The flight with at most so many of its images, evenly spread."""
@@ -100,15 +97,30 @@ class Flight:
         )
 
 
-def _foretold(time_s: Array, values: Array, fine_s: Array, width: float) -> tuple[float, Array]:
-    """How badly (N, C) values, smoothed, foretell one that is left out; and them smoothed."""
-    fine = np.column_stack([np.interp(fine_s, time_s, value) for value in values.T])
-    smooth = gaussian_filter1d(fine, width * FINER, axis=0, mode="nearest")
-    apart = values - np.column_stack([np.interp(time_s, fine_s, value) for value in smooth.T])
-    middle = round(6 * width + 1) * FINER
-    alone = np.maximum(0.0, 1 - np.abs(np.arange(-middle, middle + 1)) / FINER)
-    own = gaussian_filter1d(alone, width * FINER)[middle]
-    return float(np.mean(apart**2)) / (1 - own) ** 2, smooth
+def _smoothed(values: Array) -> Array:
+    """(N, C) values without their noise: a bilateral filter (Tomasi and Manduchi 1998), repeated.
+
+    How large the noise is their second differences tell, whose median no jump moves.
+    """
+    if len(values) < 3:
+        return values
+    bends = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0)
+    noise = np.maximum(1.4826 * bends / np.sqrt(6.0), 1e-9)[:, None]
+    side = np.ceil(3 * WIDTH).astype(int)
+    near = np.exp(-0.5 * (np.arange(-side, side + 1) / WIDTH) ** 2)
+    around = _around(values, side)
+    smooth = median_filter(values, size=(3, 1), mode="nearest")
+    for _ in range(TIMES):
+        apart = (_around(smooth, side) - smooth[:, :, None]) / (APART * noise)
+        alike = near / (1 + apart**2) ** 2
+        smooth = (alike * around).sum(axis=2) / alike.sum(axis=2)
+    return np.asarray(smooth)
+
+
+def _around(values: Array, side: int) -> Array:
+    """(N, C, 2 side + 1) values around each of (N, C); beyond an end stands the last one."""
+    padded = np.pad(values, ((side, side), (0, 0)), mode="edge")
+    return sliding_window_view(padded, 2 * side + 1, axis=0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,3 +105,22 @@ def test_attitude_loses_its_noise_and_keeps_its_motion() -> None:
             for one, wanted in zip(found.attitude_rad.T, slow.T, strict=True)
         ]
         assert np.std(left, axis=1).max() < most_rad
+
+
+def test_attitude_that_jumps_loses_its_noise_and_keeps_its_jumps() -> None:
+    at_s, rng = np.arange(0, 60, 0.01), np.random.default_rng(1)
+    since_s = at_s % 1.5
+    true = np.column_stack([0.1 * np.exp(-since_s / 0.25), -0.05 * np.exp(-since_s / 0.25)])
+    noise = rng.normal(0, 0.005, true.shape)
+    here = flight([], np.zeros((0, 2)))
+    left = replace(here, attitude_s=at_s, attitude_rad=true + noise).smoothed().attitude_rad - true
+    assert np.std(left, axis=0).max() < 0.6 * 0.005
+    jumps = np.flatnonzero(np.diff(since_s) < 0)
+    for beside in (jumps, jumps + 1):
+        assert np.abs(left[beside].mean(axis=0)).max() < 0.005
+
+
+def test_attitude_of_two_samples_stays_as_it_is() -> None:
+    two = np.array([[0.1, 0.2], [0.3, 0.4]])
+    here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(2.0), attitude_rad=two)
+    assert here.smoothed().attitude_rad.tolist() == two.tolist()
