@@ -13,9 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dmrl.border.locking import UNSUPPORTED, is_held, refuse_locked, take_file, take_folder
+from dmrl.border.disk import sync, sync_one
+from dmrl.border.locking import is_held, refuse_locked, take_file, take_folder
 from dmrl.errors import FullDisk, OutputError
-from dmrl.storage import Remote, uploaded_file, uploaded_folder
+from dmrl.storage import Remote, added_files, uploaded_file, uploaded_folder
 from dmrl.storage.whole import require_bucket
 
 SUFFIX = ".partial"
@@ -160,7 +161,7 @@ def rewritten_file(path: Path) -> Iterator[Path]:
             yield partial
             sync(partial)
             partial.replace(path)
-            _sync_one(path.parent)
+            sync_one(path.parent)
         finally:
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
@@ -213,6 +214,56 @@ def partial_folder(
 
 
 @contextmanager
+def grown_folder(path: Path, last: str) -> Iterator[Path]:
+    """Folder to write in; its files go into ``path``, which is there, when the block ends well.
+
+    They are brought to the disk and moved one by one, so what they are to others must hang on one
+    of them: a process that is killed leaves some of the others, and not that one.
+
+    Parameters
+    ----------
+    path
+        A folder.
+    last
+        Name of the file that is moved after all others.
+
+    Raises
+    ------
+    OutputError
+        If another process is writing it, or the system refuses a write.
+    """
+    if isinstance(path, Remote):
+        with added_files(path, last) as here:
+            yield here
+        return
+    partial = partial_of(path)
+    with _refusals(path, partial):
+        held = take_folder(partial)
+        try:
+            _empty(partial)
+            yield partial
+            sync(partial)
+            _move(partial, path, last)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+            os.close(held)
+
+
+def _move(partial: Path, path: Path, last: str) -> None:
+    files = [one.relative_to(partial) for one in sorted(partial.rglob("*")) if one.is_file()]
+    for file in files:
+        if file != Path(last):
+            (path / file).parent.mkdir(parents=True, exist_ok=True)
+            (partial / file).replace(path / file)
+    for folder in {above for file in files for above in (path / file).parents}:
+        if folder.is_relative_to(path):
+            sync_one(folder)
+    if files:
+        (partial / last).replace(path / last)
+        sync_one(path)
+
+
+@contextmanager
 def _noted(path: Path) -> Iterator[None]:
     """An output in a bucket, which is begun here and done with when the block ends."""
     _begun.append(path)
@@ -250,32 +301,6 @@ def _refusals(path: Path, partial: Path) -> Iterator[None]:
         raise as_output_error(path, e) from e
 
 
-def sync(path: Path) -> None:
-    """Bring a file, or a folder with everything in it, to the disk.
-
-    Raises
-    ------
-    OSError
-        If the disk refuses.
-    """
-    if path.is_dir():
-        for inner in sorted(path.iterdir()):
-            if not inner.is_symlink():
-                sync(inner)
-    _sync_one(path)
-
-
-def _sync_one(path: Path) -> None:
-    held = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(held)
-    except OSError as e:
-        if e.errno not in UNSUPPORTED:
-            raise
-    finally:
-        os.close(held)
-
-
 class _CameBetween(OutputError):
     """Somebody else has made what we were about to name."""
 
@@ -297,7 +322,7 @@ def _link(partial: Path, path: Path) -> None:
         _refuse_taken(path)  # FAT has no links: looked at, then renamed
         partial.rename(path)
     try:
-        _sync_one(path.parent)
+        sync_one(path.parent)
     except BaseException:
         path.unlink()  # not sure to be there after a power loss, so not there at all
         raise
@@ -312,7 +337,7 @@ def _rename(partial: Path, path: Path) -> None:
             raise _CameBetween(partial, path) from None
         raise
     try:
-        _sync_one(path.parent)
+        sync_one(path.parent)
     except BaseException:
         path.rename(partial)
         raise

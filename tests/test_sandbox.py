@@ -400,10 +400,25 @@ def test_a_hostile_dataset_is_read_and_carded_where_it_is(
     assert "<img" not in card.replace("`", "")
     assert "\n# x" not in card
     for edit in (
-        lambda d: (d / "dataset_dict.json").write_text('{"splits": ["../../victim"]}'),
-        lambda d: (d / "dataset_dict.json").write_text('{"splits": [3, null]}'),
-        lambda d: (d / "train/state.json").write_text(
-            json.dumps({"_data_files": [{"filename": "../../../victim/keep"}]})
+        lambda d: (
+            (d / "manifest.json").unlink(),
+            (d / "dataset_dict.json").write_text('{"splits": ["../../victim"]}'),
+        ),
+        lambda d: (
+            (d / "manifest.json").unlink(),
+            (d / "dataset_dict.json").write_text('{"splits": [3, null]}'),
+        ),
+        lambda d: (d / "manifest.json").write_text(
+            (d / "manifest.json").read_text().replace("data-", "../../../victim/data-")
+        ),
+        lambda d: (d / "manifest.json").write_text(
+            (d / "manifest.json").read_text().replace('"train"', '"../../victim"')
+        ),
+        lambda d: (
+            (d / "manifest.json").unlink(),
+            (d / "train/state.json").write_text(
+                json.dumps({"_data_files": [{"filename": "../../../victim/keep"}]})
+            ),
         ),
         lambda d: (shutil.rmtree(d / "figures"), (d / "figures").symlink_to(box.victim)),
         lambda d: ((d / "README.md").unlink(), (d / "README.md").symlink_to(box.victim / "keep")),

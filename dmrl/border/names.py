@@ -22,7 +22,10 @@ LINE_MAX = 480
 _PLAIN = re.compile(r"[^A-Za-z0-9 ._,:+()=-]")
 _SPLIT = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
 _MARKUP = re.compile(r"([\\`\[\]<>|])")
-_TAKEN = ("data", "figures", "README.md", "provenance.json", "dataset_dict.json")
+_TAKEN = (
+    *("data", "figures", "parts", "README.md", "croissant.json", "facts.json"),
+    *("manifest.json", "provenance.json", "dataset_dict.json"),
+)
 """What a dataset's folder holds beside its splits."""
 
 

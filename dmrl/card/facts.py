@@ -2,13 +2,13 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from dmrl.border.documents import parse_json
 from dmrl.border.names import code, markdown
-from dmrl.datasets.twins import NEAR_BITS
+from dmrl.datasets.seen import NEAR_BITS
 from dmrl.errors import DatasetError
 
 FILE = "facts.json"
@@ -34,6 +34,8 @@ class Facts:
         Images of test splits whose pixels stand in train too.
     near
         Images of test splits that look like one in train, by a perceptual hash; the twins too.
+    compared
+        Images of test splits that were compared for ``near``. 0: all of them.
     sensors
         Patterns of topics that the recordings have besides images and labels.
     cameras
@@ -47,6 +49,7 @@ class Facts:
     licences: Mapping[str, str] = field(default_factory=dict)
     twins: int = 0
     near: int = 0
+    compared: int = 0
     sensors: Sequence[str] = ()
     cameras: Mapping[str, str] = field(default_factory=dict)
 
@@ -111,6 +114,25 @@ def cautions(
     yield ""
 
 
+def merged(parts: Sequence[Facts]) -> Facts:
+    """Facts of a dataset from those of its parts; of leaks the last knows all."""
+    reasons = dict.fromkeys(why for part in parts for why in part.left_out)
+    by_recording = {
+        name: {key: value for part in parts for key, value in getattr(part, name).items()}
+        for name in ("used", "beside", "findings", "licences", "cameras")
+    }
+    return replace(
+        parts[-1],
+        left_out={why: sum(part.left_out.get(why, 0) for part in parts) for why in reasons},
+        sensors=list(dict.fromkeys(pattern for part in parts for pattern in part.sensors)),
+        **by_recording,
+    )
+
+
+def _compared(facts: Facts) -> str:
+    return f"of {facts.compared} that were compared " if facts.compared else ""
+
+
 def equipment(facts: Facts) -> Iterator[str]:
     """Lines of Markdown: which sensors and cameras the recordings have."""
     known = ", ".join(code(str(pattern)) for pattern in facts.sensors)
@@ -136,7 +158,8 @@ def told(facts: Facts) -> Iterator[str]:
     yield f"- Left out: {'; '.join(reasons) or 'no image'}."
     yield (
         f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train, "
-        f"{facts.near or 'none'} look like one in train: their perceptual hashes (64 bits) differ "
+        f"{facts.near or 'none'} {_compared(facts)}look like one in train: their perceptual hashes "
+        f"(64 bits) differ "
         f"in {NEAR_BITS} at most, as those of pictures before one background do."
     )
     for name, licence in sorted(facts.licences.items()):

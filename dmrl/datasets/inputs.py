@@ -13,7 +13,7 @@ SAME_LENS = 1.05
 """Most that the focal lengths of one dataset may differ by without a word, a ratio."""
 
 
-def refuse_twins(recordings: Sequence[Path], made: Provenance) -> None:
+def refuse_twins(recordings: Sequence[Path], made: Provenance, there: Sequence[Input] = ()) -> None:
     """Nothing, if no two recordings share a name, bytes or images.
 
     Parameters
@@ -22,14 +22,16 @@ def refuse_twins(recordings: Sequence[Path], made: Provenance) -> None:
         To be put into one dataset.
     made
         Names them as its inputs, in their order.
+    there
+        What the dataset holds already.
 
     Raises
     ------
     SettingError
         If two do.
     """
-    names: dict[str, Path] = {}
-    contents: dict[str, Path] = {}
+    names = {one.name: Path(one.name) for one in there}
+    contents = {one.sha256: Path(one.name) for one in there}
     for path, source in zip(recordings, made.inputs, strict=False):
         if (twin := names.setdefault(path.name, path)) is not path:
             raise SettingError(

@@ -8,8 +8,11 @@ An Arrow dataset is a folder that ``datasets.load_from_disk`` opens, written wit
     OUT/train/data-00000-of-00002.arrow   uncompressed Arrow IPC stream
     OUT/README.md, figures/               the card
     OUT/provenance.json                   how it was made
+    OUT/manifest.json, parts/             the shards, and what each time of adding brought
 
-A Parquet dataset has ``OUT/data/train-00000-of-00002.parquet`` in place of the first four.
+A Parquet dataset has ``OUT/data/train-00000-of-00002.parquet`` in place of the first four. A shard
+is numbered among those that were there when it was added: ``data-00002-of-00003`` comes after
+``data-00001-of-00002``.
 """
 
 import json
@@ -23,6 +26,7 @@ from dmrl.geometry.frames import STRIDE_PX
 
 PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"
+MANIFEST = "manifest.json"
 NAMES = (PIXELS, IMAGE, MASKS, "peers", CONFIDENCE, DEPTH, "robot", "source", "log_time", "split")
 
 PEER = pa.struct(
@@ -121,6 +125,6 @@ def shard_path(folder: Path, split: str, index: int, count: int, *, parquet: boo
     return folder / split / f"data-{number}.arrow"
 
 
-def write_json(path: Path, document: Any) -> None:
-    """Write a small JSON file, keys sorted so that equal content is equal bytes."""
-    path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+def json_text(document: Any) -> str:
+    """A small JSON file, keys sorted so that equal content is equal bytes."""
+    return json.dumps(document, indent=1, sort_keys=True) + "\n"

@@ -5,9 +5,9 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from dmrl.datasets.inputs import refuse_twins
-from dmrl.datasets.splits import SplitOf, held_out, of_source
+from dmrl.datasets.splits import SplitOf, held_out, held_out_alone, of_source
 from dmrl.errors import SettingError
-from dmrl.recording import Provenance, splits, summary
+from dmrl.recording import Input, Provenance, splits, summary
 
 
 def splits_of(
@@ -18,6 +18,7 @@ def splits_of(
     val: str,
     test_share: float,
     seed: int,
+    there: Sequence[Input] | None = None,
 ) -> dict[Path, SplitOf]:
     """Split of every log time of each recording.
 
@@ -29,6 +30,8 @@ def splits_of(
         Its provenance, whose first inputs they are.
     split, val, test_share, seed
         As ``dmrl dataset`` has them.
+    there
+        What the dataset holds already. None: it is new.
 
     Raises
     ------
@@ -38,16 +41,17 @@ def splits_of(
         If what a recording says of its split cannot be understood.
     """
     hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=False)}
-    refuse_twins(recordings, made)
+    refuse_twins(recordings, made, there or ())
     watched = [path for path in recordings if fnmatchcase(path.name, val)]
-    if val and not watched:
+    if val and not watched and there is None:
         names = ", ".join(path.name for path in recordings)
         raise SettingError(f"--val {val} fits none of {names}. Give another pattern")
     learnt = [path for path in recordings if path not in watched]
     own = {path: splits(path, summary(path)) for path in learnt if split == "auto"}
     by_source = {path: parts for path, parts in own.items() if parts}
     whole = {path: hashes[path] for path in learnt if path not in by_source}
-    test = held_out(whole, 0.0 if split == "none" else test_share, seed)
+    share = 0.0 if split == "none" else test_share
+    test = held_out(whole, share, seed) if there is None else held_out_alone(whole, share, seed)
     named = {path: _constant("test" if path in test else "train") for path in whole}
     named |= {path: of_source(path, parts) for path, parts in by_source.items()}
     return named | {path: _constant("val") for path in watched}

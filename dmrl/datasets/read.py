@@ -16,6 +16,7 @@ from dmrl.border import limits
 from dmrl.border.documents import parse_json
 from dmrl.border.names import inside, split_name
 from dmrl.datasets import layout
+from dmrl.datasets.manifest import Manifest, read_manifest
 from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
@@ -131,11 +132,14 @@ class Dataset:
         Names of its splits.
     parquet
         Parquet files in place of Arrow shards.
+    manifest
+        What it says of its shards. None: it was not written by dmrl, or by an earlier one.
     """
 
     path: Path
     splits: tuple[str, ...]
     parquet: bool = False
+    manifest: Manifest | None = None
 
     def split(self, name: str) -> Split:
         """One split, mapped into memory.
@@ -148,7 +152,7 @@ class Dataset:
         if name not in self.splits:
             present = ", ".join(self.splits)
             raise DatasetError(f"no split {name} in {self.path}. It has: {present}")
-        shards = self._parquet_shards(name) if self.parquet else self._arrow_shards(name)
+        shards = self._shards(name)
         tables = [open_shard(path, rows) for path, rows in shards]
         for (path, _), table in zip(shards, tables, strict=True):
             if table.schema != tables[0].schema:
@@ -156,6 +160,13 @@ class Dataset:
         if not sum(table.num_rows for table in tables):
             raise DatasetError(f"split {name} of {self.path} has no images. Make it again")
         return Split(name, pa.concat_tables(tables))
+
+    def _shards(self, name: str) -> list[tuple[Path, int | None]]:
+        """Files and their rows, where these are known."""
+        if self.manifest is not None:
+            own = self.manifest.splits[name]
+            return [(self.manifest.place(self.path, name, shard), shard.rows) for shard in own]
+        return self._parquet_shards(name) if self.parquet else self._arrow_shards(name)
 
     def _arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
         folder = inside(self.path, name, f"{self.path}: a split")
@@ -200,6 +211,9 @@ def open_dataset(path: Path) -> Dataset:
     UnsafeName
         If a split is called what could not be a folder's name.
     """
+    manifest = read_manifest(path)
+    if manifest is not None and manifest.splits:
+        return Dataset(path, tuple(manifest.splits), manifest.parquet, manifest)
     parquet = not (path / "dataset_dict.json").is_file()
     if not parquet:
         splits = _splits(path / "dataset_dict.json")

@@ -55,6 +55,11 @@ class Tally:
     without_mask: int = 0
     in_no_split: int = 0
     flagged: int = 0
+    twice: int = 0
+
+    def refuse_twin(self) -> None:
+        """Count one that was kept, and is there already."""
+        self.kept, self.twice = self.kept - 1, self.twice + 1
 
     def left_out(self) -> dict[str, int]:
         """Why images were left out, and how many."""
@@ -65,6 +70,7 @@ class Tally:
             "show a peer, but have no mask (--masks)": self.without_mask,
             "belong to no split of their source (--split)": self.in_no_split,
             "were flagged (--without)": self.flagged,
+            "are there already: same camera, time and pixels": self.twice,
         }
 
 
@@ -298,20 +304,3 @@ def _row(
     grid = grid_label(ahead[:, :2], ahead[:, 2], shape=shape)
     row = Row(rgb, peers, grid, _robot(image), path.name, image.time_ns)
     return replace(row, mask=_mask(path, row, covered)) if masks else row
-
-
-def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
-    """Nothing, if a row's image has the size of the rows before it.
-
-    Raises
-    ------
-    RecordingError
-        If it has not.
-    """
-    if row.size_px != size_px:
-        width_px, height_px = row.size_px
-        raise RecordingError(
-            f"{path}: the image of {row.robot} at {row.time_ns} ns is {width_px} x {height_px} px, "
-            f"those before it {size_px[0]} x {size_px[1]} px. Make one dataset for each size, "
-            "or scale: dmrl convert --from images --width-px 320 --height-px 224"
-        )

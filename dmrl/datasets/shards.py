@@ -60,6 +60,27 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
     return table.select([name for name in table.schema.names if name in layout.NAMES])
 
 
+def schema_of(path: Path) -> pa.Schema:
+    """The columns of a shard, from its head alone.
+
+    Raises
+    ------
+    DatasetError
+        If it is missing or damaged.
+    """
+    try:
+        with path.open("rb") as stream:
+            if path.suffix == ".parquet":
+                return pq.read_schema(stream)
+            return pa.ipc.open_stream(stream).schema
+    except FileNotFoundError:
+        raise DatasetError(f"shard {path} is missing. {AGAIN}") from None
+    except (pa.ArrowException, OSError, ValueError) as e:
+        raise DatasetError(
+            f"shard {path} is damaged: {' '.join(str(e).split())}. {AGAIN}"
+        ) from None
+
+
 def _mapped(path: Path) -> pa.Table:
     if path.suffix == ".parquet":
         return pq.ParquetFile(os.fspath(path), memory_map=True).read()

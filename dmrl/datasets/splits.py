@@ -41,6 +41,19 @@ def held_out(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Pa
     return set(sorted(sha256, key=rank)[:count])
 
 
+def held_out_alone(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Path]:
+    """Recordings that become test when they are added to what is there; see `held_out`.
+
+    Each is drawn by its own hash, so it does not depend on which others come with it, or before.
+    """
+
+    def drawn(path: Path) -> float:
+        digest = hashlib.sha256(f"{seed} {sha256[path]}".encode()).digest()
+        return int.from_bytes(digest[:8], "big") / 2**64
+
+    return {path for path in sha256 if drawn(path) < test_share}
+
+
 def of_source(path: Path, own: Mapping[str, Sequence[tuple[int, int]]]) -> SplitOf:
     """The split that a recording itself gives each log time.
 

@@ -1,6 +1,5 @@
 """Write datasets: rows in, one Arrow stream or Parquet file per shard out, in bounded memory."""
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from dmrl.border.names import inside
 from dmrl.datasets import layout
+from dmrl.datasets.manifest import Manifest, Shard
 from dmrl.images.codec import encode_png
 
 BATCH_IMAGES = 64
@@ -58,7 +57,7 @@ class Row:
 
 @dataclass(slots=True)
 class SplitWriter:
-    """Writes the shards of one split and what ``datasets`` wants to know of them.
+    """Writes the shards of one split.
 
     Parameters
     ----------
@@ -72,6 +71,8 @@ class SplitWriter:
         Parquet files in place of Arrow streams.
     shard_images
         Images per shard, at most.
+    first
+        Number of the first shard.
     """
 
     folder: Path
@@ -79,6 +80,7 @@ class SplitWriter:
     schema: pa.Schema
     parquet: bool
     shard_images: int
+    first: int = 0
     _rows: list[Row] = field(default_factory=list)
     _lengths: list[int] = field(default_factory=list)
     _files: list[Path] = field(default_factory=list)
@@ -93,30 +95,20 @@ class SplitWriter:
             if self._lengths[-1] >= self.shard_images:
                 self._close_shard()
 
-    def close(self, *, fingerprint: str, about: dict[str, str]) -> int:
-        """Finish the last shard, name all of them, write the JSON files.
-
-        Parameters
-        ----------
-        fingerprint
-            Names the content; ``datasets`` keys its cache with it.
-        about
-            ``description`` and ``license`` for dataset_info.json.
-
-        Returns
-        -------
-        int
-            Rows written.
-        """
+    def close(self) -> list[Shard]:
+        """Finish the last shard, and give all their names: the shards, in the order of rows."""
         if self._rows:
             self._flush()
         self._close_shard()
-        names = [self._path(k, len(self._files)) for k in range(len(self._files))]
+        count = self.first + len(self._files)
+        names = [self._path(self.first + k, count) for k in range(len(self._files))]
         for file, name in zip(self._files, names, strict=True):
             file.rename(name)
-        if not self.parquet:
-            self._write_info(names, fingerprint, about)
-        return sum(self._lengths)
+        sizes = [name.stat().st_size for name in names]
+        return [
+            Shard(name.name, *found)
+            for name, *found in zip(names, self._lengths, sizes, strict=True)
+        ]
 
     def _path(self, index: int, count: int) -> Path:
         return layout.shard_path(self.folder, self.name, index, count, parquet=self.parquet)
@@ -130,7 +122,7 @@ class SplitWriter:
 
     def _open_shard(self) -> None:
         # How many shards there will be is not known yet: the name says 0 until close().
-        path = self._path(len(self._files), 0)
+        path = self._path(self.first + len(self._files), 0)
         path.parent.mkdir(exist_ok=True)
         if self.parquet:
             plain = {"compression": "zstd", "use_dictionary": False, "write_statistics": False}
@@ -145,66 +137,38 @@ class SplitWriter:
             self._sink.close()
             self._sink = None
 
-    def _write_info(self, shards: list[Path], fingerprint: str, about: dict[str, str]) -> None:
-        digest = hashlib.sha256(f"{fingerprint} {self.name}".encode()).hexdigest()
-        state: dict[str, Any] = {
-            "_data_files": [{"filename": path.name} for path in shards],
-            "_fingerprint": digest[:16],
-            "_format_columns": None,
-            "_format_kwargs": {},
-            "_format_type": None,
-            "_output_all_columns": False,
-            "_split": self.name,
-        }
-        split = {
-            "name": self.name,
-            "num_bytes": sum(path.stat().st_size for path in shards),
-            "num_examples": sum(self._lengths),
-            "shard_lengths": self._lengths,
-            "dataset_name": None,
-        }
-        info = {**about, "features": layout.features(self.schema), "splits": {self.name: split}}
-        folder = inside(self.folder, self.name, "a split")
-        layout.write_json(folder / "state.json", state)
-        layout.write_json(folder / "dataset_info.json", info)
 
-
-def write_dataset(
+def write_shards(
     folder: Path,
     rows: Iterable[tuple[str, Row]],
     *,
     png: bool,
-    parquet: bool,
     shard_images: int,
-    fingerprint: str,
-    about: dict[str, str],
-) -> dict[str, int]:
-    """Rows written per split, train first.
+    before: Manifest,
+) -> dict[str, list[Shard]]:
+    """Shards written, by split.
 
     Parameters
     ----------
     folder
-        There already, and empty.
+        There already.
     rows
         Name of the split and row; all images of one size.
     png
         PNG bytes in place of raw pixels.
-    parquet, shard_images
+    shard_images
         See `SplitWriter`.
-    fingerprint, about
-        See `SplitWriter.close`.
+    before
+        Of the dataset that they are for, whose shards are counted on.
     """
     writers: dict[str, SplitWriter] = {}
     for split, row in rows:
         if split not in writers:
             schema = layout.schema(*row.rgb.shape[:2], png=png, masks=row.mask is not None)
-            writers[split] = SplitWriter(folder, split, schema, parquet, shard_images)
+            first = len(before.splits.get(split, ()))
+            writers[split] = SplitWriter(folder, split, schema, before.parquet, shard_images, first)
         writers[split].add(row)
-    names = sorted(writers, key=lambda name: (name != "train", name))
-    counts = {name: writers[name].close(fingerprint=fingerprint, about=about) for name in names}
-    if not parquet:
-        layout.write_json(folder / "dataset_dict.json", {"splits": names})
-    return counts
+    return {name: writer.close() for name, writer in writers.items()}
 
 
 def _record_batch(rows: list[Row], schema: pa.Schema, split: str) -> pa.RecordBatch:

@@ -1,38 +1,35 @@
 """``dmrl dataset``: recordings to an Arrow dataset, with its card."""
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 
+from dmrl import recipe as recipes
 from dmrl import topics
 from dmrl.card import write_card
-from dmrl.card.facts import Facts
+from dmrl.card.facts import FILE as FACTS
+from dmrl.card.facts import Facts, merged, read_facts
 from dmrl.card.front import check_license
 from dmrl.card.sensors import cameras_of, sensors_of
+from dmrl.datasets.build import Wanted, beside, explain, has_masks, rows, unused
 from dmrl.datasets.flags import read_flags
+from dmrl.datasets.growth import Before, made_of, opened
 from dmrl.datasets.inputs import warn_of_lenses
+from dmrl.datasets.layout import MANIFEST
+from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
+from dmrl.datasets.names import fingerprint_of, rewrite, write_names
 from dmrl.datasets.parts import splits_of
-from dmrl.datasets.rows import (
-    Tally,
-    count_images,
-    label_source,
-    one_size,
-    rows_of,
-    sources_of,
-)
-from dmrl.datasets.splits import SplitOf
-from dmrl.datasets.twins import Twins
-from dmrl.datasets.write import Row, write_dataset
-from dmrl.errors import RecordingError, SettingError
-from dmrl.images.ahead import ahead
-from dmrl.output import partial_folder
+from dmrl.datasets.rows import Tally, count_images, label_source
+from dmrl.datasets.seen import Seen
+from dmrl.datasets.settings import Settings
+from dmrl.datasets.write import write_shards
+from dmrl.errors import SettingError
+from dmrl.output import grown_folder, note, partial_folder
 from dmrl.pipeline.crew import cores
-from dmrl.pipeline.folders import all_recordings
+from dmrl.pipeline.folders import all_recordings, differing
 from dmrl.pipeline.once import done_on
 from dmrl.recording import (
     Contents,
@@ -40,71 +37,13 @@ from dmrl.recording import (
     label_findings,
     licences,
     provenance,
-    summary,
 )
+from dmrl.recording.inputs import input_of
+from dmrl.recording.provenance import FILE_NAME as PROVENANCE
+from dmrl.storage import Remote
 from dmrl.terminal.arguments import On, Workers
-from dmrl.terminal.progress import say, track
+from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
-
-Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))]
-Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How recordings become a dataset.
-
-    Parameters
-    ----------
-    labels
-        Whose labels. "auto" takes, for each recording, the first of estimate, truth, hand and
-        published that it has: what dmrl label made goes before the truth. "best" takes the truth
-        before estimates.
-    keep_all
-        Use labels that are not OK as well. Without it, images with such a label are left out.
-    split
-        "auto": as the source says, where it does, else whole recordings. "recordings": whole
-        recordings. "none": everything is train.
-    test_share
-        Share of the recordings that become the test split, 0 to 1.
-    val
-        Pattern of the recordings' names that become the split val, on which a training chooses its
-        threshold and never learns, such as "held*". Empty: none.
-    seed
-        Another seed holds out other recordings.
-    masks
-        Keep the masks of rendered robots: a training can then paste robots without what was
-        around them. Images that show a peer and have no mask are left out.
-    png
-        Store PNG images in place of raw pixels: less disk, but decoded at each opening.
-    parquet
-        Write Parquet files in place of Arrow shards: for publishing. Images are PNG then, which
-        others show as images.
-    without
-        CSV file of images to leave out: source, robot, log_time. dmrl view DATASET --flag helps
-        to write one.
-    shard_images
-        Images per shard, at most.
-    title
-        Name of the dataset on its card. Empty: made from the recordings' names.
-    license
-        License on the card: an SPDX identifier such as cc-by-4.0, or a word of the Hugging Face
-        Hub's: unknown, other.
-    """
-
-    labels: Literal["auto", "best", "truth", "estimate", "hand", "published"] = "auto"
-    keep_all: bool = False
-    split: Literal["auto", "recordings", "none"] = "auto"
-    test_share: Share = 0.2
-    val: str = ""
-    seed: int = 0
-    masks: bool = False
-    png: bool = False
-    parquet: bool = False
-    without: Path | None = None
-    shard_images: Positive = 2048
-    title: str = ""
-    license: str = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,41 +82,137 @@ def run(
         If ``out`` exists.
     """
     check_license(settings.license)
-    if settings.masks and not any(_has_masks(path) for path in recordings):
-        raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
+    before = Before(manifest=Manifest(parquet=settings.parquet))
     with partial_folder(out) as partial:
-        made = _provenance(recordings, settings)
-        total = sum(count_images(path) for path in recordings)
-        held = {path: Contents(path, topics.LABELS, topics.CALIBRATION) for path in recordings}
-        sources = {path: label_source(held[path], settings.labels) for path in recordings}
-        beside = _beside(held, sources)
-        split_of = splits_of(
-            recordings,
-            made,
-            split=settings.split,
-            val=settings.val,
-            test_share=settings.test_share,
-            seed=settings.seed,
-        )
-        warn_of_lenses(held.values())
-        tally = Tally()
-        twins = Twins()
-        images = write_dataset(
-            partial,
-            twins.seen(_rows(held, sources, split_of, tally, total, settings, workers or cores())),
-            png=settings.png or settings.parquet,
-            parquet=settings.parquet,
-            shard_images=settings.shard_images,
-            fingerprint=hashlib.sha256(json.dumps(made.to_json()).encode()).hexdigest(),
-            about={"description": settings.title, "license": settings.license},
-        )
-        _explain(recordings, images, tally, settings)
-        _unused(settings, tally)
-        made.write(partial)
-        result = Result(images, {path.name: source for path, source in sources.items()}, tally)
-        _facts(result, held, beside, twins).write(partial)
-        write_card(partial)
+        result = _part(partial, recordings, settings, before, workers or cores())
+        _describe(partial)
     return result
+
+
+def add(
+    recordings: Sequence[Path], out: Path, settings: Settings, *, workers: int | None = None
+) -> Result:
+    """Images that were added to the dataset ``out``, per split.
+
+    Nothing that is there is written again but the manifest, and the files that are made of it: the
+    card, the names for ``datasets``, provenance.json, facts.json. If it was stopped, do it again.
+
+    Parameters
+    ----------
+    recordings
+        Those that are in it already, by their content, are left out.
+    out
+        A dataset.
+    settings
+        Where they are not the default ones, they must be those that it was made with.
+    workers
+        See `run`.
+
+    Raises
+    ------
+    RecordingError, SettingError
+        As `run`; or if a setting is another than the dataset's.
+    DatasetError
+        If ``out`` is no dataset that can grow.
+    OutputError
+        If another process is writing it, or the system refuses a write.
+    """
+    settings = _as_before(settings, opened(out), out)
+    result = Result({}, {}, Tally())
+    with grown_folder(out, MANIFEST) as partial:
+        before = opened(out)  # again: another may have added to it meanwhile
+        known = {one.sha256 for one in before.inputs}
+        fresh = [path for path in recordings if input_of(path).sha256 not in known]
+        if there := len(recordings) - len(fresh):
+            say(f"{there} of {len(recordings)} recordings are in {out} already")
+        if fresh:
+            result = _part(partial, fresh, settings, before, workers or cores())
+    note(out)
+    _describe(out)
+    return result
+
+
+def _as_before(settings: Settings, before: Before, out: Path) -> Settings:
+    """Settings of the dataset, which those given must not contradict."""
+    made = before.made
+    assert made is not None
+    names = {f.name for f in fields(Settings)} - {"without"}
+    for name in sorted(names & differing(settings).keys()):
+        if getattr(settings, name) != made.settings.get(name):
+            flag = f"--{name.replace('_', '-')}"
+            raise SettingError(
+                f"{out} was made with {flag} {made.settings.get(name)}. Leave out {flag}, or make "
+                "another dataset"
+            )
+    own = {name: value for name, value in made.settings.items() if name in names}
+    return replace(recipes.check(f"{out}/provenance.json", own, Settings), without=settings.without)
+
+
+def _part(
+    folder: Path, recordings: Sequence[Path], settings: Settings, before: Before, workers: int
+) -> Result:
+    """Write the shards of recordings, the manifest with them, and what is known of them."""
+    if settings.masks and not any(has_masks(path) for path in recordings):
+        raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
+    made = _provenance(recordings, settings)
+    total = sum(count_images(path) for path in recordings)
+    held = {path: Contents(path, topics.LABELS, topics.CALIBRATION) for path in recordings}
+    sources = {path: label_source(held[path], settings.labels) for path in recordings}
+    others = beside(held, sources)
+    split_of = splits_of(
+        recordings,
+        made,
+        split=settings.split,
+        val=settings.val,
+        test_share=settings.test_share,
+        seed=settings.seed,
+        there=before.inputs if before.made else None,
+    )
+    warn_of_lenses(held.values())
+    tally, seen = Tally(), Seen(before.seen())
+    flagged = frozenset() if settings.without is None else read_flags(settings.without)
+    wanted = Wanted(settings.keep_all, settings.masks, flagged)
+    size_px = before.size_px
+    found = rows(
+        held, sources, split_of, tally, wanted, total=total, size_px=size_px, workers=workers
+    )
+    shards = write_shards(
+        folder,
+        seen.new(found, tally.refuse_twin),
+        png=settings.png or settings.parquet,
+        shard_images=settings.shard_images,
+        before=before.manifest,
+    )
+    manifest = before.manifest.with_part(shards)
+    explain(recordings, manifest, tally, settings)
+    unused(settings, tally)
+    images = {
+        name: sum(one.rows for one in shards[name]) for name in manifest.splits if name in shards
+    }
+    result = Result(images, {path.name: source for path, source in sources.items()}, tally)
+    place = part_folder(folder, before.manifest.parts)
+    place.mkdir(parents=True)
+    made.write(place)
+    _facts(result, held, others, seen).write(place)
+    seen.write(place)
+    manifest.write(folder)
+    return result
+
+
+def _describe(folder: Path) -> None:
+    """Write what follows from the manifest and the parts: names, provenance, facts, the card."""
+    manifest = read_manifest(folder)
+    assert manifest is not None
+    made = made_of(folder, manifest)
+    about = {"description": str(made.settings["title"]), "license": str(made.settings["license"])}
+    write_names(folder, manifest, fingerprint=fingerprint_of(made.to_json()), about=about)
+    parts = [read_facts(part_folder(folder, k)) for k in range(manifest.parts)]
+    rewrite(folder / PROVENANCE, made.to_json())
+    rewrite(folder / FACTS, asdict(merged([part for part in parts if part is not None])))
+    if isinstance(folder, Remote):
+        say(f"{folder}: the card is as it was; a bucket's would be read as a whole for it")
+    else:
+        write_card(folder)
 
 
 def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
@@ -186,93 +221,23 @@ def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
     return provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
 
 
-def _unused(settings: Settings, tally: Tally) -> None:
-    """Say so where flags name no image: they may be of another recording."""
-    if settings.without is not None:
-        flags = len(read_flags(settings.without))
-        if flags > tally.flagged:
-            say(f"{settings.without}: {flags - tally.flagged} of {flags} flags name no image here")
-
-
 def _facts(
-    result: Result, held: Mapping[Path, Contents], beside: dict[str, list[str]], twins: Twins
+    result: Result, held: Mapping[Path, Contents], others: dict[str, list[str]], seen: Seen
 ) -> Facts:
     """What the card says beside the counts: what is left out, and what to be careful of."""
+    near, compared, outside = seen.near()
     return Facts(
         {why: count for why, count in result.tally.left_out().items() if count},
         result.sources,
-        beside,
+        others,
         {path.name: found for path in held if (found := label_findings(held[path]))},
         licences(list(held)),
-        twins.count,
-        twins.near,
+        seen.twins(),
+        near,
+        0 if compared == outside else compared,
         sensors_of(held.values()),
         cameras_of(held.values()),
     )
-
-
-def _has_masks(recording: Path) -> bool:
-    return any(topics.names(topics.MASKS, topic) for topic in summary(recording).topics)
-
-
-def _beside(held: Mapping[Path, Contents], sources: Mapping[Path, str]) -> dict[str, list[str]]:
-    """Sources that are not used, by recording, which is said where one might be meant."""
-    found = {path.name: sorted(sources_of(held[path]) - {used}) for path, used in sources.items()}
-    for path, used in sources.items():
-        if {"truth", "estimate"} <= {*found[path.name], used}:
-            other = "estimate" if used == "truth" else "truth"
-            say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
-    return {name: others for name, others in found.items() if others}
-
-
-def _rows(
-    held: Mapping[Path, Contents],
-    sources: dict[Path, str],
-    split_of: dict[Path, SplitOf],
-    tally: Tally,
-    total: int,
-    settings: Settings,
-    workers: int,
-) -> Iterator[tuple[str, Row]]:
-    flagged = frozenset() if settings.without is None else read_flags(settings.without)
-    how = {"keep_all": settings.keep_all, "masks": settings.masks}
-    rows = (
-        (path, row)
-        for path, source in sources.items()
-        for row in rows_of(held[path], source, split_of[path], tally, flagged=flagged, **how)
-    )
-    size_px: tuple[int, int] | None = None
-    for path, kept in track(ahead(_made, rows, workers), "Writing images", total):
-        if kept is not None:
-            size_px = size_px or kept[1].size_px
-            one_size(path, kept[1], size_px)
-            yield kept
-
-
-def _made(
-    planned: tuple[Path, tuple[str, Callable[[], Row]] | None],
-) -> tuple[Path, tuple[str, Row] | None]:
-    path, kept = planned
-    return path, None if kept is None else (kept[0], kept[1]())
-
-
-def _explain(
-    recordings: Sequence[Path], images: dict[str, int], tally: Tally, settings: Settings
-) -> None:
-    reasons = [f"{count} images {why}" for why, count in tally.left_out().items() if count]
-    if not images:
-        names = ", ".join(str(path) for path in recordings)
-        raise RecordingError(
-            f"no image of {names} can be used: {'; '.join(reasons) or 'there is none'}. "
-            "Try: dmrl info, dmrl label"
-        )
-    for reason in reasons:
-        say(f"left out: {reason}")
-    if list(images) == ["train"] and settings.split != "none" and settings.test_share > 0:
-        say(
-            "nothing is held out for testing. Name two or more recordings or one with a split "
-            "of its own, or test on another dataset"
-        )
 
 
 DEFAULTS = Settings()
@@ -285,29 +250,37 @@ def command(
     *,
     settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
     from_index: str | None = None,
+    into: Annotated[bool, Parameter(name="--add", negative=())] = False,
     workers: Workers = None,
     on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Build an Arrow dataset and its card from recordings.
+    """Build an Arrow dataset and its card from recordings, or add them to one that is there.
 
     Parameters
     ----------
     recordings
         Recordings with images and labels, or folders of them.
     out
-        Folder to write. Must not exist.
+        Folder to write. Must not exist, but for --add.
     from_index
         Of the recordings in folders that dmrl index has seen, only those that this is true of, such
         as 'camera = "cf1" and ok_labels > 100'; see dmrl find.
+    into
+        Add the recordings to OUT, a dataset, with the settings that it was made with. Shards that
+        are there stay as they are; recordings and images that are there already are left out.
     workers
         Threads that decode images. Without it, as many as there are cores. Changes no byte.
     as_json
         Print one JSON document in place of the tables.
     """
+    if into and on is not None:
+        raise SettingError("--add is done here. Leave out --on")
     named = all_recordings(recordings, from_index)
-    result = run(named, out, settings, workers=workers) if on is None else None
-    if on is not None and (said := done_on(on, "dataset", out, {"recordings": named}, settings)):
+    result: Result | None = None
+    if on is None:
+        result = (add if into else run)(named, out, settings, workers=workers)
+    elif said := done_on(on, "dataset", out, {"recordings": named}, settings):
         result = Result(said["images"], said["sources"], Tally(**said["tally"]))
     if result is None:
         print_line(f"{out} was there, made of the same by the same settings")
@@ -317,5 +290,6 @@ def command(
         document = {"dataset": str(out), "images": result.images}
         print_json({**document, "labels": result.sources, "left_out": left_out})
         return
-    print_table(str(out), ("split", "images"), list(result.images.items()))
+    title = f"{out}, added" if into else str(out)
+    print_table(title, ("split", "images"), list(result.images.items()))
     print_table("", ("recording", "labels from"), list(result.sources.items()))

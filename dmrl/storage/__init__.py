@@ -6,6 +6,6 @@ as a path does. Who opens one by its name, as a library does, gets a copy on thi
 
 from dmrl.storage.names import SCHEMES, path_of
 from dmrl.storage.remote import Remote
-from dmrl.storage.whole import uploaded_file, uploaded_folder
+from dmrl.storage.whole import added_files, uploaded_file, uploaded_folder
 
-__all__ = ["SCHEMES", "Remote", "path_of", "uploaded_file", "uploaded_folder"]
+__all__ = ["SCHEMES", "Remote", "added_files", "path_of", "uploaded_file", "uploaded_folder"]

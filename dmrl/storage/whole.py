@@ -77,6 +77,24 @@ def uploaded_folder(path: Remote) -> Iterator[Path]:
         mark.unlink()
 
 
+@contextmanager
+def added_files(path: Remote, last: str) -> Iterator[Path]:
+    """A folder here to write in; its files are uploaded into one that is there, ``last`` last.
+
+    Raises
+    ------
+    StorageError
+        If the server cannot be reached, or refuses.
+    """
+    with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
+        here = inside(Path(folder), path.name, f"{path}: its name")
+        here.mkdir()
+        yield here
+        files = [one.relative_to(here) for one in here.rglob("*") if one.is_file()]
+        for file in sorted(files, key=lambda one: (one == Path(last), one)):
+            _put(here / file, path / file.as_posix())
+
+
 def _put(here: Path, path: Remote) -> None:
     with here.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()

@@ -49,6 +49,7 @@ def recorder(folder: Path) -> Record:
         split: Mapping[str, str] | None = None,
         sizes_px: Mapping[int, tuple[int, int]] | None = None,
         masks: Mapping[int, Any] | None = None,
+        begin_ns: int = 0,
     ) -> Path:
         path = folder / name
         path.parent.mkdir(exist_ok=True)
@@ -57,14 +58,15 @@ def recorder(folder: Path) -> Record:
                 sink.add_metadata("dmrl.split", dict(split))
             for k, listed in enumerate(peers):
                 size_px = (sizes_px or {}).get(k, (HEIGHT_PX, WIDTH_PX))
+                at = begin_ns + k * STEP_NS
                 data = encode_png(pixels_of(1000 * seed + k, *size_px))
                 picture = message("CompressedImage")(data=data, format="png")
-                sink.write(k * STEP_NS, camera_image("cf1"), picture)
+                sink.write(at, camera_image("cf1"), picture)
                 if k in (masks or {}):
                     covered = message("CompressedImage")(data=encode_png(masks[k]), format="png")
-                    sink.write(k * STEP_NS, topics.masks("cf1"), covered)
+                    sink.write(at, topics.masks("cf1"), covered)
                 if listed is not None:
-                    sink.write(k * STEP_NS, labels("cf1"), message("PeerLabels")(peers=listed))
+                    sink.write(at, labels("cf1"), message("PeerLabels")(peers=listed))
         return path
 
     return write

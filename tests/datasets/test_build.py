@@ -266,7 +266,7 @@ def test_a_run_that_dies_in_the_middle_leaves_no_dataset(
         raise KeyboardInterrupt
 
     flight = record(peers=[[peer()]] * 100)
-    monkeypatch.setattr(stage, "one_size", die)
+    monkeypatch.setattr("dmrl.datasets.build.one_size", die)
     with pytest.raises(KeyboardInterrupt):
         run([flight], tmp_path / "out", PLAIN)
     assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]

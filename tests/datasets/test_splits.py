@@ -133,7 +133,7 @@ def test_a_recording_beside_one_that_knows_it_through_a_dataset(
     run([flight], tmp_path / "set", Settings())
     with RecordingWriter(other, provenance("render", {}, [tmp_path / "set"])) as sink:
         for stamped in read(flight):
-            sink.write(stamped.time_ns, stamped.topic, stamped.message)
+            sink.write(stamped.time_ns + 1, stamped.topic, stamped.message)
     assert sum(run([flight, other], tmp_path / "out", Settings()).images.values()) == 12
 
 

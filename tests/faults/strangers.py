@@ -77,9 +77,10 @@ SOURCES: dict[str, Source] = {
     "an int8 model": Source(lambda i: i.int8, "*.npz", _export),
     "an int8 model's description": Source(lambda i: i.int8, "*.json", _export),
     "a dataset's table": Source(lambda i: i.set, "train/*.arrow", _train),
-    "a dataset's state": Source(lambda i: i.set, "train/state.json", _train),
-    "a dataset's features": Source(lambda i: i.set, "train/dataset_info.json", _train),
-    "a dataset's splits": Source(lambda i: i.set, "dataset_dict.json", _train),
+    "a dataset's manifest": Source(lambda i: i.set, "manifest.json", _train),
+    "a dataset's state": Source(lambda i: i.saved, "train/state.json", _train),
+    "a dataset's features": Source(lambda i: i.saved, "train/dataset_info.json", _train),
+    "a dataset's splits": Source(lambda i: i.saved, "dataset_dict.json", _train),
     "a dataset's provenance": Source(lambda i: i.set, "provenance.json", _train),
 }
 

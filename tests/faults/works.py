@@ -160,6 +160,14 @@ class Inputs:
         return self.made("set", lambda path: cli("dataset", self.dots, path))
 
     @property
+    def saved(self) -> Path:
+        """The same without a manifest, as if `datasets` had saved it."""
+        return self.made("saved", self._saved)
+
+    def _saved(self, path: Path) -> None:
+        shutil.copytree(self.set, path, ignore=shutil.ignore_patterns("manifest.json", "parts"))
+
+    @property
     def model(self) -> Path:
         """A network of one epoch."""
         return self.made("model", lambda path: cli("train", self.set, path, *self.training))

@@ -1,0 +1,145 @@
+"""Rows of many recordings, images decoded ahead of their turn; and what is said of them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
+from pathlib import Path
+
+from dmrl import topics
+from dmrl.datasets.flags import Flag, read_flags
+from dmrl.datasets.manifest import Manifest
+from dmrl.datasets.rows import Tally, rows_of, sources_of
+from dmrl.datasets.settings import Settings
+from dmrl.datasets.splits import SplitOf
+from dmrl.datasets.write import Row
+from dmrl.errors import RecordingError
+from dmrl.images.ahead import ahead
+from dmrl.recording import Contents, summary
+from dmrl.terminal.progress import say, track
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is wanted of each image; see `rows_of`."""
+
+    keep_all: bool
+    masks: bool
+    flagged: Set[Flag]
+
+
+def rows(
+    held: Mapping[Path, Contents],
+    sources: Mapping[Path, str],
+    split_of: Mapping[Path, SplitOf],
+    tally: Tally,
+    wanted: Wanted,
+    *,
+    total: int,
+    size_px: tuple[int, int] | None,
+    workers: int,
+) -> Iterator[tuple[str, Row]]:
+    """Split and row of every image that is kept, recording after recording.
+
+    Parameters
+    ----------
+    held, sources, split_of
+        Of each recording: its labels, the source that is used, its splits.
+    tally
+        Is counted up.
+    wanted
+        Which images.
+    total
+        How many there are, for the progress.
+    size_px
+        Width and height that they must have. None: as the first has.
+    workers
+        Threads that decode.
+
+    Raises
+    ------
+    RecordingError
+        If an image has another size.
+    """
+    how = {"keep_all": wanted.keep_all, "masks": wanted.masks}
+    planned = (
+        (path, row)
+        for path, source in sources.items()
+        for row in rows_of(held[path], source, split_of[path], tally, flagged=wanted.flagged, **how)
+    )
+    for path, kept in track(ahead(_made, planned, workers), "Writing images", total):
+        if kept is not None:
+            size_px = size_px or kept[1].size_px
+            one_size(path, kept[1], size_px)
+            yield kept
+
+
+def _made(
+    planned: tuple[Path, tuple[str, Callable[[], Row]] | None],
+) -> tuple[Path, tuple[str, Row] | None]:
+    path, kept = planned
+    return path, None if kept is None else (kept[0], kept[1]())
+
+
+def has_masks(recording: Path) -> bool:
+    """Whether a recording has masks."""
+    return any(topics.names(topics.MASKS, topic) for topic in summary(recording).topics)
+
+
+def beside(held: Mapping[Path, Contents], sources: Mapping[Path, str]) -> dict[str, list[str]]:
+    """Sources that are not used, by recording, which is said where one might be meant."""
+    found = {path.name: sorted(sources_of(held[path]) - {used}) for path, used in sources.items()}
+    for path, used in sources.items():
+        if {"truth", "estimate"} <= {*found[path.name], used}:
+            other = "estimate" if used == "truth" else "truth"
+            say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
+    return {name: others for name, others in found.items() if others}
+
+
+def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
+    """Nothing, if a row's image has the size of the rows before it.
+
+    Raises
+    ------
+    RecordingError
+        If it has not.
+    """
+    if row.size_px != size_px:
+        width_px, height_px = row.size_px
+        raise RecordingError(
+            f"{path}: the image of {row.robot} at {row.time_ns} ns is {width_px} x {height_px} px, "
+            f"those before it {size_px[0]} x {size_px[1]} px. Make one dataset for each size, "
+            "or scale: dmrl convert --from images --width-px 320 --height-px 224"
+        )
+
+
+def unused(settings: Settings, tally: Tally) -> None:
+    """Say so where flags name no image: they may be of another recording."""
+    if settings.without is not None:
+        flags = len(read_flags(settings.without))
+        if flags > tally.flagged:
+            say(f"{settings.without}: {flags - tally.flagged} of {flags} flags name no image here")
+
+
+def explain(
+    recordings: Sequence[Path], manifest: Manifest, tally: Tally, settings: Settings
+) -> None:
+    """Say what was left out, and where nothing is held out.
+
+    Raises
+    ------
+    RecordingError
+        If no image can be used.
+    """
+    reasons = [f"{count} images {why}" for why, count in tally.left_out().items() if count]
+    if not (tally.kept or tally.twice):
+        names = ", ".join(str(path) for path in recordings)
+        raise RecordingError(
+            f"no image of {names} can be used: {'; '.join(reasons) or 'there is none'}. "
+            "Try: dmrl info, dmrl label"
+        )
+    for reason in reasons:
+        say(f"left out: {reason}")
+    if list(manifest.splits) == ["train"] and settings.split != "none" and settings.test_share > 0:
+        say(
+            "nothing is held out for testing. Name two or more recordings or one with a split "
+            "of its own, or test on another dataset"
+        )

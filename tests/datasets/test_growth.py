@@ -1,0 +1,236 @@
+"""Datasets that grow: what is there stays as it is, what is added comes once, whoever dies."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from datasets import load_from_disk
+
+from dmrl.border.locking import take_folder
+from dmrl.datasets import open_dataset
+from dmrl.errors import BusyOutput, DatasetError, RecordingError, SettingError
+from dmrl.stages.dataset import Settings, add, run
+from dmrl.stages.trim import Settings as Cut
+from dmrl.stages.trim import run as trim
+
+from .conftest import Record, peer, pixels_of
+
+PLAIN = Settings(split="none", shard_images=4)
+MADE_OF_IT = ("README.md", "manifest.json", "provenance.json", "facts.json", "croissant.json")
+
+
+def flights(record: Record, *numbers: int) -> list[Path]:
+    """Flights of six images, each with its own."""
+    return [record(f"{k}.mcap", seed=k, begin_ns=k * 10**10) for k in numbers]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()
+    }
+
+
+def stamps(folder: Path) -> dict[str, tuple[int, int]]:
+    """What shows that a file was written again."""
+    return {
+        p.relative_to(folder).as_posix(): (p.stat().st_mtime_ns, p.stat().st_ino)
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
+
+
+def sources(folder: Path, split: str = "train") -> list[str]:
+    found: list[str] = open_dataset(folder).split(split).table["source"].to_pylist()
+    return list(dict.fromkeys(found))
+
+
+@pytest.mark.parametrize("parquet", [False, True])
+def test_what_is_there_is_not_written_again_and_what_is_added_comes_after_it(
+    record: Record, tmp_path: Path, parquet: bool
+) -> None:
+    out, settings = tmp_path / "set", Settings(split="none", shard_images=4, parquet=parquet)
+    run(flights(record, 0, 1), out, settings)
+    before = stamps(out)
+    assert add(flights(record, 2), out, Settings()).images == {"train": 6}
+    after = stamps(out)
+    changed = {name for name in before if before[name] != after[name]}
+    assert changed <= {*MADE_OF_IT, "train/state.json", "train/dataset_info.json"}
+    assert {"manifest.json", "provenance.json"} <= changed
+    assert sources(out) == ["0.mcap", "1.mcap", "2.mcap"]
+    split = open_dataset(out).split("train")
+    shown = np.concatenate(split.pixels)
+    assert np.array_equal(shown, [pixels_of(1000 * k + i) for k in range(3) for i in range(6)])
+    made = json.loads((out / "provenance.json").read_text())
+    assert [one["name"] for one in made["inputs"]] == ["0.mcap", "1.mcap", "2.mcap"]
+    assert "18 camera images" in (out / "README.md").read_text()
+    assert "`2.mcap`" in (out / "README.md").read_text()
+
+
+def test_others_open_what_has_grown(record: Record, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    run(flights(record, 0), out, PLAIN)
+    mark = load_from_disk(str(out))["train"]._fingerprint
+    add(flights(record, 1), out, PLAIN)
+    theirs = load_from_disk(str(out))["train"]
+    assert theirs["source"] == ["0.mcap"] * 6 + ["1.mcap"] * 6
+    assert bytes(theirs[7]["pixels"]) == pixels_of(1001).tobytes()
+    assert theirs._fingerprint != mark
+    info = json.loads((out / "train" / "dataset_info.json").read_text())["splits"]["train"]
+    assert info["num_examples"] == 12 and info["shard_lengths"] == [4, 2, 4, 2]
+    sizes = [path.stat().st_size for path in (out / "train").glob("*.arrow")]
+    assert info["num_bytes"] == sum(sizes)
+
+
+def test_the_same_steps_make_the_same_bytes_and_a_step_again_changes_nothing(
+    record: Record, tmp_path: Path
+) -> None:
+    one, two, three = flights(record, 0, 1, 2)
+    for name, workers in (("a", 1), ("b", 3)):
+        run([one], tmp_path / name, Settings(test_share=0.5))
+        add([two], tmp_path / name, Settings(), workers=workers)
+        add([three], tmp_path / name, Settings(), workers=workers)
+    made = contents(tmp_path / "a")
+    assert made == contents(tmp_path / "b") and len(made) > 12
+    again = add([three, one], tmp_path / "a", Settings())
+    assert again.images == {} and contents(tmp_path / "a") == made
+
+
+def test_a_recording_that_is_there_and_an_image_that_is_there_come_once(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "set"
+    (first,) = flights(record, 0)
+    run([first], out, PLAIN)
+    copied = shutil.copy(first, tmp_path / "copy.mcap")
+    assert add([copied], out, PLAIN).images == {}
+    assert "1 of 1 recordings are in" in capsys.readouterr().err
+    # The same images and one more, in other bytes and without a word of where they are from.
+    more = record("more.mcap", [[peer()]] * 7, seed=0)
+    result = add([more], out, PLAIN)
+    assert result.images == {"train": 1} and result.tally.twice == 6
+    assert len(open_dataset(out).split("train")) == 7
+    assert "6 images are there already" in (out / "README.md").read_text().replace("`", "")
+    all_there = record("all.mcap", [[peer(depth_m=2.0)]] * 6, seed=0)
+    assert add([all_there], out, PLAIN).images == {}
+    assert add([all_there], out, PLAIN).tally.kept == 0
+
+
+def test_a_name_twice_or_a_part_of_what_is_there_is_refused(record: Record, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    (first,) = flights(record, 0)
+    run([first], out, PLAIN)
+    made = contents(out)
+    other = record("other/0.mcap", seed=5)
+    with pytest.raises(SettingError, match="have one name"):
+        add([other], out, PLAIN)
+    trim(first, tmp_path / "part.mcap", Cut(to_s=0.3))
+    with pytest.raises(SettingError, match=r"part\.mcap is made from 0\.mcap"):
+        add([tmp_path / "part.mcap"], out, PLAIN)
+    with pytest.raises(RecordingError, match="64 x 40 px"):
+        add([record("small.mcap", seed=6, sizes_px=dict.fromkeys(range(6), (40, 64)))], out, PLAIN)
+    assert contents(out) == made
+
+
+def test_its_settings_hold(record: Record, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    run(flights(record, 0), out, Settings(png=True, test_share=0.0))
+    second = flights(record, 1)
+    with pytest.raises(SettingError, match=r"made with --shard-images 2048\. Leave out"):
+        add(second, out, Settings(shard_images=3))
+    add(second, out, Settings(png=True))
+    assert "image" in open_dataset(out).split("train").table.column_names
+
+
+def test_a_flight_has_its_split_whatever_comes_with_it(record: Record, tmp_path: Path) -> None:
+    first, *others = flights(record, *range(8))
+    for name, parts in (("a", [others]), ("b", [[one] for one in reversed(others)])):
+        run([first], tmp_path / name, Settings(test_share=0.5))
+        for part in parts:
+            add(part, tmp_path / name, Settings())
+    of = {name: set(sources(tmp_path / name, "test")) for name in "ab"}
+    assert of["a"] == of["b"] and 0 < len(of["a"]) < 7
+    assert "test" in (tmp_path / "b" / "dataset_dict.json").read_text()
+
+
+def test_what_cannot_grow_is_one_line(record: Record, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    first, new = flights(record, 0), flights(record, 1)
+    with pytest.raises(DatasetError, match="no dataset that can grow"):
+        add(first, out, PLAIN)
+    run(first, out, PLAIN)
+    held = contents(out)
+    for name, text in (
+        ("manifest.json", b"[]"),
+        ("manifest.json", held["manifest.json"].replace(b'"rows": 4', b'"rows": -4')),
+        ("manifest.json", held["manifest.json"].replace(b'"parts": 1', b'"parts": 9')),
+        ("parts/00000/seen.npy", b"nothing"),
+        ("parts/00000/seen.npy", held["parts/00000/seen.npy"][:-5]),
+        ("parts/00000/provenance.json", b"{}"),
+    ):
+        (out / name).write_bytes(text)
+        with pytest.raises((DatasetError, RecordingError), match="Make"):
+            add(new, out, PLAIN)
+        (out / name).write_bytes(held[name])
+    held_by_another = take_folder(tmp_path / "set.partial")
+    with pytest.raises(BusyOutput, match="being written by another"):
+        add(new, out, PLAIN)
+    os.close(held_by_another)
+    assert contents(out) == held
+
+
+def dying(at: int, work: Callable[[], Any]) -> bool:
+    """Whether a process that does some work dies at its n-th change of a file."""
+    child = os.fork()
+    if child == 0:
+        count = 0
+
+        def counted(real: Callable[..., Any]) -> Callable[..., Any]:
+            def call(*given: Any, **named: Any) -> Any:
+                nonlocal count
+                count += 1
+                if count == at:
+                    os._exit(9)
+                return real(*given, **named)
+
+            return call
+
+        for name in ("replace", "rename", "mkdir", "fsync", "unlink", "rmdir"):
+            setattr(os, name, counted(getattr(os, name)))
+        work()
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+
+
+@pytest.mark.parametrize("step", [6, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_process_that_dies_anywhere_leaves_one_dataset_or_the_other(
+    record: Record, tmp_path: Path, step: int
+) -> None:
+    """Killed at each change of a file: it opens, and the command again makes the same bytes."""
+    first, second, out = *flights(record, 0, 1), tmp_path / "set"
+    settings = Settings(split="none", shard_images=3)
+    run([first], tmp_path / "sound", settings)
+    shutil.copytree(tmp_path / "sound", tmp_path / "grown")
+    add([second], tmp_path / "grown", settings, workers=1)
+    old, new = (contents(tmp_path / name) for name in ("sound", "grown"))
+    rows, at, seen = set(), -2, True
+    while seen:
+        at += step
+        shutil.copytree(tmp_path / "sound", out)
+        seen = dying(at, lambda: add([second], out, settings, workers=1))
+        here = len(open_dataset(out).split("train"))
+        assert here == len(load_from_disk(str(out))["train"]) or here == 12
+        assert here in (6, 12)
+        rows.add((here, seen))
+        left = contents(out)
+        shards = [name for name in old if name.endswith((".arrow", ".npy"))]
+        assert all(left[name] == old[name] for name in shards)
+        add([second], out, settings, workers=1)
+        assert contents(out) == new, at
+        assert not list(tmp_path.glob("*.partial"))
+        shutil.rmtree(out)
+    assert {(6, True), (12, False)} <= rows <= {(6, True), (12, True), (12, False)} and at > 20
