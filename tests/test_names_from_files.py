@@ -26,6 +26,7 @@ REASONS = {
     "datasets/layout.py: f'data-{number}.arrow'": OURS,
     "datasets/layout.py: f'{split}-{number}.parquet'": CHECKED_BEFORE,
     "datasets/layout.py: split": CHECKED_BEFORE,
+    "datasets/manifest.py: f'{number:05d}'": OURS,
     "deploy/c/__init__.py: file": "named by c_name",
     "deploy/c/text.py: template": OURS,
     "deploy/compiled.py: f'{name}.c'": "named by c_name",
@@ -44,6 +45,8 @@ REASONS = {
     "formats/nanocockpit.py: folder": OURS,
     "learn/checkpoint.py: name": OURS,
     "learn/pretrained/__init__.py: model": LISTED,
+    "output.py: file": "what we wrote ourselves just now",
+    "output.py: last": OURS,
     "output.py: path.name + SUFFIX": GIVEN,
     "page/gather.py: name": LISTED,
     "page/sections.py: name": LISTED,
@@ -68,6 +71,7 @@ REASONS = {
     "stages/sketch.py: name": OURS,
     "storage/remote.py: *one.parts[len(self.parts):]": "a name in the same bucket",
     "storage/remote.py: hashlib.sha256(version.encode()).hexdigest()[:16]": OURS,
+    "storage/whole.py: file": "what we wrote ourselves just now",
 }
 PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
 MAY_PARSE = {

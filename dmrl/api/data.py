@@ -80,8 +80,8 @@ class Rows:
         chosen %= max(len(self), 1)
         return {
             "image": np.stack(list(self._split.images(chosen.tolist()))),
-            "confidence": self._split.confidence[chosen],
-            "depth": self._split.depth[chosen],
+            "confidence": self._split.grids(layout.CONFIDENCE, chosen.tolist()),
+            "depth": self._split.grids(layout.DEPTH, chosen.tolist()),
         }
 
     @property
@@ -133,7 +133,13 @@ class Rows:
         return found
 
     def loader(
-        self, batch_size: int = 32, *, shuffle: bool = False, seed: int = 0, workers: int = 0
+        self,
+        batch_size: int = 32,
+        *,
+        shuffle: bool = False,
+        seed: int = 0,
+        workers: int = 0,
+        part: tuple[int, int] | None = None,
     ) -> "DataLoader[Any]":
         """Batches for a training, as a DataLoader of torch; each is gathered at once.
 
@@ -142,11 +148,14 @@ class Rows:
         batch_size
             Rows of a batch; the last may have fewer.
         shuffle
-            In another order every epoch.
+            In another order every epoch; of a large split, 8,192 rows at a time of shuffled blocks.
         seed
             Of those orders.
         workers
             Processes that gather ahead; 0: this one.
+        part
+            ``(k, n)``: this is process k of n, from 0, and reads its own part of the rows. None: as
+            torchrun says (RANK, WORLD_SIZE), or all of them.
 
         Returns
         -------
@@ -158,9 +167,11 @@ class Rows:
         ------
         MissingExtra
             If torch is not installed.
+        SettingError
+            If there is no such part.
         """
         found: DataLoader[Any] = _torch_rows().loader_of(
-            self, batch_size, shuffle=shuffle, seed=seed, workers=workers
+            self, batch_size, shuffle=shuffle, seed=seed, workers=workers, part=part
         )
         return found
 

@@ -117,7 +117,7 @@ def cautions(
 def merged(parts: Sequence[Facts]) -> Facts:
     """Facts of a dataset from those of its parts; of leaks the last knows all."""
     reasons = dict.fromkeys(why for part in parts for why in part.left_out)
-    by_recording = {
+    by_recording: dict[str, Any] = {
         name: {key: value for part in parts for key, value in getattr(part, name).items()}
         for name in ("used", "beside", "findings", "licences", "cameras")
     }

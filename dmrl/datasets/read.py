@@ -1,9 +1,11 @@
 """Open datasets: shards are mapped into memory, never read as a whole."""
 
 import re
-from collections.abc import Iterable, Iterator
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -67,11 +69,43 @@ class Split:
         return [self._decoded(chunk) for chunk in self.table[layout.IMAGE].chunks]
 
     def images(self, rows: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-        """The images of these rows, (H, W, 3) each."""
-        ends = np.cumsum([len(chunk) for chunk in self.pixels])
-        for row in rows:
-            chunk = int(np.searchsorted(ends, row, side="right"))
-            yield self.pixels[chunk][row - int(ends[chunk])]
+        """The images of these rows, (H, W, 3) each; PNGs of other rows are not decoded."""
+        packed = layout.IMAGE in self.table.schema.names and "pixels" not in self.__dict__
+        for chunk, place in map(self._place, rows):
+            if packed:
+                yield self._decoded(self.table[layout.IMAGE].chunk(chunk).slice(place, 1))[0]
+            else:
+                yield self.pixels[chunk][place]
+
+    def grids(self, name: str, rows: Sequence[int]) -> NDArray[np.float32]:
+        """(n, rows, cols) grid labels of these rows, and no others."""
+        out = np.empty((len(rows), *self.grid_shape), np.float32)
+        for grid, (chunk, place) in zip(out, map(self._place, rows), strict=True):
+            grid[:] = self._grids[name][chunk][place]
+        return out
+
+    def _place(self, row: int) -> tuple[int, int]:
+        """Number of a row's batch, and its place there."""
+        chunk = bisect_right(self._ends, row)
+        return chunk, row - (self._ends[chunk - 1] if chunk else 0)
+
+    @cached_property
+    def _ends(self) -> list[int]:
+        return list(accumulate(len(chunk) for chunk in self.table["source"].chunks))
+
+    @cached_property
+    def _grids(self) -> dict[str, list[NDArray[np.float32]]]:
+        """Views of the mapped grids, (n_i, rows, cols), one per batch."""
+        return {
+            name: [
+                chunk.flatten()
+                .flatten()
+                .to_numpy(zero_copy_only=True)
+                .reshape(-1, *self.grid_shape)
+                for chunk in self.table[name].chunks
+            ]
+            for name in (layout.CONFIDENCE, layout.DEPTH)
+        }
 
     @cached_property
     def masks(self) -> list[NDArray[np.uint8]]:
@@ -114,10 +148,8 @@ class Split:
         return out
 
     def _grid(self, name: str) -> NDArray[np.float32]:
-        chunks = self.table[name].chunks
-        flat = [chunk.flatten().flatten().to_numpy(zero_copy_only=True) for chunk in chunks]
-        joined = flat[0] if len(flat) == 1 else np.concatenate(flat)
-        return joined.reshape(len(self), *self.grid_shape)
+        parts = self._grids[name]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 @dataclass(frozen=True)

@@ -39,9 +39,9 @@ def said(capsys: pytest.CaptureFixture[str], status: int, *words: object) -> Any
     return printed
 
 
-def pictured(path: Path) -> Path:
+def pictured(path: Path, *, seed: int = 0) -> Path:
     """Numbers of two robots, and pictures that are ten times as much."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(3000):
             at = 1_000_000_000 + k * 10_000_000
@@ -179,6 +179,29 @@ def test_a_dataset_is_made_and_opened_in_a_bucket(
     made = (tmp_path / "set" / "train").glob("*.arrow")
     name = next(made)
     assert lab.cat_file(f"lab/sets/set/train/{name.name}") == name.read_bytes()
+
+
+def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
+    lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], empty_figures: None
+) -> None:
+    first, second = (pictured(tmp_path / f"{k}.mcap", seed=k) for k in range(2))
+    words = ("--split", "none", "--shard-images", 200, "--workers", 1)
+    for out in (tmp_path / "set", "s3://lab/grows/set"):
+        said(capsys, 0, "dataset", first, out, *words)
+    before = {name: lab.info(name)["LastModified"] for name in lab.find("lab/grows/set")}
+    shards = {name: lab.cat_file(name) for name in before if name.endswith(".arrow")}
+    for out in (tmp_path / "set", "s3://lab/grows/set"):
+        told = said(capsys, 0, "dataset", second, out, "--add", "--workers", 1)
+    assert "the card is as it was" in told.err
+    assert {name: lab.cat_file(name) for name in shards} == shards
+    made = tmp_path / "set"
+    for path in (p for p in made.rglob("*") if p.is_file() and p.name != "README.md"):
+        name = path.relative_to(made).as_posix()
+        if name != "croissant.json":
+            assert lab.cat_file(f"lab/grows/set/{name}") == path.read_bytes(), name
+    again = said(capsys, 0, "dataset", second, "s3://lab/grows/set", "--add")
+    assert "1 of 1 recordings are in" in again.err
+    assert len(open_dataset(path_of("s3://lab/grows/set")).split("train")) == 600
 
 
 CHAIN = """
