@@ -1,0 +1,131 @@
+"""What recordings carry beside messages: splits, licences, counts, times of an index."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import IndexType, Writer
+
+from dmrl.errors import RecordingError
+from dmrl.messages import message, schema_bytes
+from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording.container import INDEX
+from dmrl.recording.extras import copy_extras, splits
+from dmrl.recording.index import channel_on
+from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
+from dmrl.recording.message_index import as_pairs, index_entries
+from dmrl.recording.times import log_times
+
+MADE = Provenance("test")
+
+
+def recording(path: Path, *metadata: tuple[str, dict[str, str]]) -> Path:
+    with RecordingWriter(path, MADE, recipe="kind = 'test'\n") as sink:
+        for k in range(10):
+            sink.write(10 * k, "/cf1/height", message("Height")(height_m=k))
+        for name, values in metadata:
+            sink.add_metadata(name, values)
+        sink.add_attachment("notes", "text/plain", b"hello")
+    return path
+
+
+def test_a_split_is_its_intervals_by_name(tmp_path: Path) -> None:
+    path = recording(
+        tmp_path / "a.mcap",
+        ("dmrl.split", {"train": "[[0, 10], [30, 40]]", "test": "[[20, 25]]"}),
+        ("dmrl.split", {"train": "[[50, 60]]"}),
+    )
+    assert splits(path, summary(path)) == {
+        "train": [(0, 10), (30, 40), (50, 60)],
+        "test": [(20, 25)],
+    }
+
+
+@pytest.mark.parametrize("text", ["[[1]]", "[1, 2]", '[["a", 2]]', "{", "[[null, 3]]"])
+def test_a_split_that_is_none_is_one_line(text: str, tmp_path: Path) -> None:
+    path = recording(tmp_path / "a.mcap", ("dmrl.split", {"train": text}))
+    with pytest.raises(RecordingError, match=r"a\.mcap: its split is not a list") as e:
+        splits(path, summary(path))
+    assert "\n" not in str(e.value)
+
+
+def test_metadata_and_attachments_go_along_but_no_provenance_or_recipe(tmp_path: Path) -> None:
+    one = recording(tmp_path / "a.mcap", ("own", {"k": "v"}), ("own", {"k": "w"}))
+    other = tmp_path / "b.mcap"
+    with RecordingWriter(other, Provenance("other")) as sink:
+        copy_extras(summary(one), sink)
+    found = summary(other)
+    assert found.metadata["own"] == [{"k": "v"}, {"k": "w"}]
+    assert found.provenance is not None and found.provenance.stage == "other"
+    assert len(found.metadata["dmrl.provenance"]) == 1
+    assert found.attachments.keys() - summary(one).attachments.keys() == set()
+    assert found.attachments["notes"] == b"hello"
+
+
+def test_the_licence_beside_a_source_is_told_by_its_first_words(tmp_path: Path) -> None:
+    source = tmp_path / "photo.jpg"
+    source.write_bytes(b"x")
+    assert licence_beside(source) is None
+    (tmp_path / "LICENSES").write_text("no")
+    (tmp_path / "LICENCE.md").mkdir()
+    assert licence_beside(tmp_path) is None
+    found = tmp_path / "LICENSE.txt"
+    found.write_text("\n## " + "CC BY 4.0" + "x" * 200 + "\nmore\n")
+    assert licence_beside(source) == licence_beside(tmp_path) == found
+    assert licence_words(found) == ("CC BY 4.0" + "x" * 200)[:100]
+    found.write_text(" \n")
+    assert licence_words(found) == "empty"
+
+
+def test_licences_of_recordings_are_put_together(tmp_path: Path) -> None:
+    paths = [
+        recording(tmp_path / "a.mcap", (LICENCES_METADATA, {"b": "MIT"})),
+        recording(tmp_path / "b.mcap", (LICENCES_METADATA, {"a": "CC0"})),
+        recording(tmp_path / "c.mcap"),
+    ]
+    assert list(licences(paths).items()) == [("a", "CC0"), ("b", "MIT")]
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_topic_of_two_channels_is_one_topic(indexed: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        kinds = IndexType.ALL if indexed else IndexType.NONE
+        writer = Writer(stream, index_types=kinds, use_statistics=indexed)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        for number, count in ((0, 3), (1, 4)):
+            metadata = {"n": str(number)}
+            channel = writer.register_channel("/cf1/height", "protobuf", schema, metadata)
+            for k in range(count):
+                data = message("Height")(height_m=1.0).SerializeToString()
+                writer.add_message(channel, 5 + 10 * k + number, data, 0)
+        writer.finish()
+    found = summary(path)
+    assert (found.count, found.topics["/cf1/height"].count) == (7, 7)
+    assert (found.start_ns, found.end_ns) == (5, 36)
+    assert channel_on(path, "/cf1/height").metadata == (("n", "0"),)
+    times = [5, 6, 15, 16, 25, 26, 36]
+    assert log_times(path, ["/cf1/height", "/none"]) == {"/cf1/height": pytest.approx(times)}
+
+
+def test_log_times_are_half_open(tmp_path: Path) -> None:
+    path = recording(tmp_path / "a.mcap")
+    found = log_times(path, ["/cf1/height"], start_ns=20, end_ns=50)
+    assert found["/cf1/height"].tolist() == [20, 30, 40]
+    assert log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(0, 100, 10))
+
+
+def test_an_index_is_of_its_channel_and_whole() -> None:
+    pairs = np.array([[5, 0], [7, 40]], "<i8").tobytes()
+    raw = b"xy" + INDEX.pack(7, 6 + len(pairs), 3, len(pairs)) + pairs
+    assert as_pairs(index_entries(Path("a"), raw, 2, 3)).tolist() == [[5, 0], [7, 40]]
+    for wrong, at, number in (
+        (raw, 2, 4),
+        (raw[:-1], 2, 3),
+        (b"xy" + INDEX.pack(8, 6 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
+        (b"xy" + INDEX.pack(7, 7 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
+        (b"xy" + INDEX.pack(7, 6 + 15, 3, 15) + pairs, 2, 3),
+    ):
+        with pytest.raises(RecordingError, match=f"message index of channel {number}"):
+            index_entries(Path("a"), wrong, at, number)
