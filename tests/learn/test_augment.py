@@ -188,3 +188,98 @@ def test_a_grey_share_of_images_has_no_colours() -> None:
     assert 0.4 < grey.float().mean() < 0.6
     whole = torch.cat([batch.images for batch in batches(replace(settings, grey_share=1.0), 1)])
     assert (whole.amax(dim=1) == whole.amin(dim=1)).all()
+
+
+def augmenter(**settings: object) -> Augmenter:
+    """Of robots 1 and 4 m away."""
+    examples = squares(2)
+    examples.robots[:, 0, 2] = 1.0, 4.0
+    return Augmenter(examples, Augmentation(**settings), seed=0)  # type: ignore[arg-type]
+
+
+def at_depth(depth_m: float) -> NDArray[np.float32]:
+    robot = np.zeros(len(FIELDS), np.float32)
+    robot[2] = depth_m
+    return robot
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "low", "high"),
+    [
+        (None, 0.25, 8.0),
+        (2.0, 2 / 4.4, 2.2),  # between 1 m less a tenth and 4 m more
+        (1.0, 0.25, 1.1),
+        (4.0, 4 / 4.4, 4.4),
+        (0.5, 0.25, 1.0),  # nearer than any label: not nearer still
+        (9.0, 1.0, 8.0),
+    ],
+)
+def test_zooms_keep_a_robot_among_the_depths_of_the_labels(
+    depth_m: float | None, low: float, high: float
+) -> None:
+    maker, rng = augmenter(zoom=(0.25, 8.0)), np.random.default_rng(1)
+    robot = None if depth_m is None else at_depth(depth_m)
+    drawn = np.log([maker._zoom(robot, rng) for _ in range(2000)])
+    assert np.exp(drawn.min()) == pytest.approx(low, rel=0.02)
+    assert np.exp(drawn.max()) == pytest.approx(high, rel=0.02)
+    assert drawn.mean() == pytest.approx((np.log(low) + np.log(high)) / 2, abs=0.1)
+
+
+def test_turns_go_either_way_and_some_are_mirrored() -> None:
+    maker, rng = augmenter(rotation_deg=20.0, flip_share=0.25), np.random.default_rng(2)
+    turns = np.array([maker._turn(2.0, rng) for _ in range(2000)])
+    assert np.linalg.det(turns) == pytest.approx(np.where(np.linalg.det(turns) > 0, 0.25, -0.25))
+    assert (np.linalg.det(turns) < 0).mean() == pytest.approx(0.25, abs=0.03)
+    # The second column is turned and not mirrored.
+    angle = np.degrees(np.arctan2(-turns[:, 0, 1], turns[:, 1, 1]))
+    assert (angle.min(), angle.max()) == pytest.approx((-20, 20), abs=0.2)
+    assert angle.mean() == pytest.approx(0, abs=1)
+
+
+def test_a_tint_changes_contrast_about_the_middle_and_brightness() -> None:
+    maker, rng = augmenter(colour=0.1), np.random.default_rng(3)
+    grey, bright = [], []
+    for _ in range(3000):
+        pixels = torch.tensor([[[128.0] * 3, [228.0] * 3]])
+        maker._tint(pixels, rng)
+        grey.append(pixels[0, 0].numpy())
+        bright.append((pixels[0, 1] - pixels[0, 0]).numpy() / 100)
+    assert np.std(grey, axis=0) == pytest.approx([12.8] * 3, rel=0.06)
+    assert np.ptp(grey, axis=1).max() < 1e-3  # the middle is lifted, not coloured
+    gain = np.log(bright)
+    assert gain.mean(axis=1).std() == pytest.approx(np.hypot(0.1, 0.05 / 3**0.5), rel=0.06)
+    assert (gain - gain.mean(axis=1, keepdims=True)).std() == pytest.approx(
+        0.05 * (2 / 3) ** 0.5, rel=0.06
+    )
+
+
+def test_defocus_spreads_a_point_over_its_neighbours_alike() -> None:
+    maker, rng, middles = augmenter(blur_share=0.5), np.random.default_rng(4), []
+    for _ in range(600):
+        canvas = torch.zeros(7, 9, 3)
+        canvas[3, 4] = 90.0
+        maker._spoil(canvas, rng)
+        seen = canvas[..., 0]
+        assert seen.sum() == pytest.approx(90, rel=1e-5)
+        torch.testing.assert_close(seen, seen.flip(0))
+        torch.testing.assert_close(seen, seen.flip(1))
+        assert not seen[:, [0, 1, 2, 6, 7, 8]].any() and not seen[[0, 1, 5, 6]].any()
+        middles.append(float((seen[3, 4] / 90).sqrt()))
+    blurred = [1 - middle for middle in middles if middle < 0.999]
+    assert len(blurred) / 600 == pytest.approx(0.5, abs=0.06)
+    assert (min(blurred), max(blurred)) == pytest.approx((0.2, 2 / 3), abs=0.02)
+
+
+def test_no_more_robots_than_there_is_room_for_are_labelled() -> None:
+    crowd = squares(1)
+    robots = np.repeat(crowd.robots[:, :1], augment.MAX_ROBOTS + 3, axis=1)
+    maker = Augmenter(Examples(crowd.pixels, robots), Augmentation(flip_share=0.5), seed=0)
+    batch = maker.batch([0], epoch=0, index=0)
+    assert batch.robots.shape == (1, augment.MAX_ROBOTS, len(FIELDS))
+    assert torch.isfinite(batch.robots[..., 0]).all()
+
+
+def test_plain_is_whole_images_in_other_colours() -> None:
+    every = replace(GEOMETRY, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
+    wanted = Augmentation(flip_share=0.5, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
+    assert every.plain == wanted

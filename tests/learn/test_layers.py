@@ -6,7 +6,21 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.learn.batches import FIELDS
-from dmrl.learn.windows import Window, facing, flat, moved, sample, through, turned
+from dmrl.learn.windows import (
+    Window,
+    facing,
+    feather,
+    flat,
+    inside,
+    moved,
+    parts,
+    present,
+    sample,
+    slant,
+    through,
+    turned,
+    under,
+)
 
 CAMERA = (120.0, 118.0, 160.0, 100.0)
 WHOLE = (0, 0, 320, 224)
@@ -112,3 +126,57 @@ def test_pixels_without_channels_have_one() -> None:
         window = Window(flat(np.eye(2) / zoom, np.zeros(2), np.zeros(2)), zoom)
         shape = (4 * zoom, 6 * zoom)
         assert sample(mask, window, shape).shape == (*shape, 1)
+
+
+def centres(*uv: tuple[float, float]) -> NDArray[np.float32]:
+    out = np.full((len(uv), len(FIELDS)), np.nan, np.float32)
+    out[:, :2] = uv
+    return out
+
+
+def test_a_rectangle_is_cut_in_two_or_four_near_its_middle() -> None:
+    rng, kinds = np.random.default_rng(0), set()
+    for _ in range(60):
+        cut = parts((10, 20, 70, 110), rng)
+        seen = np.zeros((120, 80), int)
+        for left, top, right, bottom in cut:
+            assert right - left >= 20 and bottom - top >= 30
+            seen[top:bottom, left:right] += 1
+        assert (seen[20:110, 10:70] == 1).all() and seen.sum() == 90 * 60
+        kinds.add((len({rect[0] for rect in cut}), len({rect[1] for rect in cut})))
+    assert kinds == {(2, 1), (1, 2), (2, 2)}
+
+
+def test_a_feathered_patch_grows_by_quarters_from_its_border() -> None:
+    found = feather(9, 12)[..., 0]
+    down = torch.tensor([0.25, 0.5, 0.75, 1, 1, 1, 0.75, 0.5, 0.25])
+    across = torch.tensor([0.25, 0.5, 0.75, *[1.0] * 6, 0.75, 0.5, 0.25])
+    torch.testing.assert_close(found, down[:, None] * across)
+
+
+def test_a_rectangle_holds_its_left_and_upper_border() -> None:
+    at = centres((5, 7), (4.9, 7), (5, 6.9), (14.9, 16.9), (15, 10), (10, 17))
+    assert inside(at, (5, 7, 15, 17)).tolist() == [True, False, False, True, False, False]
+    assert present(np.concatenate([at, centres((np.nan, 1))])).shape == at.shape
+    opacity = torch.zeros(10, 10, 1)
+    opacity[0, 0], opacity[9, 9] = 0.51, 0.49
+    assert under(at, (5, 7, 15, 17), opacity).tolist() == [True] + [False] * 5
+    assert under(at, (5, 7, 15, 17), None).tolist() == inside(at, (5, 7, 15, 17)).tolist()
+
+
+def test_distance_over_depth_is_the_length_of_a_ray_one_deep() -> None:
+    points = np.array([[0.0, 0, 2], [1, 0, 2], [0, -1.5, 3], [1, 2, 2]])
+    wanted = np.linalg.norm(points, axis=1) / points[:, 2]
+    assert slant(CAMERA, seen_at(points)) == pytest.approx(wanted)
+
+
+def test_a_flat_window_is_a_turn_about_a_point() -> None:
+    turn = np.array([[0.0, -0.5], [0.5, 0.0]])
+    matrix = flat(turn, np.array([30.0, 40.0]), np.array([7.0, 9.0]))
+    shown = np.array([[7.0, 9.0], [9.0, 9.0], [7.0, 11.0]])
+    assert through(matrix, shown).tolist() == [[30, 40], [30, 41], [29, 40]]
+    robots = centres((30, 40), (30, 41))
+    robots[:, 2:6] = 4.0, 1.0, 2.0, 0.5
+    got = moved(robots, Window(matrix, 2.0), (100, 200, 120, 220))
+    assert got[:, :2].tolist() == [[107, 209], [109, 209]]
+    assert got[:, 2:6].tolist() == [[2.0, 2.0, 4.0, 0.25]] * 2
