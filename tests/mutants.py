@@ -26,7 +26,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -43,6 +43,8 @@ HEAVY = ("scipy.stats", "scipy.optimize", "pyarrow.compute", "PIL.Image")
 HEAVY += ("filterpy.kalman", "mcap.writer", "cv2", "torch", "tensorboard", "onnx", "onnxruntime")
 HEAVY += ("hypothesis.strategies", "hypothesis.extra.numpy")
 """What tests import and changes do not touch: imported once, for the tests of every change."""
+Row = dict[str, object]
+"""A change, the tests that may notice, and whether they did."""
 LEAST_S = 120.0
 """Tests that run for longer than this, and than ten times what they should, do not end."""
 
@@ -167,30 +169,29 @@ def tests_of(
     return sorted(found & took.keys(), key=lambda test: (own not in test, took[test], test))
 
 
-def quickly(copy: Copy, room: str, mutants: list[Mutant]) -> list[dict[str, object]]:
+def quickly(copy: Copy, room: str, mutants: list[Mutant]) -> Iterator[Row]:
     """Each change, and whether the tests near it noticed."""
     began = time.monotonic()
     if copy.pytest([f"tests/{room}"], 10 * LEAST_S):
         sys.exit((copy.folder / "pytest.log").read_text() + f"tests/{room} fail as they are")
     limit_s = max(LEAST_S, 10 * (time.monotonic() - began))
-    return [_row(m, near(m), copy.survives(m, near(m), limit_s)) for m in mutants]
+    for mutant in mutants:
+        yield _row(mutant, near(mutant), copy.survives(mutant, near(mutant), limit_s))
 
 
-def measured(copy: Copy, room: str, mutants: list[Mutant]) -> list[dict[str, object]]:
+def measured(copy: Copy, room: str, mutants: list[Mutant]) -> Iterator[Row]:
     """Each change, and whether it was noticed; those that were not are printed."""
     began = time.monotonic()
     lines, took = copy.lines(room)
     limit_s = max(LEAST_S, 10 * (time.monotonic() - began))
     if copy.pytest([str(files_of(room)[0].relative_to(REPOSITORY))], limit_s):
         sys.exit((copy.folder / "pytest.log").read_text() + "no test passes after a fork")
-    rows = []
     for mutant in mutants:
         tests = tests_of(mutant, lines, took, copy.folder)
-        rows.append(_row(mutant, tests, not tests or copy.survives(mutant, tests, limit_s)))
-    return rows
+        yield _row(mutant, tests, not tests or copy.survives(mutant, tests, limit_s))
 
 
-def by_hand(copy: Copy, rooms: tuple[str, ...]) -> list[dict[str, object]]:
+def by_hand(copy: Copy, rooms: tuple[str, ...]) -> Iterator[Row]:
     """The same of the changes made by hand."""
     changes, gone = named(rooms)
     for line in gone:
@@ -201,10 +202,11 @@ def by_hand(copy: Copy, rooms: tuple[str, ...]) -> list[dict[str, object]]:
         if copy.pytest(list(tests), 10 * LEAST_S):
             sys.exit((copy.folder / "pytest.log").read_text() + f"{tests} fail as they are")
         limits_s[tests] = max(LEAST_S, 10 * (time.monotonic() - began))
-    return [_row(m, tests, copy.survives(m, list(tests), limits_s[tests])) for m, tests in changes]
+    for mutant, tests in changes:
+        yield _row(mutant, tests, copy.survives(mutant, list(tests), limits_s[tests]))
 
 
-def _row(mutant: Mutant, tests: Sequence[str], survived: bool) -> dict[str, object]:
+def _row(mutant: Mutant, tests: Sequence[str], survived: bool) -> Row:
     if survived:
         print(f"{mutant.path}:{mutant.line}: {mutant.kind}, {len(tests)} tests run it")
         print(f"  - {' '.join(mutant.before.split())}\n  + {mutant.after}", flush=True)
@@ -212,9 +214,20 @@ def _row(mutant: Mutant, tests: Sequence[str], survived: bool) -> dict[str, obje
     return {"room": room, "survived": survived, "tests": list(tests), **asdict(mutant)}
 
 
-def _keep(out: Path | None, seed: int, rows: list[dict[str, object]]) -> None:
-    if out:
-        out.write_text(json.dumps({"seed": seed, "mutants": rows}, indent=1))
+def _tried(given: argparse.Namespace, copy: Copy) -> Iterator[Row]:
+    """Each change that is asked for, and whether it was noticed."""
+    if given.named:
+        yield from by_hand(copy, tuple(given.rooms))
+        return
+    alive = None
+    if given.again:
+        kept = json.loads(given.again.read_text())["mutants"]
+        alive = {(m["path"], m["before"], m["after"]) for m in kept if m["survived"]}
+    for room in given.rooms or ROOMS:
+        chosen = drawn(room, given.count, given.seed, tuple(given.without))
+        if alive is not None:
+            chosen = [m for m in chosen if (m.path, m.before, m.after) in alive]
+        yield from (quickly if given.quick else measured)(copy, room, chosen)
 
 
 def main() -> None:
@@ -232,22 +245,13 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     for name in HEAVY:
         importlib.import_module(name)
-    alive = None
-    if given.again:
-        kept = json.loads(given.again.read_text())["mutants"]
-        alive = {(m["path"], m["before"], m["after"]) for m in kept if m["survived"]}
-    rows = []
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
-        copy = Copy(Path(folder).resolve())
-        if given.named:
-            rows = by_hand(copy, tuple(given.rooms))
-        for room in () if given.named else given.rooms or ROOMS:
-            chosen = drawn(room, given.count, given.seed, tuple(given.without))
-            if alive is not None:
-                chosen = [m for m in chosen if (m.path, m.before, m.after) in alive]
-            rows += quickly(copy, room, chosen) if given.quick else measured(copy, room, chosen)
-            _keep(given.out, given.seed, rows)
-    _keep(given.out, given.seed, rows)
+        for row in _tried(given, Copy(Path(folder).resolve())):
+            rows.append(row)
+            if given.out:  # after each, so that what was stopped tells how far it came
+                kept = {"seed": given.seed, "mutants": rows}
+                given.out.write_text(json.dumps(kept, indent=1))
     for room in dict.fromkeys(row["room"] for row in rows):
         count = Counter(row["survived"] for row in rows if row["room"] == room)
         share = count[False] / max(count.total(), 1)
