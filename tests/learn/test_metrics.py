@@ -14,6 +14,8 @@ from dmrl.learn.metrics import (
     average_precision,
     by_band,
     curves,
+    figures,
+    resamples,
     score,
     weighted_quantile,
 )
@@ -211,3 +213,72 @@ def test_an_interval_holds_the_middle_95_percent() -> None:
     reach = 1.96 * math.sqrt(0.25 / images)  # of a share of one half
     assert share.value == 0.5
     assert (share.low, share.high) == pytest.approx((0.5 - reach, 0.5 + reach), abs=0.006)
+
+
+def off_by(*errors: tuple[float, float, float]) -> dict[str, float]:
+    """Figures of one label an image that was found so far right, down and behind."""
+    off = np.array(errors)
+    image, u = np.arange(len(off)), np.full(len(off), 100.0)
+    truth = Points(image, u, u / 2, u / 50, np.ones(len(off)))
+    found = Points(image, u + off[:, 0], u / 2 + off[:, 1], u / 50 + off[:, 2], np.ones(len(off)))
+    weights = np.ones((1, len(off)))
+    got = figures(score(len(off), truth, found), (0.0, np.inf), 0.5, weights)
+    return {name: float(value[0]) for name, value in got.items()}
+
+
+def test_figures_of_unlike_errors_by_hand() -> None:
+    got = off_by((3.0, 4.0, 0.1), (0.0, 12.0, -0.2), (-8.0, 0.0, 0.4), (30.0, 40.0, 0.0))
+    assert got["mean_px"] == pytest.approx((5 + 12 + 8 + 50) / 4)
+    assert got["rmse_px"] == pytest.approx(((25 + 144 + 64 + 2500) / 4) ** 0.5)
+    assert got["median_px"] == pytest.approx(10)
+    assert got["p95_px"] == pytest.approx(50)
+    assert got["bias_u_px"] == pytest.approx(-1.5)  # label minus detection: -3, 0, 8, -30
+    assert got["bias_v_px"] == pytest.approx(-8)
+    assert got["depth_mae_m"] == pytest.approx(0.7 / 4)
+    assert got["depth_rmse_m"] == pytest.approx((0.21 / 4) ** 0.5)
+    assert (got["within_8_px"], got["within_20_px"]) == (0.5, 0.75)
+    assert (got["ap_8_px"], got["ap_16_px"]) == pytest.approx((0.5 * 0.5, 0.75 * 0.75))
+
+
+@pytest.mark.parametrize(("off_px", "name"), [(8.0, "within_8_px"), (20.0, "within_20_px")])
+def test_an_error_of_the_radius_is_within_it(off_px: float, name: str) -> None:
+    assert [off_by((off, 0, 0))[name] for off in (off_px, off_px + 0.1)] == [1, 0]
+
+
+def test_a_band_holds_its_lower_end() -> None:
+    for depth_m, held in ((0.5, 2), (0.499, 1), (1.0, 3), (1.5, 4), (2.0, 5)):
+        bands = by_band(score(1, *scene(1, depth_m=depth_m)), threshold=0.33, draws=2)
+        assert [band.labels for band in bands] == [1, *(int(k == held) for k in range(1, 6))]
+        assert bands[held].images == 1
+
+
+def test_resamples_draw_as_many_images_as_there_are() -> None:
+    labels, found = scene(7)
+    rows = np.concatenate(list(resamples(score(7, labels, found), 500, 3)))
+    assert rows.shape == (500, 7)
+    assert (rows.sum(axis=1) == 7).all()
+    assert rows.mean(axis=0) == pytest.approx(np.ones(7), abs=0.15)
+    assert rows.var() == pytest.approx(6 / 7, rel=0.1)  # binomial: 7 draws of 1 / 7
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 3)), min_size=1, max_size=12))
+def test_a_weighted_quantile_is_that_of_repeated_values(pairs: list[tuple[int, int]]) -> None:
+    values_, counts = (np.array(x, float) for x in zip(*pairs, strict=True))
+    repeated = np.repeat(values_, counts.astype(int))
+    for share in (0.25, 0.5, 0.95):
+        (got,) = weighted_quantile(values_, counts[None], share)
+        if len(repeated):
+            wanted = np.quantile(repeated, share, method="averaged_inverted_cdf")
+            assert got == pytest.approx(wanted)
+        else:
+            assert math.isnan(got)
+
+
+def test_curves_are_thinned_evenly_and_full_confidence_is_in_the_last_bin() -> None:
+    labels, _ = scene(100)
+    confidence = np.linspace(1.0, 0.01, 100)
+    found = Points(labels.image, labels.u_px, labels.v_px, labels.depth_m, confidence)
+    got = curves(score(100, labels, found), most=5)
+    assert got.confidence == pytest.approx([1.0, 0.75, 0.5, 0.26, 0.01], abs=0.011)
+    assert got.recall == pytest.approx([0.01, 0.26, 0.51, 0.75, 1.0], abs=0.011)
+    assert got.bin_count[9] == 11 and got.bin_count.sum() == 100
