@@ -283,3 +283,10 @@ def test_any_camera_gives_back_what_it_saw(
     if np.isfinite(uv).all():
         back = horizontal_from_pixels(uv, depth_m, *attitude, camera)
         np.testing.assert_allclose(back, xyz, atol=1e-6)
+
+
+def test_what_is_beside_the_optical_centre_has_no_pixel() -> None:
+    beside, level = np.array([[0.0, 1.0, 0.5], [-1.0, 0.0, 0.0]]), np.zeros(2)
+    uv, depth_m, _ = pixels_from_horizontal(beside, level, level, AIDECK)
+    assert depth_m.tolist() == [0, -1]
+    assert np.isnan(uv).all()
