@@ -108,3 +108,44 @@ def test_a_label_counts_by_the_square_of_its_sigma(times: float) -> None:
     torch.testing.assert_close(got.offset_weight, exact.offset_weight / (1 + times**2))
     # 0.3 m of 2 m is one and a half times what counts half.
     torch.testing.assert_close(got.weight, exact.weight / (1 + 1.5**2))
+
+
+def test_cells_below_a_tenth_of_presence_learn_no_depth() -> None:
+    """At a width of one cell, exp(-d^2 / 2) is a tenth at d = 2.146 cells."""
+    for off_cells, counts in ((2.1, True), (2.2, False)):
+        centre = 100.0 + 8 * off_cells  # of the cell whose middle is at 100
+        got = targets(robots((centre, 100.0, 2.0)), SHAPE, sigma_cells=1.0)
+        presence = np.exp(-(off_cells**2) / 2)
+        assert float(got.confidence[0, 12, 12]) == pytest.approx(presence, rel=1e-4)
+        assert float(got.weight[0, 12, 12]) == pytest.approx(presence * counts, rel=1e-4)
+        assert float(got.depth_m[0, 12, 12]) == (2.0 if counts else 1.0)
+        assert got.offset[0, :, 12, 12].tolist() == pytest.approx([off_cells * counts, 0], abs=1e-4)
+
+
+def test_a_depth_s_sigma_counts_by_its_share_and_only_for_the_depth() -> None:
+    exact, blurred = (100.0, 100.0, 2.0, 0, 0, 0.0), (100.0, 100.0, 2.0, 0, 0, 0.2)
+    for label_noise, depth, other in (("weight", 0.5, 1.0), ("ignore", 1.0, 1.0)):
+        plain, noisy = (
+            targets(robots(row), SHAPE, sigma_cells=0.7, label_noise=label_noise)  # type: ignore[arg-type]
+            for row in (exact, blurred)
+        )
+        torch.testing.assert_close(noisy.weight, depth * plain.weight)
+        torch.testing.assert_close(noisy.offset_weight, other * plain.offset_weight)
+        torch.testing.assert_close(noisy.confidence_weight, plain.confidence_weight)
+
+
+def test_a_sigma_in_pixels_is_the_root_mean_square_of_both_ways() -> None:
+    exact, blurred = (100.0, 100.0, 2.0, 0, 0, 0), (100.0, 100.0, 2.0, 8 * 2**0.5, 0, 0)
+    plain, noisy = (
+        targets(robots(row), SHAPE, sigma_cells=0.7, label_noise="weight")
+        for row in (exact, blurred)
+    )
+    torch.testing.assert_close(noisy.offset_weight, 0.5 * plain.offset_weight)
+    assert noisy.confidence_weight[0, 12, 12] == pytest.approx(0.5)
+    assert noisy.confidence_weight[0, 0, 0] == 1  # that nobody is there is sure
+    soft = targets(robots(blurred), SHAPE, sigma_cells=0.7, label_noise="soften")
+    wider = (0.49 + 1.0) ** 0.5
+    assert float(soft.confidence[0, 12, 12] / soft.confidence[0, 12, 14]) == pytest.approx(
+        np.exp(2**2 / (2 * wider**2)), rel=1e-3
+    )
+    assert float(soft.confidence[0, 12, 12]) == pytest.approx(0.49 / 1.49, rel=1e-3)
