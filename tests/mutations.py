@@ -24,7 +24,7 @@ OTHER: dict[type, tuple[type, ...]] = {
     **{ast.BitOr: (ast.BitAnd,), ast.LShift: (ast.RShift,), ast.RShift: (ast.LShift,)},
 }
 """What takes the place of an operator."""
-IN_ANY_ORDER = ("min", "max", "minimum", "maximum", "hypot", "logical_and", "logical_or")
+IN_ANY_ORDER = ("min", "max", "minimum", "maximum", "hypot", "logical_and", "logical_or", "equal")
 """Functions that give the same whichever argument comes first."""
 
 

@@ -255,3 +255,14 @@ def test_a_streamer_image_without_a_checksum_is_taken() -> None:
 def test_a_jpeg_that_does_not_begin_as_one_is_broken() -> None:
     got, reader = read(pack_image(Image(32, 24, "jpeg", b"\xff\xd9" + bytes(90))))
     assert (got, reader.broken) == ([], 1)
+
+
+@pytest.mark.parametrize("cut", range(1, 40))
+def test_where_bytes_are_cut_changes_nothing_that_is_found_after_garbage(cut: int) -> None:
+    packet = pack_packet(Packet(GAP8, HOST, APP, b"abcdef"))
+    data = b"\0" * 25 + packet * 2
+    reader = PacketReader()
+    got = [*reader.feed(data[:cut]), *reader.feed(data[cut:])]
+    reader.finish()
+    assert [p.data for p in got] == [b"abcdef"] * 2 or cut > len(data)
+    assert reader.skipped_bytes == 25

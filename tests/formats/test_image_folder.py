@@ -259,3 +259,11 @@ def test_pictures_of_the_whole_sensor_are_cut_to_what_the_camera_is_of(tmp_path:
         assert (label.fields["peers"][0]["u_px"], label.fields["peers"][0]["v_px"]) == (100, 100)
     with pytest.raises(SettingError, match="as they are stored"):
         samples(tmp_path, "CompressedImage", Options(camera=AIDECK, size_px=(160, 112)))
+
+
+def test_how_much_there_will_be_is_told_before(folder: Path) -> None:
+    (folder / "labels.csv").write_text(HEADER + "a.png,cf2,10,20,0.8\na.png,cf3,10,20,0.8\n")
+    camera = replace(AIDECK, width_px=64, height_px=48)
+    for options, more in ((Options(), 0), (Options(camera=camera), 1)):
+        content = image_folder.content(folder, options)
+        assert content.total == len(list(content.samples)) == 3 + 1 + more

@@ -87,3 +87,11 @@ def test_arrays_of_strange_shapes_and_numbers_are_one_line(
     strange = np.ndim(arrays["uwb_range_1_2_np"]) != 1
     with pytest.raises(SourceError, match="arrays of other shapes" if strange else None):
         uwb_tiers.content(path)
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8", "i4"])
+def test_numbers_of_any_width_are_read(kind: str, ranges: Path) -> None:
+    with np.load(ranges) as archive:
+        np.savez(ranges, **{name: np.ceil(archive[name]).astype(kind) for name in archive})
+    found = [s for s in uwb_tiers.content(ranges).samples if s.message == "UwbRange"]
+    assert [s.fields["range_m"] for s in found] == [2.0] + [3.0] * 8

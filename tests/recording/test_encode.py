@@ -104,6 +104,9 @@ def test_columns_keep_the_rules_of_messages(tmp_path: Path) -> None:
         sink.write_columns("/a", message("Height"), times, {"height_m": 1.0}, publish_ns=times + 1)
         with pytest.raises(RecordingError, match="negative"):
             sink.write_columns("/a", message("Height"), times - 6, {"height_m": 1.0})
+        with pytest.raises(RecordingError, match="negative"):
+            late = times - np.array([0, 8])
+            sink.write_columns("/a", message("Height"), times, {}, publish_ns=late)
         with pytest.raises(RecordingError, match="carries dmrl"):
             sink.write_columns("/cf1/labels", message("Height"), times, {})
     assert [(r.time_ns, r.publish_ns) for r in read_raw(tmp_path / "a.mcap")] == [(5, 6), (7, 8)]

@@ -1,5 +1,6 @@
 """What recordings carry beside messages: splits, licences, counts, times of an index."""
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from mcap.writer import IndexType, Writer
 from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
 from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording.blocks import blocks, in_file_order, tally
 from dmrl.recording.container import INDEX
 from dmrl.recording.extras import copy_extras, splits
 from dmrl.recording.index import channel_on
@@ -114,6 +116,22 @@ def test_log_times_are_half_open(tmp_path: Path) -> None:
     found = log_times(path, ["/cf1/height"], start_ns=20, end_ns=50)
     assert found["/cf1/height"].tolist() == [20, 30, 40]
     assert log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(0, 100, 10))
+
+
+def test_messages_of_a_stretch_come_in_blocks_of_it(tmp_path: Path) -> None:
+    path = recording(tmp_path / "a.mcap")
+    for start, end, times in (
+        (20, 50, [20, 30, 40]),
+        (None, 21, [0, 10, 20]),
+        (71, None, [80, 90]),
+    ):
+        found = blocks(path, start_ns=start, end_ns=end)
+        assert [t for block, _ in found for t in block.time_ns.tolist()] == times
+    assert [len(block) for block, _ in in_file_order(path)] == [10]
+    held: Counter[int] = Counter()
+    for block, _ in blocks(path):
+        tally(held, block)
+    assert list(held.values()) == [10]
 
 
 def test_an_index_is_of_its_channel_and_whole() -> None:
