@@ -102,3 +102,31 @@ def test_a_stream_that_was_cut_says_so(
     path.write_bytes(whole)
     list(aideck_stream.content(path, Options()).samples)
     assert not capsys.readouterr().err
+
+
+def test_times_of_a_camera_that_does_not_always_tell_are_nominal_and_none_goes_back() -> None:
+    of = aideck_stream._times_ns
+    assert of([5, 3, 9], 10.0) == [5000, 5000, 9000]
+    assert of([5, None, 9], 4.0) == [0, 250_000_000, 500_000_000]
+    assert of([0, 1], 4.0) == [0, 1000]
+
+
+@pytest.mark.parametrize(("garbage", "known"), [(1000, True), (65_000, True), (66_000, False)])
+def test_a_stream_is_known_by_a_whole_picture_near_its_start(
+    garbage: int, known: bool, tmp_path: Path
+) -> None:
+    image = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
+    path = tmp_path / "flight.cpx"
+    path.write_bytes(bytes(garbage) + image * 2)
+    assert aideck_stream.recognises(path) == known
+    path.rename(tmp_path / "flight.txt")
+    assert not aideck_stream.recognises(tmp_path / "flight.txt")
+
+
+def test_the_robot_s_turning_is_told_in_radians(tmp_path: Path) -> None:
+    state = State(1000, 5_000_000, (0.0, 0.0, 0.7), turning_radps=(0.1, 0.2, 0.5))
+    raw = foreign.pictures(1)[0].tobytes()
+    data = pack_image(Image(32, 24, "raw", raw, 5_004_000, 1, state), "streamer")
+    (attitude,) = samples(tmp_path / "a.cpx", data)["/cf1/attitude"]
+    assert attitude.fields["yaw_rate_radps"] == pytest.approx(0.5)
+    assert attitude.time_ns == 5_000_000_000

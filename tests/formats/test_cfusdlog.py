@@ -358,3 +358,59 @@ def test_real_logs_without_pitch_keep_their_velocity(
     flown = np.concatenate([[0], np.cumsum(np.diff(seconds) * (vx[1:] + vx[:-1]) / 2)])
     assert np.ptp(x) > 2 and np.abs(flown - (x - x[0])).max() < 0.25
     assert "no attitude: no usable stateEstimate pitch." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("head", "known"),
+    [
+        (b"\xbc" + struct.pack("<HH", 1, 1), True),
+        (b"\xbc" + struct.pack("<HH", 2, 250), True),
+        (b"\xbc" + struct.pack("<HH", 2, 251), False),
+        (b"\xbc" + struct.pack("<HH", 2, 0), False),
+        (b"\xbc" + struct.pack("<HH", 0, 1), False),
+        (b"\xbc" + struct.pack("<HH", 3, 1), False),
+        (b"\xbd" + struct.pack("<HH", 1, 1), False),
+        (b"\xbc\1\0\1", False),
+    ],
+)
+def test_a_log_is_known_by_five_bytes(head: bytes, known: bool, tmp_path: Path) -> None:
+    (tmp_path / "log").write_bytes(head)
+    assert cfusdlog.recognises(tmp_path / "log") == known
+    assert cfusdlog.recognises(tmp_path) == known
+    if not known:
+        with pytest.raises(SourceError, match="no micro-SD log in"):
+            cfusdlog.content(tmp_path, Options())
+
+
+def test_of_what_is_left_out_three_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cf1").write_bytes(foreign.usd_log())
+    for count, words in ((3, "a1, a2, a3 is no"), (5, "a1, a2, a3 and 2 more is no")):
+        for k in range(1, count + 1):
+            (tmp_path / f"a{k}").write_text("x")
+        (tmp_path / ".hidden").write_text("x")
+        assert "/cf1/attitude" in samples(tmp_path)
+        assert f"left out: {words} micro-SD log" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("events", "words"),
+    [
+        ({1: ("a", [("x", "H"), ("x", "H")])}, "without name or known type"),
+        ({1: ("a", [("", "H")])}, "without name or known type"),
+        ({1: ("", [("x", "H")])}, "without name or known type"),
+        ({1: ("a", [("x", "d")])}, "without name or known type"),
+    ],
+)
+def test_variables_have_names_of_their_own_and_known_types(
+    events: dict[int, tuple[str, list[tuple[str, str]]]], words: str
+) -> None:
+    head = b"\xbc" + struct.pack("<HH", 2, len(events))
+    for number, (name, variables) in events.items():
+        head += (
+            struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
+        )
+        head += b"".join(f"{variable}({code})".encode() + b"\0" for variable, code in variables)
+    with pytest.raises(SourceError, match=words):
+        cfusdlog.decode(head + bytes(40))

@@ -247,3 +247,21 @@ def test_without_boxes_and_splits_a_set_is_read_all_the_same(folder: Path) -> No
         assert len(locanet.read(folder)) == 3
     first = locanet.read(folder)[0]
     assert (first.split, len(first.published)) == (None, 0)
+
+
+def test_peers_are_numbered_from_two_without_the_robot_itself() -> None:
+    assert locanet._peer_names("cf1", 3) == ["cf2", "cf3", "cf4"]
+    assert locanet._peer_names("cf3", 3) == ["cf2", "cf4", "cf5"]
+    assert locanet._peer_names("cf9", 0) == []
+
+
+def test_boxes_end_at_the_picture_s_edges() -> None:
+    found = locanet._box_px(np.array([[-5.0, -4, 319, 224, 0], [0, 1, 400, 300, 0]]))
+    assert found.tolist() == [[0, 0, 320, 224], [0, 0, 320, 224]]
+
+
+def test_the_whole_of_a_published_attitude_is_known_by_two_angles() -> None:
+    for roll, pitch in ((0.3, 0.0), (0.0, -0.2), (0.3, -0.2), (-0.1, 0.25)):
+        found = locanet.attitude_zyx(roll, pitch)
+        up = (_rx(roll) @ _ry(pitch)).T @ [0, 0, 1]  # seen from the camera
+        assert camera_from_horizontal(*found) @ [0, 0, 1] == pytest.approx(up)

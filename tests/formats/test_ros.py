@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats import ros
 from dmrl.formats.format import Options
@@ -105,3 +106,55 @@ def test_a_real_bag_of_ranges_odometry_and_motion_capture(data: Path) -> None:
     assert counts["/turtlebot3_cap/pose/truth"] == 1032
     assert counts["/turtle03/velocity"] == counts["/turtle03/attitude"] == 340
     assert sum(counts.values()) == 16204
+
+
+RANGE, ODOMETRY, IMU = (
+    "sensor_msgs/msg/Range",
+    "nav_msgs/msg/Odometry",
+    "sensor_msgs/msg/Imu",
+)
+
+
+def planned(
+    *held: tuple[str, str, int], **names: str
+) -> tuple[dict[str, tuple[str, str]], list[str]]:
+    """Robot and peer of each topic that is taken, and what is left out."""
+    lines, unknown = ros.plan(list(held), Options(robot="me", names=names))
+    return {line.topic: (line.robot, line.peer) for line in lines.values()}, unknown
+
+
+def test_topics_tell_whose_they_are() -> None:
+    found, unknown = planned(
+        ("/cf1/uwb/cf2/range", RANGE, 5),
+        ("/imu/data", IMU, 5),
+        ("/drone 3/odom", ODOMETRY, 5),
+        ("/cf1/uwb", RANGE, 5),  # to whom?
+        ("/cf1/cf1/range", RANGE, 5),
+        ("/cf9/odom", ODOMETRY, 0),
+        (topics.MASKS.format(robot="cf1"), "sensor_msgs/msg/Image", 5),
+        ("/chatter", "std_msgs/msg/String", 1),
+        ("/quiet", "std_msgs/msg/String", 0),
+        cf2="anchor",
+    )
+    assert found == {
+        "/cf1/uwb/cf2/range": ("cf1", "anchor"),
+        "/imu/data": ("me", ""),
+        "/drone 3/odom": ("drone_3", ""),
+    }
+    assert {"/cf1/uwb", "/cf1/cf1/range", "/chatter"} <= set(unknown)
+    assert not {"/cf9/odom", "/quiet"} & set(unknown)
+
+
+def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
+    kind = "geometry_msgs/msg/PoseStamped"
+    found, unknown = planned(
+        ("/cf1/pose", kind, 5), ("/vrpn_client_node/cf1/pose", kind, 9), ("/vio/cf1/pose", kind, 5)
+    )
+    assert found.keys() == {"/cf1/pose", "/vrpn_client_node/cf1/pose"}
+    assert unknown == ["/vio/cf1/pose"]  # as long as the first, and after it
+
+
+def test_how_many_messages_there_will_be_is_told_before(tmp_path: Path) -> None:
+    content = ros.content(bag("sqlite3", tmp_path), Options())
+    with_odometry = 4  # of one message come attitude, velocity, height and pose
+    assert content.total == len(list(content.samples)) - 5 * (with_odometry - 1)
