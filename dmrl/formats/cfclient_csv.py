@@ -127,8 +127,8 @@ def _of_one_clock(blocks: list[Block]) -> list[Block]:
     """Blocks with the wraps added that one of them began before and another after."""
     period_ns, start_ns = NS_PER_MS << TIME_BITS, blocks[0].time_ns[0]
     wraps = [round((start_ns - block.time_ns[0]) / period_ns) for block in blocks]
-    return [
-        replace(block, time_ns=block.time_ns + count * period_ns)
+    return [  # the earliest stays: no time is before 0
+        replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
         for block, count in zip(blocks, wraps, strict=True)
     ]
 

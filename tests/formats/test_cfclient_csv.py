@@ -74,14 +74,37 @@ def test_units_signs_and_the_clock_s_wrap(swarm: Path) -> None:
     assert [s.fields["range_m"] for s in found["/cf1/range/cf2"]] == [1.5, 2.5]
 
 
-def test_blocks_before_and_after_the_clock_s_wrap_are_of_one_flight(tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", ["ab", "ba"])
+def test_blocks_before_and_after_the_clock_s_wrap_are_of_one_flight(
+    names: str, tmp_path: Path
+) -> None:
+    early, late = names
     before = [f"{2**24 - 30 + 10 * k},{k}" for k in range(3)]
     after = [f"{5 + 10 * k},{k}.5" for k in range(3)]
-    (tmp_path / "a.csv").write_text("\n".join(["Timestamp,gyro.z", *before]) + "\n")
-    (tmp_path / "b.csv").write_text("\n".join(["Timestamp,ranging.distance2", *after]) + "\n")
+    (tmp_path / f"{early}.csv").write_text("\n".join(["Timestamp,gyro.z", *before]) + "\n")
+    (tmp_path / f"{late}.csv").write_text("\n".join(["Timestamp,ranging.distance2", *after]) + "\n")
     found = samples(tmp_path)
-    first = found["/cf1/log/a"][0].time_ns
+    first = found[f"/cf1/log/{early}"][0].time_ns
+    assert first == (2**24 - 30) * 1_000_000
     assert [s.time_ns - first for s in found["/cf1/range/cf2"]] == [35e6, 45e6, 55e6]
+
+
+@pytest.mark.parametrize(
+    ("cell", "kind"),
+    [("2147483647", "i"), ("-2147483647", "i"), ("2147483648", "d"), ("+7", "i"), ("7.0", "d")],
+)
+def test_whole_numbers_of_32_bits_are_integers(cell: str, kind: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"Timestamp,x\n5,{cell}\n6,1\n")
+    block = cfclient_csv.read_block(tmp_path / "a.csv")
+    assert block.columns["x"].dtype.char.replace("l", "i") == kind
+    assert block.columns["x"].tolist() == [float(cell), 1]
+    assert block.time_ns.tolist() == [5_000_000, 6_000_000]
+
+
+def test_a_block_is_named_without_its_date(tmp_path: Path) -> None:
+    for stem, name in (("my-log-20221011T10-33-31", "my-log"), ("log-2022", "log-2022")):
+        (tmp_path / f"{stem}.csv").write_text("Timestamp,x\n5,1\n")
+        assert cfclient_csv.read_block(tmp_path / f"{stem}.csv").name == name
 
 
 def test_a_last_line_that_was_cut_is_left_out_and_said(
