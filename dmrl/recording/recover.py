@@ -165,8 +165,11 @@ def _pieces(stream: Bounded, walk: _Walk) -> Iterator[Piece]:
 
 def _copied_sums(record: McapRecord, at: int) -> bool:
     """Whether this record holds sums of another file."""
-    sums_of = isinstance(record, Metadata) and record.name == sums.METADATA_NAME
-    return sums_of and not sums.of_this_file(record.metadata, at)
+    return (
+        isinstance(record, Metadata)
+        and record.name == sums.METADATA_NAME
+        and not sums.of_this_file(record.metadata, at)
+    )
 
 
 def _unpacked(stream: Bounded, walk: _Walk, chunk: Chunk, at: int) -> Block | None:
