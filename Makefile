@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help bench demo test test-all test-faults mutants check format lint types imports spell schemas docs site examples wheels layout clean
+.PHONY: help bench demo test test-heavy test-all test-faults mutants check format lint types imports spell schemas docs site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -22,10 +22,13 @@ help: ## Show this list.
 demo: $(VENV)/.demo ## Run the whole pipeline, small; pictures and a table end up in demo/.
 	$(BIN)/dmrl demo --out demo
 
-test: $(VENV)/.dev ## Run the tests that take seconds. ARGS="-k name" picks some.
+test: $(VENV)/.dev ## Run the tests, but for those below. ARGS="-k name" picks some.
 	$(PYTEST) $(ARGS)
 
-test-all: $(VENV)/.dev ## Run every test, the slow ones too.
+test-heavy: $(VENV)/.dev ## Run the tests that take a second of CPU or more.
+	$(PYTEST) -m "heavy and not slow" $(ARGS)
+
+test-all: $(VENV)/.dev ## Run every test, those too that take minutes.
 	$(PYTEST) -m "slow or not slow" --timeout 3600 $(ARGS)
 
 bench: $(VENV)/.dev ## Time dmrl beside others, on flights it makes; JSON ends up in build/bench/.

@@ -67,7 +67,7 @@ class Copy:
         self.env |= {"PYTHONPATH": str(folder), "TMPDIR": str(folder / "tmp")}
         (self.folder / "tmp").mkdir()
         self.quietly = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:anyio"]
-        self.quietly += ["--basetemp", str(folder / "tmp" / "pytest")]
+        self.quietly += ["-m", "not slow", "--basetemp", str(folder / "tmp" / "pytest")]
         self.quietly += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
 
     def pytest(self, tests: list[str], limit_s: float) -> int | None:

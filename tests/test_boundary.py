@@ -72,6 +72,7 @@ def test_what_the_system_refuses_is_one_line(
     assert said.count("\n") == 1
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_says_that_nothing_has_its_final_name(
     number: signal.Signals, tmp_path: Path
@@ -143,6 +144,7 @@ def test_no_file_is_opened_as_a_closed_standard_stream(tmp_path: Path) -> None:
     assert subprocess.run(command, check=False).returncode > 2
 
 
+@pytest.mark.heavy
 def test_nothing_of_the_process_is_needed(tmp_path: Path) -> None:
     """No home, no temporary folder, no working folder, a name that is no text."""
     out, gone = tmp_path / os.fsdecode(b"\xff.out"), tmp_path / "gone"

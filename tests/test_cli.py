@@ -188,6 +188,7 @@ def test_a_command_that_does_not_exist_is_a_bad_command_line_with_or_without_ext
         assert done.stderr == "dmrl: no command trian. Did you mean train?\n"
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "arguments",
     [["info"], ["info", "a.mcap", "--colour"], ["fly", "fly_in_view", "a.mcap", "--seed", "1.5"]],
@@ -207,6 +208,7 @@ def test_a_known_error_is_one_line_on_stderr_with_status_1(tmp_path: Path) -> No
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.heavy
 def test_a_flag_that_wants_a_robot_says_so(tmp_path: Path) -> None:
     done = dmrl("label", str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"), "--camera", "my.toml")
     assert (done.returncode, done.stdout) == (2, "")
@@ -269,6 +271,7 @@ def test_stages_print_data_only_and_leave_messages_to_progress(path: Path) -> No
     assert list(_prints(path)) == []
 
 
+@pytest.mark.heavy
 def test_the_shell_completes_commands_flags_and_choices(tmp_path: Path) -> None:
     script = tmp_path / "dmrl.bash"
     command = [sys.executable, "-m", "dmrl.cli", "--install-completion", "--shell", "bash"]

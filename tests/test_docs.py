@@ -128,6 +128,7 @@ def test_the_page_on_the_architecture_has_the_layers_and_homes_that_are_checked(
     assert homes == held
 
 
+@pytest.mark.heavy
 def test_the_page_on_python_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -167,6 +168,7 @@ def walk(page: Path, until: str | None = None) -> None:
                 app(shlex.split(line, comments=True)[1:], result_action="return_value")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("name", "until", "said"),
     [

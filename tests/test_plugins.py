@@ -164,6 +164,7 @@ def test_a_broken_format_is_said_and_passed_over(
     assert "of the package alt-logs" in line
 
 
+@pytest.mark.heavy
 def test_a_format_that_fails_while_it_reads_leaves_nothing(
     install: Install, tmp_path: Path
 ) -> None:
@@ -210,6 +211,7 @@ def test_a_broken_network_is_one_line_and_others_are_built(
         build("tin")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("entry", ["say-it = stages_of_mine", "say-it = stages_of_mine:command"])
 def test_a_stage_of_another_package_is_a_command(entry: str, install: Install) -> None:
     install("stages-of-mine", STAGE, stages=entry)
@@ -223,6 +225,7 @@ def test_a_stage_of_another_package_is_a_command(entry: str, install: Install) -
     assert failed.stderr.count("\n") == 1
 
 
+@pytest.mark.heavy
 def test_a_broken_stage_is_listed_and_is_one_line_when_called(install: Install) -> None:
     install("stages-of-mine", "import nothing_like_it", stages="say-it = stages_of_mine")
     helped = dmrl("--help")

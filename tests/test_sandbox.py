@@ -279,6 +279,7 @@ def test_every_command_is_given_hostile_inputs() -> None:
     assert HOSTILE.keys() == COMMANDS.keys()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", COMMANDS)
 def test_no_command_writes_elsewhere_for_hostile_inputs(
     name: str, inputs: Path, box: Box, capsys: pytest.CaptureFixture[str]
@@ -305,6 +306,7 @@ def test_no_command_writes_elsewhere_for_hostile_inputs(
     assert not any("<img src=x" in page or "<script" in page for page in pages)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("words", "links"),
     [
@@ -351,6 +353,7 @@ def test_links_in_out_are_not_written_through(
             path.unlink()
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize("split", ELSEWHERE)
 def test_a_split_of_a_recording_stays_in_the_dataset(
@@ -494,6 +497,7 @@ def test_a_model_s_numbers_are_numbers(
 
 
 # doctor reads none; index writes into the folder, and what cannot be read is a row of its own
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("doctor", "index")])
 def test_every_command_takes_damaged_inputs_as_errors(
     name: str, box: Box, capsys: pytest.CaptureFixture[str]
@@ -557,6 +561,7 @@ def _with_junk(path: Path, junk: str, calibration: dict[str, Any]) -> Path:
     return path
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize(
     ("junk", "calibration"),

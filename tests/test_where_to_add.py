@@ -149,6 +149,7 @@ SENSORS = """    Topic(
 """
 
 
+@pytest.mark.heavy
 def test_a_sensor(clone: Clone, tmp_path: Path) -> None:
     pytest.importorskip("grpc_tools")
     own = 'syntax = "proto3";\npackage dmrl.v1;\nmessage {} {{\n  double {} = 1;\n}}\n'
@@ -216,6 +217,7 @@ FORMAT = '''
 '''
 
 
+@pytest.mark.heavy
 def test_a_foreign_format(clone: Clone, tmp_path: Path) -> None:
     clone.write("dmrl/formats/altitudes.py", FORMAT)
     assert clone.touched() == promised("a foreign format")
@@ -242,6 +244,7 @@ class Tiny(Network):
 """
 
 
+@pytest.mark.heavy
 def test_a_network(clone: Clone, tmp_path: Path) -> None:
     name = "dmrl/learn/network.py"
     clone.after(name, "    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)\n", "\n" + NETWORK)
@@ -271,6 +274,7 @@ def _certain(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
 """
 
 
+@pytest.mark.heavy
 def test_a_loss(clone: Clone) -> None:
     name = "dmrl/learn/losses.py"
     clone.after(name, "    classes: tuple[str, ...] = ()\n", "    certain_weight: float = 0.0\n")
@@ -339,6 +343,7 @@ VIEW = '''
 '''
 
 
+@pytest.mark.heavy
 def test_a_view(clone: Clone, tmp_path: Path) -> None:
     clone.write("viewer/views/heights.py", VIEW)
     assert clone.touched() == promised("a view")

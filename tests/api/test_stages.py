@@ -46,6 +46,7 @@ def test_wrong_settings_are_said(flight: Path) -> None:
         dmrl.label(flight, gate=0.4)
 
 
+@pytest.mark.heavy
 def test_nothing_heavy_is_loaded_before_it_is_used(flight: Path) -> None:
     code = (
         "import sys, dmrl; first = set(sys.modules)\n"

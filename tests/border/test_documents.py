@@ -45,6 +45,7 @@ def test_arrays_come_back(tmp_path: Path) -> None:
     assert found["two"].shape == (2, 3)
 
 
+@pytest.mark.heavy
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

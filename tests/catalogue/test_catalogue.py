@@ -61,6 +61,7 @@ def names(folder: Path, query: str) -> list[str]:
     return [str(name) for name in found]
 
 
+@pytest.mark.heavy
 def test_a_row_says_what_its_recording_holds(flights: Path) -> None:
     made = index.update(flights, workers=1)
     assert made == index.Result(recordings=4, looked_at=4, known=0, gone=0, unread=1)
@@ -79,6 +80,7 @@ def test_a_row_says_what_its_recording_holds(flights: Path) -> None:
     assert "cut short" in rows["torn.mcap"]["error"] and rows["torn.mcap"]["messages"] is None
 
 
+@pytest.mark.heavy
 def test_queries_are_of_a_recording_its_cameras_and_their_labels(flights: Path) -> None:
     index.update(flights, workers=1)
     assert names(flights, 'camera = "cf1" and ok_labels > 3') == ["a.mcap"]
@@ -90,6 +92,7 @@ def test_queries_are_of_a_recording_its_cameras_and_their_labels(flights: Path) 
     assert names(flights, "false") == []
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "query",
     [
@@ -110,6 +113,7 @@ def test_a_query_that_cannot_be_answered_is_one_line_and_reads_nothing_else(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.heavy
 def test_only_what_changed_is_looked_at_again(flights: Path) -> None:
     index.update(flights, workers=1)
     before = (flights / NAME).stat().st_mtime_ns
@@ -126,6 +130,7 @@ def test_only_what_changed_is_looked_at_again(flights: Path) -> None:
     assert names(flights, "camera = 'cf7'") == ["a.mcap"]
 
 
+@pytest.mark.heavy
 def test_what_was_seen_before_a_stop_is_kept(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,6 +150,7 @@ def test_what_was_seen_before_a_stop_is_kept(
     assert (again.looked_at, again.known) == (3, 1)  # one of the two cannot be read
 
 
+@pytest.mark.heavy
 def test_a_file_that_is_no_catalogue_is_left_alone(flights: Path) -> None:
     with pytest.raises(RecordingError, match=r"has no catalogue\. Make it: dmrl index"):
         open_catalogue(flights)
@@ -162,6 +168,7 @@ def _indexed(flights: Path) -> Path:
     return flights / NAME
 
 
+@pytest.mark.heavy
 def test_the_commands_print_tables_paths_and_json(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,6 +185,7 @@ def test_the_commands_print_tables_paths_and_json(
     assert [one["recording"] for one in found["recordings"]] == ["torn.mcap"]
 
 
+@pytest.mark.heavy
 def test_a_dataset_of_what_a_query_finds(
     flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -200,6 +208,7 @@ def test_a_dataset_of_what_a_query_finds(
     assert [one["name"] for one in made["inputs"]] == ["a.mcap", "b.mcap"]
 
 
+@pytest.mark.heavy
 def test_the_page_tells_of_a_catalogue_and_opens_no_thousand_recordings(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,6 +267,7 @@ def test_a_query_takes_no_disk_and_little_memory(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.heavy
 def test_a_focal_length_that_is_no_number_is_not_known(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         said = message("CameraCalibration")(width=64, height=48, K=[float("nan")] * 9)

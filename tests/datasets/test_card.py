@@ -111,6 +111,7 @@ def test_figures_have_units_on_their_axes(built: Path) -> None:
     assert "<!-- u, px -->" in (built / "figures/position.svg").read_text()
 
 
+@pytest.mark.heavy
 def test_writing_it_again_gives_the_same_bytes(built: Path, with_figures: None) -> None:
     before = {p: p.read_bytes() for p in built.rglob("*") if p.is_file()}
     assert run_card(built, CardSettings()) == built / "README.md"
@@ -201,6 +202,7 @@ def test_a_licence_that_nobody_knows_is_refused(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.heavy
 def test_the_backend_of_a_notebook_stops_no_figure(tmp_path: Path) -> None:
     code = (
         "import os, sys\nfrom pathlib import Path\nimport numpy as np\nfrom dmrl import plots\n"

@@ -71,6 +71,7 @@ def test_a_compressed_shard_is_read(shard: Path, compression: str) -> None:
     assert open_shard(shard, 4).equals(sound)
 
 
+@pytest.mark.heavy
 def test_a_shard_that_unpacks_to_much_is_refused(shard: Path) -> None:
     many = pa.concat_tables([table_of(shard).slice(0, 1)] * 5_000).combine_chunks()
     rewritten(shard, many, "zstd", times=20)
@@ -79,6 +80,7 @@ def test_a_shard_that_unpacks_to_much_is_refused(shard: Path) -> None:
         open_shard(shard, None)
 
 
+@pytest.mark.heavy
 def test_a_parquet_file_that_repeats_one_row_without_end_is_refused(
     shard: Path, tmp_path: Path
 ) -> None:

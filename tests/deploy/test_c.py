@@ -127,6 +127,7 @@ def test_the_c_calls_no_library(level: str, tmp_path: Path) -> None:
     assert said.stdout == b""
 
 
+@pytest.mark.heavy
 def test_the_self_test_passes_and_fails_when_a_weight_is_changed(tmp_path: Path) -> None:
     network = quantised_network(2)
     write_c(network, tmp_path, list(noise(network, 1, seed=5)))
@@ -149,6 +150,7 @@ def test_the_self_test_needs_no_library_when_silent(tmp_path: Path) -> None:
     subprocess.run(command, cwd=tmp_path, check=True)
 
 
+@pytest.mark.heavy
 def test_a_self_test_for_raw_mosaics_passes_as_well(tmp_path: Path) -> None:
     network = next(n for n in map(quantised_network, range(20)) if n.channels == 3)
     write_c(network, tmp_path, list(noise(network, 1)), bayer=True)
@@ -175,6 +177,7 @@ def test_layers_may_have_any_names(tmp_path: Path) -> None:
     assert (result.error, result.mismatches) == ("", 0)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("architecture", "name"),
     [
@@ -220,6 +223,7 @@ def test_the_same_network_gives_the_same_text() -> None:
     assert one == two
 
 
+@pytest.mark.heavy
 def test_of_many_peaks_the_first_stay() -> None:
     network = replace(quantised_network(1), threshold=0.0)
     compiled = Compiled(network)

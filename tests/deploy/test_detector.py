@@ -23,6 +23,7 @@ from .graphs import quantised_network
 needs_riscv = pytest.mark.skipif(bool(missing(RISCV, EMULATOR)), reason="no RISC-V tools")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "backend", ["integer", "onnx-int8", "c", pytest.param("riscv32", marks=needs_riscv)]
 )

@@ -49,6 +49,7 @@ def test_the_same_boards_give_the_same_digits_each_time() -> None:
     assert len({one.camera for one in made}) == 1
 
 
+@pytest.mark.heavy
 def test_a_drawn_board_gives_the_camera_that_drew_it() -> None:
     pairs = shown(AIDECK, np.random.default_rng(0), 10)
     assert len(pairs) >= 8
@@ -61,6 +62,7 @@ def test_a_drawn_board_gives_the_camera_that_drew_it() -> None:
     assert (made.camera.width_px, made.camera.height_px) == (320, 224)
 
 
+@pytest.mark.heavy
 def test_corners_are_found_to_a_twentieth_of_a_pixel() -> None:
     pairs = shown(AIDECK, np.random.default_rng(1), 8)
     errors = np.concatenate([found - true for found, true in pairs])

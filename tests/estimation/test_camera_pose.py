@@ -47,6 +47,7 @@ def test_mount_and_delay_are_found_again() -> None:
     assert np.abs(errors).max() < 4.0
 
 
+@pytest.mark.heavy
 def test_a_camera_that_is_right_is_left_as_it_is() -> None:
     found = calibrate([flight(1, AIDECK)], AIDECK, Noise(3.0, 0.005))
     assert found is not None
@@ -54,6 +55,7 @@ def test_a_camera_that_is_right_is_left_as_it_is() -> None:
     assert abs(found.camera.delay_s) < 0.005
 
 
+@pytest.mark.heavy
 def test_several_flights_are_left_out_in_turn() -> None:
     found = calibrate([flight(seed, images=150) for seed in range(4)], AIDECK, Noise(3.0, 0.005))
     assert found is not None
@@ -65,6 +67,7 @@ def test_detections_that_fit_nothing_give_nothing() -> None:
     assert calibrate([flight(2, outliers=1.0, images=60)], AIDECK, Noise()) is None
 
 
+@pytest.mark.heavy
 def test_gaps_in_the_positions_are_not_bridged() -> None:
     whole = flight(3)
     peer = whole.peers["cf2"]
@@ -75,6 +78,7 @@ def test_gaps_in_the_positions_are_not_bridged() -> None:
     assert found.matched < 300
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("delay_s", [-0.3, 0.0, 0.2])
 def test_the_delay_does_not_hang_on_where_it_starts(delay_s: float) -> None:
     # Attitude as a log has it: its noise moves a peer by a pixel from sample to sample.
@@ -116,6 +120,7 @@ def test_tilts_that_come_at_once_do_not_shift_the_delay() -> None:
     assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.003)
 
 
+@pytest.mark.heavy
 def test_a_path_that_is_far_off_for_seconds_does_not_turn_the_mount() -> None:
     # Only what lay within 25 px was kept: of a path that is 30 px off to either side, one half.
     clean = flight(8, images=900, outliers=0.0)
@@ -129,6 +134,7 @@ def test_a_path_that_is_far_off_for_seconds_does_not_turn_the_mount() -> None:
     assert found.matched > 850
 
 
+@pytest.mark.heavy
 def test_how_far_single_detections_are_off_is_found() -> None:
     sharp, blunt = (
         calibrate([flight(9, images=600, outliers=0.0)], AIDECK, Noise(pixels, 0.005))

@@ -43,6 +43,7 @@ def test_the_statuses_are_those_of_the_schema() -> None:
     )
 
 
+@pytest.mark.heavy
 def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
     seeds = (1000, 1001, 1002, 1003)
     pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
@@ -57,6 +58,7 @@ def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
     assert max(batch) < 0.35
 
 
+@pytest.mark.heavy
 def test_only_sensors_that_look_calibrated_are_taken_to_have_small_scales() -> None:
     scales = []
     for noise in ("calibrated", "realistic", "harsh"):
@@ -99,6 +101,7 @@ def test_nor_is_it_in_other_flights(trajectory: Trajectory, noise: str, seed: in
     assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
 
 
+@pytest.mark.heavy
 def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
     pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
     gap = (pair.time_s > 30) & (pair.time_s < 33)
@@ -111,6 +114,7 @@ def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
     assert (estimate.status == room.OK).mean() > 0.2
 
 
+@pytest.mark.heavy
 def test_where_ranges_are_silent_nothing_is_ok_and_nothing_is_out_of_their_reach() -> None:
     pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
     kept = (pair.range_time_s < 30) | (pair.range_time_s > 33)
@@ -139,6 +143,7 @@ def test_a_fault_does_not_move_the_flight(fault: str) -> None:
     assert (estimate.status == room.OK).mean() > 0.5
 
 
+@pytest.mark.heavy
 def test_a_flight_without_ranges_is_ambiguous() -> None:
     pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
     none = Pair(pair.time_s, pair.own, pair.peer, np.zeros(0), np.zeros(0))

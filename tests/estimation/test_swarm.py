@@ -47,6 +47,7 @@ def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
     )
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("noise", "share"), [("calibrated", 0.9), ("realistic", 1.02)])
 def test_all_together_are_as_near_the_truth_as_pair_by_pair(noise: str, share: float) -> None:
     """With little noise nearer; else, where a sure pair contradicts, they are the pairs' own."""
@@ -77,6 +78,7 @@ def test_the_frame_is_one_positions_agree_around_a_triangle() -> None:
     assert np.allclose(around, three[:, 0] + 1j * three[:, 1])
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("trajectory", ["parallel", "hover"])
 def test_what_no_motion_tells_is_ambiguous_here_too(trajectory: Trajectory) -> None:
     *_, swarm = solved(trajectory, "calibrated", duration_s=20.0)
@@ -84,6 +86,7 @@ def test_what_no_motion_tells_is_ambiguous_here_too(trajectory: Trajectory) -> N
         assert not (estimate.status == OK).any()
 
 
+@pytest.mark.heavy
 def test_an_observer_that_stands_still_has_no_bearings() -> None:
     *_, swarm = solved("observer_static", "calibrated", duration_s=20.0)
     for peer in ("cf2", "cf3"):
@@ -97,6 +100,7 @@ def test_two_robots_stay_a_pair() -> None:
     assert estimate_swarm({names: pairs[names]}, alone) == alone
 
 
+@pytest.mark.heavy
 def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
     # Ranges 1 m too long for 3 s, twice: taken as they are, all three robots were 0.3 m off.
     shadow = Fault("nlos", "cf1", "cf2", size=1.0, duration_s=3.0, number=2)

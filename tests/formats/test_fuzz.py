@@ -176,6 +176,7 @@ def _in_a_process(which: str, count: int, folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("which", SOURCES)
 def test_damaged_sources_give_one_line_or_a_part(which: str, tmp_path: Path) -> None:
     run(which, 12, tmp_path)

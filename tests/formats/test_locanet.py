@@ -124,6 +124,7 @@ def test_true_projections_lie_in_the_middle_of_the_boxes(data: Path) -> None:
     np.testing.assert_allclose(np.median(published - middle, axis=0), (2, 10.5), atol=0.6)
 
 
+@pytest.mark.heavy
 def test_only_the_unnegated_attitudes_fit_the_outlines(data: Path) -> None:
     """The boxes show how robots are tilted in the picture, hence every sign at once."""
     images = locanet.read(data / "locanet-synthetic")

@@ -97,6 +97,7 @@ def test_of_two_odometries_of_a_robot_the_longer_counts() -> None:
     assert unknown == ["/cf1/odom"]
 
 
+@pytest.mark.heavy
 def test_a_real_bag_of_ranges_odometry_and_motion_capture(data: Path) -> None:
     counts = Counter(
         sample.topic

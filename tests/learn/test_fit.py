@@ -111,6 +111,7 @@ def test_same_seed_same_bytes_and_another_seed_others(examples: Examples, tmp_pa
     assert weights[0] == weights[1] != weights[2]
 
 
+@pytest.mark.heavy
 def test_training_finds_the_dot(tmp_path: Path) -> None:
     examples = dots(150)
     settings = replace(SETTINGS, epochs=12, learning_rate=3e-3)
@@ -140,6 +141,7 @@ def test_dmrl_nano_finds_the_dot_within_its_cell(tmp_path: Path) -> None:
     assert 0.05 < threshold < 0.95
 
 
+@pytest.mark.heavy
 def test_the_kept_weights_are_the_mean_of_those_of_many_steps(tmp_path: Path) -> None:
     examples, settings = dots(12), replace(EVERYTHING, epochs=2)
     _, last = trained(examples, tmp_path / "last", replace(settings, ema_steps=0))

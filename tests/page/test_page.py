@@ -41,6 +41,7 @@ class _Seen(HTMLParser):
         self._heading = False
 
 
+@pytest.mark.heavy
 def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None:
     html = page(gather(outputs))
     seen = _Seen(html)
@@ -55,6 +56,7 @@ def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None
     assert "seen from cf1; 95 % ellipses" in html
 
 
+@pytest.mark.heavy
 def test_names_and_documents_cannot_become_markup(outputs: Path, evaluation: Evaluation) -> None:
     bad = "<script>alert(1)</script>"
     document = evaluation(against=bad, split=bad, recording={"name": bad, "sha256": ""})
@@ -68,6 +70,7 @@ def test_names_and_documents_cannot_become_markup(outputs: Path, evaluation: Eva
     assert "script" not in seen.tags and "x" not in seen.places
 
 
+@pytest.mark.heavy
 def test_documents_that_are_not_as_they_should_be_leave_the_rest(
     outputs: Path, evaluation: Evaluation
 ) -> None:
@@ -94,6 +97,7 @@ def test_documents_that_are_not_as_they_should_be_leave_the_rest(
     assert "Training" in html and "Recordings" in html
 
 
+@pytest.mark.heavy
 def test_damaged_recordings_and_pictures_are_named_and_the_rest_is_shown(outputs: Path) -> None:
     (outputs / "cut.mcap").write_bytes((outputs / "flight.mcap").read_bytes()[:-20])
     (outputs / "odd.png").write_bytes(b"\xff\xd8 no picture" * 30_000)
@@ -102,6 +106,7 @@ def test_damaged_recordings_and_pictures_are_named_and_the_rest_is_shown(outputs
     assert "odd.png" in html
 
 
+@pytest.mark.heavy
 def test_large_pictures_are_made_smaller_and_the_page_stays_small(outputs: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (900, 1600, 3), np.uint8)
     picture = encode_png(noise)
@@ -112,6 +117,7 @@ def test_large_pictures_are_made_smaller_and_the_page_stays_small(outputs: Path)
     assert "data:image/jpeg" in html and "no room left in this page" in html
 
 
+@pytest.mark.heavy
 def test_a_report_is_written_again_but_no_other_file(outputs: Path) -> None:
     first = write(outputs)
     assert first == outputs / "report.html"

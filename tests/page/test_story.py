@@ -68,6 +68,7 @@ def pipeline(outputs: Path) -> Path:
     return outputs
 
 
+@pytest.mark.heavy
 def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
     html = page(gather(pipeline))
     story = html[html.index("The paper, again</h2>") : html.index("Detections</h2>")]
@@ -79,6 +80,7 @@ def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
     assert story.count("data:image/") == 2
 
 
+@pytest.mark.heavy
 def test_maps_say_how_far_they_are_from_the_first(pipeline: Path) -> None:
     html = page(gather(pipeline))
     grid = np.linspace(0.1, 0.9, 12)
@@ -88,6 +90,7 @@ def test_maps_say_how_far_they_are_from_the_first(pipeline: Path) -> None:
     assert ">absent<" not in html  # an optional step, left out
 
 
+@pytest.mark.heavy
 def test_a_figure_that_cannot_be_drawn_says_why_and_the_rest_is_shown(pipeline: Path) -> None:
     (pipeline / "model/model.json").write_text("{")
     (pipeline / "judged/circles.png").write_bytes(b"no picture")
@@ -98,6 +101,7 @@ def test_a_figure_that_cannot_be_drawn_says_why_and_the_rest_is_shown(pipeline: 
     assert ">0.5<" in story
 
 
+@pytest.mark.heavy
 def test_what_leads_out_of_the_folder_is_not_shown(pipeline: Path, tmp_path: Path) -> None:
     secret = tmp_path / "secret.json"
     secret.write_text('{"overall": "hidden words"}')
@@ -106,6 +110,7 @@ def test_what_leads_out_of_the_folder_is_not_shown(pipeline: Path, tmp_path: Pat
     assert "hidden words" not in page(gather(pipeline))
 
 
+@pytest.mark.heavy
 def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> None:
     (pipeline / "recipe.toml").write_text("[[figure]]\nshows = 3\n")
     html = page(gather(pipeline))

@@ -31,6 +31,7 @@ def run(script: Path, element: int) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["sh", str(script)], env=own, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.heavy
 def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
     flights: Path,
     tmp_path: Path,

@@ -71,6 +71,7 @@ def test_signs_in_the_name_of_a_file_are_no_pattern(tmp_path: Path) -> None:
     assert is_many(tmp_path / "b[1].mcap")
 
 
+@pytest.mark.heavy
 def test_the_bytes_are_those_of_one_at_a_time_with_any_number_of_workers(
     flights: Path, tmp_path: Path
 ) -> None:
@@ -83,6 +84,7 @@ def test_the_bytes_are_those_of_one_at_a_time_with_any_number_of_workers(
     assert (tmp_path / "alone.mcap").read_bytes() == made["monday/a.mcap"]
 
 
+@pytest.mark.heavy
 def test_one_that_fails_stops_no_other_and_is_told_at_the_end(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -96,6 +98,7 @@ def test_one_that_fails_stops_no_other_and_is_told_at_the_end(
     ]
 
 
+@pytest.mark.heavy
 def test_what_is_there_and_made_of_the_same_is_left_as_it_is(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -113,6 +116,7 @@ def test_what_is_there_and_made_of_the_same_is_left_as_it_is(
     }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("wrong", ["settings", "input", "torn"])
 def test_what_is_there_and_of_something_else_is_refused(
     wrong: str, flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -143,6 +147,7 @@ def test_an_empty_folder_and_the_folder_itself_are_refused(flights: Path, tmp_pa
         trimmed(flights, flights / "a.mcap")
 
 
+@pytest.mark.heavy
 def test_check_of_a_folder_is_a_line_each_and_one_for_all(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,6 +159,7 @@ def test_check_of_a_folder_is_a_line_each_and_one_for_all(
     assert lines[-1].startswith("4 recordings: 4 without errors; 0 errors, ")
 
 
+@pytest.mark.heavy
 def test_check_of_many_with_a_bad_one_says_so_in_json_and_status(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -167,6 +173,7 @@ def test_check_of_many_with_a_bad_one_says_so_in_json_and_status(
     ]
 
 
+@pytest.mark.heavy
 def test_sources_in_a_folder_become_recordings_of_their_names(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -187,6 +194,7 @@ def children(process: int) -> list[int]:
     return [int(number) for task in tasks for number in (task / "children").read_text().split()]
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes")
 def test_ctrl_c_ends_the_workers_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     png = encode_png(np.zeros((224, 320, 3), np.uint8))

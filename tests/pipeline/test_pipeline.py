@@ -41,6 +41,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
+@pytest.mark.heavy
 def test_a_pipeline_gives_the_same_bytes_with_any_number_of_workers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -60,6 +61,7 @@ def test_a_pipeline_gives_the_same_bytes_with_any_number_of_workers(
     assert len(json.loads(capsys.readouterr().out)["steps"]) == 6
 
 
+@pytest.mark.heavy
 def test_an_edited_recipe_goes_on_in_the_same_folder(tmp_path: Path) -> None:
     recipe, out = write(tmp_path, SMALL.replace("from_s = 0.05", "from_s = 99.0")), tmp_path / "o"
     with pytest.raises(DmrlError, match=r"^end\.mcap \(trim\): "):
@@ -130,6 +132,7 @@ def gone(number: int) -> bool:
         return True
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signal.Signals) -> None:
@@ -150,6 +153,7 @@ def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signa
     assert not any(d.skipped for d in done) and not (out / "unfinished").exists()
 
 
+@pytest.mark.heavy
 def test_a_killed_worker_is_one_line(tmp_path: Path) -> None:
     before = set(children(os.getpid()))
     with Crew(1) as crew:
@@ -164,6 +168,7 @@ def test_a_killed_worker_is_one_line(tmp_path: Path) -> None:
         assert crew.give(line, alone=False).result().keys() == {"sha256"}
 
 
+@pytest.mark.heavy
 def test_what_a_user_can_mend_and_what_only_we_can_are_told_apart(tmp_path: Path) -> None:
     with Crew(1) as crew:
         wrong = job("convert", tmp_path / "a", {"source": tmp_path / "no"}, {}, resume=False)

@@ -262,6 +262,7 @@ def test_a_figure_of_what_no_step_writes_is_a_fault_of_the_recipe(tmp_path: Path
         load(tmp_path, SMALL + figure)
 
 
+@pytest.mark.heavy
 def test_data_of_optional_steps_need_not_be_there(tmp_path: Path) -> None:
     step = '[[step]]\nstage = "convert"\nsource = "{data}/none"\nout = "a.mcap"\n'
     text = HEAD + '[[step]]\nstage = "sketch"\nimages = 1\nout = "pictures"\n' + step
@@ -274,6 +275,7 @@ def test_data_of_optional_steps_need_not_be_there(tmp_path: Path) -> None:
     assert [one.left_out for one in done] == [False, True]
 
 
+@pytest.mark.heavy
 def test_a_recipe_with_figures_ends_with_its_page_drawn_again_where_something_changed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

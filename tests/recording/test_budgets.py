@@ -101,6 +101,7 @@ def test_bombs_are_refused(tmp_path: Path) -> None:
         assert "nothing to recover" in recovered, name
 
 
+@pytest.mark.heavy
 def test_many_small_bombs_are_refused(tmp_path: Path) -> None:
     size = 100_000_000
     data = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22 + size, 1, 0, 0, 0) + bytes(size)
@@ -119,6 +120,7 @@ def test_as_many_messages_as_a_chunk_may_hold_are_read_within_the_budget(tmp_pat
     assert read_bounded(path, spare=1_000_000_000) == [["read"] * 4]
 
 
+@pytest.mark.heavy
 def test_an_indexed_bomb_is_refused(tmp_path: Path) -> None:
     """As a writer would have written it: the summary tells the size."""
     path = tmp_path / "bomb.mcap"
@@ -144,6 +146,7 @@ def _name(writer: Writer) -> None:
     writer.register_channel("/" + "a" * limits.NAME_CHARACTERS, "protobuf", 1)
 
 
+@pytest.mark.heavy
 def test_topics_and_names_have_a_budget(tmp_path: Path) -> None:
     paths = [tmp_path / "topics.mcap", tmp_path / "name.mcap"]
     for path, fill in zip(paths, (_topics, _name), strict=True):

@@ -91,6 +91,7 @@ def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
     assert [raw.time_ns for raw in read_raw(out, "/cf1/labels")] == [m.time_ns for m in fresh]
 
 
+@pytest.mark.heavy
 def test_what_is_left_out_leaves_the_rest_bit_for_bit(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=["/cf2/attitude"], fresh=())
@@ -121,6 +122,7 @@ def test_a_stretch_that_begins_with_a_chunk_defines_what_it_holds(
         assert summary(tmp_path / f"{k}.whole.mcap").count == len(ours)
 
 
+@pytest.mark.heavy
 def test_parts_are_merged_to_what_they_were(flight: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     trim(flight, parts[0], topics=["/cf1/*", "/cf1/camera/*"])

@@ -69,6 +69,7 @@ def test_a_dead_worker_is_replaced_and_its_job_done_again(start: Start) -> None:
         assert workers.replaced == 1
 
 
+@pytest.mark.heavy
 def test_no_worker_outlives_a_pool_that_is_left_early(start: Start) -> None:
     with pytest.raises(KeyError), Pool(start, 4) as workers:
         for k, _ in enumerate(workers.map(double, range(100))):

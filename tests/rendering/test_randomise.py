@@ -94,6 +94,7 @@ def test_robots_turn_about_their_axes_in_the_order_asked_for(
     assert ahead / aside == pytest.approx((0.57, 1.0)[level], abs=0.12)
 
 
+@pytest.mark.heavy
 def test_depths_are_spread_by_factor_or_by_metre(tmp_path: Path) -> None:
     shares = []
     for spacing in ("log", "linear"):

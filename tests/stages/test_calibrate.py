@@ -57,6 +57,7 @@ def test_mount_and_delay_come_from_a_flight(calibrated: tuple[Path, calibrate.Re
     assert found.camera.delay_s == pytest.approx(0.03, abs=0.012)
 
 
+@pytest.mark.heavy
 def test_labels_made_with_it_lie_where_the_peer_was_seen(
     seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
@@ -150,6 +151,7 @@ def test_detections_of_something_else_are_refused(seen: Path, tmp_path: Path) ->
         calibrate.run([wrong], tmp_path / "camera.toml", Settings(against="truth"))
 
 
+@pytest.mark.heavy
 def test_positions_without_covariance_are_not_exact(
     seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
@@ -191,6 +193,7 @@ def _normalised(sources: list[Path], out: Path, camera: Camera) -> np.ndarray:
     return np.asarray((found - true) / [*figures["mount_std_deg"], figures["delay_std_ms"]])
 
 
+@pytest.mark.heavy
 def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None:
     seen = _seen(4000, tmp_path, CROOKED)
     assert np.abs(_normalised([seen], tmp_path / "camera.toml", CROOKED)).max() < 3.5

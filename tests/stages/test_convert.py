@@ -191,6 +191,7 @@ def test_recordings_are_never_overwritten(pictures: Path, tmp_path: Path) -> Non
     assert out.read_text() == "mine"
 
 
+@pytest.mark.heavy
 def test_the_command_prints_counts_and_exits_by_kind_of_error(
     pictures: Path, tmp_path: Path
 ) -> None:
@@ -216,6 +217,7 @@ def test_an_empty_file_is_one_line(tmp_path: Path) -> None:
     assert list(tmp_path.glob("out*")) == []
 
 
+@pytest.mark.heavy
 def test_flights_logged_on_micro_sd_can_be_labelled(tmp_path: Path) -> None:
     """A simulated flight, written as the firmware would log it: take-off frame, degrees."""
     flight = tmp_path / "flight.mcap"

@@ -301,6 +301,7 @@ def test_the_table_has_a_column_for_each_band_with_labels(
     assert "0.5 to 1 m" not in text
 
 
+@pytest.mark.heavy
 def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: Path) -> None:
     predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
     for name in ("a", "b"):

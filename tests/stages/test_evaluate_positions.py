@@ -57,6 +57,7 @@ def test_positions_are_judged_pair_by_pair(labelled: Path) -> None:
     assert made["overall"]["samples"] == 1599
 
 
+@pytest.mark.heavy
 def test_figures_and_plots_are_written(labelled: Path, tmp_path: Path) -> None:
     out = tmp_path / "judged"
     made = run([labelled], out, Settings(settle_s=5.0))
@@ -141,6 +142,7 @@ def test_recordings_with_nothing_to_judge_are_refused(tmp_path: Path) -> None:
         run([other], None, Settings())
 
 
+@pytest.mark.heavy
 def test_a_pipeline_shows_judged_positions(
     labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -33,6 +33,7 @@ def grids(model: Path, recording: Path, out: Path, backend: str) -> np.ndarray:
     return np.stack([np.frombuffer(grid.data, "<f4").reshape(shape) for grid in maps])
 
 
+@pytest.mark.heavy
 def test_every_backend_runs_a_quantised_model_and_an_export(
     quantised: Path, exported: Path, dots: Path, tmp_path: Path
 ) -> None:

@@ -180,6 +180,7 @@ def test_the_same_input_gives_the_same_bytes(flight: Path, labelled: Path, tmp_p
     assert (tmp_path / "labelled.mcap").read_bytes() == labelled.read_bytes()
 
 
+@pytest.mark.heavy
 def test_the_report_knows_the_error_where_the_truth_is_recorded(
     flight: Path, tmp_path: Path
 ) -> None:
@@ -226,6 +227,7 @@ def test_a_robot_without_logs_is_left_out_with_a_word(changed: Callable[[Change]
     assert "cf3: no /cf3/attitude and no /cf3/velocity" in warnings_of(changed(third))
 
 
+@pytest.mark.heavy
 def test_a_robot_with_a_log_but_no_position_may_be_in_any_image(
     flight: Path, tmp_path: Path
 ) -> None:
@@ -251,6 +253,7 @@ def test_who_looked_is_written_where_nobody_is_in_view(flight: Path, labelled: P
     assert sum("estimate" in sources for sources in looked) > 40
 
 
+@pytest.mark.heavy
 def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(write_camera(replace(AIDECK, width_px=160)))
@@ -332,6 +335,7 @@ def test_a_recording_without_ranges_says_so(changed: Callable[[Change], Path]) -
         label.run(bare, out.with_name("out.mcap"), Settings())
 
 
+@pytest.mark.heavy
 def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> None:
     flown = tmp_path / "still.mcap"
     fly.run(

@@ -39,6 +39,7 @@ def off(found: Likeness, real: Likeness) -> float:
     return max(abs(getattr(found, name) / getattr(real, name) - 1) for name in there)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_figures_of_the_fitted_preset_are_those_of_the_frames(camera: str, tmp_path: Path) -> None:
     result = run(frames(tmp_path / "own", camera), tmp_path / "own.toml", Settings())
@@ -52,6 +53,7 @@ def test_figures_of_the_fitted_preset_are_those_of_the_frames(camera: str, tmp_p
     assert sheet.shape[0] > 6 * 144
 
 
+@pytest.mark.heavy
 def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
     own = frames(tmp_path / "own", "grey")
     for name in ("a", "b"):
@@ -60,6 +62,7 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
         assert (tmp_path / f"a{end}").read_bytes() == (tmp_path / f"b{end}").read_bytes()
 
 
+@pytest.mark.heavy
 def test_a_recording_will_do_and_json_says_it_all(
     dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,6 +102,7 @@ def test_what_cannot_be_measured_is_one_line(tmp_path: Path, dots: Path) -> None
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "mixed", "none"]
 
 
+@pytest.mark.heavy
 def test_black_frames_have_no_grain_and_no_edges(tmp_path: Path) -> None:
     (tmp_path / "own").mkdir()
     for k in range(3):

@@ -116,6 +116,7 @@ def test_evaluating_is_one_pass(flight: Path, passes: Passes) -> None:
     assert passes(flight) <= 1.0
 
 
+@pytest.mark.heavy
 def test_labelling_is_two_passes_one_of_them_the_copy(
     flight: Path, passes: Passes, tmp_path: Path
 ) -> None:

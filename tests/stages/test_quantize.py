@@ -40,6 +40,7 @@ def test_the_report_has_every_layer_and_both_accuracies(quantised: Path) -> None
     assert said["accuracy"]["int8"]["median_px"] > 0
 
 
+@pytest.mark.heavy
 def test_same_inputs_same_bytes(
     settled: Path, dots_dataset: Path, quantised: Path, tmp_path: Path
 ) -> None:
@@ -51,6 +52,7 @@ def test_same_inputs_same_bytes(
         assert path.read_bytes() == (again / path.name).read_bytes(), path.name
 
 
+@pytest.mark.heavy
 def test_float_and_int8_maps_are_drawn(model: Path, dots_dataset: Path, tmp_path: Path) -> None:
     sized = tmp_path / "model"
     shutil.copytree(model, sized)
@@ -104,6 +106,7 @@ def test_an_output_that_exists_is_kept(settled: Path, dots_dataset: Path, tmp_pa
         run(settled, dots_dataset, tmp_path / "out", Settings())
 
 
+@pytest.mark.heavy
 def test_the_command_prints_layers_and_accuracies(
     settled: Path,
     dots_dataset: Path,

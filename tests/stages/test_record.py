@@ -76,6 +76,7 @@ def by_source(result: Result) -> dict[str, tuple[int, int, int]]:
     return {h.source: (h.received, h.lost, h.broken) for h in result.healths}
 
 
+@pytest.mark.heavy
 def test_all_that_was_sent_is_recorded_as_it_was_flown(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     # The clock of the drones wraps one second after take-off.
@@ -194,6 +195,7 @@ def attitudes_in(partial: Path, mended: Path) -> int:
         return 0
 
 
+@pytest.mark.heavy
 def test_a_killed_session_comes_back_to_its_last_second(flight: Path, tmp_path: Path) -> None:
     out, mended = tmp_path / "out.mcap", tmp_path / "mended.mcap"
     partial = tmp_path / "out.mcap.partial"

@@ -115,6 +115,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -
     assert sorted(p.name for p in tmp_path.iterdir()) == ["killed.mcap", "r.toml", "whole.mcap"]
 
 
+@pytest.mark.heavy
 def test_what_is_resumed_must_be_of_the_same_settings(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "out.mcap.partial").write_bytes(recording.read_bytes())
     with pytest.raises(RecordingError, match="other settings"):
@@ -171,6 +172,7 @@ def _mesh_box(robot: Robot, camera: Camera) -> Array:
 OWN = Camera(160, 120, 100.0, 101.0, 81.0, 58.0, (-0.28, 0.09, 0.0, 0.0, 0.0))
 
 
+@pytest.mark.heavy
 def test_what_stands_beside_the_photos_stands_in_the_recording(
     blender: Path, tmp_path: Path
 ) -> None:
@@ -183,6 +185,7 @@ def test_what_stands_beside_the_photos_stands_in_the_recording(
     assert licences([out]) == {"hall": "CC BY-SA 3.0"}
 
 
+@pytest.mark.heavy
 def test_renders_are_taken_with_a_camera_of_the_user_s(blender: Path, tmp_path: Path) -> None:
     path, out = tmp_path / "mine.toml", tmp_path / "out.mcap"
     path.write_text(write_camera(replace(OWN, mount_rad=(0.0, 0.1, 0.0), delay_s=0.03)))
@@ -210,6 +213,7 @@ CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1
 )
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("up", "height_m"), [("auto", 0.3), ("y", 0.3), ("z", 0.2)])
 def test_an_obj_stands_upright(
     blender: Path, tmp_path: Path, up: Literal["auto", "y", "z"], height_m: float
@@ -224,6 +228,7 @@ def test_an_obj_stands_upright(
     assert sorted(sides) == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
 
 
+@pytest.mark.heavy
 def test_a_scale_for_a_model_that_is_not_given_asks_for_it(blender: Path, tmp_path: Path) -> None:
     settings = settings_of("synthetic_published", images=1, workers=1)
     with pytest.raises(SettingError, match=r"Give the --model that this scale is for"):
@@ -264,6 +269,7 @@ def _off_middle(recording: Path) -> Array:
     return np.array(off)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["glb", "stl", "blend", "obj"])
 def test_a_file_that_is_no_model_is_refused(blender: Path, tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"no.{kind}"

@@ -61,6 +61,7 @@ def test_tracks_are_better_than_single_images_and_honest(judged: dict[str, Any])
     assert judged["false_tracks_per_min"] <= 4
 
 
+@pytest.mark.heavy
 def test_tracks_are_judged_with_the_camera_that_made_them(
     detected: Path, judged: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -79,6 +80,7 @@ def test_tracks_are_judged_with_the_camera_that_made_them(
         assert now["robots"][0][figure] == pytest.approx(judged[figure], rel=0.05)
 
 
+@pytest.mark.heavy
 def test_other_messages_stay_and_old_tracks_go(
     detected: Path, tracked: Path, tmp_path: Path
 ) -> None:
@@ -147,6 +149,7 @@ def test_tracks_without_truth_cannot_be_judged(tracked: Path, tmp_path: Path) ->
         evaluate.run([short], None, evaluate.Settings(what="tracks"))
 
 
+@pytest.mark.heavy
 def test_the_plots_show_the_errors_of_both(tracked: Path, tmp_path: Path) -> None:
     out = tmp_path / "plots"
     evaluate.run([tracked], out, evaluate.Settings(what="tracks"))

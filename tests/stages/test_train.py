@@ -51,6 +51,7 @@ def test_a_run_folder_says_what_was_trained_on_what(dataset: Path, tmp_path: Pat
     assert names == {"model.json", "model.safetensors", "provenance.json", "tensorboard"}
 
 
+@pytest.mark.heavy
 def test_same_inputs_same_weights(dataset: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         run(dataset, tmp_path / name, SETTINGS)
@@ -58,6 +59,7 @@ def test_same_inputs_same_weights(dataset: Path, tmp_path: Path) -> None:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
+@pytest.mark.heavy
 def test_a_share_of_the_first_weights_is_kept(dataset: Path, tmp_path: Path) -> None:
     run(dataset, tmp_path / "a", SETTINGS)
     for share in (0.0, 0.25, 1.0):
@@ -74,6 +76,7 @@ def test_a_share_of_the_first_weights_is_kept(dataset: Path, tmp_path: Path) -> 
         run(dataset, tmp_path / "c", replace(SETTINGS, init_share=0.5))
 
 
+@pytest.mark.heavy
 def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) -> None:
     slow = replace(SETTINGS, learning_rate=1e-9, final_learning_rate=0.0)
     run(dataset, tmp_path / "a", SETTINGS)
@@ -84,6 +87,7 @@ def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) 
     assert [source["name"] for source in made["inputs"]] == ["dots", "a"]
 
 
+@pytest.mark.heavy
 def test_a_teacher_is_learnt_from_and_named(dataset: Path, tmp_path: Path) -> None:
     taught = replace(SETTINGS, distill_share=1.0)
     run(dataset, tmp_path / "teacher", replace(SETTINGS, architecture="dmrl-large"))
@@ -95,6 +99,7 @@ def test_a_teacher_is_learnt_from_and_named(dataset: Path, tmp_path: Path) -> No
     assert [source["name"] for source in made["inputs"]] == ["dots", "teacher"]
 
 
+@pytest.mark.heavy
 def test_classes_are_patterns_of_peer_names(dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, classes=("cf9", "cf*"), spread_weight=1.0)
     with pytest.raises(SettingError, match=r"classes: cf9 is left no peer .* Choose among cf2$"):
@@ -129,6 +134,7 @@ run(
 """
 
 
+@pytest.mark.heavy
 def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,6 +183,7 @@ def test_a_killed_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes
     assert weights[0] == weights[1]
 
 
+@pytest.mark.heavy
 def test_a_training_killed_in_its_first_epoch_starts_over(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "run.partial" / "tensorboard").mkdir(parents=True)
     run(dataset, tmp_path / "run", SETTINGS, resume=True)
@@ -218,6 +225,7 @@ def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers()
             recipe.load(name, "train", Settings)
 
 
+@pytest.mark.heavy
 def test_the_threshold_is_chosen_on_images_held_out(dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, validation_share=0.2)
     run(dataset, tmp_path / "run", settings)
@@ -303,6 +311,7 @@ def test_torchrun_trains_what_two_processes_train(dataset: Path, tmp_path: Path)
     assert first == second
 
 
+@pytest.mark.heavy
 def test_an_error_of_two_processes_is_said_once(
     dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

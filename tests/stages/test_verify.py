@@ -89,6 +89,7 @@ def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verify, "cost", lambda *_: None)
 
 
+@pytest.mark.heavy
 @needs_gcc
 @pytest.mark.usefixtures("one_level")
 def test_c_of_another_network_is_found_out(
@@ -102,6 +103,7 @@ def test_c_of_another_network_is_found_out(
     assert not gcc["error"]
 
 
+@pytest.mark.heavy
 @needs_gcc
 @pytest.mark.usefixtures("one_level")
 def test_a_proof_is_written_only_where_the_c_is_right(folder: Path, tmp_path: Path) -> None:

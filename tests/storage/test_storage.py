@@ -69,6 +69,7 @@ def test_names_of_buckets_are_paths_and_others_are_as_ever() -> None:
         assert type(path_of(plain)) is type(Path())
 
 
+@pytest.mark.heavy
 def test_a_command_from_bucket_to_bucket_makes_the_bytes_of_here(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -83,6 +84,7 @@ def test_a_command_from_bucket_to_bucket_makes_the_bytes_of_here(
     assert "10 messages" in said(capsys, 0, "info", "s3://lab/one/b.mcap").out
 
 
+@pytest.mark.heavy
 def test_a_folder_in_a_bucket_is_done_and_indexed(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,6 +101,7 @@ def test_a_folder_in_a_bucket_is_done_and_indexed(
     assert said(capsys, 0, "check", "s3://lab/many/*.mcap").out.count("20 messages") == 1
 
 
+@pytest.mark.heavy
 def test_numbers_are_read_without_the_pictures(
     lab: Any, tmp_path: Path, fetched: list[int]
 ) -> None:
@@ -165,6 +168,7 @@ def test_an_upload_that_fails_leaves_nothing(
     assert lab.find("lab/torn") == []
 
 
+@pytest.mark.heavy
 def test_a_dataset_is_made_and_opened_in_a_bucket(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], empty_figures: None
 ) -> None:
@@ -222,6 +226,7 @@ out = "short.mcap"
 """
 
 
+@pytest.mark.heavy
 def test_a_pipeline_keeps_its_folder_in_a_bucket(lab: Any, tmp_path: Path) -> None:
     recipe = tmp_path / "chain.toml"
     recipe.write_text(CHAIN)
@@ -234,6 +239,7 @@ def test_a_pipeline_keeps_its_folder_in_a_bucket(lab: Any, tmp_path: Path) -> No
     assert not [name for name in lab.find("lab/chain") if "unfinished" in name]
 
 
+@pytest.mark.heavy
 def test_what_is_wrong_with_a_bucket_is_one_line(
     lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -53,6 +53,7 @@ def test_every_row_has_a_box_that_names_it_and_nothing_is_fetched(
     assert all(place.startswith("data:image/jpeg") for place in seen.places)
 
 
+@pytest.mark.heavy
 def test_what_the_page_names_is_left_out_and_provenance_says_so(
     built: Path, make: Make, tmp_path: Path
 ) -> None:

@@ -234,6 +234,7 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
     assert before < len(set(opened)) / 2
 
 
+@pytest.mark.heavy
 def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_ends(
     fly: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,6 +40,7 @@ def panel(picture: Path, row: int, col: int) -> tuple[int, ...]:
     return tuple(int(value) for value in rgb[v - 40 : v + 40, u - 40 : u + 40].mean(axis=(0, 1)))
 
 
+@pytest.mark.heavy
 def test_a_picture_shows_the_image_nearest_to_the_time(
     make: Make, tmp_path: Path, vulkan: None
 ) -> None:
@@ -93,6 +94,7 @@ def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
     assert {environment[name] for name in ("https_proxy", "HTTPS_PROXY")} == {"http://127.0.0.1:9"}
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_the_page_is_served_until_ctrl_c_or_a_kill(make: Make, ending: signal.Signals) -> None:
     code = "from dmrl.cli import main; main()"
