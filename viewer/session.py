@@ -1,19 +1,25 @@
 """Log what is asked for into a rerun stream or file."""
 
-from collections.abc import Callable, Sequence
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
+from threading import Thread
 from typing import Any, cast
 
 import rerun as rr
 
-from dmrl.errors import OutputError
 from dmrl.output import partial_file
 from dmrl.viewer.layouts import TIMELINE
 from dmrl.viewer.scene import Scene, logged
 from dmrl.viewer.selection import Settings, at_time, moment_ns, select
 from dmrl.viewer.show import Logger, Show, cursor_at, stream_of
+
+PIECE_BYTES = 1 << 20
+"""Of an .rrd file, written at once."""
 
 
 def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
@@ -78,19 +84,49 @@ def write(show: Show, path: Path) -> None:
 
     Raises
     ------
-    OutputError
-        If the disk is full, or refuses.
+    OSError
+        If the disk refuses.
     """
-    stream = stream_of()
-    stream.save(path, default_blueprint=show.blueprint)
+    with _written_here(path) as (pipe, still_written):
+        stream = stream_of()
+        stream.save(pipe, default_blueprint=show.blueprint)
+        try:
+            log(show, stream, still_written)
+            stream.flush()
+        finally:
+            stream.disconnect()
+
+
+@contextmanager
+def _written_here(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
+    """A pipe to write to, by name, and whether what comes through still reaches ``path``.
+
+    rerun tells of a failed write by a word on standard error, and then may wait for its writer
+    for ever (0.41). So it never sees the disk: the pipe takes everything, to its end.
+    """
+    refused: list[OSError] = []
+    ear, mouth = os.pipe()
+
+    def drain() -> None:
+        with os.fdopen(ear, "rb", buffering=0) as stream:
+            try:
+                with path.open("wb") as file:
+                    shutil.copyfileobj(stream, file, PIECE_BYTES)
+            except OSError as e:
+                refused.append(e)
+                while stream.read(PIECE_BYTES):
+                    pass
+
+    drained = Thread(target=drain, daemon=True)
+    drained.start()
     try:
-        log(show, stream)
-        stream.flush()
-    except RuntimeError as e:
-        # All that rerun tells of a failed write, after the reason went to standard error.
-        raise OutputError(f"cannot write {path}: {e}. Free some space, or name another") from e
+        yield f"/dev/fd/{mouth}", lambda: not refused
     finally:
-        stream.disconnect()
+        os.close(mouth)
+        drained.join()
+    if refused:
+        error = refused[0]
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def log(show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lambda: True) -> None:

@@ -1,5 +1,6 @@
 """What is logged, read back from the .rrd files."""
 
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read_table
 from dmrl.stages import view
 from dmrl.viewer import Settings, save
+from dmrl.viewer.session import prepare, write
 
 from .rrd import column, logged, panels
 
@@ -194,6 +196,15 @@ def test_an_output_is_never_overwritten(make: Make, rrd: Path) -> None:
     with pytest.raises(OutputError, match="never overwritten"):
         save([make()], rrd, Settings())
     assert rrd.read_bytes() == b"mine"
+
+
+def test_a_full_disk_ends_it_with_the_reason_and_never_hangs(make: Make) -> None:
+    """rerun itself would say no reason, and now and then wait for ever."""
+    show = prepare([make()], Settings())
+    for _ in range(20):
+        with pytest.raises(OSError, match="/dev/full") as e:
+            write(show, Path("/dev/full"))
+        assert e.value.errno == errno.ENOSPC
 
 
 def test_a_recording_that_is_cut_short_leaves_no_file(make: Make, rrd: Path) -> None:
