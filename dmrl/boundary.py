@@ -26,8 +26,8 @@ from contextlib import suppress
 from types import FrameType
 
 from dmrl import output
-from dmrl.border.names import one_line, without_middle
-from dmrl.errors import DmrlError
+from dmrl.border.names import without_middle
+from dmrl.errors import DmrlError, one_line
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

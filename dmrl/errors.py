@@ -20,12 +20,31 @@
   - PluginError       what another package adds to dmrl does not work
 """
 
+import unicodedata
 from collections.abc import Iterable
 from difflib import get_close_matches
 
 
+def one_line(text: str) -> str:
+    r"""The text in one line: control characters as ``\x1b``, line ends as spaces.
+
+    What orders a terminal about, or turns a text's direction, is shown and not obeyed.
+    """
+    return "".join(map(_shown, " ".join(text.splitlines())))
+
+
+def _shown(character: str) -> str:
+    if unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp"):
+        return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+    return character
+
+
 class DmrlError(Exception):
     """Base of every error that ``dmrl`` prints without a traceback."""
+
+    def __str__(self) -> str:
+        """One line, whatever names of a file, or words of a library, stand in it."""
+        return one_line(super().__str__())
 
 
 class OutputError(DmrlError):

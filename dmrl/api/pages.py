@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.names import one_line
+from dmrl.errors import one_line
 
 MOST_ROWS = 200
 

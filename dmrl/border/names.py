@@ -6,12 +6,11 @@ path, a comment of C, Markdown, or a line on a terminal, it goes through one of 
 """
 
 import re
-import unicodedata
 from functools import cache
 from pathlib import Path
 from urllib.parse import quote
 
-from dmrl.errors import UnsafeName
+from dmrl.errors import UnsafeName, one_line
 
 MOST_BYTES = 200
 """Of a name: with ``-00000-of-00001.parquet`` it still fits a file system's 255."""
@@ -141,20 +140,6 @@ def code(text: str) -> str:
     fence = "`" * (1 + max((len(run) for run in re.findall("`+", line)), default=0))
     pad = " " if line.startswith("`") or line.endswith("`") else ""
     return f"{fence}{pad}{line}{pad}{fence}"
-
-
-def one_line(text: str) -> str:
-    r"""The text in one line: control characters as ``\x1b``, line ends as spaces.
-
-    What orders a terminal about, or turns a text's direction, is shown and not obeyed.
-    """
-    return "".join(map(_shown, " ".join(text.splitlines())))
-
-
-def _shown(character: str) -> str:
-    if unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp"):
-        return character.encode("unicode_escape", "surrogatepass").decode("ascii")
-    return character
 
 
 def shortened(text: str) -> str:

@@ -5,6 +5,7 @@ page of ``dmrl view DATASET --flag`` writes such files, and so does any spreadsh
 """
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from dmrl.errors import SettingError
 
 NEEDED = ("source", "robot", "log_time")
 OPTIONAL = ("reason", "row", "split")
+_TIME = re.compile(r"-?\d{1,19}", re.ASCII)
 MOST = 1_000_000
 """Lines of a file of flags."""
 Flag = tuple[str, str, int]
@@ -59,6 +61,6 @@ def _flag(where: str, cells: Mapping[str | None, str | None]) -> Flag:
     if None in cells or not all(values):
         raise SettingError(f"{where}: not a {', '.join(NEEDED)}. Mend the line")
     source, robot, time = values
-    if not time.lstrip("-").isdecimal() or len(time) > 20:
+    if not _TIME.fullmatch(time):
         raise SettingError(f"{where}: {time[:40]!r} is no time in nanoseconds. Mend the line")
     return source, robot, int(time)

@@ -3,6 +3,7 @@
 ``[[figure]]`` tables of a pipeline recipe. They name outputs of steps; `dmrl.page` draws them.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ from dmrl import recipe as recipes
 KEY, TITLE = "figure", "title"
 MOST = 40
 """Figures of one recipe."""
+_FORM = re.compile(r",?(\.\d{1,2})?[efg%]")
+"""Of a number: no width, which could be a gigabyte of spaces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +91,12 @@ def told(name: str | Path, recipe: Mapping[str, Any]) -> list[Shown]:
     RecipeError
         If a table is not as it should be.
     """
-    tables = recipe.get(KEY, [])
-    return [recipes.check(name, table, Shown) for table in tables]
+    if wrong := list(faults(recipe)):
+        raise recipes.faulty(name, wrong)
+    return [recipes.check(name, table, Shown) for table in recipe.get(KEY, [])]
 
 
-def faults(recipe: Mapping[str, Any], outs: Set[str]) -> Iterator[str]:
+def faults(recipe: Mapping[str, Any], outs: Set[str] | None = None) -> Iterator[str]:
     """What is wrong with the figures of a recipe.
 
     Parameters
@@ -100,7 +104,7 @@ def faults(recipe: Mapping[str, Any], outs: Set[str]) -> Iterator[str]:
     recipe
         Its keys.
     outs
-        What its steps write.
+        What its steps write. None: not known.
     """
     if not isinstance(recipe.get(TITLE, ""), str):
         yield f"{TITLE}: must be a text"
@@ -115,22 +119,22 @@ def faults(recipe: Mapping[str, Any], outs: Set[str]) -> Iterator[str]:
         )
         yield from (f"{where}.{fault}" for fault in wrong)
         if not wrong:
-            yield from (f"{where}.{fault}" for fault in _slips(told("", {KEY: [table]})[0], outs))
+            shown = recipes.check("", table, Shown)
+            yield from (f"{where}.{fault}" for fault in _slips(shown, outs))
 
 
-def _slips(shown: Shown, outs: Set[str]) -> Iterator[str]:
+def _slips(shown: Shown, outs: Set[str] | None) -> Iterator[str]:
     needs, unused = ("rows", "of") if shown.shows == "numbers" else ("of", "rows")
     if not getattr(shown, needs) or getattr(shown, unused):
         yield f"{needs}: {shown.shows} needs {needs}, and no {unused}"
     if len(shown.named) > len(shown.of):
         yield "named: has more words than there are outputs"
     for name in shown.outputs:
-        if name.split("/")[0] not in outs or ".." in name.split("/"):
+        parts = name.split("/")
+        if ".." in parts or (outs is not None and parts[0] not in outs):
             yield f"of: no step writes {name}. Name a step's out"
     for row in shown.rows:
-        try:
-            format(1.0, row.form)
-        except ValueError:
+        if not _FORM.fullmatch(row.form):
             yield f"rows: {row.form} is no format of a number. Try: .2f, .1%"
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from dmrl.border.names import one_line
+from dmrl.errors import one_line
 from dmrl.live.crazyflie import Link
 from dmrl.live.feed import Health
 

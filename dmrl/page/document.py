@@ -7,14 +7,18 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.names import one_line
-from dmrl.errors import DmrlError
+from dmrl.errors import DmrlError, one_line
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 
 MARK = "<!-- written by dmrl report -->"
 """Stands in every page: one that has it may be written again."""
 MOST_BYTES = 9_000_000
 """Of a page, pictures and all."""
+WRONG = (
+    *(DmrlError, OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError),
+    StopIteration,
+)
+"""What a stranger's document or recording that is not as it should be leads to."""
 PLAIN_BYTES, WIDEST_PX = 250_000, 1400
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #ffffff; --line: #d0d7de;

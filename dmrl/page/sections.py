@@ -14,7 +14,7 @@ from dmrl.errors import DmrlError
 from dmrl.evaluation import positions, tracks
 from dmrl.page import document as html
 from dmrl.page.ancestry import ancestry
-from dmrl.page.document import Pictures, chart, row, table, text
+from dmrl.page.document import WRONG, Pictures, chart, row, table, text
 from dmrl.page.gather import Found
 from dmrl.page.listed import listed
 from dmrl.page.story import story
@@ -23,8 +23,6 @@ from dmrl.topics import robots
 
 MOST_SHOWN = 12
 """Evaluations, models or pairs that are drawn; tables have them all."""
-WRONG = (KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError)
-"""What a document that is not as it should be leads to."""
 FIGURES = {
     "median_px": ("median, px", ".1f"),
     "within_8_px": ("within 8 px", ".1%"),
@@ -78,7 +76,7 @@ def _each(documents: Documents, show: Callable[[str, Any], str]) -> str:
     for name, said in documents.items():
         try:
             parts.append(show(name, said))
-        except (*WRONG, DmrlError) as e:
+        except WRONG as e:
             parts.append(f"<p>{text(name)} is not as dmrl writes it ({text(repr(e))}).</p>")
     return "".join(parts)
 

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from dmrl import plots, topics
 from dmrl.border.documents import parse_json
-from dmrl.errors import DmrlError
 from dmrl.evaluation.story import Number, Shown, value_at
 from dmrl.images.codec import decode
-from dmrl.page.document import Pictures, chart, row, table, text
+from dmrl.page.document import WRONG, Pictures, chart, row, table, text
 from dmrl.page.gather import MOST_BYTES, Found
 from dmrl.plots import charts
 from dmrl.recording import Contents, read
@@ -22,7 +21,6 @@ PICTURE = {"images": "circles.png", "errors": "error-violins.png"}
 LOSSES = {"confidence_loss": "confidence loss", "depth_loss": "depth loss"}
 MOST_MAPS = 3
 """Images of a figure of maps."""
-WRONG = (DmrlError, KeyError, TypeError, ValueError, AttributeError, IndexError, OSError)
 
 
 def story(found: Found, pictures: Pictures) -> str:
@@ -58,10 +56,12 @@ def _document(found: Found, name: str) -> Any:
 
 
 def _inside(found: Found, name: str) -> Path:
-    """An output by its name; nothing outside the folder."""
+    """An output by its name; nothing outside the folder, and no pipe, which never ends."""
     path = found.folder / name
     if not path.resolve().is_relative_to(found.folder.resolve()):
         raise ValueError(f"{name} leads out of the folder")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{name} is no file")
     return path
 
 

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from dmrl.border.names import one_line
-from dmrl.errors import OutputError, SettingError
+from dmrl.errors import OutputError, SettingError, one_line
 from dmrl.output import rewritten_file
 from dmrl.pipeline.crew import ONE_THREAD
 from dmrl.pipeline.job import failed

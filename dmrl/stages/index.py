@@ -75,9 +75,13 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
         another's.
     OutputError
         If the catalogue cannot be written.
+    UnicodeEncodeError
+        If a file's name is no text.
     """
     before = open_catalogue(folder, new=True)
     found = {name.as_posix(): path for name, path in recordings_in(folder).items()}
+    for name in found:
+        name.encode()  # what no table can hold is said before the work, not after
     stamps = {name: stamp(path) for name, path in found.items()}
     kept = before.unchanged(stamps)
     rows = _Rows()

@@ -13,7 +13,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from dmrl.border.names import one_line
+from dmrl.errors import one_line
 
 Item = TypeVar("Item")
 

@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dmrl.border.names import one_line
+from dmrl.errors import one_line
 
 NOT_A_TERMINAL_COLUMNS = 200  # a pipe has no width; wrapped rows cannot be searched
 

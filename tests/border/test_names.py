@@ -11,11 +11,10 @@ from dmrl.border.names import (
     file_of_topic,
     inside,
     markdown,
-    one_line,
     plain,
     split_name,
 )
-from dmrl.errors import UnsafeName
+from dmrl.errors import RecordingError, UnsafeName, one_line
 
 HOSTILE = (
     *("", ".", "..", "../x", "../../victim", "/etc/passwd", "a/b", "a\\b", ".hidden", "a/../b"),
@@ -73,3 +72,9 @@ def test_markup_is_shown_and_not_obeyed() -> None:
     assert code("`") == "`` ` ``"
     assert code("a\n\n# b") == "`a  # b`"
     assert one_line("a\x1b]0;x\x07\u202eb\r\nc") == r"a\x1b]0;x\x07\u202eb c"
+
+
+def test_an_error_is_one_line_whatever_it_quotes() -> None:
+    """A library's words of a damaged schema held a line end, and so did the error from Python."""
+    error = RecordingError("a.mcap is damaged (invalid name (\nheight\x1b[2J)). Try: dmrl recover")
+    assert str(error) == r"a.mcap is damaged (invalid name ( height\x1b[2J)). Try: dmrl recover"

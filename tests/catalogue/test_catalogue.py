@@ -150,6 +150,19 @@ def test_what_was_seen_before_a_stop_is_kept(
     assert (again.looked_at, again.known) == (3, 1)  # one of the two cannot be read
 
 
+def test_a_name_that_no_table_can_hold_is_said_before_the_work(
+    flights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd = flights / os.fsdecode(b"\xff.mcap")
+    try:
+        odd.write_bytes(b"")
+    except (OSError, UnicodeError):
+        return  # macOS refuses such names itself
+    monkeypatch.setattr(index, "outcomes", None)
+    assert boundary.status_of(lambda: app(["index", str(flights)])) == 1
+    assert "Rename the file" in capsys.readouterr().err
+
+
 @pytest.mark.heavy
 def test_a_file_that_is_no_catalogue_is_left_alone(flights: Path) -> None:
     with pytest.raises(RecordingError, match=r"has no catalogue\. Make it: dmrl index"):

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from dmrl.errors import RecipeError
 from dmrl.evaluation.story import faults, told, value_at
 
 OUTS = {"model", "judged", "a.mcap"}
@@ -41,14 +42,19 @@ def test_a_wrong_figure_is_a_fault_of_the_recipe(change: dict[str, Any], says: s
     assert says in wrong(GOOD | change)
 
 
-def test_a_format_that_is_none_is_a_fault() -> None:
-    row = {"what": "px", "of": "judged", "at": "x", "form": "{}"}
+@pytest.mark.parametrize(
+    "form", ["{}", "999999999.1f", "1000000000", "*>900000000f", ".999999999f"]
+)
+def test_a_format_that_is_none_or_asks_for_a_gigabyte_is_a_fault(form: str) -> None:
+    row = {"what": "px", "of": "judged", "at": "x", "form": form}
     assert "is no format" in wrong({"title": "N", "shows": "numbers", "rows": [row]})
 
 
 def test_tables_that_are_none_are_faults() -> None:
     assert "must be [[figure]] tables" in "".join(faults({"figure": 3}, OUTS))
     assert "must be a table" in wrong("losses")
+    with pytest.raises(RecipeError, match="must be"):
+        told("mine.toml", {"figure": 3})
     assert "title: must be a text" in "".join(faults({"title": 3}, OUTS))
 
 

@@ -1,6 +1,7 @@
 """The figures of a recipe come first on its page, drawn from what its steps wrote."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -116,3 +117,25 @@ def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> 
     html = page(gather(pipeline))
     assert "recipe.toml" in html[html.index("Not read</h2>") :]
     assert "Detections</h2>" in html
+
+
+def test_what_a_stranger_wants_shown_is_shown_or_says_why(pipeline: Path) -> None:
+    """No output is there, one has no picture, one never ends: a sentence each, and no hang."""
+    (pipeline / "chip.mcap").unlink()
+    with RecordingWriter(pipeline / "chip.mcap", Provenance("test", {})) as sink:
+        fields = {"rows": 1, "cols": 1, "channels": ("confidence", "depth_m"), "stride_px": 8}
+        grid = message("GridMap")(data=np.ones(2, "<f4").tobytes(), **fields)
+        sink.write(5, "/cf1/detections/grid", grid)
+    os.mkfifo(pipeline / "judged" / "pipe.json")
+    maps_of = '[[figure]]\ntitle = "Maps"\nshows = "maps"\nof = ["{}"]\n'
+    endless = RECIPE.replace("judged/evaluation.json", "judged/pipe.json")
+    more = maps_of.format("absent.mcap") + maps_of.format("chip.mcap")
+    (pipeline / "recipe.toml").write_text(endless + more)
+    shown = page(gather(pipeline))
+    assert "judged/pipe.json is no file" in shown
+    assert shown.count("cannot be drawn") >= 3
+
+
+def test_figures_that_are_no_tables_are_named_on_the_page(pipeline: Path) -> None:
+    (pipeline / "recipe.toml").write_text('kind = "pipeline"\nfigure = 3\n')
+    assert "must be [[figure]] tables" in gather(pipeline).unread["recipe.toml"]
