@@ -81,9 +81,12 @@ def walked(path: Path, stream: Bounded) -> Walked:
 def _define(walk: Walked, schemas: dict[int, Schema], record: McapRecord) -> None:
     match record:
         case Schema():
-            schemas[record.id] = record
+            if schemas.setdefault(record.id, record) != record:
+                raise McapError(f"schema {record.id} is defined twice, as two kinds")
         case McapChannel():
-            walk.channels[record.id] = channel_of(record.id, {record.id: record}, schemas)
+            channel = channel_of(record.id, {record.id: record}, schemas)
+            if walk.channels.setdefault(record.id, channel) != channel:
+                raise McapError(f"channel {record.id} is defined twice, as two topics")
         case Metadata():
             walk.metadata.setdefault(record.name, []).append(dict(record.metadata))
         case Attachment():

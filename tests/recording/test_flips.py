@@ -296,6 +296,22 @@ def test_a_record_that_is_there_twice_is_noticed_without_any_crc(
         list(read_raw(path))
 
 
+@pytest.mark.parametrize("renamed", ["summary", "messages"])
+def test_without_an_index_too_a_topic_has_one_name(renamed: str, tmp_path: Path) -> None:
+    """Read as a whole, the later of two definitions was believed."""
+    options = {"compression": CompressionType.NONE, "index_types": IndexType.NONE}
+    path = foreign(tmp_path / "a.mcap", enable_crcs=False, **options)
+    data = path.read_bytes()
+    end = next(start for opcode, start, _ in records(data) if opcode == Opcode.DATA_END)
+    halves = {"messages": data[:end], "summary": data[end:]}
+    assert halves[renamed].count(b"/cf1/height") == 1
+    halves[renamed] = halves[renamed].replace(b"/cf1/height", b"/cf1/heigst")
+    path.write_bytes(halves["messages"] + halves["summary"])
+    for read in (summary, check, lambda path: list(read_raw(path))):
+        with pytest.raises(RecordingError, match="is defined twice"):
+            read(path)
+
+
 def test_a_summary_without_crc_that_renames_a_topic_is_noticed(tmp_path: Path) -> None:
     """The chunks say what the topic is called, as every other reader would."""
     path = foreign(tmp_path / "a.mcap", enable_crcs=False, compression=CompressionType.NONE)
