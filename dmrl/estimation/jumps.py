@@ -45,23 +45,43 @@ def levels(values: Array, step_s: float, least: float, reach: int) -> Array:
     may = max(least, NOISE_SIGMAS * noise * np.sqrt(1.5))
     middle = np.median(sliding_window_view(np.pad(values, reach, mode="edge"), reach), axis=1)
     change = middle[1 + reach : reach + len(values)] - middle[1 : len(values)] - reach * trend
-    out, level, start = np.zeros(len(values)), 0.0, 0
     change[:reach], change[-reach:] = 0.0, 0.0
+    jumps = []
     for first, last in _runs(np.abs(change) > may):
         jump = float(change[first + int(np.argmax(np.abs(change[first:last])))])
-        at = first + int(np.argmax(np.sign(jump) * single[first:last])) + 1
-        if start == 0 and jump < 0:
-            level = -jump  # it began while it was too large
-        out[start:at] = level if (at - start) * step_s < LONGEST_S else 0.0
-        level, start = _after(level, jump), at
-    out[start:] = level if (len(values) - start) * step_s < LONGEST_S else 0.0
+        jumps.append((first + int(np.argmax(np.sign(jump) * single[first:last])) + 1, jump))
+    return _between(jumps, len(values), round(LONGEST_S / step_s))
+
+
+def _between(jumps: list[tuple[int, float]], count: int, longest: int) -> Array:
+    """(count,) levels between jumps, each the first sample after it and how far it went."""
+    out, start = np.zeros(count), 0
+    level = max(0.0, -jumps[0][1]) if jumps else 0.0  # it may begin while it is too large
+    for k, (at, jump) in enumerate(jumps):
+        out[start:at] = level if at - start < longest else 0.0
+        later = [one for when, one in jumps[k:] if when - at < longest]
+        level, start = _after(level, jump, _comes_down(level, later)), at
+    out[start:] = level if count - start < longest else 0.0
     return out
 
 
-def _after(level: float, jump: float) -> float:
-    """The level after a jump: nothing is ever too small, and what jumps twice came back between."""
+def _comes_down(level: float, jumps: list[float]) -> bool:
+    """Whether jumps, each on top of the last, end where the signal is right again."""
+    for jump in jumps:
+        level += jump
+        if level <= -BACK_SHARE * jump:
+            return level >= BACK_SHARE * jump
+    return False
+
+
+def _after(level: float, jump: float, on_top: bool) -> float:
+    """The level after a jump. Nothing is ever too small.
+
+    What jumps up twice lies on top of what was there if both come down again; else the way back
+    between them was missed.
+    """
     if jump > 0:
-        return jump
+        return level + jump if on_top else jump
     return level + jump if level + jump > -BACK_SHARE * jump else 0.0
 
 

@@ -87,3 +87,27 @@ def test_few_samples_are_left_as_they_are() -> None:
         values[5:] = 1.0
         assert levels(values, 0.1, 0.45, 3).any() == seen
     assert levelled_height(TIME_S[:2], np.ones(2)).tolist() == [1, 1]
+
+
+def steps(*changes: tuple[int, float]) -> np.ndarray:
+    values = np.zeros(600)
+    for at, change in changes:
+        values[at:] += change
+    return values
+
+
+def test_a_box_on_a_table_and_two_that_overlap() -> None:
+    for values in (
+        steps((100, 0.7), (120, 0.5), (150, -0.5), (180, -0.7)),
+        steps((100, 0.7), (120, 0.7), (150, -0.7), (180, -0.7)),
+        steps((100, 0.7), (120, 0.6), (150, -1.3)),
+    ):
+        assert levels(values, 0.1, 0.45, 3) == pytest.approx(values)
+
+
+def test_where_a_way_back_was_missed_the_next_jump_begins_anew() -> None:
+    values = steps((100, 1.0), (300, 0.8), (340, -0.8))
+    ramp = np.interp(np.arange(600), [130, 160], [0.0, -1.0])  # too slow for a jump
+    found = levels(values + ramp, 0.1, 0.45, 3)
+    assert found[310] == pytest.approx(0.8)
+    assert not found[360:].any()
