@@ -1,10 +1,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from scipy.stats import chi2
 
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK, UNCONVERGED
-from dmrl.estimation.pair import Pair
+from dmrl.estimation.pair import Pair, Track
 from dmrl.estimation.problem import GLOBALS, Noise, problem
 from dmrl.estimation.stretches import contradicts, joined, mended, stretches
 
@@ -81,3 +83,74 @@ def test_who_is_not_sure_contradicts_nobody() -> None:
     assert contradicts(whole, standing(time_s, 2.0))
     assert not contradicts(whole, standing(time_s, 1.1))
     assert not contradicts(whole, standing(time_s, 2.0, UNCONVERGED))
+
+
+def heard(ranges_s: np.ndarray, lasts_s: float = 60.0, gap: np.ndarray | None = None) -> Pair:
+    """Two robots that stand still, and range to each other at these times."""
+    time_s = 5 + np.arange(round(100 * lasts_s) + 1) / 100
+    still = Track(*np.zeros((4, len(time_s))), np.zeros(len(time_s), bool))
+    own = still if gap is None else replace(still, gap=gap)
+    return Pair(time_s, own, still, 5 + ranges_s, np.ones(len(ranges_s)))
+
+
+@pytest.mark.parametrize(("silent_s", "count"), [(2.95, 0), (3.05, 2)])
+def test_a_silence_is_longer_than_three_seconds(silent_s: float, count: int) -> None:
+    ranges_s = np.concatenate([np.arange(0, 20, 0.1), np.arange(19.9 + silent_s, 60, 0.1)])
+    found = stretches(heard(ranges_s))
+    assert len(found) == count
+    if count:
+        early, late = found
+        assert (early.time_s[-1], late.time_s[0]) == pytest.approx(
+            (24.9, 24.9 + silent_s), abs=0.011
+        )
+        assert len(early.range_m) + len(late.range_m) == pytest.approx(len(ranges_s), abs=2)
+    steady = np.arange(0, 60, 0.1)
+    gap = np.zeros(6001, bool)
+    gap[2000 : 2000 + round(100 * silent_s)] = True
+    assert len(stretches(heard(steady, gap=gap))) == count
+
+
+@pytest.mark.parametrize(("lasts_s", "count"), [(9.9, 1), (10.1, 2)])
+def test_a_stretch_lasts_ten_seconds_at_least(lasts_s: float, count: int) -> None:
+    ranges_s = np.concatenate([np.arange(0, lasts_s, 0.1), np.arange(20, 60, 0.1)])
+    assert len(stretches(heard(ranges_s))) == count
+
+
+@pytest.mark.parametrize(("ranges", "count"), [(19, 1), (20, 2)])
+def test_a_stretch_has_twenty_ranges_at_least(ranges: int, count: int) -> None:
+    ranges_s = np.concatenate([np.linspace(0, 15, ranges), np.arange(30, 60, 0.1)])
+    assert len(stretches(heard(ranges_s))) == count
+
+
+@pytest.mark.parametrize(
+    ("share", "sigmas", "wrong"),
+    [
+        (0.19, 9.0, False),
+        (0.21, 9.0, True),
+        (1.0, 0.99 * np.sqrt(chi2.ppf(0.99, 2)), False),
+        (1.0, 1.01 * np.sqrt(chi2.ppf(0.99, 2)), True),
+    ],
+)
+def test_a_solution_is_contradicted_by_a_fifth_outside_the_ellipse_of_99_percent(
+    share: float, sigmas: float, wrong: bool
+) -> None:
+    time_s = np.arange(100.0)
+    sure = standing(time_s, 1.0)
+    state = sure.state.copy()
+    state[: round(share * 100), 1] += 0.1 * sigmas
+    assert contradicts(replace(sure, state=state), sure) == wrong
+
+
+def test_between_stretches_of_two_the_peer_goes_over_evenly() -> None:
+    pair = heard(np.arange(0, 60, 0.1))
+    flight = problem(pair)
+    key_s = flight.key_s
+    parts = [
+        standing(key_s[(key_s >= a) & (key_s <= b)], x) for a, b, x in ((5, 25, 1.0), (45, 65, 3.0))
+    ]
+    state = joined(flight, parts)
+    assert state[key_s <= 25, 0] == pytest.approx(1.0)
+    assert state[key_s >= 45, 0] == pytest.approx(3.0)
+    between = (key_s > 25) & (key_s < 45)
+    assert state[between, 0] == pytest.approx(1 + 2 * (key_s[between] - 25) / 20, abs=0.011)
+    assert not state[:, 1:].any()
