@@ -181,13 +181,12 @@ def quickly(copy: Copy, room: str, mutants: list[Mutant]) -> Iterator[Row]:
 
 def measured(copy: Copy, room: str, mutants: list[Mutant]) -> Iterator[Row]:
     """Each change, and whether it was noticed; those that were not are printed."""
-    began = time.monotonic()
     lines, took = copy.lines(room)
-    limit_s = max(LEAST_S, 10 * (time.monotonic() - began))
-    if copy.pytest([str(files_of(room)[0].relative_to(REPOSITORY))], limit_s):
+    if copy.pytest([str(files_of(room)[0].relative_to(REPOSITORY))], 10 * LEAST_S):
         sys.exit((copy.folder / "pytest.log").read_text() + "no test passes after a fork")
     for mutant in mutants:
         tests = tests_of(mutant, lines, took, copy.folder)
+        limit_s = max(LEAST_S, 10 * sum(took[test] for test in tests))
         yield _row(mutant, tests, not tests or copy.survives(mutant, tests, limit_s))
 
 
