@@ -1,9 +1,13 @@
 import os
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
 
 from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Provenance, RecordingWriter, index, summary
 
 
 def write(path: Path, heights: int) -> None:
@@ -40,3 +44,31 @@ def test_a_file_of_this_second_is_always_read_again(tmp_path: Path) -> None:
     write(path, 3)
     settled(path, int(time.time()) + 60)  # a slow machine must not let the second pass
     assert summary(path) is not summary(path)
+
+
+def test_what_is_remembered_is_of_the_same_file_and_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(index, "_MADE", {})
+    monkeypatch.setattr(index, "MOST_REMEMBERED", 2)
+    now, made = time.time_ns(), list[str]()
+
+    def asked(name: str, age_s: float = 60.0, ranged: object = None, size: int = 7) -> str:
+        status = SimpleNamespace(st_ino=1, st_size=size, st_mtime_ns=now - round(age_s * 1e9))
+        stream: Any = SimpleNamespace(status=status, ranged=ranged)
+        found = index._remembered("x", Path(name), stream, lambda: made.append(name) or name)
+        return str(found)
+
+    for name in ("a", "a", "b", "a"):
+        assert asked(name) == name
+    assert made == ["a", "b"]
+    asked("c")  # a, the oldest, is forgotten
+    asked("b")
+    asked("a")
+    assert made == ["a", "b", "c", "a"]
+    asked("a", size=8)
+    asked("a", age_s=61.0)
+    assert made[4:] == ["a", "a"]
+    made.clear()
+    for age_s, ranged, times in ((0.0, None, 2), (0.0, "bucket", 1), (30.0, None, 1)):
+        for _ in range(2):
+            asked(f"new {age_s} {ranged}", age_s, ranged)
+        assert made.count(f"new {age_s} {ranged}") == times
