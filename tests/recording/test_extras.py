@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import IndexType, Writer
 
 from dmrl.errors import RecordingError
@@ -147,3 +148,26 @@ def test_an_index_is_of_its_channel_and_whole() -> None:
     ):
         with pytest.raises(RecordingError, match=f"message index of channel {number}"):
             index_entries(Path("a"), wrong, at, number)
+
+
+@pytest.mark.parametrize("times", [[], [0], [5, 3, 9]])
+def test_statistics_say_what_is_there(times: list[int], tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, MADE) as sink:
+        for time_ns in times:
+            sink.write(time_ns, "/cf1/height", message("Height")())
+        sink.add_attachment("notes", "text/plain", b"hello")
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None and found.statistics is not None
+    said = found.statistics
+    assert (said.message_count, said.chunk_count) == (len(times), int(bool(times)))
+    assert (said.message_start_time, said.message_end_time) == (
+        min(times, default=0),
+        max(times, default=0),
+    )
+    assert (said.channel_count, said.schema_count) == (len(found.channels), len(found.schemas))
+    assert (said.channel_count, said.schema_count) == (int(bool(times)),) * 2
+    assert said.attachment_count == len(found.attachment_indexes) == 2  # and the recipe
+    assert said.metadata_count == len(found.metadata_indexes) >= 1
+    assert list(said.channel_message_counts.values()) == [len(times)] * bool(times)
