@@ -81,3 +81,4 @@ def test_what_nobody_asks_for_is_off() -> None:
         assert getattr(plain, name) == 0, name
     assert plain.processes == 1 and plain.threshold is None and plain.intrinsics is None
     assert (plain.confidence_weight, plain.depth_weight, plain.class_weight) == (1, 1, 1)
+    assert (plain.offset_weight, plain.focus) == (0.5, 2.0)  # as the weights that ship were made
