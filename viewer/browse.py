@@ -23,6 +23,7 @@ from dmrl.viewer import entities, layouts, plots
 from dmrl.viewer.entities import Scale
 from dmrl.viewer.entity import Entity, image_frame
 from dmrl.viewer.found import Found, Key, errors_of_rows, find
+from dmrl.viewer.labels import labels
 from dmrl.viewer.layouts import Eye, Plot
 from dmrl.viewer.legend import colour_bars, legend
 from dmrl.viewer.selection import Settings
@@ -237,7 +238,7 @@ def _drawn(
     frame = image_frame(ROBOT)
     (batch,) = rows.to_batches()
     yield _pictures(eye, batch)
-    yield from entities.labels(
+    yield from labels(
         eye.labels, frame, batch.select(["peers"]), sources, (eye.width_px, eye.height_px)
     )
     maps = None

@@ -5,7 +5,7 @@ image where they belong.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
@@ -15,11 +15,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.geometry.frames import inside
 from dmrl.viewer.entity import (
-    ELLIPSE_SIGMAS,
     FAINT_POINT_UI,
-    INVISIBLE,
     LINE_UI,
     POINT_UI,
     Entity,
@@ -32,8 +29,6 @@ STRIDE_PX = 8
 
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 CELL_COLOUR = (255, 255, 255)
-# rerun writes below a point; at the zoom that a layout opens with, this is a line's height.
-TEXT_PX = 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,112 +76,6 @@ def images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     yield Entity(path, columns, frame=frame)
 
 
-def labels(
-    path: str,
-    frame: str,
-    batch: pa.RecordBatch,
-    sources: set[str],
-    size_px: tuple[int, int],
-) -> Iterator[Entity]:
-    """Points, boxes and ellipses of every source of labels.
-
-    Parameters
-    ----------
-    path, frame
-        Where the labels stand, and in which image.
-    batch
-        Columns of PeerLabels.
-    sources
-        Sources met so far, grown here: a row without a source's labels must still be sent,
-        or the last ones would stay on the screen.
-    size_px
-        Width and height of the images: ellipses around points outside are left out, which
-        would cover all that is around the image.
-    """
-    column = batch["peers"]
-    row_of = _row_of(column)
-    peers = column.flatten()
-    source_of = np.array(peers.field("source").to_pylist(), dtype=object)
-    sources.update(source_of)
-    for place, source in enumerate(sorted(sources, key=_order)):
-        (at,) = np.nonzero(source_of == source)
-        mine = _Labels(peers.take(at), row_of[at], batch.num_rows, size_px, place)
-        for entity in mine.entities(f"{path}/{source}", source):
-            yield replace(entity, frame=frame)
-
-
-@dataclass(frozen=True, slots=True)
-class _Labels:
-    """The labels of one source, one after another.
-
-    ``row_of`` says in which image, ``place`` how many lines of text other sources have above.
-    """
-
-    peers: pa.StructArray
-    row_of: NDArray[np.intp]
-    rows: int
-    size_px: tuple[int, int]
-    place: int
-
-    def entities(self, path: str, source: str) -> Iterator[Entity]:
-        dot, dust, outline, curve = _label_styles(source)
-        edges = self.peers.field("box_px")
-        boxed = edges.value_lengths().to_numpy() == 4
-        corners = edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
-        centres = corners.mean(axis=1)
-        uv_px = _positions(self.peers)
-        top_px = uv_px.copy()
-        top_px[boxed] = np.column_stack([centres[:, 0], corners[:, 0, 1]])
-
-        points = rr.Points2D.columns(positions=uv_px)
-        boxes = rr.Boxes2D.columns(centers=centres, half_sizes=(corners[:, 1] - corners[:, 0]) / 2)
-        yield Entity(f"{path}/points", self._rows(points), (dot,))
-        yield Entity(f"{path}/boxes", self._rows(boxes, boxed), (outline,))
-        yield Entity(f"{path}/texts", self._rows(self._texts(top_px)), (dust,))
-        sigmas_px = _columns(self.peers, ("sigma_u_px", "sigma_v_px"))
-        unsure = (sigmas_px > 0).all(axis=1) & inside(uv_px, *self.size_px)
-        ellipses = rr.Ellipses2D.columns(
-            centers=uv_px[unsure], half_sizes=ELLIPSE_SIGMAS * sigmas_px[unsure]
-        )
-        yield Entity(f"{path}/sigmas", self._rows(ellipses, unsure), (curve,))
-
-    def _texts(self, top_px: NDArray[np.float64]) -> rr.ComponentColumnList:
-        # Above the peer: below it stands what the network found.
-        above_px = top_px[:, 1] - TEXT_PX * (self.place + 1)
-        places = np.column_stack([top_px[:, 0], np.maximum(above_px, TEXT_PX * self.place)])
-        names, depths_m = (self.peers.field(key).to_pylist() for key in ("peer", "depth_m"))
-        texts = [f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)]
-        return rr.Points2D.columns(positions=places, labels=texts)
-
-    def _rows(
-        self, columns: rr.ComponentColumnList, kept: NDArray[np.bool_] | None = None
-    ) -> rr.ComponentColumnList:
-        row_of = self.row_of if kept is None else self.row_of[kept]
-        return columns.partition(np.bincount(row_of, minlength=self.rows))
-
-
-@cache
-def _label_styles(source: str) -> tuple[rr.Points2D, rr.Points2D, rr.Boxes2D, rr.Ellipses2D]:
-    """Of points, texts, boxes and ellipses. Asked for often, so made once."""
-    colour = RGB.get(source, RGB["other"])
-    # Where two sources agree, the one named first in the table is seen.
-    order = 30.0 - _order(source)[0]
-    dot, dust = (
-        rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
-        for radius in (POINT_UI, INVISIBLE)
-    )
-    outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
-    curve = rr.Ellipses2D.from_fields(
-        colors=[colour], line_radii=[LINE_UI], draw_order=order - 10.0
-    )
-    return dot, dust, outline, curve
-
-
-def _order(source: str) -> tuple[int, str]:
-    """Place of a source in the table of colours; those it does not know come last."""
-    return list(RGB).index(source if source in RGB else "other"), source
-
-
 def detections(
     path: str, frame: str, batch: pa.RecordBatch, colour: Colour = RGB["detection"]
 ) -> Iterator[Entity]:
@@ -194,13 +83,13 @@ def detections(
     column = batch["detections"]
     found = column.flatten()
     confidence, depth_m = (found.field(key).to_numpy() for key in ("confidence", "depth_m"))
-    believed = confidence >= batch["threshold"].to_numpy()[_row_of(column)]
+    believed = confidence >= batch["threshold"].to_numpy()[rows_of(column)]
     texts = [
-        f"{c:.2f}, {d:.2f} m" if shown else ""
+        f"conf {c:.2f}, {d:.2f} m" if shown else ""
         for c, d, shown in zip(confidence, depth_m, believed, strict=True)
     ]
     columns = rr.Points2D.columns(
-        positions=_positions(found),
+        positions=points_px(found),
         labels=texts,
         radii=np.where(believed, POINT_UI, FAINT_POINT_UI),
     )
@@ -308,13 +197,16 @@ def _share(data: bytes, index: int, parts: int) -> bytes:
     return data[index * size : (index + 1) * size]
 
 
-def _row_of(column: pa.ListArray) -> NDArray[np.intp]:
+def rows_of(column: pa.ListArray) -> NDArray[np.intp]:
+    """Which row of a column each value of its lists is in."""
     return np.repeat(np.arange(len(column)), column.value_lengths().to_numpy())
 
 
-def _positions(points: pa.StructArray) -> NDArray[np.float64]:
-    return _columns(points, ("u_px", "v_px"))
+def points_px(points: pa.StructArray) -> NDArray[np.float64]:
+    """(N, 2) where labels or detections are."""
+    return fields(points, ("u_px", "v_px"))
 
 
-def _columns(points: pa.StructArray, names: Sequence[str]) -> NDArray[np.float64]:
+def fields(points: pa.StructArray, names: Sequence[str]) -> NDArray[np.float64]:
+    """(N, k) of a column of structs with these fields."""
     return np.column_stack([points.field(name).to_numpy() for name in names])

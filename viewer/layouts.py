@@ -163,13 +163,18 @@ def flight(
     elif views:
         above = rrb.Horizontal(spatial, rrb.Grid(*views, grid_columns=2), column_shares=[1, 1.3])
     tabs = [
-        rrb.Grid(*(plot_view(plot) for plot in panels), grid_columns=4, name=name)
+        rrb.Grid(*map(plot_view, panels), grid_columns=_columns(len(panels)), name=name)
         for name, panels in plots.items()
         if panels
     ]
     if not tabs:
         return window(above)
     return window(rrb.Vertical(above, rrb.Tabs(*tabs), row_shares=[1, 1]))
+
+
+def _columns(panels: int) -> int:
+    """Columns of a grid of plots, the more the fewer of its places stay empty."""
+    return min((4, 3, 5), key=lambda columns: -panels % columns) if panels > 4 else panels
 
 
 def dataset(

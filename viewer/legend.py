@@ -1,6 +1,7 @@
 """What explains the colours: drawn below the image and the maps, in image pixels."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
 
 import numpy as np
 import rerun as rr
@@ -13,8 +14,8 @@ HEIGHT_PX = 26
 
 MARK_PX, BAR_PX, BAR_STEPS = 6, 6, 64
 TEXT_COLOUR = (220, 220, 220)
-# The longest name takes about a sixth of the width of a panel.
-ENTRIES_PER_WIDTH = 6
+# In a panel a quarter as wide as the window, so many characters fit side by side.
+CHARACTERS, AROUND = 50, 4
 
 
 def legend_path(robot: str) -> str:
@@ -29,16 +30,44 @@ def bar_path(robot: str, channel: str) -> str:
 
 def legend(robot: str, colours: Mapping[str, Colour], width_px: int, height_px: int) -> Entity:
     """A line in the colour of each source, with its name."""
-    per_width = max(ENTRIES_PER_WIDTH, len(colours))
-    left_px = [(k + 0.4) * width_px / per_width for k in range(len(colours))]
-    y_px = height_px + MARK_PX
+    names = _fitting(list(colours))
+    takes = np.array([len(name) + AROUND for name in names])
+    middle_px = (np.cumsum(takes) - takes / 2) * width_px / max(CHARACTERS, takes.sum())
+    left_px, y_px = (middle_px - MARK_PX).tolist(), height_px + MARK_PX
     marks = rr.LineStrips2D(
         [[[x_px, y_px], [x_px + 2 * MARK_PX, y_px]] for x_px in left_px],
         colors=list(colours.values()),
-        labels=list(colours),
+        labels=names,
         radii=2 * LINE_UI,
     )
     return Entity(legend_path(robot), style=(marks,), frame=image_frame(robot))
+
+
+def _fitting(names: Sequence[str]) -> list[str]:
+    """Names that fit side by side: of those that are too long, what tells them apart."""
+    length = max(map(len, names), default=0)
+    while length > 3 and sum(min(len(name), length) + AROUND for name in names) > CHARACTERS:
+        length -= 1
+    long = [name for name in names if len(name) > length]
+    first, last = _alike(long), _alike([name[::-1] for name in long])
+    return [
+        name if len(name) <= length else _shortened(name, length, first, last) for name in names
+    ]
+
+
+def _alike(names: Sequence[str]) -> int:
+    """How many characters two or more names begin with, all of them."""
+    if len(names) < 2:
+        return 0
+    columns = zip(*names, strict=False)
+    return sum(1 for _ in takewhile(lambda letters: len(set(letters)) == 1, columns))
+
+
+def _shortened(name: str, length: int, first: int, last: int) -> str:
+    """What is not alike in all names; of that the beginning, if it is still too long."""
+    own = name[first : len(name) - last]
+    kept = f"{'…' * (first > 0)}{own}{'…' * (last > 0)}"
+    return kept if len(kept) <= length else f"{kept[: length - 1]}…"
 
 
 def colour_bars(

@@ -4,6 +4,7 @@ Styles are logged once, but asked for with every stretch: they are made once too
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -67,17 +68,39 @@ def sensor(
             yield line(path, values, name, OWN if own else PEER)
 
 
-def attitude(path: str, batch: pa.RecordBatch, robot: str, *, own: bool) -> Iterator[Entity]:
-    """Roll, pitch and yaw, degrees."""
-    colours = {"roll": OWN, "pitch": PEER, "yaw": OWN if own else PEER}
-    for name, colour in colours.items():
-        degrees: Array = np.degrees(batch[f"{name}_rad"].to_numpy())
-        if name == "yaw":
-            # The jump from 180 to -180 is none.
-            degrees = (degrees + 180) % 360 - 180
-            jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180)
-            degrees[jumps + 1] = np.nan
-        yield line(f"{path}/{name}", degrees, robot if name == "yaw" else name, colour)
+@dataclass(slots=True)
+class Attitude:
+    """Roll, pitch and yaw of a robot, degrees, stretch by stretch.
+
+    A robot that turns on past 180 is drawn past 180: there is no jump to -180. Yaw begins within
+    180 of zero and goes on where the stretch before ended.
+    """
+
+    path: str
+    robot: str
+    own: bool
+    last_deg: float = 0.0
+    last_ns: int = -1
+
+    def draw(self, batch: pa.RecordBatch) -> Iterator[Entity]:
+        """Some rows more."""
+        for name, colour in (("roll", OWN), ("pitch", PEER)):
+            degrees = np.degrees(batch[f"{name}_rad"].to_numpy())
+            yield line(f"{self.path}/{name}", degrees, name, colour)
+        colour = OWN if self.own else PEER
+        yield line(f"{self.path}/yaw", self._yaw(batch), self.robot, colour)
+
+    def _yaw(self, batch: pa.RecordBatch) -> Array:
+        degrees: Array = np.degrees(batch["yaw_rad"].to_numpy())
+        time_ns = batch["log_time"].to_numpy()
+        # Another recording, or another pass, begins anew.
+        before = self.last_deg if time_ns[0] >= self.last_ns else 0.0
+        known = np.isfinite(degrees)
+        if known.any():
+            degrees[known] = np.unwrap(np.append(before, degrees[known]), period=360.0)[1:]
+            self.last_deg = float(degrees[known][-1])
+        self.last_ns = int(time_ns[-1])
+        return degrees
 
 
 def distance(path: str, positions: Positions, source: str) -> Entity:

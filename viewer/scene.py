@@ -19,6 +19,7 @@ from dmrl.viewer import entities
 from dmrl.viewer.entities import Colour, Scale
 from dmrl.viewer.entity import Entity, image_frame
 from dmrl.viewer.follow import Follower
+from dmrl.viewer.labels import labels
 from dmrl.viewer.layouts import TIMELINE, Eye
 from dmrl.viewer.legend import colour_bars, legend
 from dmrl.viewer.motion import Times
@@ -170,7 +171,7 @@ def _drawn(selection: Selection, draw: Draw, batch: pa.RecordBatch) -> Iterator[
 
 
 def _times(selection: Selection, time_ns: Times) -> Any:
-    return time_column(TIMELINE, time_ns, on_wall_clock=selection.on_wall_clock)
+    return time_column(TIMELINE, time_ns, selection.zero_ns)
 
 
 def _legend(eye: Eye, sources: set[str], named: Mapping[str, Colour]) -> Entity:
@@ -245,7 +246,7 @@ def picture_draws(eye: Eye, sources: set[str]) -> list[Draw]:
         Draw(
             eye.labels,
             partial(
-                entities.labels,
+                labels,
                 eye.labels,
                 frame,
                 sources=sources,

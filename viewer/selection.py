@@ -123,9 +123,9 @@ class Selection:
         return max((int(t[-1]) for t in self.image_ns.values()), default=self.shown_ns[0])
 
     @property
-    def on_wall_clock(self) -> bool:
-        """Whether log times count from 1970."""
-        return self.shown_ns[1] > DURATION_BELOW_NS
+    def zero_ns(self) -> int | None:
+        """Log time that is shown as 0 s; None where log times count from 1970: those are dates."""
+        return None if self.shown_ns[1] > DURATION_BELOW_NS else self.start_ns
 
     def found(self, pattern: str) -> list[dict[str, str]]:
         """Robots and peers of the topics of a pattern that hold messages, sorted."""

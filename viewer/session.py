@@ -74,7 +74,7 @@ def prepare(
         scene.blueprint,
         partial(logged, selection, scene),
         selection.images,
-        cursor_at(TIMELINE, shown_ns, on_wall_clock=selection.on_wall_clock),
+        cursor_at(TIMELINE, shown_ns, selection.zero_ns),
         f"at {(shown_ns - selection.start_ns) / 1e9:.3f} s",
     )
 

@@ -72,14 +72,15 @@ def stream_of() -> rr.RecordingStream:
     return stream
 
 
-def time_column(timeline: str, time_ns: Times, *, on_wall_clock: bool) -> rr.TimeColumn:
-    """Log times as dates, or as seconds from the start of a simulation."""
-    if on_wall_clock:
+def time_column(timeline: str, time_ns: Times, start_ns: int | None) -> rr.TimeColumn:
+    """Log times as seconds from a start, as ``--time`` has them; without one, as dates."""
+    if start_ns is None:
         return rr.TimeColumn(timeline, timestamp=time_ns.astype("datetime64[ns]"))
-    return rr.TimeColumn(timeline, duration=time_ns.astype("timedelta64[ns]"))
+    return rr.TimeColumn(timeline, duration=(time_ns - start_ns).astype("timedelta64[ns]"))
 
 
-def cursor_at(timeline: str, time_ns: int, *, on_wall_clock: bool) -> tuple[str, np.generic]:
+def cursor_at(timeline: str, time_ns: int, start_ns: int | None) -> tuple[str, np.generic]:
     """A log time as `Show` wants it."""
-    kind = np.datetime64 if on_wall_clock else np.timedelta64
-    return timeline, kind(time_ns, "ns")
+    if start_ns is None:
+        return timeline, np.datetime64(time_ns, "ns")
+    return timeline, np.timedelta64(time_ns - start_ns, "ns")

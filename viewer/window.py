@@ -12,6 +12,7 @@ import numpy as np
 from rerun.experimental import ViewerClient
 
 from dmrl.errors import OutputError, SettingError
+from dmrl.images.codec import decode, encode_png
 from dmrl.output import partial_file
 from dmrl.terminal.ending import ended_by_signal
 from dmrl.viewer.process import (
@@ -31,7 +32,9 @@ from dmrl.viewer.selection import Settings
 from dmrl.viewer.session import prepare, write
 from dmrl.viewer.show import Show
 
-PICTURE_SIZE = "1600x1000"
+# rerun keeps an empty bar above its panels, for the buttons of a window that a picture has not.
+BAR_PX = 36
+PICTURE_SIZE = f"1600x{1000 + BAR_PX}"
 
 # What rerun says when it cannot draw, and when it cannot open a window.
 NO_VULKAN = "render context"
@@ -144,11 +147,19 @@ def _picture(show: Show) -> bytes:
         where = ("--headless", "--window-size", PICTURE_SIZE, "--port", str(port), str(path))
         with running(command(LOOPBACK, *where)) as viewer:
             if picture := _settled(show, viewer, port):
-                return picture
+                return _without_bar(picture)
             said = viewer.said()
     if NO_VULKAN in said:
         raise _ViewerStopped("no Vulkan driver. Install one: apt-get install mesa-vulkan-drivers")
     raise _ViewerStopped(f"rerun's viewer stopped: {last_line(said)}. Try: dmrl view --save")
+
+
+def _without_bar(picture: bytes) -> bytes:
+    """A picture without the rows above the panels, where those show nothing."""
+    rgb = decode(picture, "rerun's picture")
+    # The corners of the window are round.
+    bar = rgb[:BAR_PX, BAR_PX:-BAR_PX]
+    return encode_png(rgb[BAR_PX:]) if (bar == bar[:, :1]).all() else picture
 
 
 def _settled(show: Show, viewer: Viewer, port: int) -> bytes | None:

@@ -79,13 +79,18 @@ def _spread(pairs: Pairs, threshold: float) -> list[Circled]:
         at = pairs.at[image]
         shown.append(
             Circled(
-                f"{at.recording.stem}, {at.time_ns / 1e9:.2f} s",
+                f"{at.recording.stem}, {_moment(at)}",
                 _picture(at),
                 np.column_stack([found.u_px, found.v_px]),
                 found.depth_m,
             )
         )
     return shown
+
+
+def _moment(at: At) -> str:
+    """When an image was taken, as ``dmrl view --time`` finds it."""
+    return f"{(at.time_ns - summary(at.recording).start_ns) / 1e9:.2f} s"
 
 
 def _picture(at: At) -> NDArray[np.uint8]:
@@ -108,14 +113,15 @@ def _examples(pairs: Pairs, error_px: Array, source: str, threshold: float) -> l
 
 
 def _example(pairs: Pairs, image: int, worst_px: float, source: str, threshold: float) -> Example:
-    recording, robot, time_ns = pairs.at[image]
-    rgb = _picture(pairs.at[image])
+    at = pairs.at[image]
+    recording, robot, time_ns = at
+    rgb = _picture(at)
     maps = _maps(recording, robot, time_ns)
     labels = pairs.labels.select(pairs.labels.image == image)
     labels_px = np.column_stack([labels.u_px, labels.v_px])
     several = len({at.recording for at in pairs.at}) > 1
     return Example(
-        title=f"{recording.stem}, " * several + f"{time_ns / 1e9:.2f} s, error {worst_px:.1f} px",
+        title=f"{recording.stem}, " * several + f"{_moment(at)}, error {worst_px:.1f} px",
         rgb=rgb,
         confidence=maps["confidence"],
         depth_m=maps["depth_m"],

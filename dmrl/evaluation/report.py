@@ -59,7 +59,8 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
         print_table(name, ["pair", *headers], positions.rows(document))
     rows = [(name, *_row(document)) for name, document in evaluations.items()]
     headers = [words for words, _ in COLUMNS.values()]
-    print_table("", ["evaluation", "against", "images", *headers], rows)
+    if rows:
+        print_table("", ["evaluation", "against", "images", *headers], rows)
     for picture in pictures:
         print(picture)
 

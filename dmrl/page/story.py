@@ -15,7 +15,7 @@ from dmrl.images.codec import decode
 from dmrl.page.document import WRONG, Pictures, chart, row, table, text
 from dmrl.page.gather import MOST_BYTES, Found
 from dmrl.plots import charts
-from dmrl.recording import Contents, read
+from dmrl.recording import Contents, read, summary
 
 PICTURE = {"images": "circles.png", "errors": "error-violins.png"}
 LOSSES = {"confidence_loss": "confidence loss", "depth_loss": "depth loss"}
@@ -117,10 +117,11 @@ def _rows_of_maps(names: Mapping[str, Path]) -> list[plots.MapPair]:
         return []
     grids = {who: dict(_grids(path, robot)) for who, path in names.items()}
     times = sorted(set.intersection(*(set(one) for one in grids.values())))
+    start_ns = summary(first).start_ns  # as in dmrl view --time
     chosen = times[:: max(1, -(-len(times) // MOST_MAPS))]
     return [
         plots.MapPair(
-            f"{robot}, {time_ns / 1e9:.2f} s",
+            f"{robot}, {(time_ns - start_ns) / 1e9:.2f} s",
             _picture(first, robot, time_ns),
             {who: one[time_ns] for who, one in grids.items()},
         )

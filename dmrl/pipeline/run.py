@@ -22,7 +22,7 @@ from dmrl.storage import Remote
 from dmrl.storage.whole import require_bucket
 from dmrl.terminal.progress import say
 
-__all__ = ["Done", "Plan", "Step", "load", "run"]
+__all__ = ["Done", "Plan", "Step", "kept_recipe", "load", "run"]
 
 
 def run(
@@ -144,6 +144,14 @@ def _lock(held: int, out: Path) -> None:
         raise OutputError(f"another dmrl run is at work in {out}. Wait for it") from None
     except OSError:
         return  # a file system without locks
+
+
+def kept_recipe(folder: Path) -> str | None:
+    """Text of the recipe that a folder was made by last; None, if there is none to be read."""
+    try:
+        return (folder / RECIPE_FILE).read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return None
 
 
 def _keep_recipe(folder: Path, plan: Plan) -> None:

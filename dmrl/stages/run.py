@@ -48,10 +48,11 @@ def command(
         Print one JSON document in place of the tables.
     """
     folder = Path(Path(recipe).stem) if out is None else out
+    plan, before = pipeline.load(recipe), pipeline.kept_recipe(folder)
     done = pipeline.run(recipe, folder, data, workers=workers, on=on)
     report(done, as_json=as_json)
-    changed = not all(one.skipped for one in done)
-    page = _page(folder, changed=changed) if pipeline.load(recipe).pictured else None
+    changed = plan.text != before or not all(one.skipped for one in done)
+    page = _page(folder, changed=changed) if plan.pictured else None
     if not as_json:
         print_line(
             f"{page}: open it in a browser" if page else f"On one page: dmrl report {folder}"

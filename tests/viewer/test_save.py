@@ -81,7 +81,7 @@ def test_labels_say_peer_and_depth_and_disappear_with_the_peer(make: Make, rrd: 
 
 def test_a_detection_below_the_threshold_is_faint_and_has_no_text(make: Make, rrd: Path) -> None:
     save([make()], rrd, Settings())
-    assert column(rrd, "/cf1/detections", "Points2D:labels") == [["0.90, 1.20 m", ""]] * 10
+    assert column(rrd, "/cf1/detections", "Points2D:labels") == [["conf 0.90, 1.20 m", ""]] * 10
     radii = column(rrd, "/cf1/detections", "Points2D:radii")
     assert radii == [[-4.0, -1.5]] * 10
 

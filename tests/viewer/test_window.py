@@ -46,7 +46,10 @@ def test_a_picture_shows_the_image_nearest_to_the_time(
 ) -> None:
     picture = tmp_path / "picture.png"
     assert screenshot([make()], picture, Settings(), time_s=0.43) == "at 0.400 s"
-    assert decode(picture.read_bytes()).shape == (1000, 1600, 3)
+    rgb = decode(picture.read_bytes())
+    assert rgb.shape == (1000, 1600, 3)
+    # No empty bar above the panels: their names stand in the first rows.
+    assert rgb[:30, 50:-50].max() > 150
     assert np.ptp(panel(picture, 0, 0)) <= 3
     # The fifth image is grey 80, and lies over the background as light does, not as bytes do.
     light = IMAGE_OPACITY * 80**2.2 + (1 - IMAGE_OPACITY) * BACKGROUND[0] ** 2.2

@@ -85,7 +85,7 @@ def _robots(selection: Selection, pairs: Sequence[Names], only: str | None) -> l
 def _robot_draws(selection: Selection, motion: Motion, robot: str, *, own: bool) -> list[Draw]:
     attitude = topics.attitude(robot)
     draws = [
-        Draw(attitude, partial(plots.attitude, attitude, robot=robot, own=own)),
+        Draw(attitude, plots.Attitude(attitude, robot, own).draw),
         *(_sensor_draw(row, robot, own=own) for row in topics.OWN_SENSORS),
         Draw(topics.tracks(robot), partial(space.tracks, topics.tracks(robot), robot)),
     ]
@@ -234,5 +234,5 @@ def _own_panels(selection: Selection, robots: Sequence[str]) -> list[Plot]:
         own = tilted[0]
         name = f"attitude of {(topics.names(topics.ATTITUDE, own) or {})['robot']}, degrees"
         panels.append(Plot(name, (f"{own}/roll", f"{own}/pitch")))
-        panels.append(Plot("yaw, degrees", tuple(f"{topic}/yaw" for topic in tilted), (-180, 180)))
+        panels.append(Plot("yaw, degrees", tuple(f"{topic}/yaw" for topic in tilted)))
     return panels

@@ -1,0 +1,169 @@
+"""Labels in an image: points, boxes, ellipses and texts, to rerun archetypes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from dmrl.colours import RGB
+from dmrl.geometry.frames import inside
+from dmrl.viewer.entities import fields, points_px, rows_of
+from dmrl.viewer.entity import ELLIPSE_SIGMAS, INVISIBLE, LINE_UI, POINT_UI, Entity
+
+# rerun writes below a point. In the smallest panel that a layout opens with, a text is as high and
+# as wide as these shares of an image's width.
+TEXT_HEIGHT, TEXT_WIDTH = 1 / 12, 1 / 4
+
+
+def labels(
+    path: str,
+    frame: str,
+    batch: pa.RecordBatch,
+    sources: set[str],
+    size_px: tuple[int, int],
+) -> Iterator[Entity]:
+    """Points, boxes and ellipses of every source of labels.
+
+    Parameters
+    ----------
+    path, frame
+        Where the labels stand, and in which image.
+    batch
+        Columns of PeerLabels.
+    sources
+        Sources met so far, grown here: a row without a source's labels must still be sent,
+        or the last ones would stay on the screen.
+    size_px
+        Width and height of the images: ellipses around points outside are left out, which
+        would cover all that is around the image.
+    """
+    column = batch["peers"]
+    row_of = rows_of(column)
+    peers = column.flatten()
+    source_of = np.array(peers.field("source").to_pylist(), dtype=object)
+    sources.update(source_of)
+    ordered = sorted(sources, key=_order)
+    first = np.lexsort([[ordered.index(source) for source in source_of], row_of])
+    texts_px = np.empty((len(peers), 2))
+    texts_px[first] = _text_places(_tops(peers)[first], row_of[first], size_px[0])
+    for source in ordered:
+        (at,) = np.nonzero(source_of == source)
+        mine = _Labels(peers.take(at), row_of[at], texts_px[at], batch.num_rows, size_px)
+        for entity in mine.entities(f"{path}/{source}", source):
+            yield replace(entity, frame=frame)
+
+
+@dataclass(frozen=True, slots=True)
+class _Labels:
+    """The labels of one source, one after another; ``row_of`` says in which image."""
+
+    peers: pa.StructArray
+    row_of: NDArray[np.intp]
+    texts_px: NDArray[np.float64]
+    rows: int
+    size_px: tuple[int, int]
+
+    def entities(self, path: str, source: str) -> Iterator[Entity]:
+        dot, dust, outline, curve = _label_styles(source)
+        boxed, corners = _boxes(self.peers)
+        centres = corners.mean(axis=1)
+        uv_px = points_px(self.peers)
+
+        points = rr.Points2D.columns(positions=uv_px)
+        boxes = rr.Boxes2D.columns(centers=centres, half_sizes=(corners[:, 1] - corners[:, 0]) / 2)
+        yield Entity(f"{path}/points", self._rows(points), (dot,))
+        yield Entity(f"{path}/boxes", self._rows(boxes, boxed), (outline,))
+        yield Entity(f"{path}/texts", self._rows(self._texts()), (dust,))
+        sigmas_px = fields(self.peers, ("sigma_u_px", "sigma_v_px"))
+        unsure = (sigmas_px > 0).all(axis=1) & inside(uv_px, *self.size_px)
+        ellipses = rr.Ellipses2D.columns(
+            centers=uv_px[unsure], half_sizes=ELLIPSE_SIGMAS * sigmas_px[unsure]
+        )
+        yield Entity(f"{path}/sigmas", self._rows(ellipses, unsure), (curve,))
+
+    def _texts(self) -> rr.ComponentColumnList:
+        names, depths_m = (self.peers.field(key).to_pylist() for key in ("peer", "depth_m"))
+        texts = [f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)]
+        return rr.Points2D.columns(positions=self.texts_px, labels=texts)
+
+    def _rows(
+        self, columns: rr.ComponentColumnList, kept: NDArray[np.bool_] | None = None
+    ) -> rr.ComponentColumnList:
+        row_of = self.row_of if kept is None else self.row_of[kept]
+        return columns.partition(np.bincount(row_of, minlength=self.rows))
+
+
+def _boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """(N,) which labels have a box; (M, 2, 2) upper left and lower right corners of those."""
+    edges = peers.field("box_px")
+    boxed = edges.value_lengths().to_numpy() == 4
+    return boxed, edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
+
+
+def _tops(peers: pa.StructArray) -> NDArray[np.float64]:
+    """(N, 2) middle of the upper edge of each label's box; the label itself, where it has none."""
+    boxed, corners = _boxes(peers)
+    out = points_px(peers)
+    out[boxed] = np.column_stack([corners.mean(axis=1)[:, 0], corners[:, 0, 1]])
+    return out
+
+
+def _text_places(
+    tops_px: NDArray[np.float64], row_of: NDArray[np.intp], width_px: int
+) -> NDArray[np.float64]:
+    """Where texts stand: above their peers (below stand detections), and none on another.
+
+    Parameters
+    ----------
+    tops_px
+        (N, 2) what they stand above; those that come first have the first choice.
+    row_of
+        (N,) in which image, sorted.
+    width_px
+        Width of the images.
+    """
+    high_px, wide_px = TEXT_HEIGHT * width_px, TEXT_WIDTH * width_px
+    out = np.column_stack([tops_px[:, 0], np.maximum(tops_px[:, 1] - high_px, 0.0)])
+    begins = np.flatnonzero(np.diff(row_of, prepend=-1))
+    ends = np.flatnonzero(np.diff(row_of, append=-1)) + 1
+    for begin, end in zip(begins, ends, strict=True):
+        for k in range(begin + 1, end):
+            near = abs(out[begin:k, 0] - out[k, 0]) < wide_px
+            out[k, 1] = _free_place(out[k, 1], out[begin:k, 1][near], high_px)
+    return out
+
+
+def _free_place(wanted: float, taken: NDArray[np.float64], high: float) -> float:
+    """The nearest height that leaves ``high`` to all that are taken; rather above than below."""
+    above, below = taken - high, taken + high
+    tried = np.concatenate([[wanted], above[above >= 0], below])
+    far = np.where(tried > wanted, 3.0, 1.0) * abs(tried - wanted)
+    free = (abs(tried[:, None] - taken) > high - 0.5).all(axis=1)
+    # Below the lowest there is always room.
+    return float(tried[np.argmin(np.where(free, far, np.inf))])
+
+
+@cache
+def _label_styles(source: str) -> tuple[rr.Points2D, rr.Points2D, rr.Boxes2D, rr.Ellipses2D]:
+    """Of points, texts, boxes and ellipses. Asked for often, so made once."""
+    colour = RGB.get(source, RGB["other"])
+    # Where two sources agree, the one named first in the table is seen.
+    order = 30.0 - _order(source)[0]
+    dot, dust = (
+        rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
+        for radius in (POINT_UI, INVISIBLE)
+    )
+    outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
+    curve = rr.Ellipses2D.from_fields(
+        colors=[colour], line_radii=[LINE_UI], draw_order=order - 10.0
+    )
+    return dot, dust, outline, curve
+
+
+def _order(source: str) -> tuple[int, str]:
+    """Place of a source in the table of colours; those it does not know come last."""
+    return list(RGB).index(source if source in RGB else "other"), source
