@@ -145,8 +145,10 @@ def test_the_page_on_python_runs_as_it_stands(
     assert "torch.Size([8, 3, 224, 320]) torch.Size([8, 28, 40])" in said
 
 
-STOP = re.compile(r"dmrl (view|render|train dataset model$)")
-"""Needs a window, Blender, or long; a test of its own runs each."""
+STOP = re.compile(
+    r"dmrl (view|render|dataset renders|train dataset (model$|refined)|train .*-renders)"
+)
+"""Needs a window, Blender, or long; a slow walk takes the last three."""
 
 
 def blocks(page: Path, until: str | None) -> list[tuple[str, str]]:
@@ -156,7 +158,7 @@ def blocks(page: Path, until: str | None) -> list[tuple[str, str]]:
     return re.findall(r"```(sh|python)\n(.*?)```", text, re.DOTALL)
 
 
-def walk(page: Path, until: str | None = None) -> None:
+def walk(page: Path, until: str | None = None, stop: re.Pattern[str] = STOP) -> None:
     """Do what a page says, word for word, in the folder we are in."""
     names: dict[str, object] = {}
     for kind, block in blocks(page, until):
@@ -164,7 +166,7 @@ def walk(page: Path, until: str | None = None) -> None:
             exec(block, names)
             continue
         for line in re.findall(r"^(dmrl .*)", block.replace("\\\n", " "), re.MULTILINE):
-            if not STOP.match(line):
+            if not stop.match(line):
                 app(shlex.split(line, comments=True)[1:], result_action="return_value")
 
 
@@ -190,6 +192,16 @@ def test_a_page_can_be_walked_word_for_word(
         app(["sketch", "shots", "--images", "12"], result_action="return_value")
     walk(ROOT / "docs" / name, until)
     assert said in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_renders_of_ones_own_camera_can_be_refined_word_for_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    app(["sketch", "shots", "--images", "40"], result_action="return_value")
+    walk(ROOT / "docs/own_camera.md", "## 4.", re.compile("dmrl view"))
+    assert capsys.readouterr().out.count("last loss") == 3
 
 
 def test_the_page_on_errors_has_words_of_the_errors() -> None:

@@ -32,7 +32,13 @@ def command(
     report(pipeline.run("demo", out), as_json=as_json)
     page = write(out)
     if not as_json:
-        print(f"""{page}: open it in a browser. Now try:
+        print(f"""{page}: open it in a browser; {_picture(out)} is a picture of it. Now try:
   dmrl view {out}/predictions.mcap       # the same in rerun, image by image
   dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap
   dmrl predict dmrl-nano YOUR.mcap found.mcap   # the network that ships, on your own images""")
+
+
+def _picture(out: Path) -> Path:
+    """What rerun drew; where it could not, what matplotlib did of the same images."""
+    drawn = out / "picture.png"
+    return drawn if drawn.is_file() else out / "evaluation" / "examples.png"
