@@ -47,7 +47,8 @@ def labels(
     source_of = np.array(peers.field("source").to_pylist(), dtype=object)
     sources.update(source_of)
     ordered = sorted(sources, key=_order)
-    first = np.lexsort([[ordered.index(source) for source in source_of], row_of])
+    places = np.array([ordered.index(source) for source in source_of], int)
+    first = np.lexsort([places, row_of])
     texts_px = np.empty((len(peers), 2))
     texts_px[first] = _text_places(_tops(peers)[first], row_of[first], size_px[0])
     for source in ordered:
