@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.datasets import layout
-from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
+from dmrl.datasets.manifest import PARTS, Manifest, part_folder, read_manifest
 from dmrl.datasets.seen import read_seen
 from dmrl.datasets.shards import schema_of
 from dmrl.errors import DatasetError
@@ -44,10 +44,22 @@ class Before:
         return self.made.inputs if self.made is not None else ()
 
     def seen(self) -> list[NDArray[np.void]]:
-        """What is known of its images, by part."""
+        """What is known of its images, by part.
+
+        Raises
+        ------
+        DatasetError
+            If a part is missing or damaged.
+        """
         if self.folder is None:
             return []
-        return [read_seen(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
+        found = [read_seen(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
+        if sum(map(len, found)) != sum(map(self.manifest.rows, self.manifest.splits)):
+            raise DatasetError(
+                f"{self.folder / PARTS} knows of {sum(map(len, found))} images, the shards hold "
+                "others. Make the dataset again"
+            )
+        return found
 
 
 def opened(folder: Path) -> Before:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dmrl.datasets.write import Row
 from dmrl.errors import DatasetError
 
-FILE = "seen.npy"
+FILE = "seen.bin"
 NEAR_BITS = 6
 """Of the 64 of a perceptual hash: pictures that differ in no more look the same to people."""
 AT_ONCE = 64
@@ -135,7 +135,7 @@ class Seen:
 
     def write(self, folder: Path) -> None:
         """Write what is known of the images that went by."""
-        np.save(folder / FILE, self._mine())
+        (folder / FILE).write_bytes(self._mine().tobytes())
 
 
 def read_seen(folder: Path) -> NDArray[np.void]:
@@ -148,13 +148,12 @@ def read_seen(folder: Path) -> NDArray[np.void]:
     """
     path = folder / FILE
     try:
-        found = np.load(os.fspath(path), mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, SyntaxError) as e:
+        if not path.stat().st_size:
+            return np.empty(0, DTYPE)  # which cannot be mapped
+        return np.memmap(os.fspath(path), DTYPE, "r")
+    except (OSError, ValueError) as e:
         why = " ".join(str(e).split())
         raise DatasetError(f"{path} is missing or damaged ({why}). Make the dataset again") from e
-    if found.dtype != DTYPE or found.ndim != 1:
-        raise DatasetError(f"{path} holds something else. Make the dataset again")
-    return np.asarray(found)
 
 
 def _hash(data: bytes | memoryview) -> int:

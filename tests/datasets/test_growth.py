@@ -168,8 +168,9 @@ def test_what_cannot_grow_is_one_line(record: Record, tmp_path: Path) -> None:
         ("manifest.json", b"[]"),
         ("manifest.json", held["manifest.json"].replace(b'"rows": 4', b'"rows": -4')),
         ("manifest.json", held["manifest.json"].replace(b'"parts": 1', b'"parts": 9')),
-        ("parts/00000/seen.npy", b"nothing"),
-        ("parts/00000/seen.npy", held["parts/00000/seen.npy"][:-5]),
+        ("parts/00000/seen.bin", b"nothing"),
+        ("parts/00000/seen.bin", held["parts/00000/seen.bin"][:-5]),
+        ("parts/00000/seen.bin", held["parts/00000/seen.bin"][:-25]),
         ("parts/00000/provenance.json", b"{}"),
     ):
         (out / name).write_bytes(text)
@@ -227,7 +228,7 @@ def test_a_process_that_dies_anywhere_leaves_one_dataset_or_the_other(
         assert here in (6, 12)
         rows.add((here, seen))
         left = contents(out)
-        shards = [name for name in old if name.endswith((".arrow", ".npy"))]
+        shards = [name for name in old if name.endswith((".arrow", ".bin"))]
         assert all(left[name] == old[name] for name in shards)
         add([second], out, settings, workers=1)
         assert contents(out) == new, at
