@@ -4,15 +4,15 @@ from collections.abc import Iterable
 from itertools import islice
 
 from dmrl import topics
-from dmrl.recording import Contents, summary
+from dmrl.recording import Contents
 
 NEVER = (topics.CAMERA_IMAGE, topics.LABELS, topics.DETECTIONS, topics.GRID, topics.TRACKS)
 """What a dataset is made of, or what was made of it: no sensors."""
 
 
-def sensors_of(held: Iterable[Contents]) -> list[str]:
-    """Rows of the table of topics that recordings have, in its order."""
-    names = {name for one in held for name in summary(one.path).topics}
+def sensors_of(names: Iterable[str]) -> list[str]:
+    """Rows of the table of topics that recordings with these topics have, in its order."""
+    names = set(names)
     patterns = (row.pattern for row in topics.TOPICS if row.pattern not in NEVER)
     return [p for p in patterns if any(topics.names(p, name) is not None for name in names)]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from dmrl import topics
 from dmrl.datasets.flags import Flag, read_flags
 from dmrl.datasets.manifest import Manifest
-from dmrl.datasets.rows import Tally, rows_of, sources_of
+from dmrl.datasets.rows import Tally, rows_of
 from dmrl.datasets.settings import Settings
 from dmrl.datasets.splits import SplitOf
 from dmrl.datasets.write import Row
@@ -27,7 +27,6 @@ class Wanted:
 
 
 def rows(
-    held: Mapping[Path, Contents],
     sources: Mapping[Path, str],
     split_of: Mapping[Path, SplitOf],
     tally: Tally,
@@ -41,8 +40,9 @@ def rows(
 
     Parameters
     ----------
-    held, sources, split_of
-        Of each recording: its labels, the source that is used, its splits.
+    sources, split_of
+        Of each recording: the source of labels that is used, its splits. One recording's labels
+        are in memory at a time.
     tally
         Is counted up.
     wanted
@@ -63,7 +63,14 @@ def rows(
     planned = (
         (path, row)
         for path, source in sources.items()
-        for row in rows_of(held[path], source, split_of[path], tally, flagged=wanted.flagged, **how)
+        for row in rows_of(
+            Contents(path, topics.LABELS),
+            source,
+            split_of[path],
+            tally,
+            flagged=wanted.flagged,
+            **how,
+        )
     )
     for path, kept in track(ahead(_made, planned, workers), "Writing images", total):
         if kept is not None:
@@ -84,14 +91,12 @@ def has_masks(recording: Path) -> bool:
     return any(topics.names(topics.MASKS, topic) for topic in summary(recording).topics)
 
 
-def beside(held: Mapping[Path, Contents], sources: Mapping[Path, str]) -> dict[str, list[str]]:
-    """Sources that are not used, by recording, which is said where one might be meant."""
-    found = {path.name: sorted(sources_of(held[path]) - {used}) for path, used in sources.items()}
+def warn_of_others(sources: Mapping[Path, str], others: Mapping[Path, Sequence[str]]) -> None:
+    """Say which source is used where another might be meant."""
     for path, used in sources.items():
-        if {"truth", "estimate"} <= {*found[path.name], used}:
+        if {"truth", "estimate"} <= {*others[path], used}:
             other = "estimate" if used == "truth" else "truth"
             say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
-    return {name: others for name, others in found.items() if others}
 
 
 def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:

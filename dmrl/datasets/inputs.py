@@ -1,6 +1,6 @@
 """Recordings that should not be put into one dataset: for their images, or for their lenses."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -58,14 +58,24 @@ def _shown_by(recording: Input) -> Iterator[str]:
             yield from _shown_by(source)
 
 
-def warn_of_lenses(held: Iterable[Contents]) -> None:
-    """Say so if the cameras differ: from the size of a drone alone its depth is not known then."""
-    focal_px = []
-    for one in held:
-        for topic in one.topics:
-            if topics.names(topics.CALIBRATION, topic):
-                first = (stamped.message.K for stamped in islice(one.messages(topic), 1))
-                focal_px += [k[0] for k in first if len(k) == 9 and k[0] > 0]
+def focal_lengths(held: Contents) -> list[float]:
+    """Focal lengths of a recording's cameras, pixels, as far as they are known."""
+    found = []
+    for topic in held.topics:
+        if topics.names(topics.CALIBRATION, topic):
+            first = (stamped.message.K for stamped in islice(held.messages(topic), 1))
+            found += [k[0] for k in first if len(k) == 9 and k[0] > 0]
+    return found
+
+
+def warn_of_lenses(focal_px: Sequence[float]) -> None:
+    """Say so if the cameras differ: from the size of a drone alone its depth is not known then.
+
+    Parameters
+    ----------
+    focal_px
+        Of all cameras.
+    """
     if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
         say(
             f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "

@@ -68,7 +68,7 @@ class Seen:
         self._fresh: set[int] = set()
 
     def new(
-        self, rows: Iterable[tuple[str, Row]], refuse: Callable[[], None]
+        self, rows: Iterable[tuple[str, Row]], refuse: Callable[[], None] | None
     ) -> Iterator[tuple[str, Row]]:
         """Those rows whose image is not there yet, by robot, time and pixels.
 
@@ -77,12 +77,12 @@ class Seen:
         rows
             Each with its split.
         refuse
-            Called for each of the others.
+            Called for each of the others. None: these are yielded as well.
         """
         for split, row in rows:
             pixels = _hash(np.ascontiguousarray(row.rgb).data)
             key = _hash(f"{pixels} {row.time_ns} {row.robot}".encode())
-            if self._has(key):
+            if refuse is not None and self._has(key):
                 refuse()
                 continue
             self._add(key)

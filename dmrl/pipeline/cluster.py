@@ -21,7 +21,7 @@ from typing import Any, Self
 from dmrl import __version__
 from dmrl.errors import ClusterError, MissingExtra
 from dmrl.pipeline.job import Answer, failed
-from dmrl.terminal.progress import say
+from dmrl.terminal.progress import Lines, say
 
 try:
     import ray
@@ -39,7 +39,9 @@ BUSY_S = 60.0
 """How long a task waits for an output that one before it may still be writing."""
 AHEAD = 4
 """Tasks for each core that Ray is told of at a time."""
-ANSWER_S, LAST_WORDS_S = 10.0, 30.0
+ANSWER_S, LAST_WORDS_S, LOOK_S = 10.0, 30.0, 2.0
+HEAD = ("node", "", "done", "failed", "s of work")
+HERE, LOST = "there", "lost"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -119,8 +121,10 @@ class Ray:
         self.workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._waiting: deque[_Given] = deque()
         self._running: dict[Any, _Given] = {}
-        self._by_node: dict[str, list[float]] = {}
+        self._by_node: dict[str, tuple[int, int, float]] = {}
+        self._known: dict[str, tuple[str, str]] = {}
         self._lock = threading.Lock()
+        self._look()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
@@ -139,11 +143,32 @@ class Ray:
         with suppress(RayError, ConnectionError):
             if self._running:
                 _cancel(list(self._running))
-        names = {node["NodeID"]: node["NodeManagerHostname"] for node in ray.nodes()}
+            self._look()
         ray.shutdown()
-        for node, (done, bad, work_s) in self._by_node.items():
-            name = f"node {names.get(node, '?')} ({node[:6]})"
-            say(f"{name}: {done:.0f} done, {bad:.0f} failed, {work_s:.1f} s of work")
+        for name, state, done, bad, work_s in self.nodes()[1:]:
+            gone = ", lost" if state == LOST else ""
+            say(f"node {name}: {done} done, {bad} failed, {work_s:.1f} s of work{gone}")
+
+    def nodes(self) -> Lines:
+        """Each node: its name, whether it is there, tasks done and failed, seconds of work."""
+        with self._lock:
+            rows = [
+                (f"{name} ({node[:6]})", state, *self._by_node.get(node, (0, 0, 0.0)))
+                for node, (name, state) in self._known.items()
+            ]
+        return [HEAD, *rows]
+
+    def _look(self) -> None:
+        """See which nodes are there, and which are no more."""
+        found = {
+            node["NodeID"]: (node["NodeManagerHostname"], HERE if node["Alive"] else LOST)
+            for node in ray.nodes()
+        }
+        with self._lock:
+            # Of those that were lost before we came nobody needs to know.
+            self._known = {
+                node: told for node, told in found.items() if told[1] == HERE or node in self._known
+            }
 
     def give(self, job: str, *, alone: bool) -> Future[Answer]:
         """The answer to a job, once it is there; see `Crew.give`."""
@@ -164,8 +189,12 @@ class Ray:
 
     def _watch(self) -> None:
         """Give Ray what waits, and hand on what it has done, until the end."""
+        looked_s = time.monotonic()
         while not self._over.is_set():
             try:
+                if time.monotonic() > looked_s + LOOK_S:
+                    self._look()
+                    looked_s = time.monotonic()
                 self._begin()
                 ready = self._ready()
             except (RayError, ConnectionError) as e:
@@ -204,9 +233,10 @@ class Ray:
         if self._again(given, answer):
             return
         if node := answer.pop("node", ""):
-            seconds, bad = answer.pop("seconds", 0.0), float(failed(answer))
-            told = self._by_node.setdefault(node, [0.0, 0.0, 0.0])
-            self._by_node[node] = [told[0] + 1 - bad, told[1] + bad, told[2] + seconds]
+            seconds, bad = answer.pop("seconds", 0.0), int(failed(answer))
+            with self._lock:
+                done, worse, work_s = self._by_node.get(node, (0, 0, 0.0))
+                self._by_node[node] = (done + 1 - bad, worse + bad, work_s + seconds)
         given.future.set_result(answer)
 
     def _again(self, given: _Given, answer: Answer) -> bool:

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from dmrl.pipeline.job import Answer, failed
+from dmrl.terminal.progress import Lines
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """A step has one core, however many run: so its sums, and its bytes, are always the same."""
@@ -56,6 +57,10 @@ class Crew:
             self._over, self._idle, found = True, [], self._all
         end(found, in_order=kind is not None)
         self._threads.shutdown()
+
+    def nodes(self) -> Lines:
+        """No table: it is this machine alone."""
+        return ()
 
     def give(self, job: str, *, alone: bool) -> Future[Answer]:
         """The answer to a job, once it is there.

@@ -7,6 +7,7 @@ from typing import Protocol, Self
 from dmrl.errors import SettingError
 from dmrl.pipeline.crew import Crew
 from dmrl.pipeline.job import Answer
+from dmrl.terminal.progress import Lines
 
 RAY, SLURM = "ray", "slurm"
 
@@ -33,6 +34,9 @@ class Executor(Protocol):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None: ...
+
+    def nodes(self) -> Lines:
+        """A table of the machines that do tasks, its head first; empty: it is this one alone."""
 
     def give(self, job: str, *, alone: bool) -> Future[Answer]:
         """The answer to a job, once it is there."""

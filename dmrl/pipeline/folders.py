@@ -186,7 +186,7 @@ def outcomes(tasks: Sequence[Task], executor: Executor, what: str) -> Iterator[t
     """
     by_size = sorted(range(len(tasks)), key=lambda k: _size(tasks[k].source), reverse=True)
     answers = {k: executor.give(tasks[k].line, alone=False) for k in by_size}
-    for k in track(range(len(tasks)), what):
+    for k in track(range(len(tasks)), what, below=executor.nodes):
         answer = answers.pop(k).result()
         place = tasks[k].out
         if place is not None and not failed(answer):

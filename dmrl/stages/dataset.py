@@ -14,15 +14,15 @@ from dmrl.card.facts import FILE as FACTS
 from dmrl.card.facts import Facts, merged, read_facts
 from dmrl.card.front import check_license
 from dmrl.card.sensors import cameras_of, sensors_of
-from dmrl.datasets.build import Wanted, beside, explain, has_masks, rows, unused
+from dmrl.datasets.build import Wanted, explain, has_masks, rows, unused, warn_of_others
 from dmrl.datasets.flags import read_flags
 from dmrl.datasets.growth import Before, made_of, opened
-from dmrl.datasets.inputs import warn_of_lenses
+from dmrl.datasets.inputs import focal_lengths, warn_of_lenses
 from dmrl.datasets.layout import MANIFEST
 from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
 from dmrl.datasets.names import fingerprint_of, rewrite, write_names
 from dmrl.datasets.parts import splits_of
-from dmrl.datasets.rows import Tally, count_images, label_source
+from dmrl.datasets.rows import Tally, count_images, label_source, sources_of
 from dmrl.datasets.seen import Seen
 from dmrl.datasets.settings import Settings
 from dmrl.datasets.write import write_shards
@@ -53,6 +53,20 @@ class Result:
     images: dict[str, int]
     sources: dict[str, str]
     tally: Tally
+
+
+@dataclass(frozen=True, slots=True)
+class _About:
+    """What is said of a recording, and is kept when its labels are not: see `Facts`."""
+
+    source: str
+    others: list[str]
+    images: int
+    focal_px: list[float]
+    topics: frozenset[str]
+    findings: list[str]
+    licences: dict[str, str]
+    cameras: dict[str, str]
 
 
 def run(
@@ -155,10 +169,9 @@ def _part(
     if settings.masks and not any(has_masks(path) for path in recordings):
         raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     made = _provenance(recordings, settings)
-    total = sum(count_images(path) for path in recordings)
-    held = {path: Contents(path, topics.LABELS, topics.CALIBRATION) for path in recordings}
-    sources = {path: label_source(held[path], settings.labels) for path in recordings}
-    others = beside(held, sources)
+    about = {path: _about(path, settings) for path in recordings}
+    sources = {path: one.source for path, one in about.items()}
+    warn_of_others(sources, {path: one.others for path, one in about.items()})
     split_of = splits_of(
         recordings,
         made,
@@ -168,17 +181,22 @@ def _part(
         seed=settings.seed,
         there=before.inputs if before.made else None,
     )
-    warn_of_lenses(held.values())
+    warn_of_lenses([px for one in about.values() for px in one.focal_px])
     tally, seen = Tally(), Seen(before.seen())
     flagged = frozenset() if settings.without is None else read_flags(settings.without)
     wanted = Wanted(settings.keep_all, settings.masks, flagged)
-    size_px = before.size_px
     found = rows(
-        held, sources, split_of, tally, wanted, total=total, size_px=size_px, workers=workers
+        sources,
+        split_of,
+        tally,
+        wanted,
+        total=sum(one.images for one in about.values()),
+        size_px=before.size_px,
+        workers=workers,
     )
     shards = write_shards(
         folder,
-        seen.new(found, tally.refuse_twin),
+        seen.new(found, tally.refuse_twin if before.made else None),
         png=settings.png or settings.parquet,
         shard_images=settings.shard_images,
         before=before.manifest,
@@ -193,7 +211,7 @@ def _part(
     place = part_folder(folder, before.manifest.parts)
     place.mkdir(parents=True)
     made.write(place)
-    _facts(result, held, others, seen).write(place)
+    _facts(result, about, seen).write(place)
     seen.write(place)
     manifest.write(folder)
     return result
@@ -221,22 +239,36 @@ def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
     return provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
 
 
-def _facts(
-    result: Result, held: Mapping[Path, Contents], others: dict[str, list[str]], seen: Seen
-) -> Facts:
+def _about(path: Path, settings: Settings) -> _About:
+    images = count_images(path)
+    held = Contents(path, topics.LABELS, topics.CALIBRATION)
+    source = label_source(held, settings.labels)
+    return _About(
+        source,
+        sorted(sources_of(held) - {source}),
+        images,
+        focal_lengths(held),
+        frozenset(held.topics),
+        label_findings(held),
+        licences([path]),
+        cameras_of([held]),
+    )
+
+
+def _facts(result: Result, about: Mapping[Path, _About], seen: Seen) -> Facts:
     """What the card says beside the counts: what is left out, and what to be careful of."""
     near, compared, outside = seen.near()
     return Facts(
         {why: count for why, count in result.tally.left_out().items() if count},
         result.sources,
-        others,
-        {path.name: found for path in held if (found := label_findings(held[path]))},
-        licences(list(held)),
+        {path.name: one.others for path, one in about.items() if one.others},
+        {path.name: one.findings for path, one in about.items() if one.findings},
+        dict(sorted(pair for one in about.values() for pair in one.licences.items())),
         seen.twins(),
         near,
         0 if compared == outside else compared,
-        sensors_of(held.values()),
-        cameras_of(held.values()),
+        sensors_of({name for one in about.values() for name in one.topics}),
+        {name: words for one in about.values() for name, words in one.cameras.items()},
     )
 
 

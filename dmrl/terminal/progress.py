@@ -1,9 +1,10 @@
 """Progress on standard error or in a notebook, silent when that is neither."""
 
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import TypeVar
 
-from rich.console import Console
+from rich.console import Console, RenderableType
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -12,10 +13,32 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 
 from dmrl.errors import one_line
 
 Item = TypeVar("Item")
+Lines = Sequence[Sequence[object]]
+
+
+class _Progress(Progress):
+    """Bars, with a table below them where there is one."""
+
+    below: Callable[[], Lines] | None = None
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        """What is drawn."""
+        yield from super().get_renderables()
+        lines = self.below() if self.below is not None else ()
+        if len(lines) > 1:
+            shown = Table(*map(_cell, lines[0]), box=None, header_style="dim")
+            for line in lines[1:]:
+                shown.add_row(*map(_cell, line))
+            yield shown
+
+
+def _cell(value: object) -> str:
+    return escape(one_line(f"{value:.1f}" if isinstance(value, float) else str(value)))
 
 
 def track(
@@ -24,6 +47,7 @@ def track(
     total: int | None = None,
     *,
     describe: Callable[[Item], str] | None = None,
+    below: Callable[[], Lines] | None = None,
 ) -> Iterator[Item]:
     """Items one by one, with a bar that says how many are done.
 
@@ -37,6 +61,9 @@ def track(
         Number of items. None: the length of ``items``, or not known.
     describe
         Words before the bar once an item is there, in place of ``what``.
+    below
+        Gives the rows of a table that is shown below the bar, its head first; asked ten times a
+        second, from another thread.
 
     Yields
     ------
@@ -56,7 +83,8 @@ def track(
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as bar:
+    with _Progress(*columns, console=console, transient=True) as bar:
+        bar.below = below
         task = bar.add_task(what, total=total)
         for item in items:
             if describe is not None:

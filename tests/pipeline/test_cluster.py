@@ -21,11 +21,16 @@ from dmrl.errors import ClusterError, DmrlError, SettingError
 from dmrl.pipeline.executors import executor
 from dmrl.pipeline.folders import over_folder
 from dmrl.pipeline.job import job
-from dmrl.stages import trim
+from dmrl.pipeline.once import done_on
+from dmrl.stages import dataset, fly, trim
 
 from .test_folders import bytes_in, record
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(1800),  # minutes, on a machine that is busy
+    pytest.mark.filterwarnings("ignore"),  # Ray's own
+]
 SETTINGS = {
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # else it advertises the machine's own address
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -115,6 +120,86 @@ def test_a_node_that_dies_at_any_moment_loses_nothing(
     killer.join()
     assert nodes.other is None
     assert bytes_in(out) == alone
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Forty short flights with all their sensors and pictures: eight, each cut five times."""
+    folder = tmp_path_factory.mktemp("flown")
+    for seed in range(8):
+        whole = folder / f"{seed}.mcap"
+        how = {"duration_s": 3.0, "noise": "calibrated", "seed": seed}
+        pictures = {"camera": True, "cameras_max": 1, "camera_rate_hz": 2.0}
+        fly.run(whole, fly.Settings(**how, **pictures))  # type: ignore[arg-type]
+        for cut in range(5):
+            out = folder / "flights" / f"{seed}{cut}.mcap"
+            out.parent.mkdir(exist_ok=True)
+            trim.run(whole, out, trim.Settings(to_s=3.0 - 0.2 * cut))
+    return folder / "flights"
+
+
+@pytest.fixture(scope="module")
+def labelled(flown: Path) -> Path:
+    """What one process here makes of them."""
+    over_folder("label", flown, flown.parent / "labelled", workers=1)
+    return flown.parent / "labelled"
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_labels_are_those_of_one_process_whenever_a_node_dies(
+    seed: int, nodes: Nodes, flown: Path, labelled: Path, tmp_path: Path
+) -> None:
+    nodes.whole()
+    out = tmp_path / "out"
+    killer = threading.Thread(target=_kill_after, args=(nodes, out, seed))
+    killer.start()
+    over_folder("label", flown, out, workers=None, on="ray")
+    killer.join()
+    assert nodes.other is None
+    assert bytes_in(out) == bytes_in(labelled) and len(bytes_in(out)) == COUNT
+
+
+def _kill_after(nodes: Nodes, out: Path, seed: int) -> None:
+    after = random.Random(seed).randrange(COUNT - 10)
+    while len(list(out.rglob("*.mcap"))) <= after:
+        time.sleep(0.01)
+    nodes.die()
+
+
+def test_a_dataset_of_the_cluster_is_the_one_of_here(
+    nodes: Nodes, labelled: Path, tmp_path: Path
+) -> None:
+    nodes.whole()
+    given, how = sorted(labelled.glob("*.mcap")), dataset.Settings(keep_all=True)
+    dataset.run(given, tmp_path / "here", how, workers=1)
+    told = done_on("ray", "dataset", tmp_path / "there", {"recordings": given}, how)
+    assert told is not None and sum(told["images"].values()) >= COUNT
+    assert bytes_in(tmp_path / "there") == bytes_in(tmp_path / "here")
+    assert done_on("ray", "dataset", tmp_path / "there", {"recordings": given}, how) is None
+
+
+def test_the_table_of_nodes_counts_and_tells_of_one_that_is_lost(
+    nodes: Nodes, flights: Path, tmp_path: Path, capfd: Any
+) -> None:
+    nodes.whole()
+    with executor("ray", None) as crew:
+        assert (
+            crew.nodes()[0][0] == "node"
+            and [row[1:4] for row in crew.nodes()[1:]] == [("there", 0, 0)] * 2
+        )
+        lines = [
+            job("trim", tmp_path / f"{k}.mcap", {"recording": flights / "0" / "00.mcap"}, {})
+            for k in range(6)
+        ]
+        for future in [crew.give(line, alone=False) for line in lines]:
+            assert "error" not in future.result()
+        assert sum(int(str(row[2])) for row in crew.nodes()[1:]) == 6
+        nodes.die()
+        until_s = time.monotonic() + 30
+        while "lost" not in {row[1] for row in crew.nodes()} and time.monotonic() < until_s:
+            time.sleep(0.2)
+    told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("node ")]
+    assert len(told) == 2 and sum(line.endswith(", lost") for line in told) == 1
 
 
 def test_what_fails_on_one_node_is_tried_on_the_other(nodes: Nodes, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import Plan, Step
 from dmrl.pipeline.runner import Runner
 from dmrl.recording.inputs import sha256_of_file
+from dmrl.terminal.progress import Lines
 
 A = Step("sketch", "a", settings={"seed": 1})
 B = Step("sketch", "b", settings={"seed": 2})
@@ -38,6 +39,9 @@ class Pretender(Crew):
     @property
     def made(self) -> list[str]:
         return [Path(job["out"]).name for job in self.jobs]
+
+    def nodes(self) -> Lines:
+        return ()
 
     def give(self, job: str, *, alone: bool) -> Future[Answer]:
         told = json.loads(job)
