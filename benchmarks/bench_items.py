@@ -64,7 +64,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         (folder / "first").mkdir()
-        labelling(folder / "first", 2, 2.0, 9)  # what is loaded and made once
+        labelling(folder / "first", 2, 6.0, 9)  # what is loaded and made once
         rows = []
         for robots, duration_s, seed in ((2, 20, 0), (2, 20, 1), (2, 60, 2), (4, 20, 3)):
             rows += labelling(folder, robots, duration_s, seed)

@@ -128,13 +128,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flown")
     for seed in range(8):
         whole = folder / f"{seed}.mcap"
-        how = {"duration_s": 3.0, "noise": "calibrated", "seed": seed}
+        how = {"duration_s": 7.5, "noise": "calibrated", "seed": seed}
         pictures = {"camera": True, "cameras_max": 1, "camera_rate_hz": 2.0}
         fly.run(whole, fly.Settings(**how, **pictures))  # type: ignore[arg-type]
         for cut in range(5):
             out = folder / "flights" / f"{seed}{cut}.mcap"
             out.parent.mkdir(exist_ok=True)
-            trim.run(whole, out, trim.Settings(to_s=3.0 - 0.2 * cut))
+            trim.run(whole, out, trim.Settings(to_s=7.5 - 0.4 * cut))
     return folder / "flights"
 
 
