@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dmrl.border import limits
 from dmrl.border.documents import parse_json
+from dmrl.border.folders import refuse_pipes
 from dmrl.border.names import inside, split_name
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, read_manifest
@@ -243,6 +244,7 @@ def open_dataset(path: Path) -> Dataset:
     UnsafeName
         If a split is called what could not be a folder's name.
     """
+    refuse_pipes(path)
     manifest = read_manifest(path)
     if manifest is not None and manifest.splits:
         return Dataset(path, tuple(manifest.splits), manifest.parquet, manifest)

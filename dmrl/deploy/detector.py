@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.border.documents import parse_json
+from dmrl.border.folders import refuse_pipes
 from dmrl.deploy.backends import Backend, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
 from dmrl.deploy.compiled import Compiled
@@ -115,6 +116,7 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
             f"no model {model}. Give a run folder, a Keras .h5, an export folder, or the name of "
             f"one that ships with dmrl: {', '.join(pretrained.names())}"
         )
+    refuse_pipes(model)
     return OPENS[backend](model, backend)
 
 

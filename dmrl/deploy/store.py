@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.border.documents import load_npz, parse_json
+from dmrl.border.folders import refuse_pipes
 from dmrl.deploy.integer import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
 from dmrl.errors import ModelError
 
@@ -71,6 +72,7 @@ def load(path: Path) -> IntegerNetwork:
     ModelError
         If there is none, or it is damaged or not sound.
     """
+    refuse_pipes(path)
     file = path / INTEGER_NAME if path.is_dir() else path
     if not file.is_file():
         raise ModelError(f"no {file.name} in {file.parent}. Make one with: dmrl quantize")

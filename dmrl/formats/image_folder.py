@@ -24,6 +24,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+from dmrl.border.folders import refuse_pipes
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import aideck
 from dmrl.formats.chip_maps import chip_maps
@@ -101,6 +102,7 @@ def list_pictures(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
     """
     if not source.is_dir():
         raise SourceError(f"no folder {source}. Name a folder of pictures")
+    refuse_pipes(source)
     paths = sorted(path for path in source.iterdir() if _is_picture(path))
     if not paths:
         raise SourceError(f"no picture ({', '.join(SUFFIXES)}) in {source}. Name another folder")

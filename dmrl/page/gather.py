@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from dmrl import recipe as recipes
 from dmrl.border.documents import parse_json
+from dmrl.border.folders import refuse_pipes
 from dmrl.catalogue import NAME as CATALOGUE
 from dmrl.catalogue import open_catalogue
 from dmrl.datasets import is_dataset
@@ -89,6 +90,7 @@ def gather(folder: Path) -> Found:
     """
     if not folder.is_dir():
         raise SettingError(f"{folder} is no folder. Name one with recordings, models, evaluations")
+    refuse_pipes(folder)
     found = _told(folder)
     files = list(_files(folder))
     together: set[Path] = set()

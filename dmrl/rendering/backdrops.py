@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
+from dmrl.border.folders import refuse_pipes
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Array, Camera
 from dmrl.geometry.lens import undistort
@@ -110,6 +111,7 @@ def photos_in(folder: Path) -> Photos:
     """
     if not folder.is_dir():
         raise SettingError(f"no folder {folder} of backgrounds. Check --backgrounds")
+    refuse_pipes(folder)
     found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_KINDS)
     paths = [path for path in found if _begins(path)]
     broken = len(found) - len(paths)

@@ -10,6 +10,7 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.border.folders import refuse_pipes
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError, SourceError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
@@ -158,6 +159,7 @@ def _shape(text: str) -> tuple[int, int]:
 def _pictures(source: Path, settings: Settings) -> Iterator[tuple[str, bytes]]:
     """Names and bytes of the pictures of a folder, or of one robot's in a recording."""
     if source.is_dir():
+        refuse_pipes(source)
         paths = sorted(p for p in source.iterdir() if p.suffix.lower() in PICTURES)
         yield from ((str(path), path.read_bytes()) for path in track(paths, "Looking for boards"))
         return

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
+from dmrl.border.folders import refuse_pipes
 from dmrl.errors import SettingError, SourceError
 from dmrl.export.ros2 import write_bag
 from dmrl.export.tables import write_tables
@@ -113,6 +114,7 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
         If ``out`` exists or cannot be written.
     """
     refuse_existing(out)
+    refuse_pipes(source)
     if settings.to == "ros2":
         return write_bag(source, out)
     if settings.to is not None:
@@ -198,6 +200,7 @@ def _sources(source: Path, settings: Settings) -> dict[Path, Path]:
     """What a folder holds that can be converted, by what is made of it."""
     if settings.to is not None:
         return {name.with_suffix(""): path for name, path in recordings_in(source).items()}
+    refuse_pipes(source)
     found: dict[Path, Path] = {}
     for path in sorted(source.iterdir()) if source.is_dir() else [source]:
         try:
