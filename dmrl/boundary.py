@@ -27,7 +27,7 @@ from types import FrameType
 
 from dmrl import output
 from dmrl.border.names import without_middle
-from dmrl.errors import DmrlError, one_line
+from dmrl.errors import DmrlError, one_line, words_of
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -78,7 +78,7 @@ def status_of(work: Callable[[], object]) -> int:
         # The interpreter would try once more, and say so with a traceback.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         if not status and not isinstance(e, BrokenPipeError):
-            return _end(_refused(e))
+            return _end(words_of(e) or _bug(e))
         return status or 1
     return status
 
@@ -92,14 +92,12 @@ def _guarded(work: Callable[[], object]) -> int:
         return _end(str(e))
     except KeyboardInterrupt as e:
         return _end(_stopped(), 128 + getattr(e, "number", signal.SIGINT))
-    except UnicodeEncodeError as e:
-        return _end(f"{ascii(e.object)[:80]} is no text that can be stored. Rename the file")
     except BrokenPipeError:
         return 1  # the reader of our output, such as `head`, has gone: nobody is left to tell
     except Exception as e:
         if os.environ.get("DMRL_DEBUG"):
             raise
-        return _end(_refused(e) if isinstance(e, OSError) and e.errno else _bug(e))
+        return _end(words_of(e) or _bug(e))
     return 0
 
 
@@ -115,16 +113,9 @@ def _stopped() -> str:
     return "stopped. Nothing stands under its final name"
 
 
-def _refused(error: OSError) -> str:
-    where = "standard output, or a disk" if error.filename is None else str(error.filename)
-    return f"cannot read or write {where}: {error.strerror}. Check its name, its rights, its space"
-
-
 def _bug(error: Exception) -> str:
     """What is said of an error that nobody foresaw; its traceback goes to a file."""
     kind = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
-    if isinstance(error, MemoryError):
-        return f"this machine has not enough memory ({kind}). Give less at once"
     text = "".join(traceback.format_exception(error))
     try:
         held, path = tempfile.mkstemp(prefix="dmrl-error-", suffix=".txt")

@@ -39,6 +39,24 @@ def _shown(character: str) -> str:
     return character
 
 
+def words_of(error: Exception) -> str | None:
+    """What is said of an error that is the user's, the disk's or the machine's; None: a bug."""
+    match error:
+        case DmrlError():
+            return str(error)
+        case UnicodeEncodeError():
+            return f"{ascii(error.object)[:80]} is no text that can be stored. Rename the file"
+        case MemoryError():
+            kind = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
+            return f"this machine has not enough memory ({kind}). Give less at once"
+        case OSError(errno=int()):
+            named = error.filename
+            where = "standard output, or a disk" if named is None else str(named)
+            why = f"cannot read or write {where}: {error.strerror}"
+            return f"{why}. Check its name, its rights, its space"
+    return None
+
+
 class DmrlError(Exception):
     """Base of every error that ``dmrl`` prints without a traceback."""
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.report import Done
-from dmrl.output import as_output_error, rewritten_file
+from dmrl.output import as_output_error, partial_of, rewritten_file
 from dmrl.pipeline.executors import executor
 from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located
@@ -23,6 +23,9 @@ from dmrl.storage.whole import require_bucket
 from dmrl.terminal.progress import say
 
 __all__ = ["Done", "Plan", "Step", "kept_recipe", "load", "run"]
+
+BEGUN = (UNFINISHED, partial_of(Path(STATE_FILE)).name)
+"""What is left where a disk broke before a pipeline had begun, and refused to remove it."""
 
 
 def run(
@@ -102,17 +105,14 @@ def _check_data(name: str | Path, plan: Plan, data: Path | None) -> None:
 def _owned(out: Path) -> Iterator[Path]:
     """The folder of outputs, for this process alone; in a bucket nothing can be locked."""
     if isinstance(out, Remote):
-        if not (out / STATE_FILE).exists() and any(p.name != UNFINISHED for p in out.iterdir()):
-            raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
+        _refuse_another_s(out)
         require_bucket(out)
         yield out
         return
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Name a folder: --out DIR")
     try:
-        known = (out / STATE_FILE).exists() or (out / UNFINISHED).exists()
-        if not known and out.exists() and any(out.iterdir()):
-            raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
+        _refuse_another_s(out)
         (out / UNFINISHED).mkdir(parents=True, exist_ok=True)
         if (out / UNFINISHED).is_symlink():
             raise OutputError(f"{out / UNFINISHED} is a link to another folder. Remove it")
@@ -120,10 +120,6 @@ def _owned(out: Path) -> Iterator[Path]:
         raise OutputError(f"{out} is a file. Name a folder: --out DIR") from None
     except OSError as e:
         raise as_output_error(out, e) from e
-    if not (out / STATE_FILE).exists() and any(p.name != UNFINISHED for p in out.iterdir()):
-        with suppress(OSError):
-            (out / UNFINISHED).rmdir()
-        raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
     held = os.open(out, os.O_RDONLY)
     try:
         _lock(held, out)
@@ -134,6 +130,14 @@ def _owned(out: Path) -> Iterator[Path]:
         raise
     finally:
         os.close(held)
+
+
+def _refuse_another_s(out: Path) -> None:
+    """Nothing, if a folder has been a pipeline's, or holds nothing but what one began with."""
+    if not out.exists() or (out / STATE_FILE).exists():
+        return
+    if any(inner.name not in BEGUN for inner in out.iterdir()):
+        raise OutputError(f"{out} is not empty. Remove it or name another: --out DIR")
 
 
 def _lock(held: int, out: Path) -> None:

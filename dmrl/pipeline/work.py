@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import BusyOutput, DmrlError, FullDisk, MissingExtra, OutputError
+from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, words_of
 from dmrl.pipeline.interface import Interface, interface_of
 from dmrl.pipeline.job import Answer
 from dmrl.recording import Provenance, provenance
@@ -46,9 +46,9 @@ def perform(line: str) -> Answer:
         return {"error": str(e), "again": "later"}
     except (FullDisk, MissingExtra) as e:
         return {"error": str(e), "again": "elsewhere"}
-    except DmrlError as e:
-        return {"error": str(e)}
     except Exception as e:
+        if words := words_of(e):
+            return {"error": words}
         traceback.print_exc()
         return {"fault": f"{type(e).__name__}: {e}"}
 

@@ -2,15 +2,23 @@
 
 import io
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 
 from dmrl.boundary import status_of
 
 
-def ended(work: Callable[[], object]) -> tuple[int, str]:
-    """Exit status and last words of a command; never a bug, never more than one line of error."""
+def ended(work: Callable[[], object], *, mute: bool = False) -> tuple[int, str]:
+    """Exit status and last words of a command; never a bug, never more than one line of error.
+
+    Parameters
+    ----------
+    work
+        The command.
+    mute
+        Standard output stays as it is, which takes nothing.
+    """
     said = io.StringIO()
-    with redirect_stderr(said), redirect_stdout(io.StringIO()):
+    with redirect_stderr(said), nullcontext() if mute else redirect_stdout(io.StringIO()):
         status = status_of(work)
     errors = [line for line in said.getvalue().splitlines() if line.startswith("dmrl: ")]
     text = errors[-1] if errors else ""

@@ -14,9 +14,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from dmrl.boundary import open_standard_streams
+
 from .disk import small_files
 from .ending import ended
-from .works import Inputs, work_named
+from .works import READS, WORKS, Inputs, work_named
 
 HANG_S = 300
 """A command that takes longer hangs, on a machine however busy."""
@@ -77,6 +79,17 @@ def run_work(inputs: Inputs, work: str, out: str, most_bytes: int | None) -> tup
     run = work_named(work).run
     with small_files(most_bytes):
         return ended(lambda: run(inputs, Path(out)))
+
+
+def run_mute(inputs: Inputs, work: str, out: str, stream: str) -> tuple[int, str]:
+    """How a work ended whose standard output is "full" or "closed"."""
+    os.close(1)
+    if stream == "full":
+        os.open("/dev/full", os.O_WRONLY)
+    sys.stdout = None  # type: ignore[assignment]
+    open_standard_streams()
+    run = (READS | {one.name: one.run for one in WORKS})[work]
+    return ended(lambda: run(inputs, Path(out)), mute=True)
 
 
 def run_together(inputs: Inputs, work: str, out: str, times: int) -> list[tuple[int, str]]:

@@ -119,6 +119,11 @@ class Inputs:
         return self.made("flights", lambda path: _flights(self, path))
 
     @property
+    def indexed(self) -> Path:
+        """The same with a catalogue."""
+        return self.made("indexed", lambda path: (_flights(self, path), cli("index", path)))
+
+    @property
     def seen(self) -> Path:
         """The same with detections."""
         return self.made("seen.mcap", lambda path: with_detections(self.flight, path))
@@ -397,6 +402,22 @@ WORKS = (
 
 RECORD = Work("record", _record, "a.mcap", keeps=True, same=False)
 """Apart from the others: it writes what comes in, and that is never the same."""
+
+
+READS: dict[str, Run] = {
+    "info": lambda i, _: cli("info", i.dots),
+    "info as JSON": lambda i, _: cli("info", i.dots, "--json"),
+    "check": lambda i, _: cli("check", i.flight),
+    "evaluate to read": lambda i, _: cli("evaluate", i.found),
+    "find": lambda i, _: cli("find", "true", i.indexed),
+    "find as JSON": lambda i, _: cli("find", "true", i.indexed, "--json"),
+    "doctor": lambda _, __: cli("doctor"),
+    "verify to read": lambda i, _: cli(
+        "verify", i.c, "--images", 1, "--noise", 1, "--targets", "gcc"
+    ),
+    "help": lambda _, __: cli("--help"),
+}
+"""Commands that only say something."""
 
 
 def work_named(name: str) -> Work:

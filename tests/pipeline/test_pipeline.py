@@ -1,5 +1,6 @@
 """Pipelines in their processes: the same bytes, kills, and who owns a folder."""
 
+import errno
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ import pytest
 from dmrl.errors import DmrlError, OutputError, RecipeError, SettingError
 from dmrl.evaluation.report import report
 from dmrl.pipeline import run as pipeline
+from dmrl.pipeline import work
 from dmrl.pipeline.crew import Crew
 from dmrl.pipeline.job import job
 
@@ -95,6 +97,33 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     assert [p.name for p in foreign.iterdir()] == ["recipe.toml"]
     with pytest.raises(OutputError, match=r"is a file\. Name a folder"):
         pipeline.run(write(tmp_path, SMALL), foreign / "recipe.toml")
+
+
+ONE = 'kind = "pipeline"\n[[step]]\nstage = "sketch"\nout = "pictures"\nimages = 1\n'
+
+
+def test_what_a_broken_disk_kept_of_a_beginning_is_no_folder_of_another(tmp_path: Path) -> None:
+    """The first thing written could neither be finished nor removed; now the disk is well."""
+    out = tmp_path / "out"
+    (out / "unfinished").mkdir(parents=True)
+    (out / "pipeline.json.partial").write_text("{")
+    (done,) = pipeline.run(write(tmp_path, ONE), out, workers=1)
+    assert not done.skipped
+    assert {p.name for p in out.iterdir()} == {"pictures", "pipeline.json", "recipe.toml"}
+
+
+def test_what_the_system_refuses_a_step_is_its_error_and_no_bug(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error", "a.png")
+
+    monkeypatch.setattr(work, "interface_of", refused)
+    answer = work.perform(job("sketch", None, {}, {}))
+    assert answer == {
+        "error": "cannot read or write a.png: Input/output error. Check its name, its rights, its "
+        "space"
+    }
 
 
 LONG = SMALL.replace("images = 2", "images = 900")

@@ -1,0 +1,56 @@
+"""Standard output that is closed or full: one line, and the work that was done stays."""
+
+from pathlib import Path
+
+import pytest
+
+from .broken import Broken
+from .conftest import Count
+from .disk import Disk
+from .works import READS, WORKS, Work, clear
+
+STREAMS = ("full", "closed")
+QUICK = ("info", "find as JSON")
+
+
+def read_mute(name: str, disk: Disk, folder: Path, count: Count) -> None:
+    """What only says something says in one line that it cannot."""
+    clear(folder)
+    for stream in STREAMS:
+        given = {"work": name, "out": str(folder / "none"), "stream": stream}
+        status, said = disk.call("server:run_mute", **given)
+        assert status == 1, (stream, said)
+        assert "standard output" in said, said
+        assert not list(folder.iterdir())
+        count("standard output closed or full", cases=1, refused=1)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_what_cannot_be_said_is_one_line(
+    name: str, disk: Disk, tmp_path: Path, count: Count
+) -> None:
+    read_mute(name, disk, tmp_path / "disk", count)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READS.keys() - set(QUICK))
+def test_what_no_reading_command_can_say_is_one_line(
+    name: str, disk: Disk, tmp_path: Path, count: Count
+) -> None:
+    read_mute(name, disk, tmp_path / "disk", count)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("work", WORKS, ids=lambda work: work.name)
+def test_a_command_that_cannot_speak_has_done_its_work_or_nothing(
+    work: Work, disk: Disk, tmp_path: Path, count: Count
+) -> None:
+    broken = Broken(work, disk, tmp_path / "disk", disk.inputs)
+    for stream in STREAMS:
+        broken.clear()
+        given = {"work": work.name, "out": str(broken.out), "stream": stream}
+        status, said = disk.call("server:run_mute", **given)
+        assert status == 0 or (status == 1 and "standard output" in said), (stream, said)
+        assert broken.done, (stream, said)
+        count("standard output closed or full", cases=1, refused=status, right=1)
