@@ -229,7 +229,7 @@ def whole_chunk(
     raw = stream.read(size)
     record = _chunk_record(path, raw, said)
     data = unpacked(path, record, at)
-    if not summary.proven:
+    if summary.must_confirm(said):
         summary.confirm(path, scanned(data).definitions())
     if not said.message_index_offsets:
         block = of_channels(scanned(data).block, channels, summary.channels)

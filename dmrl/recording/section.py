@@ -41,6 +41,20 @@ class Section(McapSummary):
     """
 
     proven: bool = False
+    _firsts: frozenset[int] | None = None
+
+    def must_confirm(self, chunk: ChunkIndex) -> bool:
+        """Whether a chunk is to be held against this section: without a CRC all are.
+
+        With one, it is enough that definitions are the same where each channel begins: who made
+        two of them, and every sum right, would give other readers other topics.
+        """
+        if self._firsts is None:
+            firsts: dict[int, int] = {}
+            for one in sorted(self.chunk_indexes, key=lambda one: -one.chunk_start_offset):
+                firsts |= dict.fromkeys(one.message_index_offsets, one.chunk_start_offset)
+            self._firsts = frozenset(firsts.values())
+        return not self.proven or chunk.chunk_start_offset in self._firsts
 
     def confirm(self, path: Path, definitions: Iterable[Schema | Channel]) -> None:
         """Nothing, if schemas and channels are defined among the messages as they are here.

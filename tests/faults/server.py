@@ -88,8 +88,12 @@ def run_mute(inputs: Inputs, work: str, out: str, stream: str) -> tuple[int, str
         os.open("/dev/full", os.O_WRONLY)
     sys.stdout = None  # type: ignore[assignment]
     open_standard_streams()
+    kept = sys.stdout  # a child that forgets it would close 1, where it answers
     run = (READS | {one.name: one.run for one in WORKS})[work]
-    return ended(lambda: run(inputs, Path(out)), mute=True)
+    try:
+        return ended(lambda: run(inputs, Path(out)), mute=True)
+    finally:
+        del kept
 
 
 def run_together(inputs: Inputs, work: str, out: str, times: int) -> list[tuple[int, str]]:

@@ -52,5 +52,5 @@ def test_a_command_that_cannot_speak_has_done_its_work_or_nothing(
         given = {"work": work.name, "out": str(broken.out), "stream": stream}
         status, said = disk.call("server:run_mute", **given)
         assert status == 0 or (status == 1 and "standard output" in said), (stream, said)
-        assert broken.done, (stream, said)
+        assert broken.done, (stream, said, sorted(tmp_path.rglob("*")))
         count("standard output closed or full", cases=1, refused=status, right=1)

@@ -1,6 +1,7 @@
 """Every byte of a small recording flipped: the flip is noticed, or changes nothing."""
 
 import struct
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from dmrl.recording import (
     summary,
     trim,
 )
+from dmrl.recording.opening import MAGIC
 
 TOPICS = ("/cf1/height", "/cf1/range/cf2")
 PATTERNS = (0x01, 0x80, 0xFF)
@@ -294,6 +296,27 @@ def test_a_record_that_is_there_twice_is_noticed_without_any_crc(
     rejoined(path, [*parts[:at], other, *parts[at:]])
     with pytest.raises(RecordingError, match=complaint):
         list(read_raw(path))
+
+
+def test_a_summary_with_a_crc_that_renames_a_topic_is_noticed(tmp_path: Path) -> None:
+    """Made by somebody who knows: every sum is right, and other readers would see another topic."""
+    path = foreign(tmp_path / "a.mcap", compression=CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    end = next(start for opcode, start, _ in records(bytes(data)) if opcode == Opcode.DATA_END)
+    at = data.index(b"/cf1/height", end)
+    data[at : at + 11] = b"/cf1/heigst"
+    footer = len(data) - len(MAGIC) - 9 - 20
+    (start,) = struct.unpack_from("<Q", data, footer + 9)
+    struct.pack_into("<I", data, footer + 25, zlib.crc32(data[start : footer + 25]))
+    path.write_bytes(data)
+    for read in (
+        lambda: list(read_raw(path)),
+        lambda: trim(path, tmp_path / "b.mcap"),
+        lambda: read_table(path, "/cf1/heigst"),
+        lambda: check(path),
+    ):
+        with pytest.raises(RecordingError, match="is not what its summary repeats of it"):
+            read()
 
 
 @pytest.mark.parametrize("renamed", ["summary", "messages"])
