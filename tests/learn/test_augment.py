@@ -10,6 +10,7 @@ from dmrl.learn import augment
 from dmrl.learn.augment import Augmentation, Augmenter
 from dmrl.learn.batches import FIELDS, Batch, Examples
 from dmrl.learn.settings import FitSettings
+from dmrl.learn.windows import facing, through
 
 GEOMETRY = Augmentation(
     flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0
@@ -283,3 +284,23 @@ def test_plain_is_whole_images_in_other_colours() -> None:
     every = replace(GEOMETRY, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
     wanted = Augmentation(flip_share=0.5, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
     assert every.plain == wanted
+
+
+def test_a_camera_is_turned_no_further_than_a_quarter_of_the_depth_is_left() -> None:
+    camera, rng = (60.0, 64.0, 80.0, 56.0), np.random.default_rng(5)
+    maker, kept = augmenter(intrinsics=camera), []
+    k = np.array([[60.0, 0, 80], [0, 64, 56], [0, 0, 1]])
+    for _ in range(300):
+        left, top = rng.integers(0, 60, 2).tolist()
+        rect = (left, top, left + int(rng.integers(20, 100)), top + int(rng.integers(20, 50)))
+        size = np.array([rect[2] - left, rect[3] - top])
+        seen, shown = rng.uniform((-100, -100), (260, 210)), size * rng.random(2)
+        turn = facing(camera, seen) @ facing(camera, shown + rect[:2]).T
+        corners = np.array([[x, y, 1.0] for x in (left, rect[2]) for y in (top, rect[3])])
+        ahead = (turn @ np.linalg.inv(k) @ corners.T)[2]
+        window = maker._window(np.eye(2), 1.0, seen, shown, rect)
+        kept.append(window.camera is not None)
+        assert kept[-1] == (ahead.min() > 0.25 * ahead.max())
+        found = through(window.matrix, shown[None])[0]
+        assert found == pytest.approx(seen, abs=1e-6)  # as far as it is shown where it should be
+    assert 0.2 < np.mean(kept) < 0.9
