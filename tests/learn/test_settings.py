@@ -82,3 +82,10 @@ def test_what_nobody_asks_for_is_off() -> None:
     assert plain.processes == 1 and plain.threshold is None and plain.intrinsics is None
     assert (plain.confidence_weight, plain.depth_weight, plain.class_weight) == (1, 1, 1)
     assert (plain.offset_weight, plain.focus) == (0.5, 2.0)  # as the weights that ship were made
+
+
+def test_defaults_are_those_that_docs_training_md_tells() -> None:
+    plain = FitSettings()
+    assert (plain.architecture, plain.epochs) == ("dmrl-nano", 60)
+    assert (plain.validation_share, plain.false_alarms) == (0.1, 0.05)
+    assert (plain.optimizer, plain.label_noise, plain.precision) == ("muon", "ignore", "float32")
