@@ -304,3 +304,26 @@ def test_a_camera_is_turned_no_further_than_a_quarter_of_the_depth_is_left() -> 
         found = through(window.matrix, shown[None])[0]
         assert found == pytest.approx(seen, abs=1e-6)  # as far as it is shown where it should be
     assert 0.2 < np.mean(kept) < 0.9
+
+
+def test_a_window_is_turned_about_where_the_robot_comes_to_be(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maker, rng, asked = (
+        augmenter(zoom=(1.0, 2.0), rotation_deg=20.0, flip_share=0.5),
+        np.random.default_rng(6),
+        [],
+    )
+    made = maker._window
+    monkeypatch.setattr(maker, "_window", lambda *given: asked.append(given) or made(*given))
+    robot, whole = maker._examples.robots[0, 0], (0, 0, 160, 112)
+    empty, shown_at = np.empty((0, len(FIELDS)), np.float32), []
+    for _ in range(60):
+        found = maker._layer(torch.empty(112, 160, 3), whole, 0, empty, rng)
+        _, _, seen, shown, _ = asked[-1]
+        if len(found):
+            np.testing.assert_allclose(seen, robot[:2])
+            np.testing.assert_allclose(found[0, :2], shown, atol=1e-3)
+            shown_at.append(shown)
+    assert len(shown_at) > 40  # most windows hold the robot
+    assert np.std(shown_at, axis=0).min() > 2  # not always at one place
