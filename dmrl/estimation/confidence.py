@@ -21,6 +21,7 @@ from dmrl.estimation.linear import linearise
 from dmrl.estimation.motion import Increments, rotation
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import Noise, Problem
+from dmrl.estimation.robust import curvature_of, weights_of
 
 CALM_S = 0.8
 """Moving average: what is faster than robots fly is noise."""
@@ -48,6 +49,9 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
     # The calmed copy does not fit the ranges; their weights come from the solution.
     linear.ranges[:, -1] = at_solution.range
     equations = equations_of(calm, noise, linear, solution.constants)
+    weights = weights_of(linear, noise, solution.constants)
+    held = curvature_of(noise, solution.constants) - weights.prior * noise.prior_std() ** -2
+    equations.corner[...] += np.diag(held)
     return _inverse(equations)
 
 

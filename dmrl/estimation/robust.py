@@ -76,6 +76,16 @@ def weights_of(linear: Linear, noise: Noise, constants: Array) -> Weights:
     )
 
 
+def curvature_of(noise: Noise, constants: Array) -> Array:
+    """(G,) information that the prior of what is constant holds of it, where that is.
+
+    The weight says where the slope is that of a square. The loss itself is bent less: what is as
+    far out as the prior is wide, the prior hardly holds.
+    """
+    out = (constants / noise.prior_std()) ** 2 / PRIOR
+    return np.asarray(np.maximum(1 - out, 0.0) / (1 + out) ** 2 * noise.prior_std() ** -2)
+
+
 def _first(linear: Linear, noise: Noise) -> float:
     """The first range error's square against what may jump."""
     return float(linear.error_m[0] / (noise.jump * noise.range_error_std_m)) ** 2

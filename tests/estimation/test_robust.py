@@ -5,7 +5,7 @@ import pytest
 
 from dmrl.estimation.linear import RANGE_ERROR, SIZE, Linear
 from dmrl.estimation.problem import GLOBALS, Noise
-from dmrl.estimation.robust import MOTION, PRIOR, cost_of, limits, weights_of
+from dmrl.estimation.robust import MOTION, PRIOR, cost_of, curvature_of, limits, weights_of
 
 NOISE = Noise(jump=0.7, cauchy_m=0.3, range_std_m=0.1)
 STEPS, RANGES = 3, 4
@@ -64,3 +64,18 @@ def test_an_error_of_a_range_is_held_against_none_and_a_long_detour_hardly() -> 
 def _at(residuals: np.ndarray) -> tuple[Linear, Noise, np.ndarray]:
     found, constants = linear(residuals)
     return found, NOISE, constants
+
+
+@pytest.mark.parametrize("out", [0.0, 0.3, 0.9, 1.1, 3.0])
+def test_what_the_prior_holds_is_the_curvature_of_the_cost_and_never_negative(out: float) -> None:
+    count = STEPS * SIZE + RANGES + 1 + len(GLOBALS)
+    at = np.zeros(count)
+    at[-len(GLOBALS) :] = out * np.sqrt(np.minimum(PRIOR, 4.0))
+    found, constants = linear(at)
+    held = curvature_of(NOISE, constants)
+    for k, step in enumerate(1e-3 * np.diag(NOISE.prior_std())):
+        costs = [cost_of(found, NOISE, constants + sign * step) for sign in (-1, 0, 1)]
+        bend = (costs[0] - 2 * costs[1] + costs[2]) / (1e-3 * NOISE.prior_std()[k]) ** 2
+        assert held[k] == pytest.approx(
+            max(bend, 0.0), rel=1e-3, abs=1e-3 * NOISE.prior_std()[k] ** -2
+        )
