@@ -146,6 +146,7 @@ def test_its_settings_hold(record: Record, tmp_path: Path) -> None:
     assert "image" in open_dataset(out).split("train").table.column_names
 
 
+@pytest.mark.heavy
 def test_a_flight_has_its_split_whatever_comes_with_it(record: Record, tmp_path: Path) -> None:
     first, *others = flights(record, *range(8))
     for name, parts in (("a", [others]), ("b", [[one] for one in reversed(others)])):
@@ -207,7 +208,9 @@ def dying(at: int, work: Callable[[], Any]) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
 
 
-@pytest.mark.parametrize("step", [6, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "step", [pytest.param(6, marks=pytest.mark.heavy), pytest.param(1, marks=pytest.mark.slow)]
+)
 def test_a_process_that_dies_anywhere_leaves_one_dataset_or_the_other(
     record: Record, tmp_path: Path, step: int
 ) -> None:

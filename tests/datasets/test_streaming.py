@@ -48,6 +48,7 @@ def grown(record: Record, out: Path, *, parquet: bool = False) -> Path:
     return out
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["parquet", "arrow"])
 def test_datasets_streams_it_from_a_file_server(
     record: Record, tmp_path: Path, served: str, kind: str, monkeypatch: pytest.MonkeyPatch

@@ -186,6 +186,7 @@ def test_a_dataset_is_made_and_opened_in_a_bucket(
     assert lab.cat_file(f"lab/sets/set/train/{name.name}") == name.read_bytes()
 
 
+@pytest.mark.heavy
 def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], empty_figures: None
 ) -> None:
