@@ -4,7 +4,7 @@
     python benchmarks/bench_cluster.py flights
 
 `dmrl label` of the folder with one process, with one for each core, and as Ray tasks on a cluster
-of this machine alone; then `dmrl trim` of one small recording many times over, which is all overhead.
+of this machine alone; then `dmrl trim` of one small recording many times, which is all overhead.
 Wall times are of a machine as busy as it is: the load is printed. CPU is of this process, which
 hands the tasks out, and so bounds how many tasks a second can be begun, wherever they run.
 """
