@@ -4,8 +4,8 @@
 
 Rules are those of `dmrl --on ray`: the largest inputs first, one task a core, a task of a node that
 dies is begun again at most five times, and one driver hands tasks out, one after the other. Its
-assumptions are options; their defaults are figures of `bench_items.py` and `bench_cluster.py`, but
-for what no measurement here can tell: how often nodes are slow, and how often they die.
+assumptions are options. The seconds of a task are by `bench_items.py` (docs/scale.md); what handing
+one out costs is measured by `bench_cluster.py`. How often nodes are slow or die is assumed.
 """
 
 import argparse
@@ -119,7 +119,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     for name, value in (("tasks", 10_000), ("nodes", 32), ("cores", 16), ("seeds", 5)):
         parser.add_argument(f"--{name}", type=int, default=value)
-    for name, value in (("task-s", 900.0), ("spread", 0.3), ("overhead-s", 0.02)):
+    for name, value in (("task-s", 135.0), ("spread", 0.3), ("overhead-s", 0.02)):
         parser.add_argument(f"--{name}", type=float, default=value)
     given = parser.parse_args()
     calm = {
