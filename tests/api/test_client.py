@@ -1,0 +1,63 @@
+"""A program that uses dmrl passes mypy --strict, and what is wrong in it is found."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CLIENT = """
+from pathlib import Path
+
+import dmrl
+
+
+def learn(path: Path) -> float:
+    rec = dmrl.open(path)
+    names: list[str] = list(rec.topics)
+    for image in rec.images("cf1").between(0.0, 2.0):
+        height, width, _ = image.shape
+    table = rec[names[0]].to_arrow()
+    train = dmrl.dataset("dataset")["train"]
+    for batch in train.loader(batch_size=8, shuffle=True, seed=1):
+        print(batch["image"].shape)
+    found: list[list[dmrl.Detection]] = dmrl.load("model").detect(rec.images("cf1"))
+    dmrl.label(path, "labelled.mcap")
+    with dmrl.writer("found.mcap", network="mine") as out:
+        out.write("/cf1/detections", 0.5, {"detections": [], "threshold": 0.5})
+    return found[0][0].depth_m + float(table.num_rows)
+"""
+
+
+@pytest.fixture(scope="module")
+def layout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sources as they are installed, where mypy finds viewer/ and the like below dmrl/."""
+    folder = tmp_path_factory.mktemp("layout")
+    (folder / "dmrl").mkdir()
+    for part in [*(ROOT / "dmrl").iterdir(), *(ROOT / n for n in ("viewer", "schemas", "recipes"))]:
+        (folder / "dmrl" / part.name).symlink_to(part)
+    return folder
+
+
+def strict(layout: Path, program: str) -> tuple[int, str]:
+    (layout / "client.py").write_text(program)
+    # Strict, and without what other packages lack: as dmrl itself is checked.
+    words = ["--config-file", str(ROOT / "pyproject.toml"), "--cache-dir", str(layout / "cache")]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *words, "client.py"],
+        cwd=layout,
+        capture_output=True,
+        text=True,
+        timeout=1500,
+    )
+    return done.returncode, done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_a_client_is_typed(layout: Path) -> None:
+    assert strict(layout, CLIENT) == (0, "Success: no issues found in 1 source file\n")
+    wrong = CLIENT.replace("found[0][0].depth_m", "found[0][0].depth")
+    status, said = strict(layout, wrong)
+    assert status == 1 and 'has no attribute "depth"' in said
