@@ -414,3 +414,13 @@ def test_variables_have_names_of_their_own_and_known_types(
         head += b"".join(f"{variable}({code})".encode() + b"\0" for variable, code in variables)
     with pytest.raises(SourceError, match=words):
         cfusdlog.decode(head + bytes(40))
+
+
+@pytest.mark.parametrize("numbers", [(1, 257), (0x0102, 0xFF02), (0xFFFF, 0x00FF)])
+def test_events_whose_numbers_end_alike_are_told_apart(numbers: tuple[int, int]) -> None:
+    events = {numbers[0]: ("a", [("x", "H")]), numbers[1]: ("b", [("y", "I"), ("z", "H")])}
+    rows = [
+        (numbers[k % 3 == 0], 1000 * k, (k,) if k % 3 else (70_000 + k, 257)) for k in range(200)
+    ]
+    raw = plain_usd.encode(events, rows)
+    same(cfusdlog.decode(raw), raw)

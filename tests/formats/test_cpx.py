@@ -266,3 +266,10 @@ def test_where_bytes_are_cut_changes_nothing_that_is_found_after_garbage(cut: in
     reader.finish()
     assert [p.data for p in got] == [b"abcdef"] * 2 or cut > len(data)
     assert reader.skipped_bytes == 25
+
+
+@pytest.mark.parametrize(("width", "packets"), [(1019, 2), (1020, 3), (1021, 3), (2039, 3)])
+def test_an_image_ends_with_its_first_packet_that_is_not_full(width: int, packets: int) -> None:
+    image = raw(width, 1)
+    assert len(list(PacketReader().feed(pack_image(image)))) == packets
+    assert read(pack_image(image) * 2)[0] == [image, image]

@@ -68,6 +68,8 @@ def test_a_steady_turn_is_found_in_the_body_rates(roll: float, pitch: float, rat
 def test_without_a_gyroscope_the_yaw_tells_its_rate() -> None:
     yaw = Series(TIMES, np.column_stack([0 * TIMES, 0 * TIMES, 2e-9 * TIMES]))
     assert yaw_rate_of([], yaw) == pytest.approx(2.0)
+    late = Series(17 * 10**17 + TIMES, yaw.values)  # as exactly on a clock of today
+    assert yaw_rate_of([], late) == pytest.approx(2.0, rel=1e-9)
     only_z = block("imu", gyro__z=[90.0] * 3)
     assert yaw_rate_of([only_z], yaw) == pytest.approx(np.pi / 2)
     packed = block("z", stateEstimateZ__rateYaw=[1500.0] * 3)

@@ -326,3 +326,33 @@ def test_a_folder_is_a_robot_per_file_by_its_name(table: Path) -> None:
     (folder / "notes.txt").write_text("x")
     found = samples(folder, Options(columns=table, names={"a": "left"}))
     assert {topic.split("/")[1] for topic in found} - {"tf"} == {"left", "b"}
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "fault"),
+    [
+        ('name = "phi"', 'name = ""', "[roll] name: not the name of a column"),
+        ('name = "phi"', "name = 5", "[roll] name: not the name of a column"),
+        ("sign = -1", "sign = true", "[pitch] sign: not 1 or -1"),
+        ("sign = -1", "sign = 0", "[pitch] sign: not 1 or -1"),
+        ('unit = "deg/s"', 'unit = "deg"', "[yaw_rate] unit: not one of rad/s, deg/s"),
+        (
+            '[vy]\nname = "vy"\nunit = "cm/s"\nframe = "world"',
+            '[vy]\nname = "vy"\nunit = "cm/s"\nframe = "body"',
+            "velocities of several frames",
+        ),
+        ("[height]", '[z]\nname = "h"\nunit = "m"\n[height]', "leave one out"),
+        ("[range.cf2]", "[range.cf2]\nsign = 2", "[range.cf2] sign: not 1 or -1"),
+    ],
+)
+def test_one_fault_of_a_table_is_said_and_no_other(
+    was: str, now: str, fault: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "map.toml"
+    path.write_text(TABLE)
+    read_map(path)
+    assert was in TABLE
+    path.write_text(TABLE.replace(was, now, 1))
+    with pytest.raises(SourceError) as e:
+        read_map(path)
+    assert fault in str(e.value)
