@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dmrl.estimation.camera_pose import WORST, _misfit
 from dmrl.estimation.camera_views import (
     Flight,
     Noise,
@@ -124,3 +125,11 @@ def test_attitude_of_two_samples_stays_as_it_is() -> None:
     two = np.array([[0.1, 0.2], [0.3, 0.4]])
     here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(2.0), attitude_rad=two)
     assert here.smoothed().attitude_rad.tolist() == two.tolist()
+
+
+@pytest.mark.parametrize("found", [1, 2, 4])
+def test_images_without_a_detection_near_are_the_worst_there_are(found: int) -> None:
+    views, values = [(flight(list(range(found)), seen()[:found]), PATH)], np.zeros(4)
+    misfit = _misfit(views, CAMERA, np.array([*CAMERA.mount_rad, CAMERA.delay_s]), Noise())
+    assert misfit == pytest.approx(WORST * (4 - found) / 4, abs=1e-6)
+    assert 0 < _misfit(views, CAMERA, values, Noise()) <= WORST
