@@ -139,3 +139,11 @@ def test_a_pause_is_of_more_than_four_paces(late: float, stands: bool) -> None:
     assert (sender(after) == after) == stands
     again = [after + step * MS for step in (30, 90, 170, 200, 270, 310)]
     assert ([sender(moment) for moment in again] == again) == stands
+
+
+def test_nothing_is_sent_after_it_arrived_on_a_clock_of_today() -> None:
+    """Where a float is a quarter of a microsecond coarse."""
+    rng, sender = np.random.default_rng(4), SteadySender()
+    steps = rng.integers(49 * MS, 51 * MS, 300)
+    for arrival in (17 * 10**17 + np.cumsum(steps)).tolist():
+        assert sender(arrival) <= arrival
