@@ -14,6 +14,8 @@ Count = Callable[..., None]
 ROW = "faults"
 SHARE = float(os.environ.get("DMRL_FAULTS", "1"))
 """Of the cases that the slow tests try. 0.1 on a machine that has little time."""
+SEED = int(os.environ.get("DMRL_FAULTS_SEED", "2"))
+"""Of the mutated recordings: another one tries others."""
 
 
 def cases_of(most: int) -> int:

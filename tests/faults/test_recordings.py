@@ -33,7 +33,7 @@ from dmrl.recording import (
     summary,
 )
 
-from .conftest import Count, cases_of
+from .conftest import SEED, Count, cases_of
 from .mutate import mutated, mutated_within
 
 HANG_S = 20
@@ -245,4 +245,4 @@ def test_mutated_recordings_are_read_or_refused(tmp_path: Path, count: Count) ->
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_ten_thousand_mutated_recordings_are_read_or_refused(tmp_path: Path, count: Count) -> None:
-    hunt(tmp_path, cases_of(10_000), 2, count)
+    hunt(tmp_path, cases_of(10_000), SEED, count)
