@@ -25,6 +25,7 @@ def read_mute(name: str, disk: Disk, folder: Path, count: Count) -> None:
         count("standard output closed or full", cases=1, refused=1)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", QUICK)
 def test_what_cannot_be_said_is_one_line(
     name: str, disk: Disk, tmp_path: Path, count: Count

@@ -102,6 +102,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
 ONE = 'kind = "pipeline"\n[[step]]\nstage = "sketch"\nout = "pictures"\nimages = 1\n'
 
 
+@pytest.mark.heavy
 def test_what_a_broken_disk_kept_of_a_beginning_is_no_folder_of_another(tmp_path: Path) -> None:
     """The first thing written could neither be finished nor removed; now the disk is well."""
     out = tmp_path / "out"

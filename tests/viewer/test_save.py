@@ -198,6 +198,7 @@ def test_an_output_is_never_overwritten(make: Make, rrd: Path) -> None:
     assert rrd.read_bytes() == b"mine"
 
 
+@pytest.mark.heavy
 def test_a_full_disk_ends_it_with_the_reason_and_never_hangs(make: Make) -> None:
     """rerun itself would say no reason, and now and then wait for ever."""
     show = prepare([make()], Settings())
