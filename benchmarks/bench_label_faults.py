@@ -306,7 +306,7 @@ def _held(row: Row) -> Row:
 def draw(rows: list[Row], stem: Path) -> None:
     """Error, share kept and share bad of every fault, by method."""
     faults = list(dict.fromkeys(row.fault for row in rows))
-    figure = Figure((9.0, 0.6 + 0.27 * len(faults)), layout="constrained")
+    figure = Figure((10.0, 0.6 + 0.27 * len(faults)), layout="constrained")
     panels = figure.subplots(1, 4, sharey=True)
     titles = "RMSE, m", "in the 95 % ellipse", "kept", "bad of kept, worst flight"
     for axes, key, title in zip(
@@ -319,7 +319,10 @@ def draw(rows: list[Row], stem: Path) -> None:
             axes.plot([getattr(row, key) for row in mine], places, mark, label=method, alpha=0.8)
         axes.set_title(title, fontsize=9)
         axes.grid(alpha=0.3)
-    panels[0].set(xscale="log", yticks=range(len(faults)), yticklabels=faults)
+        if key != "rmse_m":
+            axes.set_xlim(-0.04, 1.04)
+    panels[0].set(xscale="log", yticks=range(len(faults)), yticklabels=faults, xlim=(0.05, 5.0))
+    panels[0].set_xticks([0.1, 1.0], ["0.1", "1"])
     panels[0].invert_yaxis()
     panels[1].legend(fontsize=8)
     figure.savefig(stem.with_suffix(".png"), dpi=130)
