@@ -287,7 +287,7 @@ def command(
     on: On = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Build an Arrow dataset and its card from recordings, or add them to one that is there.
+    """Build an Arrow dataset and its card from recordings.
 
     Parameters
     ----------
