@@ -27,6 +27,7 @@ class Wanted:
 
 
 def rows(
+    held: Mapping[Path, Contents],
     sources: Mapping[Path, str],
     split_of: Mapping[Path, SplitOf],
     tally: Tally,
@@ -40,9 +41,10 @@ def rows(
 
     Parameters
     ----------
+    held
+        Labels that are in memory already. Others are read when it is their turn.
     sources, split_of
-        Of each recording: the source of labels that is used, its splits. One recording's labels
-        are in memory at a time.
+        Of each recording: the source of labels that is used, its splits.
     tally
         Is counted up.
     wanted
@@ -64,7 +66,7 @@ def rows(
         (path, row)
         for path, source in sources.items()
         for row in rows_of(
-            Contents(path, topics.LABELS),
+            held[path] if path in held else Contents(path, topics.LABELS),
             source,
             split_of[path],
             tally,

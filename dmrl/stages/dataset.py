@@ -45,6 +45,10 @@ from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
+HELD_IMAGES = 50_000
+"""Labels of so many images stay in memory between the two looks at them; of more, they are read
+twice, so that memory does not grow with the number of recordings."""
+
 
 @dataclass(frozen=True, slots=True)
 class Result:
@@ -169,7 +173,7 @@ def _part(
     if settings.masks and not any(has_masks(path) for path in recordings):
         raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     made = _provenance(recordings, settings)
-    about = {path: _about(path, settings) for path in recordings}
+    about, held = _read(recordings, settings)
     sources = {path: one.source for path, one in about.items()}
     warn_of_others(sources, {path: one.others for path, one in about.items()})
     split_of = splits_of(
@@ -186,6 +190,7 @@ def _part(
     flagged = frozenset() if settings.without is None else read_flags(settings.without)
     wanted = Wanted(settings.keep_all, settings.masks, flagged)
     found = rows(
+        held,
         sources,
         split_of,
         tally,
@@ -239,9 +244,24 @@ def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
     return provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
 
 
-def _about(path: Path, settings: Settings) -> _About:
+def _read(
+    recordings: Sequence[Path], settings: Settings
+) -> tuple[dict[Path, _About], dict[Path, Contents]]:
+    """What is said of recordings, and the labels of the first, which are not read again."""
+    about: dict[Path, _About] = {}
+    held: dict[Path, Contents] = {}
+    images = 0
+    for path in recordings:
+        labels = Contents(path, topics.LABELS, topics.CALIBRATION)
+        about[path] = _about(path, labels, settings)
+        images += about[path].images
+        if images <= HELD_IMAGES:
+            held[path] = labels
+    return about, held
+
+
+def _about(path: Path, held: Contents, settings: Settings) -> _About:
     images = count_images(path)
-    held = Contents(path, topics.LABELS, topics.CALIBRATION)
     source = label_source(held, settings.labels)
     return _About(
         source,

