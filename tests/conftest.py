@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import dmrl.learn  # noqa: F401  # before any test imports torch, which reads its settings once
 from dmrl.rendering import environment
 
 REPOSITORY = Path(__file__).parents[1]

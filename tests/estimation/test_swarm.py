@@ -48,7 +48,7 @@ def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(("noise", "share"), [("calibrated", 0.9), ("realistic", 1.02)])
+@pytest.mark.parametrize(("noise", "share"), [("calibrated", 1.0), ("realistic", 1.02)])
 def test_all_together_are_as_near_the_truth_as_pair_by_pair(noise: str, share: float) -> None:
     """With little noise nearer; else, where a sure pair contradicts, they are the pairs' own."""
     flight, _, pairwise, swarm = solved("in_view", noise)
