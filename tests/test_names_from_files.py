@@ -94,7 +94,9 @@ def sources() -> Iterator[tuple[str, ast.Module]]:
 
 
 def _is_path_hint(hint: ast.expr | None) -> bool:
-    return hint is not None and ast.unparse(hint).split(" | ")[0] == "Path"
+    while isinstance(hint, ast.BinOp):  # Path | None
+        hint = hint.left
+    return isinstance(hint, ast.Name) and hint.id == "Path"
 
 
 class Paths:
@@ -129,13 +131,14 @@ class Paths:
                 yield from node.args[1:]
 
     def _names(self, tree: ast.Module) -> set[str]:
+        nodes = list(ast.walk(tree))
         found = {
             node.arg
-            for node in ast.walk(tree)
+            for node in nodes
             if isinstance(node, ast.arg) and _is_path_hint(node.annotation)
         }
         for _ in range(3):  # names that are made of names
-            for node in ast.walk(tree):
+            for node in nodes:
                 if isinstance(node, ast.Assign) and self._is_path(node.value, found):
                     found |= {t.id for t in node.targets if isinstance(t, ast.Name)}
                 elif isinstance(node, ast.withitem) and isinstance(node.optional_vars, ast.Name):

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from dmrl.estimation.estimate import estimate_pairs
 from dmrl.estimation.estimated import Estimate
@@ -23,6 +24,7 @@ def reflected(pair: Pair, std_m: float, fades_s: float, seed: int) -> Pair:
     return replace(pair, range_m=np.maximum(pair.range_m + np.array(error), 0.05))
 
 
+@pytest.mark.heavy
 def test_errors_of_ranges_that_fade_are_noticed_and_the_ellipse_holds_them() -> None:
     flight = flown("random", "calibrated", 1003, 60.0)
     plain = pair_of(flight)

@@ -111,6 +111,7 @@ def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
     assert (error[kept] > 0.3).mean() < 0.02
 
 
+@pytest.mark.heavy
 def test_one_solve_that_contradicts_a_sure_pair_is_not_believed() -> None:
     *_, pairwise, swarm = solved("in_view", "calibrated")
     names = ("cf1", "cf2")

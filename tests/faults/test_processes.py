@@ -48,6 +48,7 @@ def race(work: Work, disk: Disk, folder: Path, count: Count) -> None:
     count("six writers of one output", cases=WRITERS, refused=refused, right=WRITERS - refused)
 
 
+@pytest.mark.heavy
 def test_of_six_writers_one_succeeds(disk: Disk, tmp_path: Path, count: Count) -> None:
     race(work_named("trim"), disk, tmp_path / "disk", count)
 

@@ -238,6 +238,7 @@ def nothing_is_lost(path: Path, sound: Held | None) -> bool:
     return theirs is not None
 
 
+@pytest.mark.heavy
 def test_mutated_recordings_are_read_or_refused(tmp_path: Path, count: Count) -> None:
     hunt(tmp_path, 60, 1, count)
 

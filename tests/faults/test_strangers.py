@@ -34,6 +34,7 @@ def damaged(name: str, disk: Disk, folder: Path, cases: int, count: Count) -> No
     count(f"damaged: {name}", cases=cases, refused=refused, right=cases - refused)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", QUICK)
 def test_damaged_files_are_refused_or_used(
     name: str, disk: Disk, tmp_path: Path, count: Count

@@ -43,6 +43,7 @@ def errors(pairs: list[tuple[Flight, Flight]], name: str) -> Array:
 Preset = tuple[Noise, list[tuple[Flight, Flight]]]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("column", "white", "bias"),
     [
@@ -76,6 +77,7 @@ def test_velocity_noise_is_white_and_coloured(preset: Preset) -> None:
     assert rest.std() == pytest.approx(both, rel=0.02)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", PRESETS)
 def test_velocity_scale_and_bias_are_those_of_the_table(name: str) -> None:
     preset = NOISE[name]

@@ -36,6 +36,7 @@ def scene(light: str, depth_m: float) -> Scene:
     return CAMERA, (robot,), Look(grey, shining, Sensor())
 
 
+@pytest.mark.heavy
 def test_pixels_come_through_files_where_memory_is_shut(
     blender: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -53,6 +54,7 @@ def test_pixels_come_through_files_where_memory_is_shut(
         assert other.surface_m.max() > 0.4
 
 
+@pytest.mark.heavy
 def test_what_was_rendered_before_changes_no_pixel(blender: Path) -> None:
     with Renderer(blender, Model(), workers=1, samples=2) as renderer:
         first, second = renderer.lights[0], renderer.lights[1]

@@ -87,6 +87,7 @@ def camera_error_s(folder: Path, duration_s: float) -> float:
     return float(np.abs(times - true).max() * 1e-9)
 
 
+@pytest.mark.heavy
 def test_a_camera_is_set_by_the_turns_it_saw(tmp_path: Path) -> None:
     assert camera_error_s(tmp_path, 40.0) < 0.005
 

@@ -51,6 +51,7 @@ def test_every_backend_runs_a_quantised_model_and_an_export(
         assert np.abs(fast - reference)[:, 0].mean() < 0.01
 
 
+@pytest.mark.heavy
 def test_an_export_says_what_it_holds(
     quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -27,6 +27,7 @@ rows = [{ what = "px", published = "one", of = "pictures/none.json", at = "nothi
 """
 
 
+@pytest.mark.heavy
 def test_a_page_is_drawn_again_when_a_step_or_a_figure_has_changed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

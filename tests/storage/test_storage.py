@@ -126,6 +126,7 @@ def test_numbers_are_read_without_the_pictures(
     assert summary(path).count == summary(source).count
 
 
+@pytest.mark.heavy
 def test_what_is_not_whole_is_not_there(lab: Any, tmp_path: Path) -> None:
     file, folder = path_of("s3://lab/whole/a.bin"), path_of("s3://lab/whole/set")
     with pytest.raises(RuntimeError), partial_file(file) as here:
