@@ -187,14 +187,12 @@ def _part(
     )
     warn_of_lenses([px for one in about.values() for px in one.focal_px])
     tally, seen = Tally(), Seen(before.seen())
-    flagged = frozenset() if settings.without is None else read_flags(settings.without)
-    wanted = Wanted(settings.keep_all, settings.masks, flagged)
     found = rows(
         held,
         sources,
         split_of,
         tally,
-        wanted,
+        _wanted(settings),
         total=sum(one.images for one in about.values()),
         size_px=before.size_px,
         workers=workers,
@@ -218,8 +216,13 @@ def _part(
     made.write(place)
     _facts(result, about, seen).write(place)
     seen.write(place)
-    manifest.write(folder)
+    manifest.write(folder)  # last: from here on the part belongs to the dataset
     return result
+
+
+def _wanted(settings: Settings) -> Wanted:
+    flagged = frozenset() if settings.without is None else read_flags(settings.without)
+    return Wanted(settings.keep_all, settings.masks, flagged)
 
 
 def _describe(folder: Path) -> None:
