@@ -71,7 +71,9 @@ def write_card(
     license_id = license_id or before.get("license") or made.settings.get("license", "unknown")
     counts = {name: count(split) for name, split in splits.items()}
     figures = _draw(readme.parent / "figures", counts, splits)
-    text = [*front_matter(splits, str(title), str(license_id), parquet=dataset.parquet)]
+    files = {name: [file.relative_to(folder) for file in dataset.files(name)] for name in splits}
+    packed = files if dataset.parquet else {}
+    text = [*front_matter(splits, str(title), str(license_id), packed)]
     text += sections.about(splits, str(title), made)
     text += sections.loading(splits, parquet=dataset.parquet)
     facts = read_facts(folder)
@@ -88,6 +90,7 @@ def write_card(
         title=str(title),
         license_id=str(license_id),
         licences=facts.licences if facts else {},
+        files=files,
         parquet=dataset.parquet,
     )
     for path, content in ((readme, written), (readme.parent / CROISSANT, about)):

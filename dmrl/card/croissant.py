@@ -4,7 +4,8 @@ Version 1.0 of MLCommons' vocabulary, https://docs.mlcommons.org/croissant/docs/
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -45,6 +46,7 @@ def croissant(
     title: str,
     license_id: str,
     licences: Mapping[str, str],
+    files: Mapping[str, Sequence[Path]],
     parquet: bool,
 ) -> str:
     """The JSON document of a dataset.
@@ -59,6 +61,8 @@ def croissant(
         As on the card.
     licences
         Licences of what it was made from, by the name of the asset.
+    files
+        Shards of each split, relative to the document.
     parquet
         Shards are Parquet files, which Croissant's loaders read; else Arrow streams.
     """
@@ -78,21 +82,20 @@ def croissant(
             {"@type": "sc:CreativeWork", "name": name, "license": words}
             for name, words in sorted(licences.items())
         ],
-        "distribution": [_files(name, parquet=parquet) for name in splits],
+        "distribution": [_files(name, files[name], parquet=parquet) for name in splits],
         "recordSet": [_rows(name, split) for name, split in splits.items()],
     }
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
-def _files(split: str, *, parquet: bool) -> dict[str, Any]:
-    where = f"data/{split}-*.parquet" if parquet else f"{split}/data-*.arrow"
+def _files(split: str, files: Sequence[Path], *, parquet: bool) -> dict[str, Any]:
     return {
         "@type": "cr:FileSet",
         "@id": f"{split}-shards",
         "name": f"{split}-shards",
         "description": f"Shards of the split {split}.",
         "encodingFormat": KINDS["parquet" if parquet else "arrow"],
-        "includes": where,
+        "includes": [file.as_posix() for file in files],
     }
 
 

@@ -1,7 +1,7 @@
 """The YAML front matter of a card, as the Hugging Face Hub reads it."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ def check_license(text: str) -> None:
 
 
 def front_matter(
-    splits: dict[str, Split], title: str, license_id: str, *, parquet: bool
+    splits: dict[str, Split], title: str, license_id: str, files: Mapping[str, Sequence[Path]]
 ) -> Iterator[str]:
     """Lines of the front matter, with the dashes around it.
 
@@ -70,8 +70,10 @@ def front_matter(
         By name.
     title, license_id
         For ``pretty_name`` and ``license``.
-    parquet
-        Name the Parquet files, so that ``datasets.load_dataset`` finds them.
+    files
+        Parquet files of each split, relative to the card, so that ``datasets.load_dataset`` finds
+        these and no others: ``--add`` that was killed leaves some that do not belong to it yet.
+        Empty: there are none.
     """
     total = sum(map(len, splits.values()))
     size = next((name for limit, name in SIZES.items() if total < limit), "n>1M")
@@ -87,9 +89,9 @@ def front_matter(
         "tags": ["dmrl", "multi-robot", "relative-localization"],
         "dataset_info": {"features": [_yaml_feature(f) for f in schema], "splits": sizes},
     }
-    if parquet:
-        files = [{"split": name, "path": f"data/{name}-*"} for name in splits]
-        front["configs"] = [{"config_name": "default", "data_files": files}]
+    if files:
+        named = [{"split": name, "path": [p.as_posix() for p in files[name]]} for name in splits]
+        front["configs"] = [{"config_name": "default", "data_files": named}]
     yield from ("---", *_yaml(front), "---", "")
 
 

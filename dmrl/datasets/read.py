@@ -194,6 +194,10 @@ class Dataset:
             raise DatasetError(f"split {name} of {self.path} has no images. Make it again")
         return Split(name, pa.concat_tables(tables))
 
+    def files(self, name: str) -> list[Path]:
+        """The shards of a split, in the order of its rows."""
+        return [path for path, _ in self._shards(name)]
+
     def _shards(self, name: str) -> list[tuple[Path, int | None]]:
         """Files and their rows, where these are known."""
         if self.manifest is not None:

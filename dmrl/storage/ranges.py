@@ -4,6 +4,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
+from dmrl.errors import StorageError
 from dmrl.storage.system import told
 
 TOGETHER_BYTES, TOGETHER = 16 << 20, 64
@@ -60,7 +61,23 @@ class Ranged(io.RawIOBase):
         if place in self._held:
             return self._held.pop(place)
         with told(self._url):
-            return bytes(self._system.cat_file(self._name, start=start, end=start + size))
+            data = self._system.cat_file(self._name, start=start, end=start + size)
+        return self._whole(data, size)
+
+    def _whole(self, data: bytes, size: int) -> bytes:
+        """What a server sent for a place, if it is as long as that.
+
+        Raises
+        ------
+        StorageError
+            If not.
+        """
+        if len(data) != size:
+            raise StorageError(
+                f"{self._url}: the server sent {len(data)} bytes for {size}. Copy the file, "
+                "and check it"
+            )
+        return bytes(data)
 
     def _fetch_some(self) -> None:
         """Fetch the next places that are expected, side by side."""
@@ -74,7 +91,9 @@ class Ranged(io.RawIOBase):
             found = self._system.cat_ranges(
                 [self._name] * len(some), starts, ends, on_error="raise"
             )
-        self._held = dict(zip(some, map(bytes, found), strict=True))
+        self._held = {
+            place: self._whole(data, place[1]) for place, data in zip(some, found, strict=True)
+        }
 
     def readable(self) -> bool:
         """It is."""

@@ -23,6 +23,10 @@ def system(scheme: str) -> Any:
     try:
         import fsspec  # noqa: PLC0415 - an extra
 
+        if scheme in ("http", "https"):
+            from dmrl.storage.web import Web  # noqa: PLC0415 - aiohttp, the same extra
+
+            return Web(use_listings_cache=False)
         return fsspec.filesystem(scheme, use_listings_cache=False)
     except ImportError as e:
         raise MissingExtra(PACKAGES[scheme], "storage", f"{scheme}://") from e

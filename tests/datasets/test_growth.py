@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from datasets import load_from_disk
+from datasets import load_dataset, load_from_disk
 
 from dmrl.border.locking import take_folder
 from dmrl.datasets import open_dataset
@@ -21,6 +21,7 @@ from dmrl.stages.trim import run as trim
 from .conftest import Record, peer, pixels_of
 
 PLAIN = Settings(split="none", shard_images=4)
+SHARDS = ((0, 2), (1, 2), (2, 4), (3, 4))
 MADE_OF_IT = ("README.md", "manifest.json", "provenance.json", "facts.json", "croissant.json")
 
 
@@ -84,6 +85,24 @@ def test_others_open_what_has_grown(record: Record, tmp_path: Path) -> None:
     assert info["num_examples"] == 12 and info["shard_lengths"] == [4, 2, 4, 2]
     sizes = [path.stat().st_size for path in (out / "train").glob("*.arrow")]
     assert info["num_bytes"] == sum(sizes)
+
+
+def test_what_an_add_that_was_killed_leaves_belongs_to_nobody(
+    record: Record, tmp_path: Path
+) -> None:
+    """Parquet files are named one by one: a pattern would find those without a manifest too."""
+    out, settings = tmp_path / "set", Settings(split="none", shard_images=4, parquet=True)
+    run(flights(record, 0), out, settings)
+    shutil.copy(
+        out / "data/train-00000-of-00002.parquet", out / "data/train-00002-of-00003.parquet"
+    )
+    assert len(load_dataset(str(out), cache_dir=str(tmp_path / "c"))["train"]) == 6
+    add(flights(record, 1), out, settings)
+    rows = load_dataset(str(out), cache_dir=str(tmp_path / "c"))["train"]
+    assert rows["source"] == ["0.mcap"] * 6 + ["1.mcap"] * 6
+    about = json.loads((out / "croissant.json").read_text())
+    (files,) = about["distribution"]
+    assert files["includes"] == [f"data/train-0000{k}-of-0000{n}.parquet" for k, n in SHARDS]
 
 
 def test_the_same_steps_make_the_same_bytes_and_a_step_again_changes_nothing(

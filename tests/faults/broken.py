@@ -61,9 +61,11 @@ class Broken:
         for _ in range(times):
             self.clear()
             self.before = contents(self.out) if self.out.exists() else {}
+            self.found = [self.read()]
             self.sound = self.run()
         assert self.sound.status == 0, self.sound.said or self.wrong
         self.whole = contents(self.out)
+        self.found.append(self.read())
         self._inputs = (inputs, contents(inputs))
 
     def clear(self) -> None:
@@ -71,6 +73,10 @@ class Broken:
         clear(self.folder)
         if self.work.before:
             self.disk.prepare(self.work.name, self.folder, self.work.out)
+
+    def read(self) -> dict[str, object]:
+        """What others find in the output."""
+        return {} if self.work.reads is None else self.work.reads(self.out)
 
     def run(
         self,
@@ -126,6 +132,8 @@ class Broken:
             unfinished = any(part.endswith(".partial") for part in Path(name).parts)
             wanted = (self.whole.get(name), self.before.get(name))
             assert unfinished or data in wanted, f"{why}: half of {name}"
+        for who, found in self.read().items():
+            assert found in [known[who] for known in self.found], f"{why}: {who} finds {found}"
 
     def judge(self, ending: Ending, why: str, *, may_stay: bool, again: bool) -> None:
         """What came of a disturbance; then, or where anything is left of it, once more."""

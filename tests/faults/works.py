@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dmrl.cli import app
+from dmrl.datasets import open_dataset
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.output import partial_of
@@ -165,8 +166,18 @@ class Inputs:
         return self.made("set", lambda path: cli("dataset", self.dots, path))
 
     @property
+    def more(self) -> Path:
+        """Twelve other images."""
+        return self.made("more.mcap", lambda path: _dots(path, seed=1))
+
+    @property
+    def packed(self) -> Path:
+        """A dataset of ``dots`` in Parquet."""
+        return self.made("packed", lambda path: cli("dataset", self.dots, path, "--parquet"))
+
+    @property
     def saved(self) -> Path:
-        """The same without a manifest, as if `datasets` had saved it."""
+        """``set`` without a manifest, as if `datasets` had saved it."""
         return self.made("saved", self._saved)
 
     def _saved(self, path: Path) -> None:
@@ -228,6 +239,8 @@ class Work:
         Whether it writes the same bytes each time; else they are about as many.
     pieces
         Whether its output is a folder whose parts stand by themselves.
+    reads
+        Who else reads the output, and what each finds: as before or as after, at every moment.
     """
 
     name: str
@@ -238,6 +251,7 @@ class Work:
     before: Run | None = None
     same: bool = True
     pieces: bool = False
+    reads: Callable[[Path], dict[str, object]] | None = None
 
     @property
     def of(self) -> str:
@@ -263,9 +277,9 @@ def cli(*words: object) -> None:
             raise
 
 
-def _dots(path: Path) -> None:
+def _dots(path: Path, seed: int = 0) -> None:
     """Twelve images of a bright square on dark noise, in chunks of a few, with labels."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.add_metadata(
             SPLIT_METADATA,
@@ -328,6 +342,33 @@ def _copied(i: Inputs, out: Path) -> None:
     shutil.copytree(i.set, out)
 
 
+def _copied_packed(i: Inputs, out: Path) -> None:
+    shutil.copytree(i.packed, out)
+
+
+def _grow(i: Inputs, out: Path) -> None:
+    cli("dataset", i.more, out, "--add")
+
+
+def _rows_read(out: Path) -> dict[str, object]:
+    """Times of the rows that dmrl finds in a dataset, and those that `datasets` finds.
+
+    Of shards in Arrow `datasets` has a list for each split: here one may be longer already.
+    """
+    datasets = import_module("datasets")
+    opened = open_dataset(out)
+    ours = {name: opened.split(name).table["log_time"].to_pylist() for name in opened.splits}
+    if opened.parquet:
+        found = datasets.load_dataset(str(out), streaming=True)
+        theirs = {name: [row["log_time"] for row in rows] for name, rows in found.items()}
+        return {"dmrl": ours, "datasets": theirs}
+    found = datasets.load_from_disk(str(out))
+    return {
+        "dmrl": ours,
+        **{f"datasets, {name}": own["log_time"][:] for name, own in found.items()},
+    }
+
+
 def _card(i: Inputs, out: Path) -> None:
     cli("card", out, "--title", "Another")
 
@@ -385,6 +426,15 @@ WORKS = (
     Work("likeness", lambda i, out: cli("likeness", i.dots, out), "like.toml"),
     Work("dataset", lambda i, out: cli("dataset", i.dots, out), "set"),
     Work("dataset to parquet", lambda i, out: cli("dataset", i.dots, out, "--parquet"), "set"),
+    Work("dataset --add", _grow, "set", before=_copied, pieces=True, reads=_rows_read),
+    Work(
+        "dataset --add to parquet",
+        _grow,
+        "set",
+        before=_copied_packed,
+        pieces=True,
+        reads=_rows_read,
+    ),
     Work("card", _card, "set", before=_copied, pieces=True),
     Work("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
     Work("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots"),

@@ -1,0 +1,104 @@
+"""Files on a web server, which may be anybody's: no byte is taken but those that were asked for.
+
+fsspec reads whatever a server answers, as a whole, into memory. Here an answer is read up to the
+size that was asked for, and has to be that part of that version of the file.
+"""
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from fsspec.implementations.http import HTTPFileSystem
+
+from dmrl.errors import StorageError
+
+STEP_BYTES = 1 << 20
+PARTIAL = 206
+RANGE = re.compile(r"bytes (\d+)-(\d+)/(?:\d+|\*)")
+VERSION = ("ETag", "Last-Modified")
+"""Headers that tell a version of a file from another."""
+
+
+class Web(HTTPFileSystem):  # type: ignore[misc]
+    """Web servers, for `dmrl.storage.system`."""
+
+    protocol = ("http", "https")
+
+    def __init__(self, **given: Any) -> None:
+        # What is packed could unpack to any size.
+        super().__init__(client_kwargs={"auto_decompress": False}, **given)
+        self._versions: dict[str, dict[str, str]] = {}
+
+    async def _info(self, url: str, **given: Any) -> dict[str, Any]:
+        """Size and version; parts that are read later have to be of this version."""
+        info: dict[str, Any] = await super()._info(url, **given)
+        if info["size"] is None:
+            raise StorageError(f"{url}: the server does not say how large it is. Copy the file")
+        self._versions[url] = {name: info[name] for name in VERSION if info.get(name)}
+        return info
+
+    async def _cat_file(
+        self, url: str, start: int | None = None, end: int | None = None, **_: Any
+    ) -> bytes:
+        """Bytes from ``start`` to ``end``."""
+        assert start is not None and end is not None
+        session = await self.set_session()
+        asked = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity"}
+        async with session.get(self.encode_url(url), headers=asked) as answer:
+            self._raise_not_found_for_status(answer, url)
+            if answer.status != PARTIAL:
+                raise StorageError(f"{url}: the server cannot send parts of a file. Copy the file")
+            found = RANGE.fullmatch(answer.headers.get("Content-Range", ""))
+            self._refuse_other(url, answer)
+            data = await _read(answer, end - start)
+            if not found or int(found[1]) != start or len(data) != end - start:
+                raise _other(url)
+            return data
+
+    async def _get_file(self, url: str, path: str, **_: Any) -> None:
+        """Copy a file, which has the size that the server said."""
+        size = (await self._info(url))["size"]
+        free = shutil.disk_usage(Path(path).parent).free
+        if size > free:
+            raise StorageError(f"{url} has {size} bytes, and here are {free} free. Free some")
+        session = await self.set_session()
+        with Path(path).open("wb") as out:
+            async with session.get(
+                self.encode_url(url), headers={"Accept-Encoding": "identity"}
+            ) as answer:
+                self._raise_not_found_for_status(answer, url)
+                self._refuse_other(url, answer)
+                left = size
+                while left and (data := await _read(answer, min(left, STEP_BYTES))):
+                    out.write(data)
+                    left -= len(data)
+        if left:
+            raise _other(url)
+
+    async def _find(self, *_: Any, **__: Any) -> list[str]:
+        """Nothing: pages with links are no folders, and such pages could go on for ever."""
+        return []
+
+    def _refuse_other(self, url: str, answer: Any) -> None:
+        """Nothing, if an answer is of the version of a file that is being read, and not packed."""
+        known = self._versions.get(url, {})
+        if any(answer.headers.get(name, said) != said for name, said in known.items()):
+            raise StorageError(f"{url} changed while it was read. Run it again")
+        if answer.headers.get("Content-Encoding", "identity") != "identity":
+            raise _other(url)
+
+
+async def _read(answer: Any, size: int) -> bytes:
+    """So many bytes of an answer, or all that there are."""
+    parts, left = [], size
+    while left and (data := await answer.content.read(left)):
+        parts.append(data)
+        left -= len(data)
+    return b"".join(parts)
+
+
+def _other(url: str) -> StorageError:
+    return StorageError(
+        f"{url}: the server sent other bytes than it was asked for. Copy the file, and check it"
+    )

@@ -1,0 +1,228 @@
+"""Web servers of strangers: no more is read than was asked for, and nothing of another file."""
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import StorageError
+from dmrl.recording import summary
+from dmrl.storage import path_of
+from dmrl.storage.system import system
+
+from ..faults.ending import ended
+from ..faults.works import Inputs, cli
+
+pytest.importorskip("aiohttp")
+pytestmark = pytest.mark.filterwarnings("ignore")  # of aiohttp and of broken connections
+MOST_SENT = 10_000_000
+"""What a server could send as one answer, into buffers of sockets, before nobody takes any more."""
+ZEROS = bytes(1 << 20)
+
+
+@dataclass
+class Site:
+    """A file on a web server, and what is wrong with the server."""
+
+    data: bytes
+    wrong: str = ""
+    most_sent: int = 0
+    asked: int = 0
+    address: str = ""
+    paths: list[str] = field(default_factory=list)
+
+    @property
+    def url(self) -> str:
+        """Of the file."""
+        return f"{self.address}/a.mcap"
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers ranges, well or badly."""
+
+    site: Site
+
+    def setup(self) -> None:
+        """Small buffers: what is not taken is soon not sent."""
+        self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65_536)
+        super().setup()
+
+    def do_HEAD(self) -> None:
+        """Its size."""
+        self.site.paths.append(self.path)
+        if self.site.wrong == "lists" and "a.mcap" not in self.path:
+            self._head(200, 0, {"Content-Type": "text/html"})
+            return
+        wrong = {"huge": 1 << 60, "none": None}
+        self._head(200, wrong.get(self.site.wrong, len(self.site.data)))
+
+    def do_GET(self) -> None:
+        """A range, or the whole file."""
+        site = self.site
+        site.asked += 1
+        site.paths.append(self.path)
+        asked = self.headers.get("Range")
+        if site.wrong == "lists":
+            self._list()
+            return
+        if asked is None or site.wrong == "whole":
+            self._send_whole()
+            return
+        first, last = (int(n) for n in asked.removeprefix("bytes=").split("-"))
+        part = site.data[first : last + 1]
+        part += bytes(last + 1 - first - len(part)) if site.wrong == "huge" else b""
+        more = {"Content-Range": f"bytes {first}-{last}/{len(site.data)}"}
+        match site.wrong:
+            case "endless":
+                self._head(206, None, more)
+                self._send(part, ZEROS * 20)
+            case "more" | "fewer":
+                part = part + ZEROS if site.wrong == "more" else part[:-1]
+                self._head(206, len(part), more)
+                self._send(part)
+            case "elsewhere":
+                part = (site.data[first + 1 :] + ZEROS)[: last + 1 - first]
+                more["Content-Range"] = f"bytes {first + 1}-{last + 1}/{len(site.data)}"
+                self._head(206, len(part), more)
+                self._send(part)
+            case "packed":
+                self._head(206, len(part), {**more, "Content-Encoding": "deflate"})
+                self._send(part)
+            case _:
+                self._head(206, len(part), more)
+                self._send(part)
+
+    def _send_whole(self) -> None:
+        site = self.site
+        size = None if site.wrong in ("none", "endless", "short") else len(site.data)
+        self._head(200, size)
+        more = ZEROS * 20 if site.wrong == "endless" else b""
+        self._send(site.data[: -9 if site.wrong == "short" else None], more)
+
+    def _list(self) -> None:
+        """A folder that holds a folder, without end."""
+        text = b'<a href="b/">b/</a><a href="../../../victim">x</a>'
+        self._head(200, len(text), {"Content-Type": "text/html"})
+        self._send(text)
+
+    def _head(self, status: int, size: int | None, more: dict[str, str] | None = None) -> None:
+        self.send_response(status)
+        if size is not None:
+            self.send_header("Content-Length", str(size))
+        changed = self.site.wrong == "changes" and self.site.asked > 1
+        for name, value in {"ETag": '"b"' if changed else '"a"', **(more or {})}.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def _send(self, *parts: bytes) -> None:
+        data, sent = b"".join(parts), 0
+        try:
+            while sent < len(data):
+                sent += self.connection.send(data[sent : sent + len(ZEROS)])
+        except OSError:
+            self.close_connection = True
+        self.site.most_sent = max(self.site.most_sent, sent)
+
+    def log_message(self, *_: object) -> None:
+        """Nothing."""
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    return Inputs(tmp_path_factory.mktemp("inputs"))
+
+
+@pytest.fixture
+def site(inputs: Inputs) -> Iterator[Site]:
+    """A recording on a server."""
+    site = Site(inputs.dots.read_bytes())
+    handler = type("Mine", (Handler,), {"site": site})
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        site.address = f"http://127.0.0.1:{server.server_port}"
+        yield site
+        server.shutdown()
+    system.cache_clear()
+
+
+def test_a_recording_on_a_web_server_is_that_of_here(
+    site: Site, inputs: Inputs, tmp_path: Path
+) -> None:
+    for name, source in (("here", inputs.dots), ("there", site.url)):
+        out = tmp_path / f"{name}.mcap"
+        cli("trim", source, out, "--to-s", 0.9)
+    here, there = (summary(tmp_path / f"{name}.mcap") for name in ("here", "there"))
+    assert here.count == there.count > 10 and here.topics == there.topics
+    assert here.provenance and there.provenance
+    assert here.provenance.inputs[0].sha256 == there.provenance.inputs[0].sha256
+
+
+@pytest.mark.parametrize("wrong", [pytest.param("endless", marks=pytest.mark.heavy), "more"])
+def test_what_a_server_sends_beyond_what_was_asked_is_not_read(wrong: str, site: Site) -> None:
+    site.wrong = wrong
+    for command in ("info", "check"):
+        cli(command, site.url)
+    assert site.asked > 10 and site.most_sent < MOST_SENT
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("fewer", "the server sent other bytes than it was asked for"),
+        ("elsewhere", "the server sent other bytes than it was asked for"),
+        ("packed", "the server sent other bytes than it was asked for"),
+        ("whole", "the server cannot send parts of a file"),
+        ("changes", "changed while it was read"),
+        ("none", "the server does not say how large it is"),
+        ("huge", "is cut short"),
+    ],
+)
+def test_a_server_that_sends_what_was_not_asked_is_one_line(
+    wrong: str, said: str, site: Site
+) -> None:
+    site.wrong = wrong
+    for command in ("info", "check"):
+        site.asked = 0
+        status, text = ended(lambda c=command: cli(c, site.url))
+        assert status == 1 and f"{site.url}" in text and said in text, text
+    assert site.most_sent < MOST_SENT
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("", None),
+        ("endless", None),
+        ("huge", "bytes, and here are"),
+        ("short", "sent other bytes"),
+        ("changes", "changed while it was read"),
+    ],
+)
+def test_a_copy_is_what_the_server_said_and_no_more(
+    wrong: str, said: str | None, site: Site
+) -> None:
+    """As of a model, which a library opens by its name."""
+    site.wrong = wrong
+    if said is None:
+        assert Path(os.fspath(path_of(site.url))).read_bytes() == site.data
+        assert site.most_sent < MOST_SENT
+        return
+    site.asked = 1
+    with pytest.raises(StorageError, match=said):
+        os.fspath(path_of(site.url))
+
+
+def test_a_folder_on_a_web_server_is_not_walked(site: Site, tmp_path: Path) -> None:
+    site.wrong, out = "lists", tmp_path / "out"
+    url = f"{site.address}/set"
+    assert list(path_of(url).glob("*.mcap")) == list(path_of(url).iterdir()) == []
+    for words in (("convert", url, out), ("check", url)):
+        status, _ = ended(lambda w=words: cli(*w))
+        assert status == 1 and not out.exists()
+    assert len(site.paths) < 50
