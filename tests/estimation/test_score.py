@@ -1,3 +1,5 @@
+from dataclasses import asdict, replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from dmrl.estimation.score import (
     figures,
     inside_truth,
     overall,
+    squared_distances,
 )
 from dmrl.geometry.frames import Array
 
@@ -96,3 +99,75 @@ def test_truth_reaches_as_far_as_it_is_dense() -> None:
     near = [False, True, True, True, True, True, False, True, False, True, False]
     assert inside_truth(at_ns, true_ns).tolist() == near
     assert not inside_truth(at_ns, true_ns[:0]).any()
+
+
+def test_figures_are_those_of_a_plain_count() -> None:
+    rng = np.random.default_rng(5)
+    count, settle_s = 101, 3.0  # one sample stands at the border, and counts
+    root = rng.normal(size=(count, 2, 2)) * 0.2
+    found = Judged(
+        np.arange(count) / 10,
+        rng.normal(size=(count, 2)) * 0.25,
+        root @ root.swapaxes(1, 2),
+        rng.uniform(1, 2, count),
+        rng.random(count) < 0.6,
+    )
+    size = [float(np.hypot(x, y)) for x, y in found.error_m]
+    squared = [
+        float(e @ np.linalg.solve(c, e))
+        for e, c in zip(found.error_m, found.covariance, strict=True)
+    ]
+    late = [k for k in range(count) if found.time_s[k] >= settle_s]
+    kept = [k for k in range(count) if found.kept[k]]
+    good = [k for k in range(count) if size[k] <= 0.3]
+    both = len(set(kept) & set(good))
+    wanted = {
+        "samples": count,
+        "rmse_m": np.sqrt(np.mean([size[k] ** 2 for k in late])),
+        "p95_m": np.percentile([size[k] for k in late], 95),
+        "wrong_basin": 0.0,
+        "nees": np.mean([squared[k] for k in late]),
+        "coverage_95": np.mean([squared[k] <= 5.991 for k in late]),
+        "good": len(good) / count,
+        "kept": len(kept) / count,
+        "precision": both / len(kept),
+        "recall": both / len(good),
+        "kept_coverage_95": np.mean([squared[k] <= 5.991 for k in kept]),
+        "kept_rmse_m": np.sqrt(np.mean([size[k] ** 2 for k in kept])),
+    }
+    assert asdict(figures(found, settle_s)) == pytest.approx(wanted)
+    assert found.sigma_m == pytest.approx(np.sqrt([np.diag(c) for c in found.covariance]))
+
+
+@pytest.mark.parametrize(("share", "wrong"), [(0.49, 0.0), (0.51, 1.0)])
+def test_half_the_distance_is_a_wrong_basin(share: float, wrong: float) -> None:
+    errors = np.tile([0.0, 1.5 * share], (9, 1))
+    assert figures(judged(errors), 0.0).wrong_basin == wrong
+    errors[:4] = 1.5 * (1 - share)  # fewer than half of them say nothing
+    assert figures(judged(errors), 0.0).wrong_basin == wrong
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [[[1, 1], [1, 1]], [[-1, 0], [0, -1]], [[-1, 0], [0, 1]], [[0, 0], [0, 1]], [[1, 2], [2, 1]]],
+)
+def test_what_is_no_covariance_gives_no_distance(covariance: list[list[float]]) -> None:
+    one = replace(judged(np.array([[1.0, 0.0]])), covariance=np.array([covariance], float))
+    assert np.isnan(squared_distances(one)).all()
+
+
+def test_figures_over_all_pairs_are_means_medians_or_shares() -> None:
+    def pair(k: float, samples: int) -> Figures:
+        return Figures(samples, k, 2 * k, k, 3 * k, k / 4, 0.5, k / 3, 0.5, k / 3, k / 5, 4 * k)
+
+    one, two, nan = pair(0.3, 100), pair(0.9, 300), Figures(50, *[float("nan")] * 5, *[0.0] * 2,
+                                                           *[float("nan")] * 4)  # fmt: skip
+    found = overall([one, two, nan])
+    assert found.samples == 450
+    assert (found.rmse_m, found.p95_m, found.kept_rmse_m) == pytest.approx((0.6, 1.2, 2.4))
+    assert (found.wrong_basin, found.nees) == pytest.approx((0.6, 1.8))
+    assert (found.coverage_95, found.kept_coverage_95) == pytest.approx((0.15, 0.12))
+    good, kept = 0.5 * 400, 0.1 * 100 + 0.3 * 300
+    both = 50 * 0.1 + 150 * 0.3
+    assert (found.good, found.kept) == pytest.approx((good / 450, kept / 450))
+    assert (found.precision, found.recall) == pytest.approx((both / kept, both / good))

@@ -126,6 +126,7 @@ def test_a_stretch_has_twenty_ranges_at_least(ranges: int, count: int) -> None:
     ("share", "sigmas", "wrong"),
     [
         (0.19, 9.0, False),
+        (0.20, 9.0, False),
         (0.21, 9.0, True),
         (1.0, 0.99 * np.sqrt(chi2.ppf(0.99, 2)), False),
         (1.0, 1.01 * np.sqrt(chi2.ppf(0.99, 2)), True),
@@ -154,3 +155,101 @@ def test_between_stretches_of_two_the_peer_goes_over_evenly() -> None:
     between = (key_s > 25) & (key_s < 45)
     assert state[between, 0] == pytest.approx(1 + 2 * (key_s[between] - 25) / 20, abs=0.011)
     assert not state[:, 1:].any()
+
+
+def circling(vx: float, vy: float, turn: float, count: int) -> tuple[Track, np.ndarray, np.ndarray]:
+    """A robot that flies a circle, as it measures it; its heading and where it is, as x + iy."""
+    time_s = np.arange(count) / 100
+    ones = np.ones(count)
+    height_m = 1 + 0.1 * vx * time_s
+    track = Track(vx * ones, vy * ones, turn * ones, height_m, np.zeros(count, bool))
+    place = (vx + 1j * vy) * (np.exp(1j * turn * time_s) - 1) / (1j * turn)
+    return track, turn * time_s, place
+
+
+def test_a_part_of_a_flight_is_what_was_measured_then() -> None:
+    rng = np.random.default_rng(2)
+    count = 6001
+    time_s = 5 + np.arange(count) / 100
+
+    def anything() -> Track:
+        return Track(*rng.normal(size=(4, count)), np.zeros(count, bool), rng.random(count) < 0.5)
+
+    ranges_s = np.concatenate([np.arange(5, 25, 0.1), np.arange(45, 65, 0.1)])
+    pair = Pair(time_s, anything(), anything(), ranges_s, rng.uniform(1, 2, len(ranges_s)))
+    found = stretches(pair)
+    assert len(found) == 2
+    for part in found:
+        at = (time_s >= part.time_s[0]) & (time_s <= part.time_s[-1])
+        assert (part.time_s == time_s[at]).all()
+        for cut, whole in ((part.own, pair.own), (part.peer, pair.peer)):
+            for one, other in zip(cut.values(), whole.values(), strict=True):
+                assert (one == other[at]).all()
+            assert whole.height_gap is not None and cut.height_gap is not None
+            assert (cut.gap == whole.gap[at]).all()
+            assert (cut.height_gap == whole.height_gap[at]).all()
+        heard_then = (ranges_s >= part.time_s[0]) & (ranges_s <= part.time_s[-1])
+        assert (part.range_time_s == ranges_s[heard_then]).all()
+        assert (part.range_m == pair.range_m[heard_then]).all()
+    assert sum(len(part.range_m) for part in found) >= len(ranges_s) - 2
+
+
+def test_joined_stretches_of_two_that_circle_are_the_way_they_flew() -> None:
+    own, turned, here = circling(0.3, -0.1, 0.2, 6001)
+    peer, there_turned, there = circling(-0.2, 0.4, -0.35, 6001)
+    time_s = 5 + np.arange(6001) / 100
+    flight = problem(Pair(time_s, own, peer, np.array([6.0]), np.array([1.0])))
+    apart = ((1.5 + 0.5j) + np.exp(0.7j) * there - here) * np.exp(-1j * turned)
+    truth = np.column_stack([apart.real, apart.imag, 0.7 + there_turned - turned])
+    key_s = flight.key_s
+    truth = np.column_stack([np.interp(key_s, time_s, column) for column in truth.T])
+
+    def part(start_s: float, end_s: float, turns: int, error_m: float) -> Estimate:
+        at = (key_s > start_s - 0.01) & (key_s < end_s + 0.01)
+        made = standing(key_s[at], 0.0)
+        state = truth[at] + [0.0, 0.0, 2 * np.pi * turns]  # which turn it is is nobody's
+        return replace(made, state=state, range_error_m=np.full(at.sum(), error_m))
+
+    for parts in (
+        [part(8, 20, 0, 0.1), part(30, 40, 1, 0.2), part(50, 60, -1, 0.3)],
+        [part(25, 35, 0, 0.4)],
+        [part(8, 20, 0, 0.1), replace(part(30, 40, 0, 0.0), range_error_m=None)],
+    ):
+        state = joined(flight, parts)
+        assert state.shape == (len(key_s), 6)
+        assert state[:, :3] == pytest.approx(truth, abs=0.01)
+        assert not state[:, 3:5].any()
+        wanted = np.zeros(len(key_s))
+        for one in parts:
+            if one.range_error_m is not None:
+                wanted[np.isin(key_s, one.time_s)] = one.range_error_m[0]
+        assert state[:, 5] == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("doubted", ["here", "there", "neither"])
+def test_a_surer_stretch_counts_whichever_robot_it_contradicts(doubted: str) -> None:
+    time_s = np.arange(0.0, 20.0, 0.1)
+    inner = time_s[50:101]
+    whole = standing(time_s, 1.0, UNCONVERGED)
+    part = standing(inner, 1.0)
+    part.covariance[...] *= np.linspace(1, 2, len(inner))[:, None, None]
+    part.status[3] = UNCONVERGED
+    part.state[:, 2] = np.linspace(3.0, 3.5, len(inner))
+    own, peer = replace(part), replace(part)
+    if doubted != "neither":
+        side = own if doubted == "here" else peer
+        object.__setattr__(side, "state", part.state * [-1.0, 1.0, 1.0])
+    found = mended((whole, whole), [(own, peer)])
+    if doubted == "neither":
+        assert found == (whole, whole)
+        return
+    at = np.zeros(len(time_s), bool)
+    at[50:101] = True
+    for got, alone in zip(found, (own, peer), strict=True):
+        assert got.state[at] == pytest.approx(alone.state)
+        assert got.covariance[at] == pytest.approx(alone.covariance)
+        assert (got.status[at] == alone.status).all()
+        assert (got.state[~at] == whole.state[~at]).all()
+        assert (got.covariance[~at] == whole.covariance[~at]).all()
+        assert (got.status[~at] == whole.status[~at]).all()
+    assert (whole.state[:, 0] == 1.0).all()
