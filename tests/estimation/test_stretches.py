@@ -143,18 +143,22 @@ def test_a_solution_is_contradicted_by_a_fifth_outside_the_ellipse_of_99_percent
 
 
 def test_between_stretches_of_two_the_peer_goes_over_evenly() -> None:
-    pair = heard(np.arange(0, 60, 0.1))
-    flight = problem(pair)
+    flight = problem(heard(np.arange(0, 60, 0.1)))
     key_s = flight.key_s
-    parts = [
-        standing(key_s[(key_s >= a) & (key_s <= b)], x) for a, b, x in ((5, 25, 1.0), (45, 65, 3.0))
-    ]
-    state = joined(flight, parts)
-    assert state[key_s <= 25, 0] == pytest.approx(1.0)
-    assert state[key_s >= 45, 0] == pytest.approx(3.0)
-    between = (key_s > 25) & (key_s < 45)
-    assert state[between, 0] == pytest.approx(1 + 2 * (key_s[between] - 25) / 20, abs=0.011)
-    assert not state[:, 1:].any()
+
+    def part(start_s: float, end_s: float, from_m: float, to_m: float) -> Estimate:
+        """The peer moves, other than its log says; at times of its own."""
+        time_s = np.arange(start_s, end_s, 0.07)
+        made = standing(time_s, 0.0)
+        made.state[:, 0] = from_m + (to_m - from_m) * (time_s - start_s) / (end_s - start_s)
+        return made
+
+    found = joined(flight, [part(5, 20, 0.0, 1.5), part(45, 60, 3.0, 4.5)])
+    wanted = np.interp(key_s, [5, 20, 45, 60, 65], [0, 1.5, 3, 4.5, 4.5])
+    assert found[:, 0] == pytest.approx(wanted, abs=0.021)
+    assert not found[:, 1:].any()
+    alone = joined(flight, [part(10, 20, 1.0, 2.0)])
+    assert alone[:, 0] == pytest.approx(np.interp(key_s, [10, 20], [1, 2]), abs=0.021)
 
 
 def circling(vx: float, vy: float, turn: float, count: int) -> tuple[Track, np.ndarray, np.ndarray]:

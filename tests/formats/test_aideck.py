@@ -65,3 +65,12 @@ def test_a_label_ends_at_the_picture_s_edges() -> None:
         assert len(seen(2.0, u, v)) == count
     assert len(seen(0.051, 50, 40)) == 1
     assert len(seen(0.049, 50, 40)) == 0
+
+
+def test_a_picture_s_first_edges_are_in_it_and_its_last_are_not() -> None:
+    """In numbers that floats hold exactly."""
+    camera = Camera(128, 64, 32.0, 32.0, 64.0, 32.0, ())
+    for u, v, count in ((0, 0, 1), (128, 32, 0), (64, 64, 0), (127, 63, 1)):
+        place = (1.0, (64 - u) / 32, (32 - v) / 32)
+        *_, labels = samples(7, "cf1", "cf2", (0.0, 0.0, *place, 0.0), camera)
+        assert len(labels.fields["peers"]) == count

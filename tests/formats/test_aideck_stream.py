@@ -130,3 +130,18 @@ def test_the_robot_s_turning_is_told_in_radians(tmp_path: Path) -> None:
     (attitude,) = samples(tmp_path / "a.cpx", data)["/cf1/attitude"]
     assert attitude.fields["yaw_rate_radps"] == pytest.approx(0.5)
     assert attitude.time_ns == 5_000_000_000
+
+
+def test_a_state_is_logged_in_the_order_of_its_names(tmp_path: Path) -> None:
+    state = State(
+        *(1000, 5_000_000, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+        turning_radps=tuple(np.radians((7.0, 8.0, 9.0)).tolist()),
+    )
+    raw = foreign.pictures(1)[0].tobytes()
+    data = pack_image(Image(32, 24, "raw", raw, 5_004_000, 1, state), "streamer")
+    (logged,) = samples(tmp_path / "a.cpx", data)["/cf1/log/cpx_state"]
+    values = [*(1, 2, 3), *(4, 5, 6), *(0, 0, 0, 1), *(7, 8, 9)]
+    assert list(logged.fields.values()) == pytest.approx(values, abs=0.03)
+    names = ("x", "y", "z", "vx", "vy", "vz", "qx", "qy", "qz", "qw")
+    turns = [f"gyro_{axis}" for axis in "xyz"]
+    assert list(logged.fields) == [*(f"stateEstimate_{name}" for name in names), *turns]

@@ -191,3 +191,33 @@ def test_a_log_of_very_many_variables_is_refused(tmp_path: Path) -> None:
     path.write_text(f"Timestamp,{names}\n" + f"{'1,' * 1001}1\n" * 2)
     with pytest.raises(SourceError, match="1001 variables, more than 1000"):
         list(cfclient_csv.content(path, Options()).samples)
+
+
+@pytest.mark.parametrize(
+    ("line", "whole"), [("nan,1", False), ("inf,1", False), ("5,nan", True), ("5,1,1", False)]
+)
+def test_a_time_is_a_number_and_a_value_may_be_none(line: str, whole: bool, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"Timestamp,x\n{line}\n6,1\n")
+    if whole:
+        assert cfclient_csv.read_block(tmp_path / "a.csv").time_ns.tolist() == [
+            5_000_000,
+            6_000_000,
+        ]
+    else:
+        with pytest.raises(SourceError, match=r"a\.csv:2: not 2 numbers"):
+            cfclient_csv.read_block(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("head", ["Timestamp,,x", "Time,x", "x,Timestamp", ""])
+def test_a_header_is_the_time_and_names(head: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"{head}\n1,2,3\n")
+    with pytest.raises(SourceError, match=r"a\.csv:1: not Timestamp and names"):
+        cfclient_csv.read_block(tmp_path / "a.csv")
+
+
+def test_a_block_of_one_row_is_one(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("Timestamp,x\n5,1\n")
+    (tmp_path / "b.csv").write_text("Timestamp,y\n5,1\n7,2\n")
+    found = samples(tmp_path)
+    assert [s.time_ns for s in found["/cf1/log/a"]] == [5_000_000]
+    assert [s.time_ns for s in found["/cf1/log/b"]] == [5_000_000, 7_000_000]

@@ -424,3 +424,18 @@ def test_events_whose_numbers_end_alike_are_told_apart(numbers: tuple[int, int])
     ]
     raw = plain_usd.encode(events, rows)
     same(cfusdlog.decode(raw), raw)
+
+
+def test_a_log_has_250_types_of_events_at_most_and_names_that_print() -> None:
+    events = {k: (f"e{k}", [("x", "H")]) for k in range(251)}
+    most = {k: events[k] for k in range(250)}
+    raw = plain_usd.encode(most, [(k, k, (k,)) for k in range(250)])
+    assert len(cfusdlog.decode(raw).blocks) == 250
+    with pytest.raises(SourceError, match="no micro-SD log of version 1 or 2"):
+        cfusdlog.decode(plain_usd.encode(events, []))
+    for name, variable in (("a\n", "x"), ("a", "x\n")):
+        with pytest.raises(SourceError, match="without name or known type"):
+            cfusdlog.decode(plain_usd.encode({1: (name, [(variable, "H")])}, []))
+    for head in (b"\xbc\2\0\0\0", b"\xbc\2\0"):
+        with pytest.raises(SourceError):
+            cfusdlog.decode(head + bytes(9))

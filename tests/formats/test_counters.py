@@ -1,5 +1,11 @@
+import math
+from fractions import Fraction
+from itertools import combinations
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dmrl.formats.counters import SteadySender, Unwrapped, _lower_hull, _numbered, dejitter, unwrap
 
@@ -147,3 +153,36 @@ def test_nothing_is_sent_after_it_arrived_on_a_clock_of_today() -> None:
     steps = rng.integers(49 * MS, 51 * MS, 300)
     for arrival in (17 * 10**17 + np.cumsum(steps)).tolist():
         assert sender(arrival) <= arrival
+
+
+def test_three_arrivals_are_evened_out_and_two_stand() -> None:
+    assert dejitter([0, 10, 19]).tolist() == [0, 9, 19]
+    assert dejitter([0, 10]).tolist() == [0, 10]
+    assert dejitter([]).tolist() == []
+
+
+def plain_line(x: list[int], y: list[int]) -> list[int]:
+    """Of all lines through two points with none below, the one that is highest on average."""
+    best: tuple[Fraction, Fraction, Fraction] | None = None
+    for (a, b), (c, d) in combinations(list(zip(x, y, strict=True)), 2):
+        slope = Fraction(d - b, c - a)
+        offset = b - slope * a
+        if all(offset + slope * at <= due for at, due in zip(x, y, strict=True)):
+            height = offset + slope * Fraction(sum(x), len(x))
+            if best is None or height > best[0]:
+                best = height, offset, slope
+    assert best is not None
+    return [math.floor(best[1] + best[2] * at) for at in x]
+
+
+@given(st.lists(st.tuples(st.integers(1, 9), st.integers(0, 90)), min_size=3, max_size=12))
+def test_times_are_those_of_the_highest_line_under_all_arrivals(
+    steps: list[tuple[int, int]],
+) -> None:
+    number = np.cumsum([step for step, _ in steps])
+    arrival = 100 * number + np.array([late for _, late in steps])
+    found = dejitter(10**15 + arrival, number) - 10**15
+    line = plain_line(number.tolist(), arrival.tolist())
+    # Of two lines as high on average, either will do.
+    assert (found <= arrival).all()
+    assert found.tolist() == line or abs(found.sum() - sum(line)) <= len(line)

@@ -2,6 +2,8 @@ import struct
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dmrl.formats import cpx
 from dmrl.formats.cpx import Image, ImageReader
@@ -273,3 +275,158 @@ def test_an_image_ends_with_its_first_packet_that_is_not_full(width: int, packet
     image = raw(width, 1)
     assert len(list(PacketReader().feed(pack_image(image)))) == packets
     assert read(pack_image(image) * 2)[0] == [image, image]
+
+
+@pytest.mark.parametrize("width", [100, 4080 - 12 - 148, 4080 - 12 - 147, 4500, 8996, 12_001])
+def test_streamer_images_of_many_packets_come_back(width: int) -> None:
+    sent = [raw(width, 1, time_us=7 + k, frame_id=k) for k in range(2)]
+    data = b"".join(pack_image(image, "streamer") for image in sent)
+    got, reader = read(data)
+    assert [image.data for image in got] == [image.data for image in sent]
+    assert (reader.broken, reader.skipped_bytes) == (0, 0)
+    packets = list(PacketReader().feed(pack_image(sent[0], "streamer")))
+    sizes = [len(packet.data) for packet in packets]
+    assert sizes[:-1] == [4080] * (len(sizes) - 1) and sizes[-1] <= 4080
+    assert all(size % 4 == 0 for size in sizes)
+    assert packets[0].data[:2] == b"\x10\1"
+    assert all(packet.data[:4] == b"\x11\0\0\0" for packet in packets[1:])
+    pixels = packets[0].data[12 + 148 :] + b"".join(packet.data[4:] for packet in packets[1:])
+    assert pixels[:width] == sent[0].data and 0 <= len(pixels) - width < 4
+
+
+def app_packet(data: bytes) -> bytes:
+    return pack_packet(Packet(GAP8, HOST, APP, data))
+
+
+@pytest.mark.parametrize("layout", ["plain", "stamped", "streamer"])
+def test_what_others_send_amid_an_image_does_not_break_it(layout: cpx.Layout) -> None:
+    image = raw(90, 100, time_us=9000, frame_id=1)
+    packets = [pack_packet(p) for p in PacketReader().feed(pack_image(image, layout))]
+    words = b"Starting camera task"
+    counted = 0 if layout == "streamer" else 2  # as that firmware counts, whatever it sends
+    text = struct.pack("<HBB", len(words) + counted, 3 | 4 << 3 | 1 << 6, 2) + words
+    got, reader = read(text.join(packets))
+    assert [found.data for found in got] == [image.data]
+    assert reader.broken == 0
+
+
+def test_a_plain_image_has_not_a_byte_too_many() -> None:
+    header = cpx.HEADER.pack(cpx.MAGIC, 10, 10, 1, 0, 100)
+    for sizes, count in (((60, 40), 1), ((60, 41), 0), ((100,), 1), ((101,), 0)):
+        got, reader = read(b"".join(map(app_packet, [header, *(bytes(size) for size in sizes)])))
+        assert (len(got), reader.broken) == (count, 1 - count)
+
+
+def test_a_streamer_image_has_up_to_three_bytes_to_spare() -> None:
+    begin = next(PacketReader().feed(pack_image(raw(10, 10), "streamer"))).data
+    for spare, count in ((0, 1), (3, 1), (4, 0)):
+        data = pack_packet(Packet(GAP8, HOST, STREAMER, begin + bytes(spare)))
+        got, reader = read(data)
+        assert (len(got), reader.broken) == (count, 1 - count)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "whole"),
+    [(0, 10, True), (0, 9, False), (1, 11, False), (3, 11, False), (3, 0, False)],
+)
+def test_streamer_metadata_is_of_version_10_and_of_as_many_pixels(
+    at: int, value: int, whole: bool
+) -> None:
+    data = bytearray(pack_image(raw(10, 10), "streamer"))
+    data[10:14] = bytes(4)  # no checksum
+    data[4 + cpx.BEGIN.size + at] = value
+    got, reader = read(bytes(data))
+    assert (len(got), reader.broken) == (whole, not whole)
+
+
+@pytest.mark.parametrize(
+    ("header", "broken"),
+    [
+        ((10, 10, 1, 0, 100), 0),
+        ((10, 10, 1, 2, 100), 1),  # no such encoding
+        ((0, 10, 1, 0, 0), 1),
+        ((10, 0, 1, 0, 0), 1),
+        ((10, 10, 1, 1, 0), 1),
+        ((10, 10, 1, 1, 1 << 22), 0),
+        ((10, 10, 1, 1, (1 << 22) + 1), 1),
+    ],
+)
+def test_where_a_header_ends_to_be_one(header: tuple[int, ...], broken: int) -> None:
+    reader = ImageReader()
+    list(reader.feed(app_packet(cpx.HEADER.pack(cpx.MAGIC, *header))))
+    assert reader.broken == broken
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "broken"),
+    [(1, 149, 0), (1, 148, 1), (1, 1 << 22, 0), (1, (1 << 22) + 1, 1), (2, 200, 0)],
+)
+def test_where_a_streamer_header_ends_to_be_one(kind: int, size: int, broken: int) -> None:
+    reader = ImageReader()
+    begin = cpx.BEGIN.pack(cpx.STREAMER_BEGIN, kind, size, 0)
+    list(reader.feed(pack_packet(Packet(GAP8, HOST, STREAMER, begin))))
+    assert reader.broken == broken
+    reader.finish()
+    assert reader.broken == (1 if kind == 1 else 0)  # it was begun, if at all
+
+
+@pytest.mark.parametrize("data", [b"\x10\1", b"\x11\0", b"\x12\0\0\0"])
+def test_a_streamer_packet_that_is_none_breaks_the_image_that_was_begun(data: bytes) -> None:
+    first, *_ = PacketReader().feed(pack_image(raw(90, 100), "streamer"))
+    reader = ImageReader()
+    list(reader.feed(pack_packet(first)))
+    list(reader.feed(pack_packet(Packet(GAP8, HOST, STREAMER, data))))
+    assert reader.broken == 1
+
+
+def test_a_stamp_s_milliseconds_wrap() -> None:
+    sent = [raw(8, 8, time_us=(2**32 - 2 + k) * 1000) for k in range(4)]
+    got, _ = read(b"".join(pack_image(image, "stamped") for image in sent))
+    assert [image.time_us for image in got] == [image.time_us for image in sent]
+
+
+def plain_packets(data: bytes) -> tuple[list[bytes], int]:
+    """Packets of a whole stream and the bytes beside them, looked for byte by byte."""
+
+    def size(at: int) -> int | None:
+        if at + 4 > len(data):
+            return None
+        length, route, function = struct.unpack_from("<HBB", data, at)
+        to, of, last = route & 7, route >> 3 & 7, route >> 6
+        known = (
+            to == 3
+            and (of, last) in {(k, last) for k in (1, 2, 4) for last in (0, 1)}
+            and function in (*range(1, 7), 14, 15)
+        )
+        return length - 2 if known and 2 <= length <= 4094 else -1
+
+    found, at, skipped, in_step = [], 0, 0, True
+    while (here := size(at)) is not None:
+        if here >= 0 and not in_step:
+            after = size(at + 4 + here)
+            if after is None:
+                break
+            here = here if after >= 0 else -1
+        if here < 0:
+            at, skipped, in_step = at + 1, skipped + 1, False
+            continue
+        if at + 4 + here > len(data):
+            break
+        found.append(data[at + 4 : at + 4 + here])
+        at, in_step = at + 4 + here, True
+    return found, skipped + len(data) - at
+
+
+NOISE = st.sampled_from([b"", bytes(3), b"\0\0\x63\5", b"\2\0\x63", b"\6\0\x63\5\0", b"\x0b\1"])
+
+
+@given(st.lists(st.tuples(NOISE, st.integers(0, 5)), max_size=9), st.integers(1, 9))
+def test_packets_amid_noise_are_those_of_a_search_byte_by_byte(
+    parts: list[tuple[bytes, int]], step: int
+) -> None:
+    data = b"".join(noise + app_packet(bytes(range(size))) for noise, size in parts)
+    reader = PacketReader()
+    pieces = [data[k : k + step] for k in range(0, len(data), step)]
+    got = [packet.data for piece in pieces for packet in reader.feed(piece)]
+    reader.finish()
+    assert (got, reader.skipped_bytes) == plain_packets(data)

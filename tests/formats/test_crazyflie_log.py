@@ -277,3 +277,80 @@ def test_a_beam_of_8_m_and_more_saw_no_floor() -> None:
     found = samples(block("b", range__zrange=[7999.0, 8001.0, 1.0]))["/cf1/height"]
     assert [s.time_ns for s in found] == [0, 20 * MS]
     assert [s.fields["height_m"] for s in found] == pytest.approx([7.999, 0.001])
+
+
+GROWING = st.lists(st.integers(0, 9), min_size=1, max_size=6).map(sorted)
+
+
+@given(GROWING, GROWING)
+def test_a_pose_takes_the_turn_of_its_own_time_or_the_next_one(
+    places: list[int], turns: list[int]
+) -> None:
+    place = Series(np.array(places), np.arange(3.0 * len(places)).reshape(-1, 3))
+    turn = Series(np.array(turns), -1 - np.arange(4.0 * len(turns)).reshape(-1, 4))
+    found = _pose(place, turn)
+    assert found is not None
+    if both := sorted(set(places) & set(turns)):
+        wanted = [(t, places.index(t), turns.index(t)) for t in both]
+    else:
+        later = [sum(t < at for t in turns) for at in places]
+        wanted = [(t, k, min(later[k], len(turns) - 1)) for k, t in enumerate(places)]
+    assert found[0].tolist() == [t for t, _, _ in wanted]
+    rows = [[*place.values[a], *turn.values[b]] for _, a, b in wanted]
+    assert found[1].tolist() == rows
+
+
+def test_frames_and_poses_turn_as_what_was_logged() -> None:
+    (quaternion,) = quaternion_zyx(np.array([[0.3, -0.2, 1.1]]))
+    names = [f"locSrv.{n}" for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    times = np.array([1_700_000_000_123_456_789])
+    rows = [np.array([value]) for value in (1.5, 2.5, 3.5, *quaternion)]
+    found = samples(Block("estPose", times, dict(zip(names, rows, strict=True))))
+    (pose,) = found["/cf1/pose/truth"]
+    assert pose.fields["timestamp"] == {"seconds": 1_700_000_000, "nanos": 123_456_789}
+    assert pose.fields["frame_id"] == "world"
+    assert pose.fields["pose"]["position"] == {"x": 1.5, "y": 2.5, "z": 3.5}
+    turn = pose.fields["pose"]["orientation"]
+    assert [turn[n] for n in "xyzw"] == pytest.approx(quaternion)
+    level, tilted, _ = found["/tf"][0].fields["transforms"]
+    assert level["translation"] == {"x": 1.5, "y": 2.5, "z": 3.5}
+    heading, tilt = (
+        turned(np.array([frame["rotation"][n] for n in "xyzw"])) for frame in (level, tilted)
+    )
+    np.testing.assert_allclose(heading @ tilt, turned(quaternion), atol=1e-9)
+    np.testing.assert_allclose(heading[2], [0, 0, 1], atol=1e-12)
+
+
+def test_a_peer_of_which_nothing_was_heard_has_no_ranges(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for kind in (np.uint16, np.float32):
+        silent = Block("r", TIMES, {"ranging.distance2": np.zeros(3, kind)})
+        assert samples(silent).keys() == {"/cf1/log/r"}
+        assert len(streams("cf1", [silent], {})) == 1
+    assert "range" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("missing", ["roll", "pitch", "yaw"])
+def test_an_attitude_is_of_three_angles(missing: str) -> None:
+    angles = {f"stabilizer__{n}": [5.0] * 3 for n in ("roll", "pitch", "yaw") if n != missing}
+    assert attitude_of([block("a", **angles)]) is None
+    assert attitude_of([block("a", **angles, **{f"stabilizer__{missing}": [5.0] * 3})]) is not None
+
+
+@pytest.mark.parametrize("step_ns", [0, MS])
+def test_the_slope_of_a_yaw_needs_times_that_go_on(step_ns: int) -> None:
+    yaw = np.column_stack([np.zeros(2), np.zeros(2), [0.0, 0.002]])
+    found = yaw_rate_of([], Series(np.array([5, 5 + step_ns]), yaw))
+    assert found == pytest.approx(2.0 if step_ns else 0.0)
+
+
+@given(ANGLE, ANGLE, ANGLE)
+def test_angles_that_were_logged_are_the_turn_of_a_pose(
+    roll: float, pitch: float, yaw: float
+) -> None:
+    degrees = np.degrees([roll, -pitch, yaw])  # as the Crazyflie has them
+    logged = {f"stateEstimate__{n}": [v] for n, v in zip(("roll", "pitch", "yaw"), degrees)}  # noqa: B905
+    found = turn_of([block("a", **logged)])
+    assert found is not None
+    np.testing.assert_allclose(turned(found.values[0]), body(roll, pitch, yaw), atol=1e-5)

@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats import flight_csv
 from dmrl.formats.format import Options
@@ -253,3 +254,68 @@ def test_times_end_with_64_bits(flight: Path) -> None:
     assert list(flight_csv.content(flight).samples)
     write(flight, "cf2", [[9.1e9 + k, *row[1:]] for k, row in enumerate(rows())])
     assert "time_s reaches 9.1e+09" in refused(flight)
+
+
+def test_two_rows_are_a_flight(flight: Path) -> None:
+    write(flight, "cf2", rows()[:2])
+    assert len([s for s in flight_csv.content(flight).samples if s.topic == "/cf2/height"]) == 2
+
+
+def test_the_first_and_the_last_time_are_looked_at(flight: Path) -> None:
+    write(flight, "cf2", rows(-0.005))
+    assert "begins before time 0" in refused(flight)
+    write(flight, "cf2", [*rows(0.0), [9.1e9, *rows()[0][1:]]])
+    assert "time_s reaches 9.1e+09" in refused(flight)
+
+
+def test_columns_that_only_look_like_ranges_are_none(flight: Path) -> None:
+    data: Rows = [[*row, 1.5, 1.5, 1.5] for row in rows()]
+    write(flight, "cf1", data, [*HEADER, "range_cf2_s", "range_cf2", "my_range_cf2_m"])
+    assert not [s for s in flight_csv.content(flight).samples if "range" in s.topic]
+
+
+def test_values_as_large_as_may_be_are_not_doubted(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for value, said in ((0.8, 0), (-0.81, 1)):
+        write(flight, "cf2", [[row[0], value, *row[2:]] for row in rows()])
+        assert len(warned(flight, capsys)) == said
+
+
+def test_pictures_are_named_by_digits(flight: Path) -> None:
+    (flight / "cf1").mkdir()
+    picture = encode_png(np.zeros((8, 8, 3), np.uint8))
+    (flight / "cf1" / "notes-of-the-flight.txt").write_text("no picture")
+    (flight / "cf1" / "001005000000.png").write_bytes(picture)
+    assert list(flight_csv.content(flight).samples)
+    (flight / "cf1" / "a_dozen_and_one.png").write_bytes(picture)
+    with pytest.raises(SourceError, match="is not named by its time"):
+        flight_csv.content(flight)
+
+
+def test_other_sensors_are_read_by_their_row_of_the_table(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def row(pattern: str, message: str, *csv: str) -> topics.Topic:
+        return topics.Topic(pattern, message, "-", "m", "10 Hz", "convert", sensor=True, csv=csv)
+
+    pressure = row("/{robot}/pressure", "Pressure", "pressure_pa", "air_c")
+    sonar = row("/{robot}/sonar/{peer}", "Sonar", "sonar_m", "echo_db")
+    monkeypatch.setattr(flight_csv, "OTHERS", (pressure, sonar))
+    names = ["pressure_pa", "air_c", "sonar_cf2_m", "echo_cf2_db", "sonar_cf3_m"]
+    data: Rows = [
+        [*one, 1e5 + k, 20.5, 1.5 + k if k % 2 else "", -3.5, 7.0] for k, one in enumerate(rows())
+    ]
+    write(flight, "cf1", data, [*HEADER, *names])
+    found = list(flight_csv.content(flight, Options(names={"cf1": "a", "cf2": "b"})).samples)
+    of_air = [s for s in found if s.topic == "/a/pressure"]
+    assert [s.fields for s in of_air] == [
+        {"pressure_pa": 1e5 + k, "air_c": 20.5} for k in range(20)
+    ]
+    heard = [s for s in found if "sonar" in s.topic]
+    assert {s.topic for s in heard} == {"/a/sonar/b"}  # of cf3 there is no echo
+    assert [(s.time_ns, s.message, s.fields) for s in heard] == [
+        (10**9 + 10**7 * k, "Sonar", {"sonar_m": 1.5 + k, "echo_db": -3.5}) for k in range(1, 20, 2)
+    ]
+    write(flight, "cf1", [line[:-4] for line in data], [*HEADER, names[0]])  # one of two
+    assert not [s for s in flight_csv.content(flight).samples if "pressure" in s.topic]

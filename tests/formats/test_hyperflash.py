@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ from dmrl.errors import SourceError
 from dmrl.formats import hyperflash
 from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
+from dmrl.geometry.frames import AIDECK
 from dmrl.images.bayer import mosaic, rgb_of
 from dmrl.images.codec import Rgb, decode
 from dmrl.samples.sample import Sample
@@ -162,3 +164,14 @@ def test_a_dump_is_whole_records_and_erased_flash_of_numbers_not_all_zero(dump: 
     ):
         dump.write_bytes(data)
         assert hyperflash.recognises(dump) == known
+
+
+def test_the_camera_comes_first_and_peers_are_named(dump: Path) -> None:
+    first, *rest = hyperflash.content(dump, Options(robot="me", names={"0": "you"})).samples
+    assert (first.topic, first.time_ns) == ("/me/camera/calibration", 0)
+    assert first.fields["K"][2] == AIDECK.cx_px
+    assert {s.topic for s in rest if "range" in s.topic} == {"/me/range/you"}
+    camera = replace(AIDECK, cx_px=99.5)
+    first, *_ = hyperflash.content(dump, Options(camera=camera)).samples
+    assert first.fields["K"][2] == 99.5
+    assert hyperflash.content(dump, Options()).total == 4  # records, and the erased one

@@ -8,6 +8,7 @@ import pytest
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import image_folder
 from dmrl.formats.format import Options
+from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import AIDECK, project
 from dmrl.images.bayer import rgb_of
 from dmrl.images.codec import decode, encode_jpeg, encode_png
@@ -267,3 +268,55 @@ def test_how_much_there_will_be_is_told_before(folder: Path) -> None:
     for options, more in ((Options(), 0), (Options(camera=camera), 1)):
         content = image_folder.content(folder, options)
         assert content.total == len(list(content.samples)) == 3 + 1 + more
+
+
+def test_a_camera_that_is_given_counts_before_the_one_beside_the_pictures(folder: Path) -> None:
+    near = replace(AIDECK, width_px=64, height_px=48, cx_px=30.0)
+    (folder / "calibration.toml").write_text(write_camera(near))
+    for camera, cx_px in ((None, 30.0), (replace(near, cx_px=31.0), 31.0)):
+        (found,) = samples(folder, "CameraCalibration", Options(camera=camera))
+        assert found.fields["K"][2] == cx_px
+        assert found.time_ns == 0
+
+
+@pytest.mark.parametrize(("labelled", "camera", "said"), [(0, 0, 1), (1, 0, 0), (0, 1, 0)])
+def test_labels_that_want_a_camera_are_said_where_there_are_no_others(
+    labelled: int, camera: int, said: int, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "label.txt").write_text("a.png 1 2 1.0 0.1 0.0 1.0\n")
+    if labelled:
+        (folder / "labels.csv").write_text(HEADER + "a.png,cf2,10,20,0.8\n")
+    known = replace(AIDECK, width_px=64, height_px=48) if camera else None
+    assert len(samples(folder, "PeerLabels", Options(camera=known))) == max(labelled, camera)
+    assert ("gives no labels without a camera" in capsys.readouterr().err) == bool(said)
+
+
+def test_names_end_to_be_times_with_64_bits(tmp_path: Path) -> None:
+    (tmp_path / f"{2**63 - 1}.png").write_bytes(b"")
+    (tmp_path / "000000000007.png").write_bytes(b"")
+    found = image_folder.list_pictures(tmp_path, 10.0)
+    assert [time_ns for time_ns, _ in found] == [7, 2**63 - 1]
+    (tmp_path / f"{2**63}.png").write_bytes(b"")
+    with pytest.raises(SourceError, match="time after the year 2262"):
+        image_folder.list_pictures(tmp_path, 10.0)
+
+
+@pytest.mark.parametrize(("digits", "timed"), [(11, False), (12, True)])
+def test_a_time_has_twelve_digits(digits: int, timed: bool, tmp_path: Path) -> None:
+    (tmp_path / f"{5:0{digits}}.png").write_bytes(b"")
+    ((time_ns, _),) = image_folder.list_pictures(tmp_path, 10.0)
+    assert time_ns == (5 if timed else 0)
+
+
+@pytest.mark.parametrize("size", [(3, 8), (8, 3), (4, 4)])
+def test_raw_pictures_are_of_four_by_four_pixels_at_least(
+    size: tuple[int, int], tmp_path: Path
+) -> None:
+    height, width = size
+    head = f"P5\n{width} {height}\n255\n".encode()
+    (tmp_path / "a.pgm").write_bytes(head + bytes(width * height))
+    if size == (4, 4):
+        assert samples(tmp_path, "CompressedImage", Options(raw=True))
+        return
+    with pytest.raises(SourceError, match="so it is not raw"):
+        samples(tmp_path, "CompressedImage", Options(raw=True))

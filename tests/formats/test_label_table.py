@@ -114,3 +114,39 @@ def test_a_picture_has_so_many_rows_at_most(
     assert len(read(tmp_path, written(*rows[:3]))["a.png"]) == 3
     with pytest.raises(SourceError, match=r":5: a\.png has more than 3 rows"):
         read(tmp_path, written(*rows))
+
+
+def test_a_column_that_is_misspelled_is_told_the_near_one(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"unknown column 'sigma_u'\. Did you mean sigma_u_px\?"):
+        read(tmp_path, "file,peer,u_px,v_px,depth_m,sigma_u\n")
+    with pytest.raises(SourceError, match=r"unknown column 'zz'\. Known are file, peer"):
+        read(tmp_path, "file,peer,u_px,v_px,depth_m,zz\n")
+
+
+def test_who_looked_and_saw_nobody_is_told(tmp_path: Path) -> None:
+    head = "file,peer,u_px,v_px,depth_m,source\n"
+    found = read(tmp_path, f"{head}a.png,,,,,\nb.png,,,,,truth\n")
+    assert (found["a.png"][0].source, found["b.png"][0].source) == ("hand", "truth")
+    found = read(tmp_path, f"{head}a.png,cf2,1,2,3,\nb.png,cf2,1,2,3,truth\n")
+    assert (found["a.png"][0].source, found["b.png"][0].source) == ("hand", "truth")
+
+
+@given(
+    st.lists(st.floats(-500, 500).map(lambda x: round(x, 3)), min_size=4, max_size=4, unique=True),
+    st.lists(st.integers(0, 8), min_size=3, max_size=3),
+    st.integers(0, 100),
+)
+def test_whatever_a_row_holds_is_read_back(
+    tmp_path_factory: pytest.TempPathFactory, edges: list[float], sigmas: list[int], share: int
+) -> None:
+    (left, right), (top, bottom) = sorted(edges[:2]), sorted(edges[2:])
+    row = LabelRow(
+        "a.png",
+        "cf9",
+        *(left, top, 0.25),
+        box_px=tuple(float(f"{edge:g}") for edge in (left, top, right, bottom)),
+        visible_share=share / 100,
+        sigmas=(sigmas[0] / 4, sigmas[1] / 4, sigmas[2] / 4),
+    )
+    if row.box_px[0] < row.box_px[2] and row.box_px[1] < row.box_px[3]:
+        assert read(tmp_path_factory.getbasetemp(), written(row)) == {"a.png": [row]}

@@ -266,3 +266,66 @@ def test_the_whole_of_a_published_attitude_is_known_by_two_angles() -> None:
         found = locanet.attitude_zyx(roll, pitch)
         up = (_rx(roll) @ _ry(pitch)).T @ [0, 0, 1]  # seen from the camera
         assert camera_from_horizontal(*found) @ [0, 0, 1] == pytest.approx(up)
+
+
+def test_a_picture_s_number_is_its_time_and_its_rows_are_its_own(folder: Path) -> None:
+    inner = folder / "synImgs"
+    jpeg = (inner / "0000.jpg").read_bytes()
+    for path in inner.iterdir():
+        path.unlink()
+    for number in (12, 7):
+        (inner / f"{number:04d}.jpg").write_bytes(jpeg)
+    (inner / "posLabel.txt").write_text(
+        "p/0012.jpg 0.2,0.1 1,0.1,0.2,0,0,0 2,-0.3,0.4,0,0,0\np/0007.jpg 0,0 3,0,0,0,0,0\n"
+    )
+    (inner / "boxLabel.txt").write_text(
+        "p/0007.jpg 1,3,5,7,0\np/0012.jpg 10,20,30,40,0 50,60,70,80,0\n"
+    )
+    (inner / "train.txt").write_text("p/0012.jpg 0.2,0.1 1,2,3000,0 4,5,6000,0\n")
+    content = locanet.content(folder, Options(robot="cf2"))
+    first, *rest = content.samples
+    assert (first.topic, first.time_ns) == ("/cf2/camera/calibration", 7 * 10**9)
+    assert content.total == 1 + len(rest) == 10
+    assert [s.time_ns for s in rest] == [7 * 10**9] * 4 + [12 * 10**9] * 5
+    topics = ["camera/image", "labels", "attitude", "peer/cf1/truth", "peer/cf3/truth"]
+    assert {s.topic for s in rest} <= {f"/cf2/{t}" for t in [*topics, "peer/cf4/truth"]}
+    labels = [s for s in rest if s.message == "PeerLabels"]
+    assert [s.fields["sources"] for s in labels] == [["truth"], ["published", "truth"]]
+    (alone,) = labels[0].fields["peers"]
+    assert (alone["u_px"], alone["v_px"], alone["depth_m"]) == pytest.approx(
+        (PUBLISHED_RENDER.cx_px, PUBLISHED_RENDER.cy_px, 3)
+    )
+    assert alone["box_px"] == [1, 2, 6, 7]
+    one, told, other, told_too = labels[1].fields["peers"]
+    assert one["peer"] == told["peer"] != other["peer"] == told_too["peer"]
+    assert (one["box_px"], other["box_px"]) == ([10, 19, 31, 40], [50, 59, 71, 80])
+    assert [told[n] for n in ("u_px", "v_px", "depth_m")] == [1, 2, 3]
+    assert [told_too[n] for n in ("u_px", "v_px", "depth_m")] == [4, 5, 6]
+    truth = [s for s in rest if s.message == "PeerPosition"]
+    assert all(s.fields["covariance"] == [0.0] * 9 for s in truth)
+    assert all(s.fields["frame_id"] == "cf2/horizontal" for s in truth)
+    tilt = [s.fields for s in rest if s.message == "Attitude"][1]
+    wanted = camera_from_horizontal(tilt["roll_rad"], tilt["pitch_rad"]).T @ [2, -0.3, 0.4]
+    assert [truth[2].fields[n] for n in "xyz"] == pytest.approx(wanted)
+
+
+def test_a_robot_at_the_camera_s_own_place_is_not_before_it(folder: Path) -> None:
+    inner = folder / "synImgs"
+    for x, fits in (("0.001", True), ("0", False)):
+        _spoil("posLabel.txt", 1, f"p/0000.jpg 0.1,-0.2 {x},0,0,0,0,0")(inner)
+        if fits:
+            assert locanet.read(folder)[0].xyz_camera[0, 0] == 0.001
+        else:
+            with pytest.raises(SourceError, match="behind the camera"):
+                locanet.read(folder)
+
+
+def test_an_empty_list_and_a_name_without_a_number_are_said(folder: Path) -> None:
+    inner = folder / "synImgs"
+    (inner / "a7.jpg").write_bytes((inner / "0000.jpg").read_bytes())
+    _spoil("posLabel.txt", 1, POSITION.format(0).replace("0000", "a7").strip())(inner)
+    with pytest.raises(SourceError, match=r"a7\.jpg is not named by its number"):
+        locanet.read(folder)
+    (inner / "posLabel.txt").write_text("")
+    with pytest.raises(SourceError, match="is empty"):
+        locanet.read(folder)

@@ -5,12 +5,16 @@ from textwrap import dedent
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
 from dmrl.formats import mapped_csv
 from dmrl.formats.column_map import QUANTITIES, read_map
 from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
+from dmrl.formats.log_block import Series
+from dmrl.geometry.frames import camera_from_horizontal
 from dmrl.geometry.turns import euler_zyx
 from dmrl.samples.sample import Sample
 
@@ -142,7 +146,7 @@ def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:
         assert fault in text
 
 
-@pytest.mark.parametrize("text", ["time = ", "range = 5\n", "time = 5\n"])
+@pytest.mark.parametrize("text", ["time = ", "range = 5\n", "time = 5\n", "vx = 5\n"])
 def test_what_is_no_table_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(text)
     with pytest.raises(SourceError, match=r"map\.toml"):
@@ -356,3 +360,97 @@ def test_one_fault_of_a_table_is_said_and_no_other(
     with pytest.raises(SourceError) as e:
         read_map(path)
     assert fault in str(e.value)
+
+
+ANGLE = st.floats(-1.4, 1.4)
+
+
+@given(ANGLE, ANGLE, st.floats(-3, 3), st.lists(st.floats(-2, 2), min_size=3, max_size=3))
+def test_a_velocity_of_any_frame_is_turned_into_the_world_s(
+    roll: float, pitch: float, yaw: float, v: list[float]
+) -> None:
+    time_ns = np.arange(3)
+    attitude = Series(time_ns, np.tile([roll, pitch, yaw], (3, 1)))
+    values = {f"v{axis}": np.full(3, part) for axis, part in zip("xyz", v, strict=True)}
+    c, s = np.cos(yaw), np.sin(yaw)
+    heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    level = {"world": heading.T, "horizontal": np.eye(3)}
+    level["body"] = camera_from_horizontal(roll, pitch).T
+    for frame, turned in level.items():
+        found = mapped_csv._world_velocity(Path("a"), time_ns, values, frame, attitude)
+        assert list(found) == [f"stateEstimate.v{axis}" for axis in "xyz"]
+        got = np.array(list(found.values()))
+        assert got == pytest.approx(np.tile((heading @ turned @ v)[:, None], 3), abs=1e-9)
+
+
+def test_a_velocity_that_cannot_be_turned_says_what_it_wants() -> None:
+    at, still = np.arange(3), np.zeros(3)
+    level = Series(at, np.zeros((3, 3)))
+    values = {"vx": still, "vy": still}
+    for frame, attitude, wanted in (
+        ("body", level, r"body wants \[vz\], \[roll\]"),
+        ("body", None, r"body wants \[vz\], \[roll\]"),
+        ("horizontal", None, "horizontal wants an attitude"),
+    ):
+        with pytest.raises(SourceError, match=wanted):
+            mapped_csv._world_velocity(Path("a"), at, values, frame, attitude)
+    for frame, attitude in (("world", None), ("horizontal", level)):
+        found = mapped_csv._world_velocity(Path("a"), at, values, frame, attitude)
+        assert len(found) == 2
+    with pytest.raises(SourceError, match="body wants"):
+        mapped_csv._world_velocity(Path("a"), at, {**values, "vz": still}, "body", None)
+    assert mapped_csv._world_velocity(Path("a"), at, {**values, "vz": still}, "body", level)
+
+
+def test_a_column_that_stands_twice_is_refused(table: Path) -> None:
+    log = table.with_name("log.csv")
+    log.write_text(log.read_text().replace(";note", ";vx"))
+    with pytest.raises(SourceError, match="a column appears twice"):
+        samples(log, Options(columns=table))
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_columns_are_parted_by_what_stands_there_most(separator: str, table: Path) -> None:
+    log = table.with_name("log.csv")
+    other = "," if separator != "," else ";"
+    text = log.read_text().replace(";", separator).replace("note", f'"a{other}b"')
+    log.write_text("\ufeff" + text, encoding="utf-8")
+    assert mapped_csv._header(log)[1] == separator
+    assert len(samples(log, Options(columns=table))["/cf1/height"]) == 2
+
+
+def test_every_quantity_of_a_table_comes_where_it_belongs(tmp_path: Path) -> None:
+    """A log in which every column has a number of its own."""
+    frames = {f"v{axis}": 'frame = "world"\n' for axis in "xyz"}
+    first = {"rad": "rad", "rad/s": "rad/s", "m": "m", "m/s": "m/s", "1": "1", "s": "s"}
+    names = [n for n in QUANTITIES if n != "height"]
+    text = "".join(
+        f'[{n}]\nname = "{n}"\nunit = "{first[next(iter(QUANTITIES[n]))]}"\n{frames.get(n, "")}'
+        for n in names
+    )
+    (tmp_path / "map.toml").write_text(text)
+    row = dict(zip(names, (np.arange(len(names)) + 1) / 64, strict=True)) | {"time": 2.0}
+    row |= {"qx": 0.0, "qy": 0.0, "qz": 0.6, "qw": 0.8, "true_qx": 0.0, "true_qy": 0.6}
+    row |= {"true_qz": 0.0, "true_qw": 0.8}
+    (tmp_path / "log.csv").write_text(f"{','.join(row)}\n{','.join(map(str, row.values()))}\n")
+    found = samples(tmp_path / "log.csv", Options(columns=tmp_path / "map.toml"))
+    assert {s.time_ns for v in found.values() for s in v} == {2 * 10**9}
+    yaw = 2 * np.arctan2(0.6, 0.8)
+    attitude = found["/cf1/attitude"][0].fields
+    assert attitude == pytest.approx(  # of the quaternion, and of both gyroscopes
+        {"roll_rad": 0, "pitch_rad": 0, "yaw_rad": yaw, "yaw_rate_radps": row["gyro_z"]}
+    )
+    c, s = np.cos(yaw), np.sin(yaw)
+    velocity = found["/cf1/velocity"][0].fields
+    assert velocity == pytest.approx(
+        {
+            "vx_mps": c * row["vx"] + s * row["vy"],
+            "vy_mps": c * row["vy"] - s * row["vx"],
+            "vz_mps": row["vz"],
+        }
+    )
+    assert found["/cf1/height"][0].fields == pytest.approx({"height_m": row["z"]})
+    for topic, before in (("/cf1/pose", ""), ("/cf1/pose/truth", "true_")):
+        pose = found[topic][0].fields["pose"]
+        assert pose["position"] == pytest.approx({n: row[f"{before}{n}"] for n in "xyz"})
+        assert pose["orientation"] == pytest.approx({n: row[f"{before}q{n}"] for n in "xyzw"})
