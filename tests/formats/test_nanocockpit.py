@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,9 @@ from dmrl.errors import SourceError
 from dmrl.formats import nanocockpit
 from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
+from dmrl.geometry.frames import AIDECK
 from dmrl.images.bayer import rgb_of
-from dmrl.images.codec import decode
+from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 
 from . import foreign
@@ -102,3 +104,84 @@ def test_a_state_that_stands_counts_once_and_none_before_the_first(folder: Path)
         row[at] = "0"
     path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
     assert samples(folder).keys() == {"/cf1/camera/image"}
+
+
+def test_a_camera_that_is_given_stands_before_the_pictures(folder: Path) -> None:
+    camera = replace(AIDECK, width_px=32, height_px=24)
+    first, *rest = nanocockpit.content(folder, Options(robot="me", camera=camera)).samples
+    while first.topic != "/me/camera/calibration":  # a state may have come before
+        first, *rest = rest
+    images = [s.time_ns for s in rest if s.topic == "/me/camera/image"]
+    assert first.time_ns == images[0] == (2**32 - 120_000) * 1000
+    assert len(images) == 6
+
+
+def test_colour_pictures_stand_in_for_raw_ones_as_they_are(folder: Path) -> None:
+    (folder / "camera_raw").rename(folder / "camera_rgb")
+    jpegs = []
+    for k, path in enumerate(sorted((folder / "camera_rgb").iterdir())):
+        path.unlink()
+        jpegs.append(encode_jpeg(np.full((24, 32, 3), 20 * k, np.uint8)))
+        path.with_suffix(".jpg").write_bytes(jpegs[-1])
+    found = samples(folder)["/cf1/camera/image"]
+    assert [s.fields["data"] for s in found] == jpegs
+    assert {s.fields["format"] for s in found} == {"jpeg"}
+    assert nanocockpit.recognises(folder)
+
+
+@pytest.mark.parametrize(("size", "fits"), [((4, 4), True), ((3, 8), False), ((8, 3), False)])
+def test_raw_pictures_are_of_four_by_four_pixels_at_least(
+    size: tuple[int, int], fits: bool, folder: Path
+) -> None:
+    for path in (folder / "camera_raw").iterdir():
+        path.write_bytes(encode_png(np.zeros(size, np.uint8)))
+    if fits:
+        assert len(samples(folder)["/cf1/camera/image"]) == 6
+    else:
+        with pytest.raises(SourceError, match="is smaller than 4 x 4 pixels"):
+            samples(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "metadata.csv:1: no column filename"),
+        ("{head}\n", "has no rows"),
+        ("{head}\n{row}\n{row}", ""),
+        ("{head}\n{row}\na,1", ""),
+        ("{head}\na,1", "has no rows"),
+        ("{head}\na,1\n{row}\n", "metadata.csv:2: not a file and whole numbers"),
+        ("{head}\n{large}\n", "a number beyond 64 bits"),
+    ],
+)
+def test_a_table_s_last_line_may_be_cut(
+    text: str, said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "metadata.csv"
+    head, row, *_ = path.read_text().splitlines()
+    large = row.replace(row.split(",")[3], str(2**64))
+    path.write_text(text.format(head=head, row=row, large=large))
+    if said:
+        with pytest.raises(SourceError, match=said.replace(".", r"\.")):
+            samples(folder)
+        return
+    cut = "a,1" in text
+    assert len(samples(folder)["/cf1/camera/image"]) == 2 - cut
+    assert ("its last line is cut short" in capsys.readouterr().err) == cut
+
+
+def test_every_number_of_a_state_is_in_its_place(folder: Path) -> None:
+    path = folder / "metadata.csv"
+    head, row, *_ = path.read_text().splitlines()
+    names, cells = head.split(","), row.split(",")
+    values = {"x": 1000, "y": -2000, "z": 3000, "vx": 400, "vy": -500, "vz": 600}
+    for name, value in values.items():
+        cells[names.index(f"state_{name}")] = str(value)
+    path.write_text(f"{head}\n{','.join(cells)}\n")
+    found = samples(folder)
+    velocity = found["/cf1/velocity"][0].fields  # it looks along x
+    assert velocity == pytest.approx({"vx_mps": 0.4, "vy_mps": -0.5, "vz_mps": 0.6})
+    place = found["/cf1/pose"][0].fields["pose"]["position"]
+    assert place == pytest.approx({"x": 1, "y": -2, "z": 3})
+    logged = found["/cf1/log/stateEstimateZ"][0].fields
+    assert logged["stateEstimateZ_x"] == 1000 and logged["stateEstimateZ_rateYaw"] == 250

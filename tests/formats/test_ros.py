@@ -1,5 +1,6 @@
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -159,3 +160,64 @@ def test_how_many_messages_there_will_be_is_told_before(tmp_path: Path) -> None:
     content = ros.content(bag("sqlite3", tmp_path), Options())
     with_odometry = 4  # of one message come attitude, velocity, height and pose
     assert content.total == len(list(content.samples)) - 5 * (with_odometry - 1)
+
+
+def test_ranges_of_both_directions_and_our_own_messages_are_all_kept() -> None:
+    ours = "dmrl_msgs/msg/Height"
+    held = [
+        ("/cf1/uwb/cf2/range", RANGE, 5),
+        ("/cf2/uwb/cf1/range", RANGE, 9),
+        ("/far/cf1/uwb/cf2/range", RANGE, 5),  # no more than the first
+        ("/cf1/height", ours, 1),
+        ("/cf2/height", ours, 2),
+        ("/cf1/odom", ODOMETRY, 2),
+        ("/cf1/imu", IMU, 3),
+    ]
+    found, unknown = planned(*held)
+    assert found == {
+        "/cf1/uwb/cf2/range": ("cf1", "cf2"),
+        "/cf2/uwb/cf1/range": ("cf2", "cf1"),
+        "/cf1/height": ("", ""),
+        "/cf2/height": ("", ""),
+        "/cf1/odom": ("cf1", ""),
+        "/cf1/imu": ("cf1", ""),
+    }
+    assert unknown == ["/far/cf1/uwb/cf2/range"]
+    lines, _ = ros.plan(held, Options())
+    assert {line.topic: line.count for line in lines.values()} == {
+        topic: count for topic, _, count in held if topic in found
+    }
+
+
+@pytest.mark.parametrize(
+    ("stamp", "time_ns"), [((3, 5), 3_000_000_005), ((0, 0), 0), ((-1, 5), 0), (None, None)]
+)
+def test_a_header_s_stamp_is_whole_nanoseconds(
+    stamp: tuple[int, int] | None, time_ns: int | None
+) -> None:
+    held = stamp and SimpleNamespace(sec=stamp[0], nanosec=stamp[1])
+    message = SimpleNamespace(header=SimpleNamespace(stamp=held)) if held else SimpleNamespace()
+    assert ros._stamp_ns(message) == time_ns
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "known"),
+    [
+        ("a.db3", b"SQLite format 3\0", True),
+        ("a.bag", b"#ROSBAG V2.0\n", True),
+        ("a.bag", b"#ROSBAG V1.2\n", False),
+        ("a.mcap", b"\x89MCAP0\r\n" + b"\1" * 20 + b"ros2", True),
+        ("a.mcap", b"\x89MCAP0\r\n" + b"\1" * 20 + b"ros1", False),
+        ("a.mcap", b"\1" * 60 + b"ros2", True),
+        ("a.mcap", b"\1" * 61 + b"ros2", False),
+        ("a.txt", b"SQLite format 3\0", False),
+    ],
+)
+def test_a_bag_is_known_by_its_first_bytes(
+    name: str, head: bytes, known: bool, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(head)
+    assert ros.recognises(tmp_path / name) == known
+    assert not ros.recognises(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("")
+    assert ros.recognises(tmp_path)

@@ -4,12 +4,26 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
-from dmrl.formats.ros_messages import HANDLERS, Placed, _angles, _levelled, _rgb, _turned_back
+from dmrl.formats.ros_messages import (
+    HANDLERS,
+    Placed,
+    _angles,
+    _is_fixed,
+    _levelled,
+    _rgb,
+    _turned_back,
+    _yaw_rate,
+)
+from dmrl.geometry.frames import camera_from_horizontal
 from dmrl.geometry.turns import quaternion_zyx
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 
 QUARTER = np.pi / 2
@@ -214,3 +228,76 @@ def test_pictures_that_cannot_be_are_one_line(change: dict[str, Any]) -> None:
     message = SimpleNamespace(**vars(picture("rgb8", 3)) | change)
     with pytest.raises(SourceError, match="bag: "):
         _rgb(message, Path("bag"))
+
+
+ANGLE = st.floats(-1.4, 1.4)
+
+
+@hypothesis.given(
+    ANGLE, ANGLE, st.floats(-3, 3), st.lists(st.floats(-2, 2), min_size=3, max_size=3)
+)
+def test_vectors_and_rates_are_turned_as_the_robot_is(
+    roll: float, pitch: float, yaw: float, vector: list[float]
+) -> None:
+    angles, body = np.array([roll, pitch, yaw]), np.array(vector)
+    level = camera_from_horizontal(roll, pitch).T @ body
+    assert _levelled(body, angles) == pytest.approx(level)
+    c, s = np.cos(yaw), np.sin(yaw)
+    heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    assert _turned_back(heading @ level, angles) == pytest.approx(level)
+    turn = camera_from_horizontal(roll, pitch) @ [0, 0, 0.7]  # a steady turn about the vertical
+    assert _yaw_rate(turn, angles) == pytest.approx(0.7)
+    (quaternion,) = quaternion_zyx(angles[None])
+    assert _angles(xyzw(*quaternion)) == pytest.approx(angles, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frame", "parent", "fixed"),
+    [
+        ("", "", False),
+        ("", "odom", False),
+        ("base", "odom", False),
+        ("base", "base", True),
+        ("odom", "", True),
+        ("a/b/map", "x", True),
+        ("map/base", "x", False),
+        ("mapped", "x", False),
+    ],
+)
+def test_frames_that_do_not_turn_are_known_by_their_names(
+    frame: str, parent: str, fixed: bool
+) -> None:
+    assert _is_fixed(frame, parent) == fixed
+
+
+def test_an_imu_that_knows_no_attitude_says_nothing() -> None:
+    lost = SimpleNamespace(orientation=xyzw(0, 0, 0, 0), angular_velocity=xyzw(0.1, 0.2, 0.4))
+    assert given("sensor_msgs/msg/Imu", lost) == []
+    held = odometry("base", (1.0, 2.0, 3.0))
+    held.pose.pose.orientation = lost.orientation
+    assert [s.message for s in given("nav_msgs/msg/Odometry", held)] == ["PoseInFrame", "Height"]
+
+
+def test_compressed_pictures_keep_their_bytes() -> None:
+    rgb = np.full((8, 8, 3), 90, np.uint8)
+    for data, kind in ((encode_png(rgb), "png"), (encode_jpeg(rgb), "jpeg")):
+        message = SimpleNamespace(data=np.frombuffer(data, np.uint8))
+        (found,) = given("sensor_msgs/msg/CompressedImage", message)
+        assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
+        assert (found.fields["data"], found.fields["format"]) == (data, kind)
+    ppm = b"P6\n8 8\n255\n" + rgb.tobytes()
+    with pytest.raises(SourceError, match=r"bag: pictures are ppm\. Save them as PNG or JPEG"):
+        given("sensor_msgs/msg/CompressedImage", SimpleNamespace(data=np.frombuffer(ppm, np.uint8)))
+
+
+def test_a_picture_is_the_robot_s_own() -> None:
+    (found,) = given("sensor_msgs/msg/Image", picture("rgb8", 3))
+    assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
+    assert decode(found.fields["data"]).tolist() == _rgb(picture("rgb8", 3), Path("bag")).tolist()
+
+
+def test_a_colour_sensor_s_picture_gets_its_colours() -> None:
+    raw = np.random.default_rng(0).integers(0, 256, (4, 6), np.uint8)
+    data = np.concatenate([raw, np.zeros((4, 2), np.uint8)], axis=1).ravel()
+    message = SimpleNamespace(height=4, width=6, step=8, encoding="bayer_rggb8", data=data)
+    assert _rgb(message, Path("bag")).tolist() == rgb_of(raw).tolist()
