@@ -7,6 +7,7 @@ import pytest
 
 import dmrl
 from dmrl.errors import SourceError
+from dmrl.formats.chip_maps import chip_maps
 from dmrl.images.codec import encode_png
 
 
@@ -49,3 +50,17 @@ def test_half_a_pair_and_pairs_of_two_sizes_are_refused(frames: Path, tmp_path: 
     with pytest.raises(SourceError, match=r"dep00009\.ppm: its other half"):
         dmrl.convert(frames, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_maps_of_one_picture_are_its_own(frames: Path) -> None:
+    assert chip_maps(frames / "img00007.png", 5, "cf7") is None
+    found = chip_maps(frames / "img00009.png", 5, "cf7")
+    assert found is not None
+    assert (found.time_ns, found.topic, found.message) == (5, "/cf7/detections/grid", "GridMap")
+    sizes = {name: found.fields[name] for name in ("rows", "cols", "stride_px", "channels")}
+    wanted = {"rows": 3, "cols": 4, "stride_px": 8, "channels": ("confidence", "depth_m")}
+    assert sizes == wanted
+    confidence, depth_m = np.frombuffer(found.fields["data"], "<f4").reshape(2, 12)
+    assert confidence[6] == 0.5 and depth_m[6] == 1.0
+    assert confidence[0] == pytest.approx(1 / (1 + np.exp(0.211 * 6)))
+    assert depth_m[0] == pytest.approx(np.exp(0.211 * 6))

@@ -430,3 +430,11 @@ def test_packets_amid_noise_are_those_of_a_search_byte_by_byte(
     got = [packet.data for piece in pieces for packet in reader.feed(piece)]
     reader.finish()
     assert (got, reader.skipped_bytes) == plain_packets(data)
+
+
+def test_a_streamer_packet_without_pixels_breaks_nothing() -> None:
+    image = raw(90, 100)
+    first, *rest = (pack_packet(p) for p in PacketReader().feed(pack_image(image, "streamer")))
+    bare = pack_packet(Packet(GAP8, HOST, STREAMER, b"\x11\0\0\0"))
+    got, reader = read(b"".join([first, bare, *rest]))
+    assert ([found.data for found in got], reader.broken) == ([image.data], 0)

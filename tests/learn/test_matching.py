@@ -95,3 +95,29 @@ def test_images_do_not_touch_each_other(seed: int) -> None:
     np.testing.assert_array_equal(together, alone)
     together_hits = (hits(labels, found, 16) >= 0).tolist()
     assert together_hits == [h >= 0 for a, b in parts for h in hits(a, b, 16)]
+
+
+ROWS = st.lists(st.tuples(st.integers(0, 3), PIXELS, PIXELS), max_size=9).map(
+    lambda rows: sorted(rows, key=lambda row: row[0])
+)
+
+
+@given(ROWS, ROWS, st.sampled_from([0.0, 1.0, 3.0, 5.0]))
+def test_detections_take_the_nearest_label_that_is_free_one_after_the_other(
+    label_rows: list[tuple[int, float, float]],
+    found_rows: list[tuple[int, float, float]],
+    radius_px: float,
+) -> None:
+    labels = points(*[(*row, 1, 1) for row in label_rows])
+    found = points(*[(*row, 1, 1) for row in found_rows])
+    free, wanted = set(range(len(label_rows))), []
+    for image, u, v in found_rows:  # as they stand: the most confident of an image first
+        near = [
+            (np.hypot(label_rows[k][1] - u, label_rows[k][2] - v), k)
+            for k in free
+            if label_rows[k][0] == image
+        ]
+        distance, k = min(near, default=(np.inf, -1))
+        wanted.append(k if distance <= radius_px else -1)
+        free.discard(wanted[-1])
+    assert hits(labels, found, radius_px).tolist() == wanted

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -64,3 +65,57 @@ def test_only_kernels_decay(name: str) -> None:
     decays = {id(p): group["weight_decay"] for group in groups for p in group["params"]}
     for parameter in network.parameters():
         assert decays[id(parameter)] == (0.01 if parameter.ndim > 1 else 0.0)
+
+
+def plain_orthogonal(matrix: np.ndarray) -> np.ndarray:
+    """The published iteration, for a matrix no taller than wide."""
+    x = matrix / np.linalg.norm(matrix)
+    for _ in range(5):
+        square = x @ x.T
+        x = 3.4445 * x + (-4.7750 * square + 2.0315 * square @ square) @ x
+    return x
+
+
+def test_steps_of_muon_are_those_that_were_published_and_the_rest_is_adam() -> None:
+    torch.manual_seed(2)
+    rate, decay = 0.02, 0.1
+    kernel = torch.nn.Parameter(torch.randn(4, 3, 3, 3))
+    other, plain = (torch.nn.Parameter(torch.linspace(-1, 1, 6)) for _ in range(2))
+    muon = Muon(
+        [
+            {"params": [kernel], "weight_decay": decay, "mixing": True, "lr": rate},
+            {"params": [other], "weight_decay": 0.0, "mixing": False, "lr": rate},
+        ]
+    )
+    adam = torch.optim.AdamW([plain], lr=rate, weight_decay=0.0, eps=1e-7)
+    wanted, momentum = kernel.detach().numpy().copy().reshape(4, 27), np.zeros((4, 27))
+    for _ in range(3):
+        gradient = torch.randn(4, 3, 3, 3)
+        flat = gradient.numpy().reshape(4, 27)
+        kernel.grad, other.grad, plain.grad = gradient.clone(), torch.ones(6), torch.ones(6)
+        muon.step()
+        adam.step()
+        momentum = 0.95 * momentum + 0.05 * flat
+        update = plain_orthogonal(0.05 * flat + 0.95 * momentum)
+        wanted = wanted * (1 - rate * decay) - rate * 0.2 * 27**0.5 * update
+        assert kernel.detach().numpy().reshape(4, 27) == pytest.approx(wanted, abs=1e-5)
+        assert kernel.grad is None
+        torch.testing.assert_close(other, plain)
+    assert muon.state[kernel]["step"] == 0
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(3, 5), (5, 3), (4, 4), (1, 7)])
+def test_a_matrix_is_brought_to_even_singular_values_lying_or_standing(
+    rows: int, columns: int
+) -> None:
+    matrix = np.random.default_rng(rows).normal(size=(rows, columns)).astype(np.float32)
+    lying = matrix.T if rows > columns else matrix
+    wanted = plain_orthogonal(lying)
+    found = orthogonal(torch.from_numpy(matrix)).numpy()
+    assert (found.T if rows > columns else found) == pytest.approx(wanted, abs=1e-4)
+
+
+def test_adam_s_epsilon_is_the_paper_s() -> None:
+    for name, decay in (("adam", 0.0), ("adam", 0.1), ("muon", 0.1)):
+        optimizer = new_optimizer(build("dmrl-nano"), name, decay)  # type: ignore[arg-type]
+        assert {group["eps"] for group in optimizer.param_groups} == {1e-7}
