@@ -244,7 +244,7 @@ def _drawn(
     maps = None
     if ranked.found is not None:
         mine = ranked.found.of(part)
-        yield from entities.detections(eye.detections, frame, mine.detections())
+        yield from entities.detections(eye.detections, frame, mine.detections(), eye.width_px)
         maps = mine.maps()
     yield from entities.grids(
         eye.grid, frame, _true_maps(batch) if maps is None else maps, scales, smooth=smooth

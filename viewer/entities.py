@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from dmrl.colours import RGB
 from dmrl.viewer.entity import (
+    DETECTION_TEXT_WIDTH,
     FAINT_POINT_UI,
     LINE_UI,
     POINT_UI,
+    TEXT_HEIGHT,
     Entity,
 )
 
@@ -77,24 +79,53 @@ def images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
 
 
 def detections(
-    path: str, frame: str, batch: pa.RecordBatch, colour: Colour = RGB["detection"]
+    path: str,
+    frame: str,
+    batch: pa.RecordBatch,
+    width_px: int,
+    colour: Colour = RGB["detection"],
 ) -> Iterator[Entity]:
-    """Points with confidence and depth; without text and faint below the model's threshold."""
+    """Points with confidence and depth; without text and faint below the model's threshold.
+
+    Of two whose texts would cover each other the surer has one. ``width_px`` is the images'.
+    """
     column = batch["detections"]
     found = column.flatten()
     confidence, depth_m = (found.field(key).to_numpy() for key in ("confidence", "depth_m"))
-    believed = confidence >= batch["threshold"].to_numpy()[rows_of(column)]
+    row_of, uv_px = rows_of(column), points_px(found)
+    believed = confidence >= batch["threshold"].to_numpy()[row_of]
+    (surest,) = np.nonzero(believed)
+    surest = surest[np.lexsort([-confidence[surest], row_of[surest]])]
+    told = set(surest[_uncovered(uv_px[surest] / width_px, row_of[surest])].tolist())
     texts = [
-        f"conf {c:.2f}, {d:.2f} m" if shown else ""
-        for c, d, shown in zip(confidence, depth_m, believed, strict=True)
+        f"conf {c:.2f}, {d:.2f} m" if k in told else ""
+        for k, (c, d) in enumerate(zip(confidence, depth_m, strict=True))
     ]
     columns = rr.Points2D.columns(
-        positions=points_px(found),
+        positions=uv_px,
         labels=texts,
         radii=np.where(believed, POINT_UI, FAINT_POINT_UI),
     )
     style = _detection_style(colour)
     yield Entity(path, columns.partition(column.value_lengths().to_numpy()), (style,), frame)
+
+
+def _uncovered(places: NDArray[np.float64], row_of: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(N,) whose texts stand on none of those before them in their image.
+
+    Parameters
+    ----------
+    places
+        (N, 2) in widths of the image.
+    row_of
+        (N,) in which image, sorted.
+    """
+    out = np.ones(len(places), bool)
+    first = np.searchsorted(row_of, row_of)
+    for k in np.flatnonzero(first < np.arange(len(places))):
+        before = places[first[k] : k][out[first[k] : k]]
+        out[k] = (abs(before - places[k]) >= (DETECTION_TEXT_WIDTH, TEXT_HEIGHT)).any(axis=1).all()
+    return out
 
 
 @cache

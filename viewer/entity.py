@@ -16,6 +16,10 @@ WORLD = "world"
 POINT_UI, FAINT_POINT_UI, LINE_UI = -4.0, -1.5, -1.0
 INVISIBLE = 0.01
 
+# rerun writes below a point. In the smallest panel that a layout opens with, a text is as high and
+# as wide as these shares of an image's width.
+TEXT_HEIGHT, TEXT_WIDTH, DETECTION_TEXT_WIDTH = 1 / 12, 1 / 4, 3 / 10
+
 ELLIPSE_SIGMAS = 2.0
 """Half axes of every ellipse and ellipsoid, in standard deviations."""
 

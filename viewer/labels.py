@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 from dmrl.colours import RGB
 from dmrl.geometry.frames import inside
 from dmrl.viewer.entities import fields, points_px, rows_of
-from dmrl.viewer.entity import ELLIPSE_SIGMAS, INVISIBLE, LINE_UI, POINT_UI, Entity
-
-# rerun writes below a point. In the smallest panel that a layout opens with, a text is as high and
-# as wide as these shares of an image's width.
-TEXT_HEIGHT, TEXT_WIDTH = 1 / 12, 1 / 4
+from dmrl.viewer.entity import (
+    ELLIPSE_SIGMAS,
+    INVISIBLE,
+    LINE_UI,
+    POINT_UI,
+    TEXT_HEIGHT,
+    TEXT_WIDTH,
+    Entity,
+)
 
 
 def labels(

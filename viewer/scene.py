@@ -268,7 +268,9 @@ def model_draws(
     """What a model found in a camera's images."""
     frame, robot = image_frame(eye.robot), eye.robot
     shown = {name: scales[name] for name in eye.channels if name in scales}
-    found = partial(entities.detections, eye.detections, frame, colour=colour)
+    found = partial(
+        entities.detections, eye.detections, frame, width_px=eye.width_px, colour=colour
+    )
     maps = partial(entities.grids, eye.grid, frame, scales=shown, smooth=smooth)
     draws = [Draw(topics.detections(robot), found, robot, recording)]
     return [*draws, Draw(topics.grid(robot), maps, robot, recording)] if shown else draws

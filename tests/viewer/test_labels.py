@@ -1,8 +1,10 @@
 """Where the texts of labels stand, and what a legend says."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
+from dmrl.viewer.entities import detections
 from dmrl.viewer.labels import _text_places
 from dmrl.viewer.legend import _fitting
 
@@ -27,6 +29,17 @@ def test_texts_of_two_estimates_at_other_heights_do_not_meet() -> None:
     tops = np.array([[100.0, 80.0], [110.0, 90.0]])
     places = _text_places(tops, np.zeros(2, int), 320)
     assert abs(places[0, 1] - places[1, 1]) >= 320 / 12 - 0.5
+
+
+def test_of_detections_whose_texts_would_meet_the_surer_has_one() -> None:
+    # Where, and how sure; the two images hold the same.
+    near = [(100.0, 80.0, 0.5), (130.0, 90.0, 0.9), (130.0, 180.0, 0.6), (260.0, 90.0, 0.7)]
+    found = [dict(zip(("u_px", "v_px", "confidence"), d, strict=True)) for d in near]
+    rows = [{"threshold": 0.4, "detections": [{**d, "depth_m": 1.0} for d in found]}] * 2
+    (entity,) = detections("/a", "a", pa.RecordBatch.from_pylist(rows), 320)
+    (texts,) = (c for c in entity.columns if "labels" in str(c.component_descriptor()))
+    told = ["", "conf 0.90, 1.00 m", "conf 0.60, 1.00 m", "conf 0.70, 1.00 m"]
+    assert texts.as_arrow_array().to_pylist() == [told, told]
 
 
 def test_names_of_a_legend_fit_or_are_shortened() -> None:
