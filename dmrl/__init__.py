@@ -15,6 +15,7 @@ _PLACES = {
     "Images": "images",
     "Model": "models",
     "Recording": "recordings",
+    "Result": "results",
     "Rows": "data",
     "Topic": "topic",
     "Writer": "writing",

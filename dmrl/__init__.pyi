@@ -7,6 +7,7 @@ from dmrl.api.models import Model as Model
 from dmrl.api.models import load as load
 from dmrl.api.recordings import Recording as Recording
 from dmrl.api.recordings import open as open
+from dmrl.api.results import Result as Result
 from dmrl.api.stages import align as align
 from dmrl.api.stages import calibrate as calibrate
 from dmrl.api.stages import convert as convert

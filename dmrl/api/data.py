@@ -47,8 +47,8 @@ class Rows:
     def __len__(self) -> int:
         return len(self._split)
 
-    def __getitem__(self, index: int) -> dict[str, NDArray[Any]]:
-        """A row as arrays.
+    def __getitem__(self, index: int | slice) -> dict[str, NDArray[Any]]:
+        """A row as arrays; of a slice such as ``rows[:9]``, rows stacked as `gathered` does.
 
         Returns
         -------
@@ -61,6 +61,8 @@ class Rows:
         IndexError
             If there is no such row.
         """
+        if isinstance(index, slice):
+            return self.gathered(range(*index.indices(len(self))))
         return {name: array[0] for name, array in self.gathered([index]).items()}
 
     def __iter__(self) -> Iterator[dict[str, NDArray[Any]]]:
@@ -178,6 +180,10 @@ class Rows:
     def __repr__(self) -> str:
         height, width = self._split.image_shape
         return f"<split {self.name}: {len(self)} images of {width} x {height} px>"
+
+    def _repr_html_(self) -> str:
+        shown = pages.spread(len(self))
+        return pages.pictures(repr(self)[1:-1], self._split.images(shown))
 
 
 class Data(Mapping[str, Rows]):

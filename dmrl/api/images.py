@@ -8,6 +8,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.api import pages
 from dmrl.images.codec import Rgb, decode
 from dmrl.messages import message
 from dmrl.recording import log_times, parsed, read_raw
@@ -97,12 +98,23 @@ class Images(Sequence[Rgb]):
         return replace(self, time_ns=self.time_ns[chosen])
 
     def nearest(self, time_s: float) -> Rgb:
-        """The image nearest to a time, seconds from the start of the recording."""
+        """The image nearest to a time, seconds from the start of the recording.
+
+        Raises
+        ------
+        IndexError
+            If there are no images here.
+        """
+        if not len(self):
+            raise IndexError(f"no image here of {self.topic} in {self.path}")
         return self[int(np.abs(self.time_s - time_s).argmin())]
 
     def to_numpy(self) -> NDArray[np.uint8]:
-        """(N, H, W, 3) all of them, in memory."""
-        return np.stack(list(self))
+        """(N, H, W, 3) all of them, in memory; of none, (0, 0, 0, 3)."""
+        return np.stack(list(self)) if len(self) else np.empty((0, 0, 0, 3), np.uint8)
 
     def __repr__(self) -> str:
         return f"<{len(self)} images of {self.topic} in {self.path}>"
+
+    def _repr_html_(self) -> str:
+        return pages.pictures(repr(self)[1:-1], (self[k] for k in pages.spread(len(self))))

@@ -113,7 +113,7 @@ class Model:
         self, images: Rgb | Sequence[Rgb], threshold: float | None, most: int
     ) -> Iterator[list[Detection]]:
         least = self.threshold if threshold is None else threshold
-        every = iter(images)
+        every = map(np.asarray, images)
         while batch := list(islice(every, BATCH)):
             for image in batch:
                 _require_rgb(image[None])
@@ -153,6 +153,8 @@ def load(model: str | os.PathLike[str], *, backend: BackendName = "torch") -> Mo
         If it cannot be used, or not by this backend.
     MissingExtra
         If a package that the backend needs is not installed.
+    SettingError
+        If there is no such backend.
 
     Examples
     --------

@@ -1,15 +1,19 @@
-"""How things look in a notebook: tables as HTML, recordings in rerun."""
+"""How things look in a notebook: tables and pictures as HTML, recordings in rerun."""
 
 import sys
-from collections.abc import Sequence
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dmrl.errors import one_line
+import numpy as np
 
-MOST_ROWS = 200
+from dmrl.errors import one_line
+from dmrl.images.codec import Rgb, encode_jpeg
+
+MOST_ROWS, MOST_PICTURES = 200, 6
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
@@ -21,6 +25,19 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
     )
     more = f"<p>and {len(rows) - MOST_ROWS} more</p>" if len(rows) > MOST_ROWS else ""
     return f"<p><b>{_cell(title)}</b></p><table><tr>{head}</tr>{body}</table>{more}"
+
+
+def spread(count: int) -> list[int]:
+    """Which of so many pictures are shown: the first and others, evenly spaced."""
+    shown = min(count, MOST_PICTURES)
+    return [k * count // shown for k in range(shown)]
+
+
+def pictures(title: str, shown: Iterable[Rgb]) -> str:
+    """A title and a row of pictures, (H, W, 3) each, as HTML that holds them."""
+    coded = (b64encode(encode_jpeg(np.ascontiguousarray(one))).decode() for one in shown)
+    row = "".join(f'<img width="160" src="data:image/jpeg;base64,{text}"> ' for text in coded)
+    return f"<p><b>{_cell(title)}</b></p><p>{row}</p>"
 
 
 def _cell(value: object) -> str:

@@ -4,6 +4,7 @@ Settings are the fields of the stage's ``Settings``, and are checked as a recipe
 recording without a name for the output lives in a temporary folder as long as its object.
 """
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from shutil import rmtree
@@ -14,7 +15,11 @@ from dmrl import recipe as recipes
 from dmrl.api.data import Data, dataset
 from dmrl.api.models import Model, load
 from dmrl.api.recordings import PathLike, Recording
+from dmrl.api.results import Result, judged
+from dmrl.errors import SettingError
 from dmrl.pipeline.interface import interface_of
+
+OneOrMore = PathLike | Sequence[PathLike]
 
 
 def label(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
@@ -65,7 +70,10 @@ def trim(recording: PathLike, out: PathLike | None = None, **settings: Any) -> R
 
 def merge(recordings: Sequence[PathLike], out: PathLike | None = None) -> Recording:
     """Recordings in one, by time: ``dmrl merge``. Errors as `label`."""
-    return _recording("merge", out, {}, recordings=[Path(path) for path in recordings])
+    named = _paths("merge", recordings)
+    if len(named) < 2:
+        raise SettingError("dmrl.merge wants two recordings or more. Name them in a list")
+    return _recording("merge", out, {}, recordings=named)
 
 
 def convert(source: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
@@ -122,9 +130,9 @@ def sketch(out: PathLike, **settings: Any) -> Path:
     return _made("sketch", Path(out), settings)
 
 
-def make_dataset(recordings: Sequence[PathLike], out: PathLike, **settings: Any) -> Data:
+def make_dataset(recordings: OneOrMore, out: PathLike, **settings: Any) -> Data:
     """A dataset of recordings, with its card: ``dmrl dataset``. Errors as `label`."""
-    given = [Path(path) for path in recordings]
+    given = _paths("make_dataset", recordings)
     return dataset(_made("dataset", Path(out), settings, recordings=given))
 
 
@@ -168,26 +176,33 @@ def quantize(model: PathLike, data: PathLike | Data, out: PathLike, **settings: 
     return load(_made("quantize", Path(out), settings, model=Path(model), dataset=images))
 
 
-def calibrate(sources: Sequence[PathLike], out: PathLike, **settings: Any) -> Path:
+def calibrate(sources: OneOrMore, out: PathLike, **settings: Any) -> Path:
     """A camera file from chessboards or flights: ``dmrl calibrate``. Errors as `label`."""
-    return _made("calibrate", Path(out), settings, sources=[Path(path) for path in sources])
+    return _made("calibrate", Path(out), settings, sources=_paths("calibrate", sources))
 
 
-def evaluate(recordings: Sequence[PathLike], **settings: Any) -> Any:
+def evaluate(recordings: OneOrMore, **settings: Any) -> Result:
     """How good detections, tracks or positions are: ``dmrl evaluate``.
+
+    Parameters
+    ----------
+    recordings
+        One, or several whose detections are judged together.
+    settings
+        Fields of ``dmrl.stages.evaluate.Settings``.
 
     Returns
     -------
-    Evaluation or dict
-        As ``dmrl.stages.evaluate.run`` gives it.
+    Result
+        Figures by name, as ``--json`` prints them; in a notebook, the table.
 
     Raises
     ------
     DmrlError
         As the command says it.
     """
-    chosen = _settings("evaluate", settings)
-    return interface_of("evaluate").run([Path(path) for path in recordings], None, **chosen)
+    named = _paths("evaluate", recordings)
+    return judged(named, _settings("evaluate", settings)["settings"])
 
 
 def _keys(kind: str, name: PathLike | None) -> dict[str, Any]:
@@ -197,6 +212,14 @@ def _keys(kind: str, name: PathLike | None) -> dict[str, Any]:
     keys = recipes.read(Path(name))
     recipes.check_kind(str(name), keys, kind)
     return {key: value for key, value in keys.items() if key != "kind"}
+
+
+def _paths(what: str, given: OneOrMore) -> list[Path]:
+    """One file or folder, or several; never none."""
+    several = [given] if isinstance(given, str | os.PathLike) else list(given)
+    if not several:
+        raise SettingError(f"dmrl.{what} was given an empty list. Name one file at least")
+    return [Path(path) for path in several]
 
 
 def _recording(

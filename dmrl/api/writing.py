@@ -18,6 +18,9 @@ from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance
 from dmrl.samples import sample
 
+END_S = 9.2e9
+"""Beyond it whole nanoseconds do not fit into 64 bits; seconds, the year 2261."""
+
 
 @runtime_checkable
 class HasFields(Protocol):
@@ -55,6 +58,7 @@ class Writer:
 
     def __init__(self, path: PathLike, settings: Mapping[str, Any]) -> None:
         self.path = Path(path)
+        self._done = False
         self._sink = RecordingWriter(self.path, provenance("python", dict(settings)))
 
     def write(self, topic: str, time_s: float, fields: Mapping[str, Any] | HasFields) -> None:
@@ -65,7 +69,7 @@ class Writer:
         topic
             One of dmrl's, such as ``/cf1/height``; README.md has the table.
         time_s
-            The sensor's time, seconds.
+            The sensor's time, seconds from 0.
         fields
             Of the message, as in its schema: ``{"height_m": 0.4}``. A message within is a
             mapping, a repeated one a list of mappings. Or a message of another recording, as it is.
@@ -73,19 +77,19 @@ class Writer:
         Raises
         ------
         RecordingError
-            If dmrl has no such topic, or its message no such field.
+            If dmrl has no such topic, its message no such field, or no recording such a time.
+        SettingError
+            If the ``with`` block has ended.
         """
-        kind = _message_of(topic)
+        kind, (time_ns,) = _message_of(topic), self._times(topic, [time_s])
         try:
             if isinstance(fields, HasFields):
                 made = _as_it_is(fields, kind)
             else:
                 made = message(kind)(**fields)
         except (TypeError, ValueError) as e:
-            raise RecordingError(
-                f"{self.path}: {topic} carries {kind}: {e}. Mend its fields"
-            ) from e
-        self._sink.write(round(time_s * 1e9), topic, made)
+            raise self._misfit(topic, kind, e) from e
+        self._sink.write(int(time_ns), topic, made)
 
     def write_columns(self, topic: str, time_s: ArrayLike, fields: Mapping[str, ArrayLike]) -> None:
         """Append many messages of one topic.
@@ -114,13 +118,11 @@ class Writer:
             for time, row in zip(times.tolist(), rows, strict=True):
                 self.write(topic, time, dict(zip(columns, row, strict=True)))
             return
-        kind, time_ns = _message_of(topic), np.rint(times * 1e9).astype(np.int64)
+        kind, time_ns = _message_of(topic), self._times(topic, times)
         try:
             self._sink.write_columns(topic, message(kind), time_ns, columns)
         except (TypeError, ValueError) as e:
-            raise RecordingError(
-                f"{self.path}: {topic} carries {kind}: {e}. Mend its fields"
-            ) from e
+            raise self._misfit(topic, kind, e) from e
 
     def image(
         self, robot: str, time_s: float, rgb: NDArray[np.uint8], *, quality: int | None = None
@@ -144,7 +146,8 @@ class Writer:
             If it is no image.
         """
         grey = rgb.ndim == 2
-        if rgb.dtype != np.uint8 or not (grey or (rgb.ndim == 3 and rgb.shape[2] == 3)):
+        coloured = rgb.ndim == 3 and rgb.shape[2] == 3
+        if rgb.dtype != np.uint8 or not (grey or coloured) or not rgb.size:
             raise SettingError(
                 f"image of {robot}: shape {rgb.shape}, type {rgb.dtype}. Give (H, W, 3), uint8"
             )
@@ -152,7 +155,8 @@ class Writer:
         whole = np.ascontiguousarray(every)
         data = encode_png(whole) if quality is None else encode_jpeg(whole, quality)
         kind = "png" if quality is None else "jpeg"
-        self._send(sample.image(round(time_s * 1e9), robot, data, kind))
+        (time_ns,) = self._times(topics.camera_image(robot), [time_s])
+        self._send(sample.image(int(time_ns), robot, data, kind))
 
     def camera(self, robot: str, camera: Camera | PathLike, time_s: float = 0.0) -> None:
         """Append the calibration of a robot's camera, or what a camera file says of it.
@@ -163,7 +167,24 @@ class Writer:
             If the file cannot be read.
         """
         known = camera if isinstance(camera, Camera) else read_camera(Path(camera))
-        self._send(sample.calibration(round(time_s * 1e9), robot, known))
+        (time_ns,) = self._times(topics.calibration(robot), [time_s])
+        self._send(sample.calibration(int(time_ns), robot, known))
+
+    def _times(self, topic: str, time_s: ArrayLike) -> NDArray[np.int64]:
+        """(N,) log times, nanoseconds."""
+        if self._done:
+            raise SettingError(f"{self.path} is written. Open another with dmrl.writer")
+        times = np.asarray(time_s, float)
+        if not ((times >= 0) & (times < END_S)).all():
+            wrong = times[~((times >= 0) & (times < END_S))][0]
+            raise RecordingError(
+                f"{self.path}: {topic} at {wrong:g} s. Give seconds from 0 to {END_S:g}"
+            )
+        return np.rint(times * 1e9).astype(np.int64)
+
+    def _misfit(self, topic: str, kind: str, error: Exception) -> RecordingError:
+        why = str(error).rstrip(".")
+        return RecordingError(f"{self.path}: {topic} carries {kind}: {why}. Mend its fields")
 
     def _send(self, made: sample.Sample) -> None:
         self._sink.write(made.time_ns, made.topic, message(made.message)(**made.fields))
@@ -186,6 +207,7 @@ class Writer:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._done = True
         self._sink.__exit__(kind, error, traceback)
 
 

@@ -110,6 +110,8 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
         If the model cannot be used, or is not what the backend needs.
     MissingExtra
         If the backend needs a package that is not installed.
+    SettingError
+        If there is no such backend.
     """
     if not model.exists():
         raise ModelError(
@@ -117,6 +119,8 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
             f"one that ships with dmrl: {', '.join(pretrained.names())}"
         )
     refuse_pipes(model)
+    if backend not in OPENS:
+        raise SettingError(f"no backend {backend}. There are: {', '.join(OPENS)}")
     return OPENS[backend](model, backend)
 
 

@@ -24,6 +24,8 @@ def learn(path: Path) -> float:
         print(batch["image"].shape)
     found: list[list[dmrl.Detection]] = dmrl.load("model").detect(rec.images("cf1"))
     dmrl.label(path, "labelled.mcap")
+    judged: dmrl.Result = dmrl.evaluate(path)
+    print(judged["overall"]["median_px"]["value"], train[:3]["depth"].mean())
     with dmrl.writer("found.mcap", network="mine") as out:
         out.write("/cf1/detections", 0.5, {"detections": [], "threshold": 0.5})
     return found[0][0].depth_m + float(table.num_rows)

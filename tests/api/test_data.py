@@ -23,6 +23,8 @@ def test_splits_rows_and_arrays(data: Path) -> None:
     assert np.array_equal(rows[1]["depth"], split.depth[1])
     with pytest.raises(IndexError):
         rows[len(rows)]
+    assert np.array_equal(rows[1:3]["image"], np.stack(every[1:3]))
+    assert rows._repr_html_().count("<img") == min(len(rows), 6)
 
 
 def test_a_frame_has_the_peers(data: Path) -> None:

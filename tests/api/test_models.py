@@ -47,3 +47,13 @@ def test_sizes_that_do_not_divide_are_said() -> None:
 def test_no_model_of_a_name_is_said() -> None:
     with pytest.raises(ModelError, match="dmrl-nano"):
         dmrl.load("dmrl-mini")
+
+
+def test_no_backend_of_a_name_is_said() -> None:
+    with pytest.raises(SettingError, match=r"no backend cuda\. There are: torch, onnx"):
+        dmrl.load("dmrl-nano", backend="cuda")  # type: ignore[arg-type]
+
+
+def test_a_path_is_no_images() -> None:
+    with pytest.raises(SettingError, match="RGB"):
+        dmrl.load("dmrl-nano").detect("flight.mcap")  # type: ignore[arg-type]

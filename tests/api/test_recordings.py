@@ -93,3 +93,12 @@ def test_html_of_names_that_are_markup(tmp_path: Path) -> None:
         out.write("/<b>/height", 0.0, {"height_m": 1.0})
     html = dmrl.open(tmp_path / "odd.mcap")._repr_html_()
     assert "<b>/height" not in html and "&lt;b&gt;" in html
+
+
+def test_images_show_themselves_and_none_is_no_error(flight: Path) -> None:
+    images = dmrl.open(flight).images("cf1")
+    assert images._repr_html_().count("<img") == 6 and images[:2]._repr_html_().count("<img") == 2
+    none = images.between(90.0, 91.0)
+    assert none._repr_html_().count("<img") == 0 and none.to_numpy().shape == (0, 0, 0, 3)
+    with pytest.raises(IndexError, match="no image here"):
+        none.nearest(1.0)

@@ -1,6 +1,7 @@
 """Stages as functions write what their commands write."""
 
 import gc
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 import dmrl
 from dmrl.cli import app
-from dmrl.errors import RecipeError
+from dmrl.errors import RecipeError, SettingError
 
 
 def test_the_bytes_are_those_of_the_command(flight: Path, tmp_path: Path) -> None:
@@ -44,6 +45,31 @@ def test_topics_and_images_keep_a_temporary_recording_there(flight: Path) -> Non
 def test_wrong_settings_are_said(flight: Path) -> None:
     with pytest.raises(RecipeError, match="gate: "):
         dmrl.label(flight, gate=0.4)
+
+
+def test_no_recording_at_all_is_said_and_one_is_a_list_of_one(flight: Path, tmp_path: Path) -> None:
+    for stage in (dmrl.evaluate, dmrl.merge):
+        with pytest.raises(SettingError, match="empty list"):
+            stage([])
+    for made in (dmrl.calibrate, dmrl.make_dataset):
+        with pytest.raises(SettingError, match="empty list"):
+            made([], tmp_path / "out")
+    with pytest.raises(SettingError, match="two recordings"):
+        dmrl.merge([flight])
+    assert list(tmp_path.iterdir()) == []
+    assert len(dmrl.make_dataset(flight, tmp_path / "set")) > 0
+
+
+def test_figures_are_those_that_the_command_prints(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = dmrl.predict("dmrl-nano", flight, tmp_path / "seen.mcap")
+    labelled = dmrl.label(flight, tmp_path / "labelled.mcap")
+    for path, word in ((seen.path, "median error, px"), (labelled.path, "cf2 sees cf1")):
+        judged = dmrl.evaluate(path)
+        app(["evaluate", str(path), "--json"], result_action="return_value")
+        assert dict(judged) == json.loads(capsys.readouterr().out)
+        assert word in judged._repr_html_() and word in repr(judged)
 
 
 @pytest.mark.heavy

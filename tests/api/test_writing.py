@@ -1,5 +1,6 @@
 """A recording of one's own holds what was written, and is checked as any other."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +52,30 @@ def test_wrong_topics_fields_and_lengths_are_said(tmp_path: Path) -> None:
             out.write_columns("/a/height", [0.0, 0.1], {"height_m": ["low", "high"]})
         with pytest.raises(SettingError, match=r"Give \(H, W, 3\)"):
             out.image("a", 0.0, np.zeros((4, 4, 4), np.uint8))
+        with pytest.raises(SettingError, match=r"Give \(H, W, 3\)"):
+            out.image("a", 0.0, np.zeros((0, 4, 3), np.uint8))
     with pytest.raises(OutputError, match="exists"):
         dmrl.writer(tmp_path / "own.mcap")
+
+
+@pytest.mark.parametrize("time_s", [math.nan, math.inf, -0.1, 1e10])
+def test_a_time_that_no_recording_holds_is_said(tmp_path: Path, time_s: float) -> None:
+    with dmrl.writer(tmp_path / "own.mcap") as out:
+        out.write("/a/height", 0.0, {"height_m": 1.0})
+        with pytest.raises(RecordingError, match=r"/a/height at .* s\. Give seconds from 0"):
+            out.write("/a/height", time_s, {"height_m": 1.0})
+        with pytest.raises(RecordingError, match=r"/a/height at .* s\. Give seconds from 0"):
+            out.write_columns("/a/height", [0.0, time_s], {"height_m": [1.0, 2.0]})
+        with pytest.raises(RecordingError, match=r"camera/image at .* s\. Give seconds from 0"):
+            out.image("a", time_s, np.zeros((4, 4, 3), np.uint8))
+    assert len(out.open()["/a/height"]) == 1
+
+
+def test_what_is_written_after_the_end_is_not_lost_in_silence(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "own.mcap") as out:
+        out.write("/a/height", 0.0, {"height_m": 1.0})
+    with pytest.raises(SettingError, match=r"own\.mcap is written"):
+        out.write("/a/height", 1.0, {"height_m": 1.0})
 
 
 def test_a_message_of_another_recording_is_written_as_it_is(tmp_path: Path) -> None:

@@ -1,0 +1,70 @@
+"""What an evaluation found, as an object: figures by name, and a table in a notebook."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from dmrl.api import pages
+
+
+class Result(Mapping[str, Any]):
+    """Figures by name, as ``dmrl evaluate --json`` prints them.
+
+    Parameters
+    ----------
+    document
+        The figures: numbers, texts, lists and mappings; None where there was nothing to measure.
+    title, columns, rows
+        The table that the command prints.
+    """
+
+    def __init__(
+        self,
+        document: Mapping[str, Any],
+        title: str,
+        columns: Sequence[str],
+        rows: Sequence[Sequence[Any]],
+    ) -> None:
+        self._document = document
+        self._table = title, columns, rows
+
+    def __getitem__(self, name: str) -> Any:
+        """A figure, or the figures below a name.
+
+        Raises
+        ------
+        KeyError
+            If there is none of that name.
+        """
+        return self._document[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._document)
+
+    def __len__(self) -> int:
+        """Names."""
+        return len(self._document)
+
+    def __repr__(self) -> str:
+        title, columns, rows = self._table
+        lines = ["  ".join(map(str, row)) for row in [columns, *rows]]
+        return "\n".join([title, *lines])
+
+    def _repr_html_(self) -> str:
+        return pages.table(*self._table)
+
+
+def judged(recordings: Sequence[Path], settings: Any) -> Result:
+    """What ``dmrl.stages.evaluate`` finds in recordings."""
+    stage = import_module("dmrl.stages.evaluate")
+    found = stage.run(recordings, None, settings)
+    named = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
+    if isinstance(found, dict):
+        kind = stage.tracks if "robots" in found else stage.positions
+        columns = [kind.EACH, *(words for _, words, _ in kind.COLUMNS)]
+        return Result(found, f"{named}: {kind.TITLE}", columns, kind.rows(found))
+    headers, rows = stage.by_band_table(found.bands)
+    document = stage.document(recordings, settings, found)
+    columns = ["label minus detection", *headers]
+    return Result(document, f"{named}: {found.pairs.images} images", columns, rows)
