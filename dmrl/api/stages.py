@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
-from typing import Any
+from typing import Any, TypeAlias
 
 from dmrl import recipe as recipes
 from dmrl.api.data import Data, dataset
@@ -19,7 +19,7 @@ from dmrl.api.results import Result, judged
 from dmrl.errors import SettingError
 from dmrl.pipeline.interface import interface_of
 
-OneOrMore = PathLike | Sequence[PathLike]
+OneOrMore: TypeAlias = PathLike | Sequence[PathLike]
 
 
 def label(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:

@@ -61,33 +61,25 @@ class Wanted:
         Of these topics.
     low_ns, high_ns
         Of log times in [low_ns, high_ns).
-    always
-        Of these topics at any time.
     """
 
     topics: frozenset[str]
     low_ns: int = 0
     high_ns: int = EVER_NS
-    always: frozenset[str] = frozenset()
-
-    def of_time(self, block: Block) -> NDArray[np.bool_]:
-        """(N,) whether messages are of the stretch of time."""
-        return np.asarray((block.time_ns >= self.low_ns) & (block.time_ns < self.high_ns))
 
     def rows(self, piece: Piece) -> NDArray[np.bool_]:
         """(N,) which messages of a piece."""
         block, present = piece.block, piece.block.numbers()
         topics = {number: piece.channels[number].topic for number in present}
-        of_time = self.of_time(block)
+        of_time = np.asarray((block.time_ns >= self.low_ns) & (block.time_ns < self.high_ns))
         if of_time.all() and self.topics.issuperset(topics.values()):
             return of_time
         mine = block.among([n for n, topic in topics.items() if topic in self.topics])
-        ever = block.among([n for n, topic in topics.items() if topic in self.always])
-        return np.asarray((mine & of_time) | ever)
+        return np.asarray(mine & of_time)
 
 
 def copy(path: Path, wanted: Wanted, sink: RecordingWriter) -> int:
-    """Copy messages into another recording; how many of the stretch of time.
+    """Copy messages into another recording; how many.
 
     Raises
     ------
@@ -111,12 +103,12 @@ def adopt(path: Path, topics: Collection[str], sink: RecordingWriter) -> None:
 
 
 def put(piece: Piece, wanted: Wanted | None, sink: RecordingWriter) -> int:
-    """Copy what is wanted of a piece, None: all; how many messages of the stretch of time."""
+    """Copy what is wanted of a piece, None: all; how many messages."""
     block = piece.block
     count = len(block)
     if wanted is not None:
         rows = wanted.rows(piece)
-        count = int((rows & wanted.of_time(block)).sum())
+        count = int(rows.sum())
         if not rows.all():
             block, piece = block.take(rows), replace(piece, chunk=None)
     if piece.chunk is not None and sink.chunks.append_chunk(piece.chunk, block, piece.channels):
@@ -162,10 +154,5 @@ def _chunks(
 ) -> list[ChunkIndex]:
     """Chunks that may hold what is wanted, by time."""
     mine = {n for n, channel in channels.items() if channel.topic in wanted.topics}
-    ever = {n for n, channel in channels.items() if channel.topic in wanted.always}
     found = chunks_between(summary, mine, wanted.low_ns, wanted.high_ns)
-    found += chunks_between(summary, ever, 0, EVER_NS) if ever else []
-    by_place = {chunk.chunk_start_offset: chunk for chunk in found}
-    return sorted(
-        by_place.values(), key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset)
-    )
+    return sorted(found, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))

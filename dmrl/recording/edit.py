@@ -2,15 +2,17 @@
 
 import heapq
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 from dmrl.errors import RecordingError
-from dmrl.recording.copying import Piece, Wanted, adopt, copy, pieces, put
+from dmrl.recording.channel import RawMessage
+from dmrl.recording.copying import Piece, Wanted, adopt, pieces, put
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import Summary, summary
 from dmrl.recording.inputs import provenance, refuse_twice
-from dmrl.recording.reader import matching
+from dmrl.recording.reader import matching, read_raw
 from dmrl.recording.times import log_times
 from dmrl.recording.writer import RecordingWriter
 from dmrl.terminal.progress import say
@@ -96,7 +98,8 @@ def trim(
 ) -> int:
     """Write the messages of a stretch of time, or of some topics; how many.
 
-    Camera calibration is kept wherever it stands, so that what is left can be used.
+    The calibration that a camera had then goes along, as the first message of the stretch, so that
+    what is left can be used, and its seconds count from where it begins.
 
     Parameters
     ----------
@@ -116,16 +119,38 @@ def trim(
     """
     found = summary(path)
     wanted = matching(path, topics) if topics else frozenset(found.topics)
-    latched = frozenset(t for t in wanted if names(CALIBRATION, t) is not None)
     settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
-    low = found.start_ns if start_ns is None else start_ns
+    low = found.start_ns if start_ns is None else max(start_ns, found.start_ns)
     high = found.end_ns + 1 if end_ns is None else end_ns
     with RecordingWriter(out, provenance("trim", settings, [path])) as sink:
         copy_extras(found, sink)
-        count = copy(path, Wanted(wanted, low, high, latched), sink)
+        adopt(path, wanted, sink)
+        for raw in _calibrations(path, wanted, low, high):
+            sink.write_raw(raw)
+        within = Wanted(wanted, low, high)
+        count = sum(put(piece, within, sink) for piece in pieces(path, within))
         if not count:
             raise RecordingError(
                 f"{path} has no message in that stretch; it lasts "
                 f"{(found.end_ns - found.start_ns) / 1e9:.3f} s. Choose times within"
             )
     return count
+
+
+def _calibrations(
+    path: Path, wanted: frozenset[str], low_ns: int, high_ns: int
+) -> Iterator[RawMessage]:
+    """The last calibration of each camera before a stretch; if all come after it, the first."""
+    topics = [topic for topic in wanted if names(CALIBRATION, topic) is not None]
+    for topic, times in sorted(log_times(path, topics).items()):
+        earlier = times[times <= low_ns]
+        later = times[times >= high_ns]
+        if len(earlier):
+            at_ns = int(earlier[-1])
+        elif len(later) == len(times) > 0:
+            at_ns = int(later[0])
+        else:
+            continue
+        if at_ns != low_ns:  # else it is in the stretch
+            *_, raw = read_raw(path, topic, start_ns=at_ns, end_ns=at_ns + 1)
+            yield replace(raw, time_ns=low_ns)

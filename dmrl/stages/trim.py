@@ -18,7 +18,7 @@ LONGEST_S = 9e9
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is kept. Camera calibration is kept wherever it stands.
+    """What is kept; with it goes the calibration that a camera had then.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def command(
 ) -> None:
     """Keep a stretch of a recording, or some of its topics.
 
-    Camera calibration is kept wherever it stands.
+    The calibration that a camera had then goes along.
 
     Parameters
     ----------

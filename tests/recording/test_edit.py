@@ -10,6 +10,7 @@ from dmrl.recording import (
     Provenance,
     RecordingWriter,
     merge,
+    read,
     read_raw,
     recover,
     splits,
@@ -61,8 +62,42 @@ def test_trimming_keeps_the_stretch_and_the_calibration(tmp_path: Path, flight: 
     out = tmp_path / "out.mcap"
     assert trim(flight, out, start_ns=10**9, end_ns=2 * 10**9) == 110
     kept = list(read_raw(out))
-    assert kept[0].topic == "/cf1/camera/calibration"
-    assert {r.time_ns // 10**9 for r in kept[1:]} == {1}
+    assert (kept[0].topic, kept[0].time_ns) == ("/cf1/camera/calibration", 10**9)
+    assert kept[0].data == next(read_raw(flight, "/cf1/camera/calibration")).data
+    assert {r.time_ns // 10**9 for r in kept} == {1}
+
+
+def test_seconds_of_a_stretch_count_from_where_it_begins(tmp_path: Path, flight: Path) -> None:
+    last, few = tmp_path / "last.mcap", tmp_path / "few.mcap"
+    stage.run(flight, last, stage.Settings(from_s=30.0))
+    stage.run(last, few, stage.Settings(to_s=3.0))
+    heights = [r for r in read_raw(few) if r.topic != "/cf1/camera/calibration"]
+    assert {r.time_ns // 10**9 for r in heights} == {30, 31, 32}
+
+
+def test_of_many_calibrations_the_one_of_then_goes_along(tmp_path: Path) -> None:
+    every, out = tmp_path / "every.mcap", tmp_path / "out.mcap"
+    with RecordingWriter(every, Provenance("test")) as sink:
+        for k in range(1, 10):  # as ROS has them, again and again; others come late
+            told = message("CameraCalibration")(width=8 * k)
+            sink.write(10 * k, "/cf1/camera/calibration", told)
+            sink.write(10 * k + 5, "/cf1/height", message("Height")(height_m=k))
+        sink.write(95, "/cf2/camera/calibration", message("CameraCalibration")(width=8))
+
+    def calibrations(**stretch: int) -> list[tuple[str, int, int]]:
+        out.unlink(missing_ok=True)
+        trim(every, out, **stretch)
+        found = read(out, "/*/camera/calibration")
+        return [(m.topic[:4], m.time_ns, m.message.width // 8) for m in found]
+
+    assert calibrations(start_ns=44, end_ns=56) == [
+        ("/cf1", 44, 4),
+        ("/cf2", 44, 1),
+        ("/cf1", 50, 5),
+    ]
+    assert calibrations(start_ns=50, end_ns=56) == [("/cf1", 50, 5), ("/cf2", 50, 1)]
+    assert calibrations(start_ns=-5, end_ns=16) == [("/cf1", 10, 1), ("/cf2", 10, 1)]
+    assert calibrations(start_ns=94) == [("/cf1", 94, 9), ("/cf2", 95, 1)]
 
 
 def test_trimming_to_nothing_is_an_error_and_leaves_no_file(tmp_path: Path, flight: Path) -> None:
