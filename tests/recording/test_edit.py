@@ -88,13 +88,10 @@ def test_of_many_calibrations_the_one_of_then_goes_along(tmp_path: Path) -> None
         out.unlink(missing_ok=True)
         trim(every, out, **stretch)
         found = read(out, "/*/camera/calibration")
-        return [(m.topic[:4], m.time_ns, m.message.width // 8) for m in found]
+        return sorted((m.topic[:4], m.time_ns, m.message.width // 8) for m in found)
 
-    assert calibrations(start_ns=44, end_ns=56) == [
-        ("/cf1", 44, 4),
-        ("/cf2", 44, 1),
-        ("/cf1", 50, 5),
-    ]
+    seen = [("/cf1", 44, 4), ("/cf1", 50, 5), ("/cf2", 44, 1)]
+    assert calibrations(start_ns=44, end_ns=56) == seen
     assert calibrations(start_ns=50, end_ns=56) == [("/cf1", 50, 5), ("/cf2", 50, 1)]
     assert calibrations(start_ns=-5, end_ns=16) == [("/cf1", 10, 1), ("/cf2", 10, 1)]
     assert calibrations(start_ns=94) == [("/cf1", 94, 9), ("/cf2", 95, 1)]
