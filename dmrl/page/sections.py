@@ -3,6 +3,7 @@
 Documents may be a stranger's: what is not as dmrl writes it is named, and the rest is shown.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -139,14 +140,14 @@ def _with_interval(figure: Mapping[str, Any], form: str) -> str:
     return format(figure["value"], form) + within
 
 
-def _bands(key: str) -> Callable[[Any], list[tuple[str, float, float, float]]]:
-    def take(said: Any) -> list[tuple[str, float, float, float]]:
+def _bands(key: str) -> Callable[[Any], list[tuple[float, ...]]]:
+    def take(said: Any) -> list[tuple[float, ...]]:
         out = []
         for band in said["bands"]:
             value, low, high = (band[key][end] for end in ("value", "low", "high"))
             if None not in (value, low, high):
-                to = "" if band["to_m"] is None else f"{band['to_m']:g}"
-                out.append((f"{band['from_m']:g}-{to}", float(value), float(low), float(high)))
+                ends = band["from_m"], math.inf if band["to_m"] is None else band["to_m"]
+                out.append(tuple(map(float, (*ends, value, low, high))))
         return out
 
     return take
@@ -168,7 +169,7 @@ def _bins(said: Any) -> tuple[Any, Any, Any]:
 def _evaluation(found: Found, name: str, said: Mapping[str, Any], pictures: Pictures) -> str:
     sources = said["recordings"] if "recordings" in said else [said["recording"]]
     inputs = " ".join(str(source["name"]) for source in sources)
-    split = f" --split {said['split']}" if said["split"] != "all" else ""
+    split = f" --split {said['split']}" if said["split"] not in (None, "all") else ""
     ran = f"dmrl evaluate {inputs} --against {said['against']}{split} --plots {name}"
     partial = " Images without Detections were left out (--partial)." if said.get("partial") else ""
     words = f"{said['labels']} labels, threshold {float(said['threshold']):.2f}.{partial}"

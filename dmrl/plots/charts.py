@@ -72,28 +72,32 @@ def losses(histories: Mapping[str, Sequence[float]], words: str = "loss") -> str
 
 
 def by_distance(
-    figures: Mapping[str, Sequence[tuple[str, float, float, float]]], words: str
+    figures: Mapping[str, Sequence[tuple[float, float, float, float, float]]], words: str
 ) -> str:
     """A figure with its interval for each range of distance, one colour per evaluation.
 
     Parameters
     ----------
     figures
-        By evaluation: words of the range, value, and both ends of the interval.
+        By evaluation: both ends of the range, metres, the last one infinite; value, and both ends
+        of the interval.
     words
         Of the axis up.
     """
     with _chart() as (figure, made):
         axes = figure.subplots()
-        ranges = list(dict.fromkeys(row[0] for rows in figures.values() for row in rows))
+        ranges = sorted({row[:2] for rows in figures.values() for row in rows})
+        beside = min(0.15, 0.8 / len(figures))  # all of a range stay nearer to it than to the next
         for k, (name, rows) in enumerate(figures.items()):
-            at = np.array([ranges.index(row[0]) for row in rows]) + 0.15 * (
-                k - (len(figures) - 1) / 2
-            )
-            value, low, high = np.array([row[1:] for row in rows], float).reshape(-1, 3).T
+            at = np.array([ranges.index(row[:2]) for row in rows], float)
+            at += beside * (k - (len(figures) - 1) / 2)
+            value, low, high = np.array([row[2:] for row in rows], float).reshape(-1, 3).T
             reach = np.maximum([value - low, high - value], 0.0)
-            axes.errorbar(at, value, reach, fmt="o", capsize=3, label=name)
-        axes.set(xticks=range(len(ranges)), xticklabels=ranges, ylabel=words, ylim=(0, None))
+            axes.errorbar(at, value, reach, fmt="o", markersize=4, capsize=2, label=name)
+        for k in range(1, len(ranges)):
+            axes.axvline(k - 0.5, color=INK, linewidth=0.5, alpha=0.25)
+        told = [f"{low:g}-{high:g}" if high < np.inf else f"{low:g}-" for low, high in ranges]
+        axes.set(xticks=range(len(ranges)), xticklabels=told, ylabel=words, ylim=(0, None))
         axes.set_xlabel("depth of the label, m; bars: 95 % intervals")
         axes.grid(axis="y", alpha=0.25)
         _legend(axes)

@@ -11,6 +11,14 @@ from numpy.typing import NDArray
 from dmrl.colours import RGB
 from dmrl.plots.style import STYLE, Figure, mpl, save, withStroke
 
+Box = tuple[float, float, float, float]
+CELL_INCHES = (3.4, 2.6)
+"""Of an image of a gallery."""
+CIRCLE_POINTS, TEXT_POINTS = (19.0, 19.0), (42.0, 11.0)
+"""Width and height of what a gallery draws of a detection."""
+PLACES = [(x, y) for y in (0.0, -16.0, 16.0, -30.0, 30.0) for x in (33.0, -33.0, 0.0) if x or y]
+"""Where the middle of its text may stand, points right and up of it; the first is best."""
+
 
 @dataclass(frozen=True, slots=True)
 class Example:
@@ -133,7 +141,7 @@ def gallery(shown: Sequence[Circled], stem: Path, *, columns: int = 3) -> None:
     columns = min(columns, len(shown))
     rows = -(-len(shown) // columns)
     with mpl.rc_context(STYLE):
-        figure = Figure((3.4 * columns, 2.6 * rows), layout="constrained")
+        figure = Figure((CELL_INCHES[0] * columns, CELL_INCHES[1] * rows), layout="constrained")
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in places:
             axes.axis("off")
@@ -147,23 +155,58 @@ def gallery(shown: Sequence[Circled], stem: Path, *, columns: int = 3) -> None:
 
 
 def _circles(axes: Any, example: Circled, width: int, height: int) -> None:
-    """White circles with a black rim; depths to the side where there is room."""
-    for (u, v), depth_m in zip(example.uv_px.tolist(), example.depth_m.tolist(), strict=True):
+    """White circles with a black rim; depths beside them, where there is room."""
+    places = _text_places(example.uv_px, width, height)
+    for (u, v), (text_u, text_v), depth_m in zip(
+        example.uv_px.tolist(), places, example.depth_m.tolist(), strict=True
+    ):
         for colour, points in (("black", 4.0), ("white", 2.0)):
             at = {"markeredgecolor": colour, "markeredgewidth": points}
             axes.plot(u, v, "o", markersize=16, markerfacecolor="none", **at)
-        right = u < 0.75 * width
-        axes.annotate(
+        axes.text(
+            text_u,
+            text_v,
             f"{depth_m:.2f} m",
-            (u, min(max(v, 8.0), height - 8.0)),
-            (13 if right else -13, 0),
-            textcoords="offset points",
-            ha="left" if right else "right",
+            ha="center",
             va="center",
             color="white",
             fontsize=9,
             path_effects=[withStroke(linewidth=2.5, foreground="black")],
         )
+
+
+def _text_places(uv_px: NDArray[np.float64], width: int, height: int) -> list[tuple[float, float]]:
+    """Where the middle of each text stands, pixels: on no circle or other text, if it can."""
+    point_px = width / (72 * CELL_INCHES[0])
+    taken = [_box((u, v), point_px, CIRCLE_POINTS) for u, v in uv_px.tolist()]
+    out = []
+    for u, v in uv_px.tolist():
+        level = min(max(v, 8.0), height - 8.0)
+        tried = [(u + right * point_px, level - up * point_px) for right, up in PLACES]
+        boxes = [_box(middle, point_px, TEXT_POINTS) for middle in tried]
+        free = [_inside(box, width, height) and not _meets(box, taken) for box in boxes]
+        # Where there is no room at all, to the side that is in the image.
+        best = free.index(True) if any(free) else int(u > 0.75 * width)
+        taken.append(boxes[best])
+        out.append(tried[best])
+    return out
+
+
+def _box(middle: tuple[float, float], point_px: float, size: tuple[float, float]) -> Box:
+    """Left, upper, right and lower edge, pixels, of what is so many points wide and high."""
+    (u, v), (half_u, half_v) = middle, (0.5 * point_px * side for side in size)
+    return u - half_u, v - half_v, u + half_u, v + half_v
+
+
+def _inside(box: Box, width: int, height: int) -> bool:
+    return box[0] >= 0 and box[1] >= 0 and box[2] <= width and box[3] <= height
+
+
+def _meets(box: Box, others: Sequence[Box]) -> bool:
+    return any(
+        box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3]
+        for other in others
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.page import gather, page, write
 from dmrl.plots import charts
+from dmrl.plots.pictures import _text_places
 
 Evaluation = Callable[..., dict[str, Any]]
 
@@ -144,3 +145,21 @@ def test_numbers_of_logarithmic_axes_are_no_formulas_and_legends_cover_no_curve(
     assert "mathdefault" not in svg and ">0.1<" in svg and ">1<" in svg
     legend = svg.index('id="legend_1"')
     assert svg.rindex('id="axes_1"') < legend and svg.count('id="legend_') == 1
+
+
+def test_ranges_of_distance_stand_in_order_whoever_has_them() -> None:
+    near, far, rest = (0.0, 0.5), (0.5, 1.0), (1.0, np.inf)
+    few = [(*far, 5.0, 4.0, 6.0), (*rest, 7.0, 6.0, 9.0)]
+    all_of_them = [(*near, 3.0, 2.0, 4.0), *few]
+    svg = charts.by_distance({"few": few, "all": all_of_them}, "median error, px")
+    assert re.findall(r">(0-0\.5|0\.5-1|1-)<", svg) == ["0-0.5", "0.5-1", "1-"]
+
+
+def test_no_depth_stands_on_another_or_outside_the_image() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        uv_px = rng.uniform([0, 0], [320, 224], (2, 2))
+        uv_px[1] = np.clip(uv_px[0] + rng.uniform(-30, 30, 2), 0, [320, 224])
+        (u, v), (other_u, other_v) = _text_places(uv_px, 320, 224)
+        assert abs(u - other_u) >= 50 or abs(v - other_v) >= 14, uv_px
+        assert 25 < u < 295 and 5 < v < 219
