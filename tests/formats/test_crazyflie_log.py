@@ -99,12 +99,11 @@ def test_a_leaning_beam_is_longer_than_the_height() -> None:
     state = {"roll": [30.0] * 3, "pitch": [-20.0] * 3, "yaw": [0.0] * 3}
     blocks = [
         block("a", **{f"stateEstimate__{name}": v for name, v in state.items()}),
-        block("b", range__zrange=[1000.0, 8000.0, 0.0]),
+        block("b", range__zrange=[1000.0, 8000.0, 2000.0]),
     ]
     found = [s for stream in streams("cf1", blocks, {}) for s in stream if "height" in s.topic]
-    (height,) = found
     lean = np.cos(np.radians(30)) * np.cos(np.radians(20))
-    assert height.fields["height_m"] == pytest.approx(lean)
+    assert [s.fields["height_m"] for s in found] == pytest.approx([lean, 2 * lean])
 
 
 def test_ranges_are_metres_and_fresh() -> None:

@@ -264,6 +264,9 @@ def test_two_rows_are_a_flight(flight: Path) -> None:
 def test_the_first_and_the_last_time_are_looked_at(flight: Path) -> None:
     write(flight, "cf2", rows(-0.005))
     assert "begins before time 0" in refused(flight)
+    for robot in ("cf1", "cf2"):
+        write(flight, robot, rows(0.0))
+    assert next(flight_csv.content(flight).samples).time_ns == 0
     write(flight, "cf2", [*rows(0.0), [9.1e9, *rows()[0][1:]]])
     assert "time_s reaches 9.1e+09" in refused(flight)
 
@@ -289,7 +292,7 @@ def test_pictures_are_named_by_digits(flight: Path) -> None:
     (flight / "cf1" / "001005000000.png").write_bytes(picture)
     assert list(flight_csv.content(flight).samples)
     (flight / "cf1" / "a_dozen_and_one.png").write_bytes(picture)
-    with pytest.raises(SourceError, match="is not named by its time"):
+    with pytest.raises(SourceError, match=r"in nanoseconds, 12 digits or more\. Rename it"):
         flight_csv.content(flight)
 
 
@@ -300,9 +303,9 @@ def test_other_sensors_are_read_by_their_row_of_the_table(
         return topics.Topic(pattern, message, "-", "m", "10 Hz", "convert", sensor=True, csv=csv)
 
     pressure = row("/{robot}/pressure", "Pressure", "pressure_pa", "air_c")
-    sonar = row("/{robot}/sonar/{peer}", "Sonar", "sonar_m", "echo_db")
+    sonar = row("/{robot}/sonar/{peer}", "Sonar", "sonar_up_m", "echo_db")
     monkeypatch.setattr(flight_csv, "OTHERS", (pressure, sonar))
-    names = ["pressure_pa", "air_c", "sonar_cf2_m", "echo_cf2_db", "sonar_cf3_m"]
+    names = ["pressure_pa", "air_c", "sonar_up_cf2_m", "echo_cf2_db", "sonar_up_cf3_m"]
     data: Rows = [
         [*one, 1e5 + k, 20.5, 1.5 + k if k % 2 else "", -3.5, 7.0] for k, one in enumerate(rows())
     ]
@@ -315,7 +318,7 @@ def test_other_sensors_are_read_by_their_row_of_the_table(
     heard = [s for s in found if "sonar" in s.topic]
     assert {s.topic for s in heard} == {"/a/sonar/b"}  # of cf3 there is no echo
     assert [(s.time_ns, s.message, s.fields) for s in heard] == [
-        (10**9 + 10**7 * k, "Sonar", {"sonar_m": 1.5 + k, "echo_db": -3.5}) for k in range(1, 20, 2)
+        (10**9 + 10**7 * k, "Sonar", {"sonar_up_m": 1.5 + k, "echo_db": -3.5}) for k in range(1, 20, 2)
     ]
     write(flight, "cf1", [line[:-4] for line in data], [*HEADER, names[0]])  # one of two
     assert not [s for s in flight_csv.content(flight).samples if "pressure" in s.topic]
