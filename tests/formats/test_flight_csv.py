@@ -318,7 +318,8 @@ def test_other_sensors_are_read_by_their_row_of_the_table(
     heard = [s for s in found if "sonar" in s.topic]
     assert {s.topic for s in heard} == {"/a/sonar/b"}  # of cf3 there is no echo
     assert [(s.time_ns, s.message, s.fields) for s in heard] == [
-        (10**9 + 10**7 * k, "Sonar", {"sonar_up_m": 1.5 + k, "echo_db": -3.5}) for k in range(1, 20, 2)
+        (10**9 + 10**7 * k, "Sonar", {"sonar_up_m": 1.5 + k, "echo_db": -3.5})
+        for k in range(1, 20, 2)
     ]
     write(flight, "cf1", [line[:-4] for line in data], [*HEADER, names[0]])  # one of two
     assert not [s for s in flight_csv.content(flight).samples if "pressure" in s.topic]

@@ -1,4 +1,6 @@
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dmrl import recipe
 from dmrl.errors import ModelError, SettingError
+from dmrl.learn import fit
 from dmrl.learn.batches import CLASS_ID, FIELDS, Examples, gathered
 from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
 from dmrl.learn.decode import decode
@@ -392,3 +395,38 @@ def test_the_loss_that_is_shown_is_the_mean_over_the_images_since_the_last(
     shown = [step.loss for step in training.steps()]
     # Seven batches of an epoch, the last of two images: looked at once, at its end.
     assert [shown[6], shown[13]] == pytest.approx([epoch["loss"] for epoch in training.history])
+
+
+def test_curves_stand_at_the_steps_of_what_they_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows: list[tuple[str, float, int]] = []
+
+    @contextmanager
+    def opened(_: Path, first_step: int) -> Iterator[Callable[..., None]]:
+        rows.append(("first", 0.0, first_step))
+        yield lambda *row: rows.append(row)
+
+    monkeypatch.setattr(fit.boards, "opened", opened)
+    settings, images = replace(SETTINGS, epochs=2), dots(7)  # three steps, the last of one image
+    network = new_network(settings, images)
+    training = Training(network, images, settings, tmp_path, validation=dots(3))
+    assert training.steps_left == 6
+    assert [step.epoch for step in training.steps()] == [1, 1, 1, 2, 2, 2]
+    assert training.steps_left == 0
+    found = {name: [row[1:] for row in rows if row[0] == name] for name, *_ in rows}
+    assert found.pop("first") == [(0.0, 1)]
+    assert [step for _, step in found["loss/train"]] == [3, 6]
+    for name, curve in found.items():
+        if name == "learning_rate":
+            assert curve == [(learning_rate_at(step, 3, settings), step) for step in (3, 6)]
+        else:
+            key = "loss" if name == "loss/train" else name.replace("/", "_", 1)
+            wanted = [
+                (pytest.approx(training.history[k][key], rel=1e-5), 3 * k + 3) for k in (0, 1)
+            ]
+            assert curve == wanted
+    shown = {name.replace("/", "_", 1) for name in found} - {"loss_train", "learning_rate"}
+    assert (
+        shown == {name for name in training.history[0] if name.startswith("validation_")} != set()
+    )
