@@ -158,3 +158,29 @@ def test_after_bursts_the_ranges_are_as_long_as_before() -> None:
     since_s = whole.key_s[:, None] - begins_s
     free = ~((since_s > -1.0) & (since_s < 4.0)).any(axis=1)
     assert np.abs(found.state[free, RANGE_ERROR]).max() < 0.03  # a jump by anything left 0.06 m
+
+
+def test_residuals_are_none_where_all_goes_as_the_processes_say(flight: Problem) -> None:
+    """A velocity error and a range error that fade, and nothing else."""
+    count = len(flight.key_s)
+    still = replace(
+        flight.own,
+        turn_rad=0 * flight.own.turn_rad,
+        shift_m=0 * flight.own.shift_m,
+    )
+    quiet = replace(flight, own=still, peer=still)
+    faded = np.exp(-(flight.key_s - flight.key_s[0]) / NOISE.velocity_tau_s)
+    longer = np.exp(-(flight.key_s - flight.key_s[0]) / NOISE.range_tau_s)
+    state = np.zeros((count, SIZE))
+    error = np.array([0.4, -0.3])
+    state[:, 3:5], state[:, RANGE_ERROR] = faded[:, None] * error, 0.2 * longer
+    steps_s = np.diff(flight.key_s)[:, None]
+    moved = np.cumsum(steps_s * (state[1:, 3:5] + state[:-1, 3:5]) / 2, axis=0)
+    state[1:, :2] = moved  # a measured velocity that is too low by its error
+    found = linearise(quiet, NOISE, state, np.zeros(len(GLOBALS))).step
+    assert np.abs(found).max() < 1e-9
+    for column in range(SIZE):
+        other = state.copy()
+        other[5, column] += 1e-3
+        off = np.abs(linearise(quiet, NOISE, other, np.zeros(len(GLOBALS))).step)
+        assert off[[4, 5]].max() > 1e-4 and np.delete(off, [4, 5], axis=0).max() < 1e-9

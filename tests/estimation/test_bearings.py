@@ -94,3 +94,17 @@ def test_behind_the_observer_azimuths_are_compared_the_short_way() -> None:
     xyz_m, _, used = corrected(time_s, believed, covariance, rows, truth, SHARP)
     assert used == 50
     assert xyz_m[25] == pytest.approx(truth[25], abs=0.02)
+
+
+def test_detections_that_share_an_error_tell_no_more_than_one() -> None:
+    """However many there are; and where positions are surer, they stay as sure."""
+    time_s = np.arange(200) * 0.05
+    truth = np.tile([2.0, 0.0, 0.0], (200, 1))
+    for std_m, azimuth in ((1.0, SHARP.bearing_std_rad), (0.01, 0.005)):
+        covariance = np.tile(std_m**2 * np.eye(3), (200, 1, 1))
+        _, spread, used = corrected(time_s, truth, covariance, np.arange(200), truth, SHARP)
+        assert used == 200
+        sigma = np.sqrt(spread[100].diagonal()) / 2  # two metres away, of its distance
+        assert sigma[1] >= azimuth * 0.999
+        assert sigma[2] == pytest.approx(sigma[1]) and sigma[1] < 1.5 * azimuth
+        assert sigma[0] >= min(SHARP.range_std_ratio, std_m / 2) * 0.999

@@ -3,7 +3,17 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from dmrl.estimation.clocks import Clock, connected, estimate_clock
+from dmrl.estimation.clocks import (
+    OVERLAP_S,
+    SLOW_S,
+    STEP_S,
+    Clock,
+    _Series,
+    _slow,
+    _smooth,
+    connected,
+    estimate_clock,
+)
 from dmrl.estimation.exchanges import estimate_from_exchanges
 
 Array = np.ndarray
@@ -143,3 +153,85 @@ def test_any_offset_and_drift_come_back(
     clock = estimate_clock(seen_s, distance(seen_s, seed), stamps, values)
     assert clock is not None
     assert np.abs(clock.corrected(stamps) - also_s).max() < 0.01
+
+
+@pytest.mark.parametrize("cut_s", [12.0, -12.0])
+def test_clocks_need_not_begin_together(cut_s: float) -> None:
+    """What one saw before the other began is a lag in either direction."""
+    seen_s, also_s = np.arange(0, 90, 0.05), np.arange(0.02, 90, 0.07)
+    seen_s, also_s = seen_s[seen_s > cut_s], also_s[also_s > -cut_s]
+    stamps = also_s + 3.3
+    clock = estimate_clock(seen_s, distance(seen_s, 4), stamps, distance(also_s, 4))
+    assert clock is not None
+    assert np.abs(clock.corrected(stamps) - also_s).max() < 0.01
+    assert also_s[0] - 1 < clock.at_s - 3.3 < also_s[-1] + 1
+
+
+def test_the_deviations_of_offset_and_drift_are_each_its_own() -> None:
+    for one in (exchanges(0), exchanges(1)):
+        clock = estimate_from_exchanges(*one)
+        assert clock is not None
+        # An offset is known as well as a line's middle, a drift by the spread of its times.
+        assert clock.sigma_s / clock.sigma_drift == pytest.approx(300 / 12**0.5, rel=0.1)
+        assert clock.sigma_s == pytest.approx(0.01 / 6**0.5 / len(one[2]) ** 0.5, rel=1.0)
+        assert abs(clock.drift + DRIFT) < 5 * clock.sigma_drift
+
+
+def test_a_chain_is_as_sure_as_its_parts_together() -> None:
+    one = Clock(1.0, 1e-5, 5.0, 0.003, 4e-6, 0.9, "ranges")
+    two = Clock(2.0, 2e-5, 7.0, 0.004, 3e-6, 0.8, "turns")
+    both = two.after(one)
+    assert (both.sigma_s, both.sigma_drift) == pytest.approx((0.005, 5e-6))
+    assert (both.correlation, both.by, both.at_s) == (0.8, "ranges, turns", 5.0)
+    assert both.after(both).by == "ranges, turns"
+    back = one.inverse()
+    assert (back.sigma_s, back.sigma_drift, back.correlation, back.by) == (
+        0.003,
+        4e-6,
+        0.9,
+        "ranges",
+    )
+    assert back.at_s == 6.0
+
+
+def test_single_outliers_are_not_heard_and_holes_are_known() -> None:
+    time_s = np.concatenate([np.arange(0, 30, 0.1), np.arange(32, 60, 0.1)])
+    values = np.sin(time_s / 3)
+    spoilt = values.copy()
+    spoilt[7:-7:9] += 5.0
+    clean, heard = (_Series.of(time_s, v) for v in (values, spoilt))
+    assert clean is not None and heard is not None
+    assert np.abs(heard.values - clean.values).max() < 0.05
+    inner = slice(30, -30)  # the ends stand for what lies beyond them
+    assert clean.values[inner] == pytest.approx(np.sin(clean.time_s[inner] / 3), abs=0.08)
+    assert clean.time_s[0] == 0.0 and np.diff(clean.time_s) == pytest.approx(STEP_S)
+    unknown = clean.time_s[~clean.known]
+    assert unknown[[0, -1]] == pytest.approx([29.9, 32.0], abs=2 * STEP_S)
+    assert len(unknown) == pytest.approx(2.1 / STEP_S, abs=3)
+
+
+@pytest.mark.parametrize(("lasts_s", "enough"), [(OVERLAP_S - 0.5, False), (OVERLAP_S + 0.5, True)])
+def test_a_series_lasts_twenty_seconds_at_least(lasts_s: float, enough: bool) -> None:
+    time_s = np.arange(0, lasts_s, 0.1)
+    assert (_Series.of(time_s, np.sin(time_s)) is not None) == enough
+
+
+@given(st.lists(st.floats(-5, 5), min_size=1, max_size=30))
+def test_a_slow_part_is_a_running_mean_of_whole_windows(values: list[float]) -> None:
+    """Of series shorter than its window here: the mean of what lies around, ends repeated."""
+    array = np.array(values)
+    width = min(int(SLOW_S / STEP_S), len(array)) | 1
+    padded = [array[0]] * (width // 2) + values + [array[-1]] * (width // 2)
+    wanted = [np.mean(padded[k : k + width]) for k in range(len(values))]
+    assert _slow(array) == pytest.approx(np.array(wanted), abs=1e-9)
+
+
+def test_smoothing_keeps_what_is_even_and_spreads_a_point_as_a_bell() -> None:
+    assert _smooth(np.full(50, 3.0), 0.3) == pytest.approx(np.full(50, 3.0))
+    point = np.zeros(401)
+    point[200] = 1.0
+    bell = _smooth(point, 0.3)
+    away_s = (np.arange(401) - 200) * STEP_S
+    assert bell.sum() == pytest.approx(1.0)
+    assert (bell * away_s).sum() == pytest.approx(0.0, abs=1e-12)
+    assert (bell * away_s**2).sum() ** 0.5 == pytest.approx(0.3, rel=0.01)

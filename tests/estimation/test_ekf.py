@@ -12,6 +12,7 @@ from dmrl.estimation.ekf import (
     pair_steps,
     stack,
 )
+from dmrl.estimation.pair import Pair, Track
 
 from .flights import flown, pair_of
 
@@ -66,3 +67,30 @@ def test_the_jacobians_are_those_of_finite_differences() -> None:
 def test_the_simulation_preset_ignores_heights() -> None:
     assert not steps_of(1000, "published-sim").height_m.any()
     assert steps_of(1000, "published-firmware").height_m.any()
+
+
+def test_a_range_is_the_length_of_all_three_sides() -> None:
+    states = np.array([[3.0, 4.0, 0.7], [0.0, 0.0, 0.1]])
+    range_m, by_state = measured(states, np.array([12.0, -2.0]))
+    assert range_m == pytest.approx([13.0, 2.0], abs=1e-3)
+    assert by_state[0] == pytest.approx([3 / 13, 4 / 13, 0.0], abs=1e-3)
+
+
+def test_steps_are_what_either_robot_measured_and_ranges_go_to_the_nearest() -> None:
+    time_s = 7 + np.arange(50) / 100
+    own, peer = (
+        Track(*(k + 10 * n + 0.01 * np.arange(50) for k in range(4)), np.zeros(50, bool))
+        for n in (1, 2)
+    )
+    pair = Pair(time_s, own, peer, np.array([7.004, 7.006, 7.012, 7.49]), np.array([1.0, 2, 3, 4]))
+    steps = pair_steps(pair, PRESETS["published-firmware"])
+    assert steps.dt_s == pytest.approx(0.01)
+    assert steps.height_m[:, 0] == pytest.approx(peer.height_m - own.height_m)
+    columns = [peer.vx_mps, peer.vy_mps, peer.yaw_rate_radps]
+    columns += [own.vx_mps, own.vy_mps, own.yaw_rate_radps]
+    assert steps.inputs[:, 0] == pytest.approx(np.column_stack(columns))
+    heard = {0: 1.0, 1: 3.0, 49: 4.0}  # of two of one step the last
+    for k, range_m in enumerate(steps.range_m[:, 0]):
+        assert range_m == heard[k] if k in heard else np.isnan(range_m)
+    twice = stack([steps, steps])
+    assert twice.inputs.shape == (50, 2, 6) and twice.range_m.shape == (50, 2)

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.exchanges import POLLED_S, SAME_M, SAME_S, _line, _same_exchange
+from dmrl.estimation.exchanges import (
+    POLLED_S,
+    SAME_M,
+    SAME_S,
+    _line,
+    _same_exchange,
+    estimate_from_exchanges,
+)
 
 
 def test_a_line_is_found_under_outliers_with_the_deviations_of_its_parts() -> None:
@@ -32,3 +39,18 @@ def test_what_both_logged_is_told_by_value_and_time() -> None:
     found, apart_s = _same_exchange(late, seen, time_s, value)
     assert set(range(100)) - set(found.tolist()) == {3, 7, 40}
     assert apart_s == pytest.approx(np.full(97, 0.05))
+
+
+def test_a_clock_s_deviations_are_of_its_offset_and_of_its_drift() -> None:
+    rng = np.random.default_rng(5)
+    time_s = np.arange(0, 200, 0.05)
+    range_m = np.round(3 + np.sin(time_s / 3) + np.sin(time_s / 1.7 + 1), 3)
+    range_m += np.round(rng.normal(0, 0.1, len(time_s)), 3)
+    late = time_s + rng.uniform(0, 0.01, len(time_s))
+    clock = estimate_from_exchanges(late, range_m, time_s + 0.04 + 2e-5 * time_s, range_m)
+    assert clock is not None
+    assert clock.sigma_s / clock.sigma_drift == pytest.approx(time_s.std(), rel=0.05)
+    assert clock.sigma_s == pytest.approx(0.01 / 12**0.5 / len(time_s) ** 0.5, rel=0.2)
+    assert clock.drift == pytest.approx(-2e-5, abs=4 * clock.sigma_drift)
+    middle = clock.at_s + clock.offset_s
+    assert middle + 0.04 + 2e-5 * middle - 0.005 == pytest.approx(clock.at_s, abs=1e-3)

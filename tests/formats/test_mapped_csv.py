@@ -15,7 +15,7 @@ from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
 from dmrl.formats.log_block import Series
 from dmrl.geometry.frames import camera_from_horizontal
-from dmrl.geometry.turns import euler_zyx
+from dmrl.geometry.turns import euler_zyx, quaternion_zyx
 from dmrl.samples.sample import Sample
 
 TABLE = """
@@ -430,16 +430,17 @@ def test_every_quantity_of_a_table_comes_where_it_belongs(tmp_path: Path) -> Non
     )
     (tmp_path / "map.toml").write_text(text)
     row = dict(zip(names, (np.arange(len(names)) + 1) / 64, strict=True)) | {"time": 2.0}
-    row |= {"qx": 0.0, "qy": 0.0, "qz": 0.6, "qw": 0.8, "true_qx": 0.0, "true_qy": 0.6}
+    (quaternion,) = quaternion_zyx(np.array([[0.4, -0.3, 1.2]]))
+    row |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.tolist(), strict=True))
+    row |= {"true_qx": 0.0, "true_qy": 0.6}
     row |= {"true_qz": 0.0, "true_qw": 0.8}
     (tmp_path / "log.csv").write_text(f"{','.join(row)}\n{','.join(map(str, row.values()))}\n")
     found = samples(tmp_path / "log.csv", Options(columns=tmp_path / "map.toml"))
     assert {s.time_ns for v in found.values() for s in v} == {2 * 10**9}
-    yaw = 2 * np.arctan2(0.6, 0.8)
-    attitude = found["/cf1/attitude"][0].fields
-    assert attitude == pytest.approx(  # of the quaternion, and of both gyroscopes
-        {"roll_rad": 0, "pitch_rad": 0, "yaw_rad": yaw, "yaw_rate_radps": row["gyro_z"]}
-    )
+    yaw, rate = 1.2, row["gyro_y"] * np.sin(0.4) + row["gyro_z"] * np.cos(0.4)
+    attitude = found["/cf1/attitude"][0].fields  # of the quaternion, and of both gyroscopes
+    wanted = {"roll_rad": 0.4, "pitch_rad": -0.3, "yaw_rad": yaw}
+    assert attitude == pytest.approx({**wanted, "yaw_rate_radps": rate / np.cos(0.3)})
     c, s = np.cos(yaw), np.sin(yaw)
     velocity = found["/cf1/velocity"][0].fields
     assert velocity == pytest.approx(

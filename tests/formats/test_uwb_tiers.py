@@ -95,3 +95,35 @@ def test_numbers_of_any_width_are_read(kind: str, ranges: Path) -> None:
         np.savez(ranges, **{name: np.ceil(archive[name]).astype(kind) for name in archive})
     found = [s for s in uwb_tiers.content(ranges).samples if s.message == "UwbRange"]
     assert [s.fields["range_m"] for s in found] == [2.0] + [3.0] * 8
+
+
+@pytest.mark.parametrize("shape", [(10, 3), (10, 1), (10,), (9, 2)])
+def test_poses_are_pairs_of_numbers(shape: tuple[int, ...], ranges: Path) -> None:
+    with np.load(ranges) as archive:
+        arrays = dict(archive)
+    np.savez(ranges, **{**arrays, "optitrack_turtle01_pose_np": np.zeros(shape)})
+    with pytest.raises(SourceError, match="the arrays of turtle01 differ in length"):
+        uwb_tiers.content(ranges)
+
+
+@pytest.mark.parametrize(("robots", "fits"), [(64, True), (65, False)])
+def test_sixty_four_robots_are_the_most(robots: int, fits: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    poses = {f"optitrack_turtle{k}_pose_np": np.zeros((2, 2)) for k in range(robots)}
+    turns = {f"optitrack_turtle{k}_orientation_np": np.zeros(2) for k in range(robots)}
+    np.savez(path, **poses, **turns, uwb_range_1_2_np=np.ones(2))
+    if fits:
+        assert uwb_tiers.content(path).total is None
+    else:
+        with pytest.raises(SourceError, match="has more than 64 robots"):
+            uwb_tiers.content(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0])
+def test_a_range_that_is_none_is_left_out(value: float, ranges: Path) -> None:
+    with np.load(ranges) as archive:
+        arrays = dict(archive)
+    arrays["uwb_range_3_1_np"][4] = value
+    np.savez(ranges, **arrays)
+    found = [s for s in uwb_tiers.content(ranges).samples if s.message == "UwbRange"]
+    assert [s.time_ns // 10**8 for s in found] == [0, 2, 3, *range(5, 10)]

@@ -10,7 +10,7 @@ from dmrl.learn import augment
 from dmrl.learn.augment import Augmentation, Augmenter
 from dmrl.learn.batches import FIELDS, Batch, Examples
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.windows import facing, through
+from dmrl.learn.windows import facing, feather, through
 
 GEOMETRY = Augmentation(
     flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0
@@ -327,3 +327,194 @@ def test_a_window_is_turned_about_where_the_robot_comes_to_be(
             shown_at.append(shown)
     assert len(shown_at) > 40  # most windows hold the robot
     assert np.std(shown_at, axis=0).min() > 2  # not always at one place
+
+
+def layered(
+    maker: Augmenter, rect: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch, focus: float
+) -> list[tuple[float, NDArray[np.float64], NDArray[np.float64]]]:
+    """Zoom of many windows of the first image, what they show of it, and where its robot comes."""
+    monkeypatch.setattr(augment, "FOCUS_SHARE", focus)
+    asked: list[tuple[NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64]]] = []
+    made = maker._window
+
+    def window(*given: object) -> object:
+        asked.append(given[:4])  # type: ignore[arg-type]
+        return made(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(maker, "_window", window)
+    monkeypatch.setattr(maker, "_show", lambda *given: given[5])
+    robots, rng = np.empty((0, len(FIELDS)), np.float32), np.random.default_rng(8)
+    size = np.array([rect[2] - rect[0], rect[3] - rect[1]])
+    found, canvas = [], torch.empty(112, 160, 3)
+    for _ in range(300):
+        maker._layer(canvas, rect, 0, robots, rng)
+        turn, zoom, seen, shown = asked[-1]
+        corners = np.array([seen + turn @ (at - shown) for at in (0 * size, size)])
+        robot = maker._examples.robots[0, 0, :2]
+        found.append((zoom, corners, np.linalg.inv(turn) @ (robot - seen) + shown))
+    return found
+
+
+@pytest.mark.parametrize("rect", [(0, 0, 160, 112), (20, 10, 120, 66), (5, 7, 45, 107)])
+def test_a_window_looks_anywhere_in_its_source_and_not_past_it(
+    rect: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maker = augmenter(zoom=(1.5, 2.5))
+    maker._examples.robots[0, 0, :3] = 90.0, 40.0, 2.0
+    size, whole = np.array([rect[2] - rect[0], rect[3] - rect[1]]), np.array([160, 112])
+    for focus in (0.0, 1.0):
+        found = layered(maker, rect, monkeypatch, focus)
+        zooms = np.array([zoom for zoom, _, _ in found])
+        assert (zooms.min(), zooms.max()) == pytest.approx((1.5, 2.2), abs=0.02)  # to 1.1 m less
+        low, high = (np.array([corners[k] for _, corners, _ in found]) for k in (0, 1))
+        assert high - low == pytest.approx(size / zooms[:, None])
+        assert (low > -1e-9).all() and (high < whole + 1e-9).all()
+        at = np.array([place for _, _, place in found])
+        held = ((at >= 0) & (at <= size)).all(axis=1)
+        # Evenly over where it may be: the least and the most there is.
+        place = low / (whole - (high - low))
+        if focus:
+            assert held.all()
+            assert at.min(axis=0) == pytest.approx(
+                np.maximum(0, size - (whole - [90, 40]) * 2.2), abs=3
+            )
+        else:
+            assert not held.all()
+            assert place.min(axis=0) == pytest.approx([0, 0], abs=0.03)
+            assert place.max(axis=0) == pytest.approx([1, 1], abs=0.03)
+            assert place.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.05)
+
+
+def test_a_window_is_no_smaller_than_its_source_lets_it_be(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for rect, least in (((0, 0, 160, 112), 1.0), ((0, 0, 80, 112), 1.0), ((0, 0, 120, 28), 0.75)):
+        found = layered(augmenter(zoom=(0.1, 0.2)), rect, monkeypatch, 0.0)
+        assert {zoom for zoom, _, _ in found} == {least}
+
+
+class Patches:
+    """Patches that one augmenter would show: rectangle, source, window and opacity of each."""
+
+    def __init__(self, maker: Augmenter, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.rects: list[tuple[int, int, int, int]] = []
+        self.sources: list[int] = []
+        self.middles: list[NDArray[np.float64]] = []
+        self.zooms: list[float] = []
+        self.mine: list[NDArray[np.float32]] = []
+
+        def show(*given: object) -> object:
+            _, rect, source, window, mine, robots, _, opacity = given
+            left, top, right, bottom = rect  # type: ignore[misc]
+            self.rects.append((left, top, right, bottom))
+            self.sources.append(source)  # type: ignore[arg-type]
+            size = np.array([[right - left, bottom - top]])
+            self.middles.append(through(window.matrix, size / 2)[0])  # type: ignore[attr-defined]
+            self.zooms.append(window.zoom)  # type: ignore[attr-defined]
+            self.mine.append(mine)  # type: ignore[arg-type]
+            if len(self.rects) < 20:
+                torch.testing.assert_close(opacity, feather(bottom - top, right - left))
+            return robots
+
+        monkeypatch.setattr(maker, "_show", show)
+        rng = np.random.default_rng(9)
+        before, canvas = np.empty((0, len(FIELDS)), np.float32), torch.empty(112, 160, 3)
+        for _ in range(300):
+            maker._patch(canvas, before, rng)
+
+
+def boxed() -> Examples:
+    """Two images; only in the second is a robot whose box is known, 24 x 10 px about (70, 33)."""
+    robots = np.full((2, 2, len(FIELDS)), np.nan, np.float32)
+    robots[0, 0, :6] = 30, 30, 2, 0, 0, 0
+    robots[1, 1, :10] = 71, 30, 2, 0, 0, 0, 58, 28, 82, 38
+    return Examples([np.zeros((2, 112, 160, 3), np.uint8)], robots)
+
+
+def test_a_patch_is_a_quarter_larger_than_its_robot_and_lies_anywhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.0)
+    found = Patches(Augmenter(boxed(), Augmentation(zoom=(0.5, 2.0)), seed=0), monkeypatch)
+    assert len(found.rects) == 300 and set(found.sources) == {1}
+    assert (min(found.zooms), max(found.zooms)) == pytest.approx((1 / 1.1, 1.1), abs=0.004)
+    rects, zooms = np.array(found.rects), np.array(found.zooms)[:, None]
+    size = rects[:, 2:] - rects[:, :2]
+    assert (size == np.ceil(zooms * 1.25 * np.array([24, 10])) + 8).all()
+    room = np.array([160, 112]) - size
+    assert (rects[:, :2] >= 0).all() and (rects[:, :2] <= room).all()
+    place = rects[:, :2] / room
+    assert (place.min(axis=0).max(), place.max(axis=0).min()) == pytest.approx((0, 1), abs=0.02)
+    assert place.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.05)
+    away = np.array(found.middles) - [70, 33]
+    assert away.min(axis=0) == pytest.approx([-2, -2], abs=0.1)
+    assert away.max(axis=0) == pytest.approx([2, 2], abs=0.1)
+    assert all(len(mine) == 1 and mine[0, 0] == 71 for mine in found.mine)
+
+
+def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 1.0)
+    found = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
+    assert np.mean(found.sources) == pytest.approx(0.5, abs=0.06)
+    assert {
+        (source, mine[0, 0]) for source, mine in zip(found.sources, found.mine, strict=True)
+    } == {
+        (0, 30.0),
+        (1, 71.0),
+    }
+    middles = np.array(found.middles)
+    assert middles.min(axis=0) == pytest.approx([0, 0], abs=2)
+    assert middles.max(axis=0) == pytest.approx([160, 112], abs=2)
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.25)
+    shares = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
+    assert np.mean(shares.sources) == pytest.approx(1 - 0.25 / 2, abs=0.06)
+
+
+def test_a_robot_too_large_for_the_canvas_is_not_pasted(monkeypatch: pytest.MonkeyPatch) -> None:
+    for width, count in ((121.6, 300), (121.7, 0)):  # a quarter more, and eight
+        examples = boxed()
+        examples.robots[1, 1, 6:10] = 0, 20, width, 40
+        assert len(Patches(Augmenter(examples, Augmentation(), seed=0), monkeypatch).rects) == count
+
+
+def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    maker = Augmenter(squares(5), Augmentation(mosaic_share=0.5), seed=0)
+    rng, shown = np.random.default_rng(3), []
+    monkeypatch.setattr(
+        maker, "_layer", lambda _, rect, source, *rest: shown.append((rect, source))
+    )
+    monkeypatch.setattr(maker, "_spoil", lambda *_: None)
+    counts = []
+    for _ in range(300):
+        shown.clear()
+        maker._draw(torch.empty(112, 160, 3), 4, rng)
+        counts.append(len(shown))
+        assert shown[0][1] == 4
+        area = sum((r - left) * (b - top) for (left, top, r, b), _ in shown)
+        assert area == 160 * 112
+        assert all(0 <= source < 5 for _, source in shown)
+    assert set(counts) == {1, 2, 4}
+    assert np.mean([count == 1 for count in counts]) == pytest.approx(0.5, abs=0.08)
+
+
+def test_patches_come_as_often_as_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    maker, rng, asked = augmenter(paste=1.5), np.random.default_rng(3), []
+    monkeypatch.setattr(maker, "_patch", lambda canvas, robots, _: asked.append(1) or robots)
+    for _ in range(400):
+        maker._draw(torch.zeros(112, 160, 3), 0, rng)
+    assert len(asked) / 400 == pytest.approx(1.5, abs=0.15)
+
+
+def test_grain_of_noise_begins_anywhere() -> None:
+    maker, rng = augmenter(noise=0.1), np.random.default_rng(4)
+    assert len(maker._grain) == 2 * 112 * 160 * 3
+    assert maker._grain.std() == pytest.approx(1, abs=0.01)
+    canvases = []
+    for _ in range(40):
+        canvases.append(torch.zeros(112, 160, 3))
+        maker._spoil(canvases[-1], rng)
+    loud = np.array([float(canvas.std()) for canvas in canvases]) / 25.5
+    assert 0 <= loud.min() < 0.3 and 0.7 < loud.max() <= 1.01
+    begun = {round(float((maker._grain - c.flatten()[0] / (25.5 * s)).abs().argmin()), -4)
+             for c, s in zip(canvases, loud, strict=True) if s > 0.3}  # fmt: skip
+    assert len(begun) > 2

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from dmrl.learn import batches
 from dmrl.learn.batches import FIELDS, Examples, ahead, batch_count, gathered, in_order, order
 
 
@@ -107,3 +108,38 @@ def test_a_batch_is_no_longer_than_the_images_and_counts_are_rounded_up() -> Non
     assert [batch_count(count, 4) for count in (0, 1, 4, 5, 8)] == [0, 1, 1, 2, 2]
     assert numbered(5).image_shape == (8, 16, 3)
     assert len(numbered(5, 2)) == 7
+
+
+@pytest.mark.parametrize("count", [40, 41, 47, 16])
+def test_of_very_many_images_those_of_a_while_lie_together(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "WINDOW", 16)
+    monkeypatch.setattr(batches, "BLOCK", 4)
+    found = [order(count, seed=3, epoch=epoch) for epoch in range(6)]
+    assert all(sorted(one) == list(range(count)) for one in found)
+    assert len({one.tobytes() for one in found}) == 6
+    if count == 16:
+        return  # few enough to be shuffled as one
+    windows = [set((one[start : start + 16] // 4).tolist()) for one in found
+               for start in range(0, count, 16)]  # fmt: skip
+    # Four blocks, or five where the short last one is among them.
+    assert max(map(len, windows)) <= 5
+    assert any(max(blocks) - min(blocks) > 4 for blocks in windows)
+    assert any((np.diff(one[:16]) != 1).sum() > 12 for one in found)
+
+
+def test_shares_come_to_whole_images_at_the_border() -> None:
+    shares = np.array([0.5, 0.5, 2.0, 1.0])
+    for epoch in range(20):
+        drawn = np.bincount(order(4, seed=0, epoch=epoch, shares=shares), minlength=4)
+        assert drawn.sum() == 4 and drawn[2] == 2 and drawn[3] == 1 and drawn[:2].sum() == 1
+
+
+def test_a_robot_at_the_rim_has_a_mask_within_the_image() -> None:
+    robots = np.full((1, 4, len(FIELDS)), np.nan, np.float32)
+    robots[0, :, :2] = (0.0, 0.0), (7.9, 3.9), (3.0, 4.0), (8.0, 2.0)
+    masks = np.zeros((1, 4, 8), np.uint8)
+    masks[0, 0, 0], masks[0, 3, 7], masks[0, 3, 3], masks[0, 2, 7] = 1, 2, 3, 4
+    examples = Examples([np.zeros((1, 4, 8, 3), np.uint8)], robots, [masks])
+    assert [examples.mask(0, k) is not None for k in range(4)] == [True, True, False, False]
