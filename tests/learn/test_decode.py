@@ -100,3 +100,66 @@ def test_peaks_below_the_least_confidence_are_dropped(least: float, count: int) 
     confidence[0, 0, [1, 2, 3, 5]] = 0.0
     found = decode(confidence, np.ones((1, 1, 9)), min_confidence=least)
     assert found.count[0] == count
+
+
+def plain(
+    confidence: np.ndarray, offset: np.ndarray | None, most: int, least: float
+) -> list[tuple[int, int, float, float]]:
+    """Row, column, u and v of the detections of one grid, the surest first, by the rules."""
+    rows, cols = confidence.shape
+    found = []
+    for r in range(rows):
+        for c in range(cols):
+            near = [
+                (y, x)
+                for y in range(max(r - 1, 0), min(r + 2, rows))
+                for x in range(max(c - 1, 0), min(c + 2, cols))
+                if (y, x) != (r, c)
+            ]
+            before = [confidence[at] for at in near if at < (r, c)]
+            after = [confidence[at] for at in near if at > (r, c)]
+            if all(confidence[r, c] > v for v in before) and all(
+                confidence[r, c] >= v for v in after
+            ):
+                found.append((-float(confidence[r, c]), r, c))
+    kept: list[tuple[int, int, float, float]] = []
+    for k, (score, r, c) in enumerate(sorted(found)[:most]):
+        if k and -score < max(least, 0.0):
+            break
+        u, v = c + 0.5, r + 0.5
+        if offset is not None:
+            u = min(max(u + offset[0, r, c], 0), cols)
+            v = min(max(v + offset[1, r, c], 0), rows)
+            if any(np.hypot(8 * u - a, 8 * v - b) < 8 for _, _, a, b in kept):
+                continue
+        kept.append((r, c, 8 * u, 8 * v))
+    return kept
+
+
+GRID = st.sampled_from([0.0, 0.005, 0.01, 0.25, 0.5, 0.75])
+
+
+@given(
+    arrays(float, (2, 4, 5), elements=GRID),
+    arrays(float, (2, 2, 4, 5), elements=st.sampled_from([-1.5, -0.25, 0.0, 0.5, 2.0])),
+    st.booleans(),
+    st.integers(1, 6),
+    st.sampled_from([-1.0, 0.01, 0.3]),
+)
+def test_detections_are_those_of_a_look_at_every_cell(
+    confidence: np.ndarray, offset: np.ndarray, shifted: bool, most: int, least: float
+) -> None:
+    depth_m, spread = np.arange(1.0, 41).reshape(2, 4, 5), np.arange(40.0).reshape(2, 4, 5) / 40
+    class_id = np.arange(40).reshape(2, 4, 5) % 7
+    moved = offset if shifted else None
+    found = decode(confidence, depth_m, moved, spread, class_id, most=most, min_confidence=least)
+    for k in range(2):
+        wanted = plain(confidence[k], offset[k] if shifted else None, most, least)
+        assert found.count[k] == len(wanted)
+        for n, (r, c, u, v) in enumerate(wanted):
+            assert (found.u_px[k, n], found.v_px[k, n]) == pytest.approx((u, v))
+            assert found.confidence[k, n] == confidence[k, r, c]
+            assert found.depth_m[k, n] == depth_m[k, r, c]
+            assert found.class_id[k, n] == class_id[k, r, c]
+            sigma = 2**0.5 * depth_m[k, r, c] * spread[k, r, c]
+            assert found.sigma_depth_m[k, n] == pytest.approx(sigma)

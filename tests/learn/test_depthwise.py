@@ -31,3 +31,21 @@ def test_an_odd_size_and_half_precision_work_too() -> None:
     out.float().sum().backward()
     assert layer.weight.grad is not None
     assert layer.weight.grad.dtype == torch.float32
+
+
+@pytest.mark.parametrize("shape", [(7, 8), (8, 7), (7, 9), (8, 8), (1, 1)])
+@pytest.mark.parametrize(("stride", "dilation"), [(2, 1), (1, 3), (1, 5), (2, 2)])
+@pytest.mark.parametrize("training", [True, False])
+def test_any_size_gives_what_torch_gives(
+    shape: tuple[int, int], stride: int, dilation: int, training: bool
+) -> None:
+    torch.manual_seed(1)
+    layer = Depthwise(2, stride=stride, dilation=dilation).double().train(training)
+    x = torch.randn(2, 2, *shape, dtype=torch.double).requires_grad_()
+    mine, torchs = layer(x), nn.Conv2d.forward(layer, x)
+    torch.testing.assert_close(mine, torchs)
+    grad = torch.randn_like(mine)
+    got = torch.autograd.grad(mine, (x, layer.weight), grad)
+    want = torch.autograd.grad(torchs, (x, layer.weight), grad)
+    for a, b in zip(got, want, strict=True):
+        torch.testing.assert_close(a, b)

@@ -10,7 +10,9 @@ from safetensors.torch import load_file, save_file
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn.model import (
     Model,
+    describe,
     load_model,
+    mixed,
     save_model,
     set_weights,
     weights_of,
@@ -208,3 +210,71 @@ def test_weights_of_another_kind_than_numbers_with_a_point_are_refused(
     save_file({k: v.to(kind) for k, v in tensors.items()}, run / "model.safetensors")
     with pytest.raises(ModelError, match=r"holds torch\.\w+. Give weights in float32"):
         load_model(run)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_weights_go_a_share_of_the_way_to_others(share: float) -> None:
+    network, first = build("locanet", seed=1), weights_of(build("locanet", seed=2))
+    before = {name: value.clone() for name, value in weights_of(network).items()}
+    assert not any(name.endswith("num_batches_tracked") for name in before)
+    del first["head.bias"]  # what others lack stays
+    mixed(network, first, share)
+    for name, value in weights_of(network).items():
+        other = first.get(name, before[name])
+        torch.testing.assert_close(value, (1 - share) * before[name] + share * other)
+
+
+@pytest.mark.parametrize(
+    ("change", "fits"),
+    [
+        ({"width_px": 0}, False),
+        ({"width_px": -8, "height_px": -8}, False),
+        ({"width_px": 1 << 20, "height_px": 1 << 20}, False),
+        ({"width_px": 8, "height_px": 8}, True),
+        ({"threshold": float("inf")}, False),
+        ({"threshold": 1}, True),
+        ({"width_px": 8.0}, False),
+        ({"label_source": 3}, False),
+        ({"training": []}, False),
+    ],
+)
+def test_a_description_is_of_images_and_numbers_that_can_be(
+    run: Path, change: dict[str, object], fits: bool
+) -> None:
+    said = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps(said | change))
+    if fits:
+        model = load_model(run)
+        assert {name: getattr(model, name) for name in change} == change
+    else:
+        with pytest.raises(
+            ModelError, match=r"model\.json (has no valid|is for images|is not JSON)"
+        ):
+            load_model(run)
+
+
+def test_a_model_is_described_by_what_it_is() -> None:
+    network = build("dmrl-nano", extra=("log_spread",))
+    model = Model(network, "dmrl-nano", "n", 64, 48, 0.25, "truth", {"epochs": 3})
+    assert describe(model) == {
+        "architecture": "dmrl-nano",
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "width_px": 64,
+        "height_px": 48,
+        "stride_px": 8,
+        "channels": 3,
+        "outputs": ["log_depth", "confidence", "offset_u", "offset_v", "log_spread"],
+        "threshold": 0.25,
+        "label_source": "truth",
+        "training": {"epochs": 3},
+    }
+
+
+@pytest.mark.parametrize(("size", "fits"), [((64, 48), True), ((60, 48), False), ((64, 44), False)])
+def test_both_sides_of_an_image_are_whole_cells(size: tuple[int, int], fits: bool) -> None:
+    model = Model(build("locanet"), "locanet")
+    if fits:
+        model.require_size(*size, "here")
+    else:
+        with pytest.raises(SettingError, match=f"here: images of {size[0]} x {size[1]} px"):
+            model.require_size(*size, "here")

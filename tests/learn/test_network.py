@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -5,6 +7,8 @@ from dmrl.errors import SettingError
 from dmrl.learn.network import (
     ARCHITECTURES,
     CHANNEL_MEANINGS,
+    LocaNet,
+    Residual,
     build,
     parameter_count,
     product_count,
@@ -89,3 +93,47 @@ def test_an_unknown_architecture_is_answered_with_the_known_ones() -> None:
         SettingError, match=r"no architecture resnet\. Choose one of: dmrl-large, dmrl-nano, "
     ):
         build("resnet")
+
+
+@pytest.mark.parametrize("name", [name for name in ARCHITECTURES if name != "locanet"])
+def test_kernels_begin_as_wide_as_keeps_the_size_of_gradients(name: str) -> None:
+    *convs, head = (m for m in build(name).modules() if isinstance(m, torch.nn.Conv2d))
+    for conv in convs:
+        outs = conv.out_channels // conv.groups
+        wanted = (2 / (conv.kernel_size[0] * conv.kernel_size[1] * outs)) ** 0.5
+        spread = float(conv.weight.detach().std())
+        assert spread == pytest.approx(wanted, rel=4 / conv.weight.numel() ** 0.5)
+        assert conv.bias is None
+    assert float(head.weight.detach().std()) == pytest.approx(0.01, rel=0.2)
+    assert head.bias is not None
+    empty = head.bias.tolist()
+    assert 1 / (1 + math.exp(-empty.pop(1))) < 0.05 and not any(empty)
+
+
+def test_locanet_is_layer_by_layer_what_was_published() -> None:
+    network = build("locanet", seed=4).eval()
+    assert isinstance(network, LocaNet)
+    images = torch.randn(1, 3, 32, 40)
+    x = images
+    for k, (conv, norm) in enumerate(zip(network.convs, network.norms, strict=True)):
+        assert isinstance(conv, torch.nn.Conv2d) and isinstance(norm, torch.nn.BatchNorm2d)
+        assert float(conv.weight.detach().std()) == pytest.approx(0.01, rel=0.2)
+        assert (norm.eps, norm.momentum) == (1e-3, 0.01)
+        torch.nn.init.uniform_(norm.running_mean, -1, 1)  # type: ignore[arg-type]
+        x = torch.nn.functional.max_pool2d(x, 2) if k else x
+        x = torch.nn.functional.conv2d(x, conv.weight, padding=1)
+        mean, var = norm.running_mean, norm.running_var
+        x = torch.nn.functional.batch_norm(x, mean, var, norm.weight, norm.bias, eps=1e-3)
+        x = x.clamp(min=0)
+    wanted = torch.nn.functional.conv2d(x, network.head.weight, network.head.bias)
+    torch.testing.assert_close(network(images), wanted)
+    assert [conv.out_channels for conv in network.convs] == [8, 16, 32, 64]  # type: ignore[union-attr]
+
+
+def test_a_block_adds_to_what_it_was_given() -> None:
+    block = Residual(4, 2).eval()
+    x = torch.randn(1, 4, 9, 11)
+    wanted = (x + block.pointwise(block.depthwise(x))).clamp(min=0)
+    torch.testing.assert_close(block(x), wanted)
+    assert (block.pointwise(x) < 0).any() and not (block.depthwise(x) < 0).any()
+    assert block.depthwise[0].dilation == (2, 2)

@@ -4,7 +4,7 @@ import torch
 
 from dmrl.geometry.frames import grid_label
 from dmrl.learn.batches import CLASS_ID, FIELDS
-from dmrl.learn.targets import as_targets, targets
+from dmrl.learn.targets import LabelNoise, as_targets, targets
 
 SHAPE = (28, 40)
 
@@ -149,3 +149,47 @@ def test_a_sigma_in_pixels_is_the_root_mean_square_of_both_ways() -> None:
         np.exp(2**2 / (2 * wider**2)), rel=1e-3
     )
     assert float(soft.confidence[0, 12, 12]) == pytest.approx(0.49 / 1.49, rel=1e-3)
+
+
+@pytest.mark.parametrize("label_noise", ["ignore", "weight", "soften"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_targets_are_those_of_a_look_at_every_cell(label_noise: LabelNoise, seed: int) -> None:
+    rng, shape, sigma_cells = np.random.default_rng(seed), (5, 7), 0.8
+    rows = np.full((2, 4, len(FIELDS)), np.nan, np.float32)
+    for image in rows:
+        for robot in image[: rng.integers(1, 5)]:
+            robot[:2] = rng.uniform((-6, -6), (62, 46))
+            robot[2:6] = *rng.uniform(0.4, 3, 1), *rng.uniform(0, 9, 2), rng.uniform(0, 0.4)
+            robot[CLASS_ID] = rng.integers(3) if rng.random() < 0.7 else np.nan
+    got = targets(torch.from_numpy(rows), shape, sigma_cells=sigma_cells, label_noise=label_noise)
+    for n, row, col in np.ndindex(2, *shape):
+        best = (0.0, 0.0, 0.0, 0.0, 1.0, 1.0, -1.0)
+        for robot in rows[n]:
+            u, v, depth, sigma_u, sigma_v, sigma_depth = map(float, robot[:6])
+            if not np.isfinite(u):
+                continue
+            du, dv = u / 8 - col - 0.5, v / 8 - row - 0.5
+            blur = ((sigma_u**2 + sigma_v**2) / 2) ** 0.5
+            variance, height = sigma_cells**2, 1.0
+            if label_noise == "soften":
+                variance += (blur / 8) ** 2
+                height = sigma_cells**2 / variance
+            present = height * np.exp(-(du**2 + dv**2) / (2 * variance))
+            trust, trust_depth = 1.0, 1.0
+            if label_noise == "weight":
+                trust = 1 / (1 + (blur / 8) ** 2)
+                trust_depth = 1 / (1 + (sigma_depth / depth / 0.1) ** 2)
+            kind = float(robot[CLASS_ID]) if np.isfinite(robot[CLASS_ID]) else -1.0
+            if present > best[0]:
+                best = present, depth, du, dv, trust, trust_depth, kind
+        present, depth, du, dv, trust, trust_depth, kind = best
+        near = present if present >= 0.1 else 0.0
+        here = n, row, col
+        assert got.confidence[here] == pytest.approx(present, rel=1e-4, abs=1e-6)
+        assert got.confidence_weight[here] == pytest.approx(trust if present > 0.01 else 1.0)
+        assert got.weight[here] == pytest.approx(near * trust_depth, rel=1e-4)
+        assert got.offset_weight[here] == pytest.approx(near * trust, rel=1e-4)
+        assert got.depth_m[here] == pytest.approx(depth if near else 1.0)
+        wanted = [du, dv] if near else [0, 0]
+        assert got.offset[n, :, row, col].tolist() == pytest.approx(wanted, abs=1e-4)
+        assert got.class_id[here] == (kind if near else -1)
