@@ -108,6 +108,8 @@ class Rows:
     def to_pandas(self) -> "pd.DataFrame":
         """A row per peer of an image, without pixels and grids; one, empty, of an image without.
 
+        ``source`` is the recording, ``label_source`` where the label comes from.
+
         Raises
         ------
         MissingExtra
@@ -119,7 +121,9 @@ class Rows:
         light = table.drop_columns([name for name in HEAVY if name in table.column_names])
         light = light.append_column("row", pa.array(np.arange(len(self))))
         found = flat(light)
-        names = [name.removeprefix("peers.") for name in found.column_names]
+        # The rows' own source is a recording.
+        renamed = {"peers.source": "label_source"}
+        names = [renamed.get(name, name.removeprefix("peers.")) for name in found.column_names]
         frame: pd.DataFrame = found.rename_columns(names).to_pandas()
         return frame
 

@@ -32,6 +32,8 @@ def test_a_frame_has_the_peers(data: Path) -> None:
     frame = rows.to_pandas()
     peers = [p["u_px"] for row in rows.to_arrow()["peers"].to_pylist() for p in row]
     assert frame["u_px"].dropna().tolist() == peers and "pixels" not in frame.columns
+    assert frame.columns.is_unique and set(frame["source"]) == {"flight.mcap"}
+    assert set(frame["label_source"].dropna()) == {"truth"}
 
 
 def test_the_loader_gives_what_single_rows_give(data: Path) -> None:
