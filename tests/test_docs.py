@@ -10,6 +10,7 @@ import pytest
 
 from dmrl.cli import COMMANDS, app
 from dmrl.estimation.gate import EXPECTED_SHARE
+from dmrl.stages.doctor import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -225,6 +226,14 @@ def _code(page: Path) -> str:
     text = page.read_text(encoding="utf-8")
     found = re.findall(r"```sh\n(.*?)```|`([^`\n]+)`", text, re.DOTALL)
     return " ".join(block or quoted for block, quoted in found)
+
+
+def test_make_demo_installs_what_the_first_evening_types() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    (installed,) = re.findall(r"^\$\(VENV\)/\.demo:.*\n\t.*'\.\[(.*)\]'", makefile, re.MULTILINE)
+    typed = {line.split()[1] for line in command_lines(ROOT / "docs/first_evening.md")}
+    needed = {e for e, words in EXTRAS.items() if typed & set(re.findall(r"[a-z]+", words))}
+    assert {"label", "view"} <= needed <= set(installed.split(","))
 
 
 def test_help_and_page_agree_with_the_gate_on_how_many_positions_are_bad() -> None:
