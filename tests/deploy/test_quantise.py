@@ -13,7 +13,7 @@ from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import FloatConv, Graph, grey_of, outputs_of, tensors_of, to_input
 from dmrl.deploy.integer import Conv
 from dmrl.deploy.layers import layer_figures
-from dmrl.deploy.quantise import About, _fixed_point, quantise
+from dmrl.deploy.quantise import MEANINGS, About, _fixed_point, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.errors import ModelError, SettingError
 
@@ -167,10 +167,24 @@ def test_the_largest_value_that_was_seen_has_the_last_level() -> None:
 
 
 def test_ranges_are_those_of_all_images_and_grey_networks_see_grey() -> None:
-    together, alone = (calibrate(small(), batches) for batches in ([NOISE[:1], NOISE[1:]], [NOISE]))
-    for one, other in ((together.low, alone.low), (together.high, alone.high)):
-        for a, b in zip(one, other, strict=True):
-            np.testing.assert_array_equal(a, b)
+    alone = calibrate(small(), [NOISE])
+    for parts in ([NOISE[:1], NOISE[1:]], [NOISE[1:], NOISE[:1]], [NOISE[2:], NOISE[:2]]):
+        together = calibrate(small(), parts)
+        for one, other in ((together.low, alone.low), (together.high, alone.high)):
+            for a, b in zip(one, other, strict=True):
+                np.testing.assert_array_equal(a, b)
     assert (together.images, together.height_px, together.width_px) == (3, 16, 24)
     grey = calibrate(small().grey(), [NOISE])
     assert grey.high[0].tolist() == [float(to_input(grey_of(NOISE)).max())]
+
+
+def test_meanings_are_those_of_their_names() -> None:
+    """Of an offset from the middle of a cell: where from its edge, in sixteenths of a pixel."""
+    for name in ("offset_u", "offset_v"):
+        assert MEANINGS[name](np.array([0.0, -0.5, 0.5, 1.0]), 8).tolist() == [64, 0, 128, 192]
+        assert MEANINGS[name](np.array([-1e6, 1e6]), 8).tolist() == [-32768, 32767]
+    logits = np.array([0.0, 2.0, -1e3, 1e3])
+    wanted = [32767.5, 65535 / (1 + np.exp(-2)), 0, 65535]
+    assert MEANINGS["confidence"](logits, 8) == pytest.approx(np.array(wanted), abs=1e-6)
+    depths = MEANINGS["depth"](np.array([0.0, np.log(2.5), 9.0, 99.0]), 8)
+    assert depths == pytest.approx(np.array([1000, 2500, 65535, 65535]))

@@ -118,3 +118,12 @@ def test_the_heads_are_channels_of_their_tensor() -> None:
     got = run(network, image)
     assert set(got) == set(network.heads)
     assert all(grid.shape == network.grid_shape for grid in got.values())
+
+
+def test_a_cell_that_reaches_the_threshold_is_believed() -> None:
+    network = network_with(offsets=False)
+    levels = {name: np.full(network.grid_shape, -128, np.int8) for name in network.heads}
+    assert -128 < network.threshold_q <= 127
+    for below, count in ((0, 1), (1, 0)):
+        levels["confidence"][1, 2] = network.threshold_q - below
+        assert len(decode(network, levels)) == count
