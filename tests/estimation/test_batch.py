@@ -4,10 +4,19 @@ import numpy as np
 import pytest
 
 from dmrl.estimation import banded
-from dmrl.estimation.batch import Solution, equations_of, near, solve_batch
-from dmrl.estimation.linear import RANGE_ERROR, RANGED, SIZE, linearise
+from dmrl.estimation.batch import SAME_M, Solution, equations_of, evidence, near, solve_batch
+from dmrl.estimation.linear import (
+    OWN_SCALE,
+    PEER_SCALE,
+    RANGE_ERROR,
+    RANGED,
+    SIZE,
+    linearise,
+    step_variance,
+)
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+from dmrl.estimation.robust import cost_of
 
 from .flights import flown, pair_of, truth_at
 
@@ -184,3 +193,44 @@ def test_residuals_are_none_where_all_goes_as_the_processes_say(flight: Problem)
         other[5, column] += 1e-3
         off = np.abs(linearise(quiet, NOISE, other, np.zeros(len(GLOBALS))).step)
         assert off[[4, 5]].max() > 1e-4 and np.delete(off, [4, 5], axis=0).max() < 1e-9
+
+
+def test_evidence_is_laplace_s_and_says_nothing_of_what_is_no_density(
+    flight: Problem, anywhere: tuple[Array, Array]
+) -> None:
+    state, constants = anywhere
+    noise = replace(NOISE, range_std_m=0.2)
+    solution = Solution(state, constants, 0.0)
+    plain = replace(noise, free_weight=0.0)
+    linear = linearise(flight, plain, state, constants)
+    full = dense(equations_of(flight, plain, linear, constants))
+    gains = 1 / (1 + constants[[OWN_SCALE, PEER_SCALE]])
+    share = np.log((gains**2).mean()) / 2  # of each of four residuals of a step
+    spread = np.log(step_variance(flight, noise)).sum() / 2 + 4 * len(flight.steps_s) * share
+    spread += len(flight.range_m) * np.log(0.2) + np.log(noise.prior_std()).sum()
+    wanted = -cost_of(linear, plain, constants) - spread - np.linalg.slogdet(full)[1] / 2
+    assert evidence(flight, noise, solution) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_two_flights_are_near_that_are_nowhere_apart() -> None:
+    here = np.zeros((5, 6))
+    for off, same in ((0.99 * SAME_M, True), (1.01 * SAME_M, False)):
+        there = here.copy()
+        there[3, :2], there[:, 2:] = np.array([0.6, -0.8]) * off, 9.0
+        assert near(here, there) == same
+
+
+def test_a_solve_finds_the_lowest_cost_from_either_side(
+    solved: tuple[Problem, Array, Solution],
+) -> None:
+    task, _, solution = solved
+    linear = linearise(task, NOISE, solution.state, solution.constants)
+    assert solution.cost == pytest.approx(cost_of(linear, NOISE, solution.constants))
+    equations = equations_of(task, NOISE, linear, solution.constants)
+    assert np.abs(equations.corner_gradient * np.sqrt(NOISE.prior_std())).max() < 5.0
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        off = 1e-3 * rng.normal(size=solution.state.shape)
+        more = 0.05 * NOISE.prior_std() * rng.normal(size=len(GLOBALS))
+        beside = linearise(task, NOISE, solution.state + off, solution.constants + more)
+        assert cost_of(beside, NOISE, solution.constants + more) > solution.cost

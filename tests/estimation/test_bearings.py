@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.bearings import Array, Sharpness, corrected
+from dmrl.estimation.bearings import (
+    Array,
+    Sharpness,
+    _cartesian,
+    _difference,
+    _nearest,
+    _polar,
+    _smoothed,
+    corrected,
+)
 
 SHARP = Sharpness()
 
@@ -108,3 +117,41 @@ def test_detections_that_share_an_error_tell_no_more_than_one() -> None:
         assert sigma[1] >= azimuth * 0.999
         assert sigma[2] == pytest.approx(sigma[1]) and sigma[1] < 1.5 * azimuth
         assert sigma[0] >= min(SHARP.range_std_ratio, std_m / 2) * 0.999
+
+
+def test_directions_and_places_turn_into_each_other_with_their_slopes() -> None:
+    xyz = np.random.default_rng(3).normal(size=(20, 3))
+    polar, turn = _polar(xyz)
+    assert _cartesian(polar) == pytest.approx(xyz)
+    assert polar[:, 2] == pytest.approx(np.log(np.linalg.norm(xyz, axis=1)))
+    assert np.tan(polar[:, 0]) == pytest.approx(xyz[:, 1] / xyz[:, 0])
+    assert np.sin(polar[:, 1]) == pytest.approx(xyz[:, 2] / np.linalg.norm(xyz, axis=1))
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        slope = _difference(_polar(xyz + step)[0], _polar(xyz - step)[0]) / 2e-6
+        assert turn[:, :, k] == pytest.approx(slope, rel=1e-5, abs=1e-5)
+
+
+def test_errors_that_fade_are_those_of_a_dense_solve() -> None:
+    rng, count = np.random.default_rng(6), 12
+    fade = rng.uniform(0.5, 0.99, count - 1)
+    std = rng.uniform(0.05, 0.3, (count, 3))
+    rows = np.array([1, 2, 5, 11])
+    off, noise = rng.normal(0, 0.2, (4, 3)), np.array([0.03, 0.05, 0.25])
+    mean, variance = _smoothed(fade, std, rows, off, noise)
+    together = np.concatenate([[0.0], np.cumsum(np.log(fade))])
+    alike = np.exp(-np.abs(np.subtract.outer(together, together)))
+    for axis in range(3):
+        prior = alike * np.outer(std[:, axis], std[:, axis])
+        gain = prior[:, rows] @ np.linalg.inv(
+            prior[np.ix_(rows, rows)] + noise[axis] ** 2 * np.eye(4)
+        )
+        assert mean[:, axis] == pytest.approx(gain @ off[:, axis])
+        left = prior - gain @ prior[rows]
+        assert variance[:, axis] == pytest.approx(np.diag(left))
+
+
+def test_of_each_image_the_nearest_within_the_gate_is_chosen() -> None:
+    rows, distance = np.array([0, 0, 1, 2, 2, 2]), np.array([2.0, 1.0, 12.0, 3.0, 3.5, 0.5])
+    assert _nearest(rows, distance, 11.3).tolist() == [1, 5]
+    assert _nearest(rows[:0], distance[:0], 11.3).tolist() == []
