@@ -100,16 +100,16 @@ def test_errors_of_a_path_show_where_the_moved_path_would_be_seen() -> None:
             moved = replace(peer, xyz_m=peer.xyz_m + move)
             shift = (expected(one, camera, moved, time_s)[0] - before).ravel() / size
             shown = path.errors[:, [column]].toarray().ravel()
-            assert shown == pytest.approx(shift, abs=0.03 * np.abs(shift).max())
+            assert shown == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
         # All knots together are one shift across the line of sight.
         moved = replace(peer, xyz_m=peer.xyz_m + size * np.sqrt(FADES) * axes[:, :, 1])
         shift = (expected(one, camera, moved, time_s)[0] - before).ravel() / size
         every = path.errors[:, 4:].sum(axis=1)
-        assert every == pytest.approx(shift, abs=0.03 * np.abs(shift).max())
+        assert every == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
         for k in range(2):
             tilted = replace(one, attitude_rad=one.attitude_rad + size * np.eye(2)[k])
             shift = (expected(tilted, camera, peer, time_s)[0] - before).ravel() / size
-            assert path.level[:, k] == pytest.approx(shift, abs=0.03 * np.abs(shift).max())
+            assert path.level[:, k] == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
 
 
 @pytest.mark.parametrize("held", [False, True])
