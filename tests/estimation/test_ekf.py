@@ -7,6 +7,7 @@ from dmrl.estimation.ekf import (
     Steps,
     filter_many,
     filter_reference,
+    input_variance,
     measured,
     moved,
     pair_steps,
@@ -94,3 +95,11 @@ def test_steps_are_what_either_robot_measured_and_ranges_go_to_the_nearest() -> 
         assert range_m == heard[k] if k in heard else np.isnan(range_m)
     twice = stack([steps, steps])
     assert twice.inputs.shape == (50, 2, 6) and twice.range_m.shape == (50, 2)
+
+
+def test_inputs_vary_as_velocities_and_as_yaw_rates() -> None:
+    preset = PRESETS["published-firmware"]
+    v, r = preset.velocity_var, preset.yaw_rate_var
+    assert v != r
+    assert np.diag(input_variance(preset)).tolist() == [v, v, r, v, v, r]
+    assert np.count_nonzero(input_variance(preset)) == 6

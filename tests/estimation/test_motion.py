@@ -8,6 +8,7 @@ import pytest
 from dmrl.estimation.confidence import (
     CALM_S,
     NOISE_FACTOR,
+    calmed,
     noise_energy,
     path_of,
     restlessness,
@@ -140,3 +141,66 @@ def test_paths_are_those_of_the_moves_and_their_energy_is_told() -> None:
     assert own == pytest.approx(cut * (VX**2 + VY**2), rel=0.03)
     assert peer == pytest.approx(np.sinc(0.3 * 1.5 / (2 * np.pi)) ** 2 * 0.2, rel=0.03)
     assert relative == 0.0
+
+
+def test_a_calm_flight_is_the_same_but_for_what_may_be_noise() -> None:
+    """Two robots that fly straight, each looking its own way: nothing is smoothed, all shrunk."""
+    heights = np.ones(len(TIME_S))
+    still = np.zeros(len(TIME_S), bool)
+
+    def straight(vx: float, vy: float) -> Track:
+        return Track(vx * heights, vy * heights, 0 * heights, heights, still)
+
+    ranges_s = np.arange(3.0, 23.0, 0.1)
+    own, peer = straight(0.3, 0.1), straight(-0.2, 0.4)
+    task = problem(Pair(TIME_S, own, peer, ranges_s, 2 + 0 * ranges_s))
+    psi = 0.7
+    in_own = (-0.2 + 0.4j) * np.exp(1j * psi)  # the peer's velocity, in the observer's frame
+    apart = (1 + 2j) + (in_own - (0.3 + 0.1j)) * (task.key_s - 3)
+    state = np.zeros((len(task.key_s), 6))
+    state[:, 0], state[:, 1], state[:, 2], state[:, 3:] = apart.real, apart.imag, psi, 9.0
+    noise = Noise(velocity_std_mps=0.1)
+    single = noise_energy(noise)
+    keep = [
+        np.sqrt(1 - NOISE_FACTOR * energy / abs(v) ** 2)
+        for energy, v in ((single, 0.3 + 0.1j), (2 * single, in_own - (0.3 + 0.1j)))
+    ]
+    assert min(keep) > 0.3 and max(keep) < 0.95
+    found, calm = calmed(task, noise, state)
+    middle = apart.mean()
+    shrunken = middle + keep[1] * (apart - middle)
+    assert calm[:, 0] + 1j * calm[:, 1] == pytest.approx(shrunken, abs=1e-6)
+    assert (calm[:, 2] == psi).all() and not calm[:, 3:].any()
+    step = keep[0] * (0.3 + 0.1j) * 0.1
+    assert found.own.shift_m[:, 0] + 1j * found.own.shift_m[:, 1] == pytest.approx(
+        np.full(200, step), abs=1e-9
+    )
+    there = (step + keep[1] * (in_own - (0.3 + 0.1j)) * 0.1) * np.exp(-1j * psi)
+    assert found.peer.shift_m[:, 0] + 1j * found.peer.shift_m[:, 1] == pytest.approx(
+        np.full(200, there), abs=1e-9
+    )
+    assert (found.own.turn_rad == task.own.turn_rad).all()
+    assert (found.range_m == task.range_m).all()
+
+
+def test_a_calm_path_turns_with_the_robots_that_fly_it() -> None:
+    """Of motion far above its noise, the poses that follow from it are those that were."""
+    task = problem(pair(np.arange(3.0, 23.0, 0.1)))
+    heading, place = path_of(task.own)
+    turned, way = path_of(task.peer)
+    psi = 0.4 + turned - heading
+    world = np.array([1.0, 2.0]) + np.einsum("ij,kj->ki", rotation(np.array(0.4)), way) - place
+    state = np.zeros((len(task.key_s), 6))
+    state[:, :2] = np.einsum("kij,kj->ki", rotation(-heading), world)
+    state[:, 2] = psi
+    found, calm = calmed(task, Noise(velocity_std_mps=1e-9), state)
+    own = np.diff(place, axis=0)
+    seen = np.einsum("kij,kj->ki", rotation(heading[:-1]), found.own.shift_m)
+    inner = slice(20, -20)  # at the ends the mean has nothing to mean over
+    assert np.abs(seen - own)[inner].max() < 0.003
+    steps = np.einsum("kij,kj->ki", rotation(heading[:-1] + psi[:-1]), found.peer.shift_m)
+    other = np.diff(np.einsum("ij,kj->ki", rotation(np.array(0.4)), way), axis=0)
+    assert np.abs(steps - other)[inner].max() < 0.006
+    back = np.einsum("kij,kj->ki", rotation(heading), calm[:, :2])
+    assert np.abs(back - world).max() < 0.35
+    assert back.mean(axis=0) == pytest.approx(world.mean(axis=0))

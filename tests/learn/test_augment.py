@@ -518,3 +518,12 @@ def test_grain_of_noise_begins_anywhere() -> None:
     begun = {round(float((maker._grain - c.flatten()[0] / (25.5 * s)).abs().argmin()), -4)
              for c, s in zip(canvases, loud, strict=True) if s > 0.3}  # fmt: skip
     assert len(begun) > 2
+
+
+def test_a_patch_takes_every_place_that_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    examples = boxed()
+    examples.robots[1, 1, 6:10] = 20, 20, 135, 100  # with its margin 152 x 108 of 160 x 112
+    found = Patches(Augmenter(examples, Augmentation(), seed=0), monkeypatch)
+    assert {rect[0] for rect in found.rects} == set(range(9))
+    assert {rect[1] for rect in found.rects} == set(range(5))
+    assert {(rect[2] - rect[0], rect[3] - rect[1]) for rect in found.rects} == {(152, 108)}
