@@ -62,7 +62,7 @@ def test_a_label_bias_is_found_and_said_in_one_line(tmp_path: Path) -> None:
 
 
 def test_times_that_go_back_repeat_or_leave_gaps_are_found(tmp_path: Path) -> None:
-    times_s = [*range(20), 15, 15, *range(60, 70)]
+    times_s = [*range(20), 15, 15, 15, *range(60, 70)]
 
     def fill(write: Write) -> None:
         for time_s in times_s:
@@ -70,7 +70,7 @@ def test_times_that_go_back_repeat_or_leave_gaps_are_found(tmp_path: Path) -> No
 
     findings = record(tmp_path / "a.mcap", fill)
     assert "warning /cf1/height 1 messages go back in time, by up to 4.000 s" in findings
-    assert "warning /cf1/height 1 messages repeat the time before them" in findings
+    assert "warning /cf1/height 2 messages repeat the time before them" in findings
     assert any("1 gaps, the longest 45.000 s" in f for f in findings)
 
 

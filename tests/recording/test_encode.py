@@ -105,6 +105,8 @@ def test_columns_keep_the_rules_of_messages(tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match="negative"):
             sink.write_columns("/a", message("Height"), times - 6, {"height_m": 1.0})
         with pytest.raises(RecordingError, match="negative"):
+            sink.write_columns("/a", message("Height"), times - 6, {}, publish_ns=times)
+        with pytest.raises(RecordingError, match="negative"):
             late = times - np.array([0, 8])
             sink.write_columns("/a", message("Height"), times, {}, publish_ns=late)
         with pytest.raises(RecordingError, match="carries dmrl"):

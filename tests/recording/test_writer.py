@@ -91,8 +91,10 @@ def test_publish_time_is_kept_apart_from_log_time(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(5, "/cf1/height", HEIGHT(), publish_ns=9)
-    (raw,) = read_raw(path)
-    assert (raw.time_ns, raw.publish_ns) == (5, 9)
+        sink.write(6, "/cf1/height", HEIGHT(), publish_ns=0)
+        sink.write(7, "/cf1/height", HEIGHT())
+    times = [(raw.time_ns, raw.publish_ns) for raw in read_raw(path)]
+    assert times == [(5, 9), (6, 0), (7, 7)]
 
 
 KILLED = """
