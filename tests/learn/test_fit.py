@@ -1,6 +1,6 @@
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +13,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from dmrl import recipe
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn import fit
-from dmrl.learn.batches import CLASS_ID, FIELDS, Examples, gathered
+from dmrl.learn.batches import CLASS_ID, FIELDS, Batch, Examples, gathered
 from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
 from dmrl.learn.decode import decode
 from dmrl.learn.fit import Training, device_of, learning_rate_at, new_network
 from dmrl.learn.model import Model, save_model
 from dmrl.learn.network import Network, build
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.step import Average, losses, train_step
+from dmrl.learn.step import LOSSES, Average, losses, train_step
 from dmrl.learn.threshold import best_threshold
 from dmrl.learn.validate import scores
 
@@ -430,3 +430,80 @@ def test_curves_stand_at_the_steps_of_what_they_show(
     assert (
         shown == {name for name in training.history[0] if name.startswith("validation_")} != set()
     )
+
+
+def test_every_step_is_asked_for_as_the_recipe_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is computed here: what each step of three epochs would be given."""
+    images, asked = dots(8), []
+    settings = replace(SETTINGS, epochs=3, frozen_norm_epochs=1, ema_steps=5, hard_share=0.25)
+    teacher = build("dmrl-nano").train()
+
+    def step(network: Network, _: object, batch: Batch, *rest: object) -> torch.Tensor:
+        norms = {m.training for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)}
+        asked.append((batch.robots[:, 0, :2].tolist(), network.training, norms, rest))
+        return torch.full((len(LOSSES),), float(len(asked)))
+
+    updated, hard = [], []
+    monkeypatch.setattr(fit, "train_step", step)
+    monkeypatch.setattr(fit, "save_checkpoint", lambda *_: None)
+    monkeypatch.setattr(fit.boards, "opened", lambda *_: nullcontext(lambda *_: None))
+    monkeypatch.setattr(fit, "mined", lambda *given: hard.append(given))
+    monkeypatch.setattr(fit.Average, "update", lambda _, at: updated.append(at))
+    shares = np.ones(8)
+    training = Training(
+        new_network(settings, images), images, settings, tmp_path, teacher=teacher, shares=shares
+    )
+    shown = [(step.epoch, step.loss) for step in training.steps()]
+    assert updated == list(range(1, 10))
+    assert [epoch for epoch, _ in shown] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
+    every = sorted(images.robots[:, 0, :2].tolist())
+    for epoch in range(3):
+        mine = asked[3 * epoch : 3 * epoch + 3]
+        assert [len(at) for at, *_ in mine] == [3, 3, 2]
+        assert sorted(at for rows, *_ in mine for at in rows) == every
+        assert {training for _, training, *_ in mine} == {True}
+        assert [norms for _, _, norms, _ in mine] == [{epoch < 2}] * 3
+        ends = np.array([3 * epoch + k for k in (1, 2, 3)])
+        means = float((ends * [3, 3, 2]).sum() / 8)
+        assert training.history[epoch] == pytest.approx(
+            {"loss": len(LOSSES) * means, **dict.fromkeys(LOSSES, means)}
+        )
+        assert shown[3 * epoch + 2][1] == pytest.approx(len(LOSSES) * means)
+    for number, (*_, (given, rate, group, share, taught)) in enumerate(asked, start=1):
+        assert (given, rate) == (settings, learning_rate_at(number, 3, settings))
+        assert (group.size, share) == (1, 1.0)  # type: ignore[attr-defined]
+        assert taught is teacher and not teacher.training
+    assert len(hard) == 3
+    for network, examples, before, share in hard:
+        assert network is training.network and examples is images
+        assert before is shares and share == 0.25
+
+
+@pytest.mark.parametrize(("width", "height", "fits"), [(48, 32, 1), (44, 32, 0), (48, 28, 0)])
+def test_both_sides_of_images_fit_a_network(width: int, height: int, fits: int) -> None:
+    robots = np.full((1, 1, len(FIELDS)), np.nan, np.float32)
+    images = Examples([np.zeros((1, height, width, 3), np.uint8)], robots)
+    if fits:
+        assert new_network(SETTINGS, images).stride_px == 8
+    else:
+        with pytest.raises(SettingError, match=f"images of {width} x {height} px do not fit"):
+            new_network(SETTINGS, images)
+
+
+@pytest.mark.parametrize("warmup", [0, 1, 2])
+def test_learning_rates_are_a_line_and_half_a_cosine(warmup: int) -> None:
+    settings = replace(
+        SETTINGS, epochs=4, warmup_epochs=warmup, learning_rate=0.5, final_learning_rate=0.1
+    )
+    rates = [learning_rate_at(step, 5, settings) for step in range(1, 21)]
+    up, rest = 5 * warmup, 20 - 5 * warmup
+    wanted = [0.5 * step / up for step in range(1, up)]
+    wanted += [0.1 + 0.2 * (1 + np.cos(np.pi * k / rest)) for k in range(rest + 1)]
+    assert rates == pytest.approx(wanted[-20:])
+
+
+def test_terms_of_the_loss_stand_in_this_order() -> None:
+    names = ("confidence", "depth", "offset", "spread", "class")
+    assert tuple(f"{name}_loss" for name in names) == LOSSES
