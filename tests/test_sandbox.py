@@ -222,7 +222,11 @@ HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
     "calibrate": (("IN/bad.mcap", "OUT/camera.toml"),),
     "align": (("IN/bad.mcap", "OUT/align.mcap"),),
     "label": (("IN/bad.mcap", "OUT/label.mcap"), ("IN/folder", "OUT/labels")),
-    "dataset": (("IN/bad.mcap", "OUT/set"), ("IN/bad.mcap", "OUT/sets", "--parquet")),
+    "dataset": (
+        ("IN/bad.mcap", "OUT/set"),
+        ("IN/bad.mcap", "OUT/sets", "--parquet"),
+        ("IN/other.mcap", "OUT/cards", "--add"),
+    ),
     "card": (("IN/bad.mcap",), ("OUT/cards",)),
     "train": (("OUT/cards", "OUT/run", "--epochs", "1"), ("IN/bad.mcap", "OUT/run")),
     "predict": (
@@ -243,7 +247,11 @@ HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
     "find": (("true", "OUT/found"), ("true", "IN/link"), ("true", "IN")),
     "recover": (("IN/bad.mcap", "OUT/recovered.mcap"), ("IN/link", "OUT/recovered2.mcap")),
     "merge": (("IN/bad.mcap", "IN/other.mcap", "OUT/merged.mcap"),),
-    "trim": (("IN/bad.mcap", "OUT/trimmed.mcap"), ("IN/link", "OUT/trimmed2.mcap")),
+    "trim": (
+        ("IN/bad.mcap", "OUT/trimmed.mcap"),
+        ("IN/link", "OUT/trimmed2.mcap"),
+        ("IN/folder", "OUT/job", "--on", "slurm"),
+    ),
 }
 """What every command is given: inputs full of hostile names, links to what is not theirs."""
 

@@ -116,7 +116,7 @@ class Model:
         every = map(np.asarray, images)
         while batch := list(islice(every, BATCH)):
             for image in batch:
-                _require_rgb(image[None])
+                _require_rgb(np.asarray(image)[None])
             if len({image.shape for image in batch}) > 1:
                 raise SettingError("images of more than one size. Give those of each size alone")
             grids = self.grids(np.stack(batch))
@@ -166,7 +166,8 @@ def load(model: str | os.PathLike[str], *, backend: BackendName = "torch") -> Mo
 
 
 def _require_rgb(images: Rgb) -> None:
-    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
+    rgb = images.dtype == np.uint8 and images.ndim == 4 and images.shape[3] == 3
+    if not rgb or 0 in images.shape[1:]:
         raise SettingError(
             f"images of shape {images.shape[1:]} and type {images.dtype}. Give (H, W, 3) RGB, uint8"
         )

@@ -20,7 +20,8 @@ LINE_MAX = 480
 
 _PLAIN = re.compile(r"[^A-Za-z0-9 ._,:+()=-]")
 _SPLIT = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
-_MARKUP = re.compile(r"([\\`\[\]<>|])")
+_MARKUP = re.compile(r"([\\`\[\]<>|]|(?<=:)/|(?<=www)\.)", re.IGNORECASE)
+"""What is markup, and what makes a link of ``https://x`` or ``www.x``."""
 _TAKEN = (
     *("data", "figures", "parts", "README.md", "croissant.json", "facts.json"),
     *("manifest.json", "provenance.json", "dataset_dict.json"),

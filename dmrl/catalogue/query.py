@@ -59,6 +59,8 @@ def find(catalogue: Catalogue, query: str) -> pa.Table:
     """
     own: dict[str, bool | str] = {
         "enable_external_access": False,
+        "autoinstall_known_extensions": False,
+        "autoload_known_extensions": False,
         "python_enable_replacements": False,
         # Else it takes most of the memory, then writes into the folder that it is called in.
         "memory_limit": f"{limits.MEMORY_BYTES}B",

@@ -16,12 +16,15 @@ from pathlib import Path, PosixPath
 from typing import Any
 
 from dmrl.border.names import inside
+from dmrl.errors import StorageError
 from dmrl.storage.names import SCHEMES
 from dmrl.storage.ranges import STEP_BYTES, Ranged
 from dmrl.storage.system import system, told
 
 UNFINISHED = ".dmrl-unfinished"
 """Stands in a folder while it is written: what has it is not whole, and not there."""
+VERSION = "?versionId="
+"""What s3fs takes for an end of the key."""
 METADATA = "dmrl-sha256"
 """Of an object that dmrl wrote: its hash, so that nobody has to read it for that."""
 
@@ -109,11 +112,29 @@ class Remote(PosixPath):
         return self
 
     def below(self) -> list["Remote"]:
-        """Every file below it, by name."""
+        """Every file below it, by name.
+
+        Raises
+        ------
+        StorageError
+            If there is one whose key no path stands for: of ``a//b`` the path is that of ``a/b``,
+            which is another.
+        """
         with told(str(self)):
             found = system(self.scheme).find(self.key)
-        head = f"{self.scheme}://"
-        return [type(self)(head + name.removeprefix(head)) for name in sorted(found)]
+        head, paths = f"{self.scheme}://", []
+        for name in sorted(found):
+            key = name.removeprefix(head)
+            if key.endswith("/"):
+                continue  # consoles make such an object for an empty folder
+            path = type(self)(head + key)
+            if path.key != key or VERSION in key:
+                raise StorageError(
+                    f"{self}: an object is called {key!r}, which can be no path. Rename it, or "
+                    "name the files"
+                )
+            paths.append(path)
+        return paths
 
     def iterdir(self) -> Iterator["Remote"]:  # type: ignore[override]
         """Files and folders in it."""

@@ -1,6 +1,7 @@
 """A network from Python finds what ``dmrl predict`` finds."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,9 +33,17 @@ def test_one_image_is_a_sequence_of_one(flight: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "images", [np.zeros((2, 224, 320), np.uint8), np.zeros((1, 224, 320, 3), np.float32)]
+    "images",
+    [
+        np.zeros((2, 224, 320), np.uint8),
+        np.zeros((1, 224, 320, 3), np.float32),
+        np.zeros((0, 0, 3), np.uint8),
+        np.zeros((1, 0, 64, 3), np.uint8),
+        ["no image"],
+        [None],
+    ],
 )
-def test_what_is_no_image_is_said(images: np.ndarray) -> None:
+def test_what_is_no_image_is_said(images: Any) -> None:
     with pytest.raises(SettingError, match="RGB"):
         dmrl.load("dmrl-nano").detect(images)
 

@@ -67,7 +67,8 @@ def test_nothing_ends_a_comment(text: str) -> None:
 
 
 def test_markup_is_shown_and_not_obeyed() -> None:
-    assert markdown("a|b<img src=x>[x](http://y)\nc") == r"a\|b\<img src=x\>\[x\](http://y) c"
+    assert markdown("a|b<img src=x>[x](http://y)\nc") == r"a\|b\<img src=x\>\[x\](http:\//y) c"
+    assert markdown("https://x WWW.y") == r"https:\//x WWW\.y"
     assert code("a`b") == "``a`b``"
     assert code("`") == "`` ` ``"
     assert code("a\n\n# b") == "`a  # b`"

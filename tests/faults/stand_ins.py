@@ -1,6 +1,7 @@
 """What would take most of the time of a trial, and writes no output.
 
-Blender, new processes, compilers, the drawing of figures: what uses them is as it always is.
+Blender, new processes, compilers, most of a search, the drawing of figures: what uses them is as
+it always is.
 """
 
 import os
@@ -18,6 +19,9 @@ from dmrl.pipeline import work
 from dmrl.rendering import crazyflie
 from dmrl.rendering.blender.protocol import Arrays
 from dmrl.rendering.pool import Start
+
+FEW = 3
+"""In place of the pictures, and the rounds, that `dmrl likeness` fits a camera by."""
 
 
 class Painter:

@@ -61,6 +61,31 @@ def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
     assert made == bytes_in(tmp_path / "here")
 
 
+@pytest.mark.heavy
+def test_names_that_a_shell_would_run_are_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of recordings, and of the folder that the job is begun in."""
+    here = tmp_path / "it's $(touch victim)\n#SBATCH --wrap=x\ntouch victim #"
+    here.mkdir()
+    names = {"$(touch victim).mcap", "`touch victim`.mcap", "a'b\"c.mcap", "-rf.mcap", "n\nl.mcap"}
+    names |= {"a;touch victim.mcap", "\u2028.mcap"}
+    for k, name in enumerate(sorted(names)):
+        record(here / "flights" / name, roll_rad=k)
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(array, "MOST", 1)
+    out = tmp_path / "out"
+    over_folder("trim", Path("flights"), out, KEPT, workers=None, on="slurm")
+    script = out / ".dmrl-job.sh"
+    lines = script.read_text().splitlines()
+    until = next(k for k, line in enumerate(lines) if not line.startswith("#"))
+    assert until == 5 and (out / ".dmrl-tasks.jsonl").read_text().count("\n") == len(names)
+    done = run(script, 0)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in out.glob("*.mcap")} == names
+    assert not list(tmp_path.rglob("victim"))
+
+
 def test_one_output_is_no_array(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--on slurm is for a folder"):
         done_on("slurm", "fly", tmp_path / "a.mcap", {}, None)

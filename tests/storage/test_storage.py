@@ -17,6 +17,7 @@ from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.output import partial_file, partial_folder, rewritten_file
 from dmrl.pipeline import run as pipeline
+from dmrl.pipeline.folders import recordings_in, tasks_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
 from dmrl.recording.blocks import place_of
 from dmrl.recording.inputs import input_of, sha256_of_file
@@ -350,3 +351,28 @@ def test_a_name_in_a_bucket_leads_nowhere_else_on_this_machine(
     monkeypatch.setattr(Remote, "below", lambda self: [hostile])
     with pytest.raises(UnsafeName, match="s3://lab/set: a file"):
         os.fspath(folder)
+
+
+@pytest.mark.parametrize("key", ["x//b.mcap", "./b.mcap", "/b.mcap", "b?versionId=3.mcap"])
+def test_a_key_that_no_path_stands_for_is_not_taken_for_another(key: str, lab: Any) -> None:
+    folder = f"lab/odd-{len(key)}-{key[0] == '/'}"
+    for name in (f"{folder}/b", f"{folder}/b.mcap", f"{folder}/x/b.mcap", f"{folder}/sub/"):
+        lab.pipe_file(name, b"another")
+    assert [path.name for path in Remote(f"s3://{folder}").below()] == ["b", "b.mcap", "b.mcap"]
+    lab.call_s3("put_object", Bucket="lab", Key=f"{folder.removeprefix('lab/')}/{key}", Body=b"odd")
+    for look in (Remote.below, lambda path: list(path.rglob("*.mcap")), os.fspath):
+        with pytest.raises(StorageError, match="can be no path"):
+            look(Remote(f"s3://{folder}"))
+
+
+def test_outputs_for_keys_with_signs_of_a_shell_or_a_terminal_stay_in_their_folder(
+    lab: Any, tmp_path: Path
+) -> None:
+    names = ("$(touch x).mcap", "-rf.mcap", "t\x1b[2J.mcap", "a%2Fb.mcap", "C:\\x.mcap")
+    hidden = ("../../up.mcap", "dir/../../../up.mcap", ".hidden.mcap")
+    for name in (*names, *hidden):
+        lab.call_s3("put_object", Bucket="lab", Key=f"signs/{name}", Body=b"")
+    found = recordings_in(path_of("s3://lab/signs"))
+    assert {str(name) for name in found} == set(names)
+    tasks = tasks_of("trim", "recording", found, tmp_path / "out")
+    assert {task.out for task in tasks} == {tmp_path / "out" / name for name in names}
