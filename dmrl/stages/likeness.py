@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
@@ -16,7 +17,7 @@ from dmrl.datasets.backgrounds import photos_of
 from dmrl.errors import RecordingError, SettingError
 from dmrl.formats.image_folder import list_pictures
 from dmrl.images.codec import Rgb, crop_and_scale, decode, encode_png
-from dmrl.output import partial_file, refuse_existing
+from dmrl.output import partial_file, partial_of, refuse_existing
 from dmrl.recording import read, summary
 from dmrl.rendering import settings as looks
 from dmrl.rendering.fitting import KNOBS, fitted, pictures
@@ -105,8 +106,9 @@ def run(real: Path, out: Path, settings: Settings) -> Result:
     picture = out.with_suffix(".png")
     if picture == out:
         raise SettingError(f"{out} is the name of the picture. Write a recipe: OUT.toml")
-    for path in (out, picture):
-        refuse_existing(path)
+    refuse_existing(out)
+    if not partial_of(out).exists():  # else one that was killed may have left the picture
+        refuse_existing(picture)
     own = _frames(real, settings.frames)
     preset = {"preset": settings.preset}
     start = recipes.check(settings.preset, looks.filled(preset), looks.Settings)
@@ -117,10 +119,29 @@ def run(real: Path, out: Path, settings: Settings) -> Result:
         list(pictures(way, photos, size_px, settings.seed + 1)) for way in (start, found)
     )
     keys = _keys(found, start)
-    with partial_file(out) as recipe, partial_file(picture) as beside:
-        beside.write_bytes(_sheet([own, before, after]))
-        recipe.write_text(_recipe(settings.preset, keys), encoding="utf-8")
+    _write(out, _recipe(settings.preset, keys), picture, _sheet([own, before, after]))
     return Result(len(own), likeness(own), likeness(before), likeness(after), keys)
+
+
+def _write(out: Path, recipe: str, picture: Path, sheet: bytes) -> None:
+    """Write the picture, then the recipe; an error leaves neither.
+
+    A process that is killed between the two leaves the picture: the same picture is no obstacle.
+    """
+    there = picture.is_file() and picture.read_bytes() == sheet
+    made = False
+    try:
+        with partial_file(out) as partial:
+            partial.write_text(recipe, encoding="utf-8")
+            if not there:
+                with partial_file(picture) as beside:
+                    beside.write_bytes(sheet)
+                made = True
+    except BaseException:
+        if made:
+            with suppress(OSError):
+                picture.unlink()
+        raise
 
 
 def _frames(real: Path, most: int) -> list[Rgb]:

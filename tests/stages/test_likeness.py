@@ -1,3 +1,4 @@
+import errno
 import json
 import tomllib
 from pathlib import Path
@@ -7,14 +8,24 @@ import pytest
 
 from dmrl import recipe as recipes
 from dmrl.cli import app
-from dmrl.errors import OutputError, RecipeError, RecordingError, SettingError, SourceError
+from dmrl.errors import (
+    FullDisk,
+    OutputError,
+    RecipeError,
+    RecordingError,
+    SettingError,
+    SourceError,
+)
 from dmrl.images.codec import decode, encode_png
+from dmrl.rendering import fitting
 from dmrl.rendering import settings as looks
 from dmrl.rendering.fitting import pictures
 from dmrl.rendering.interiors import rooms
 from dmrl.rendering.likeness import FIGURES, Likeness
 from dmrl.stages.likeness import Settings, run
 from dmrl.stages.render import settings_of
+
+from ..faults.works import Inputs
 
 SIZE_PX = (128, 96)
 CAMERAS = {
@@ -111,3 +122,32 @@ def test_black_frames_have_no_grain_and_no_edges(tmp_path: Path) -> None:
     result = run(tmp_path / "own", tmp_path / "own.toml", Settings())
     assert np.isfinite(list(result.keys.get("brightness", [0.0]))).all()  # type: ignore[call-overload]
     settings_of(str(tmp_path / "own.toml"))
+
+
+def test_a_picture_that_a_killed_run_left_is_no_obstacle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has its name before the recipe; another's picture stays, and an error leaves neither."""
+    for name in ("PICTURES", "ROUNDS"):
+        monkeypatch.setattr(fitting, name, 2)
+    dots, out = Inputs(tmp_path).dots, tmp_path / "a.toml"
+    run(dots, out, Settings())
+    made = {end: (tmp_path / f"a{end}").read_bytes() for end in (".toml", ".png")}
+    out.rename(tmp_path / "a.toml.partial")
+    run(dots, out, Settings())
+    assert {end: (tmp_path / f"a{end}").read_bytes() for end in made} == made
+    out.rename(tmp_path / "a.toml.partial")
+    (tmp_path / "a.png").write_bytes(b"mine")
+    with pytest.raises(OutputError, match=r"a\.png exists"):
+        run(dots, out, Settings())
+    assert (tmp_path / "a.png").read_bytes() == b"mine" and not out.exists()
+    (tmp_path / "a.png").unlink()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(out))
+
+    # The first name that is given is the picture's.
+    monkeypatch.setattr("dmrl.output.sync", lambda path: full() if "toml" in path.name else None)
+    with pytest.raises(FullDisk):
+        run(dots, out, Settings())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dots.mcap"]
