@@ -12,6 +12,10 @@ from dmrl.datasets.seen import NEAR_BITS
 from dmrl.errors import DatasetError
 
 FILE = "facts.json"
+LISTED = 20
+"""Lines of a kind on a card, which people read; facts.json has all."""
+NAMED = 3
+"""Names on a line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,19 +141,22 @@ def equipment(facts: Facts) -> Iterator[str]:
     """Lines of Markdown: which sensors and cameras the recordings have."""
     known = ", ".join(code(str(pattern)) for pattern in facts.sensors)
     yield f"- Besides images and labels the recordings have: {known or 'nothing'}."
+    alike: dict[str, list[str]] = {}
     for name, words in sorted(facts.cameras.items()):
-        yield f"- Camera of {code(name)}: {markdown(words)}."
+        alike.setdefault(words, []).append(name)
+    yield from _listed(
+        [f"- Camera of {_named(names)}: {markdown(words)}." for words, names in alike.items()]
+    )
     if not facts.cameras:
         yield "- No recording has the calibration of a camera."
 
 
 def told(facts: Facts) -> Iterator[str]:
     """Lines of Markdown: sources, findings, what was left out, leaks of pixels, licences."""
-    for name, others in sorted(facts.beside.items()):
-        used, more = code(facts.used[name]), ", ".join(map(code, others))
-        yield f"- {code(name)}: labels of {used} are used; there were labels of {more} too."
-    for name, findings in sorted(facts.findings.items()):
-        yield from (f"- {code(name)}: {markdown(finding)}." for finding in findings)
+    beside = sorted(facts.beside.items())
+    yield from _listed([_beside(facts.used[name], name, others) for name, others in beside])
+    found = [(name, words) for name, all_of in sorted(facts.findings.items()) for words in all_of]
+    yield from _listed([f"- {code(name)}: {markdown(words)}." for name, words in found])
     if not facts.findings:
         yield "- `dmrl check` finds no bias in the labels, as far as they have boxes to tell."
     reasons = [
@@ -162,7 +169,23 @@ def told(facts: Facts) -> Iterator[str]:
         f"(64 bits) differ "
         f"in {NEAR_BITS} at most, as those of pictures before one background do."
     )
-    for name, licence in sorted(facts.licences.items()):
-        yield f"- Licence beside {code(name)}: {markdown(licence)}."
+    licences = sorted(facts.licences.items())
+    yield from _listed([f"- Licence beside {code(n)}: {markdown(words)}." for n, words in licences])
     if not facts.licences:
         yield "- No licence was found beside what the recordings were made from."
+
+
+def _beside(used: str, name: str, others: Sequence[str]) -> str:
+    more = ", ".join(map(code, others))
+    return f"- {code(name)}: labels of {code(used)} are used; there were labels of {more} too."
+
+
+def _named(names: Sequence[str]) -> str:
+    more = len(names) - NAMED
+    return ", ".join(map(code, names[:NAMED])) + (f" and {more} more" if more > 0 else "")
+
+
+def _listed(lines: Sequence[str]) -> Iterator[str]:
+    yield from lines[:LISTED]
+    if len(lines) > LISTED:
+        yield f"- {len(lines) - LISTED} more lines like these: see `{FILE}`."

@@ -1,6 +1,6 @@
 """``dmrl dataset``: recordings to an Arrow dataset, with its card."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
@@ -8,36 +8,30 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl import recipe as recipes
-from dmrl import topics
 from dmrl.card import write_card
+from dmrl.card.about import About, facts_of, read_about
 from dmrl.card.facts import FILE as FACTS
-from dmrl.card.facts import Facts, merged, read_facts
+from dmrl.card.facts import merged, read_facts
 from dmrl.card.front import check_license
-from dmrl.card.sensors import cameras_of, sensors_of
 from dmrl.datasets.build import Wanted, explain, has_masks, rows, unused, warn_of_others
 from dmrl.datasets.flags import read_flags
 from dmrl.datasets.growth import Before, made_of, opened
-from dmrl.datasets.inputs import focal_lengths, warn_of_lenses
+from dmrl.datasets.inputs import warn_of_lenses
 from dmrl.datasets.layout import MANIFEST
 from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
 from dmrl.datasets.names import fingerprint_of, rewrite, write_names
 from dmrl.datasets.parts import splits_of
-from dmrl.datasets.rows import Tally, count_images, label_source, sources_of
+from dmrl.datasets.rows import Tally
 from dmrl.datasets.seen import Seen
 from dmrl.datasets.settings import Settings
+from dmrl.datasets.splits import SplitOf
 from dmrl.datasets.write import write_shards
 from dmrl.errors import SettingError
 from dmrl.output import grown_folder, note, partial_folder
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import all_recordings, differing
 from dmrl.pipeline.once import done_on
-from dmrl.recording import (
-    Contents,
-    Provenance,
-    label_findings,
-    licences,
-    provenance,
-)
+from dmrl.recording import Contents, Provenance, provenance
 from dmrl.recording.inputs import input_of
 from dmrl.recording.provenance import FILE_NAME as PROVENANCE
 from dmrl.storage import Remote
@@ -45,7 +39,7 @@ from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
-HELD_IMAGES = 50_000
+HELD_IMAGES = 5_000
 """Labels of so many images stay in memory between the two looks at them; of more, they are read
 twice, so that memory does not grow with the number of recordings."""
 
@@ -57,20 +51,6 @@ class Result:
     images: dict[str, int]
     sources: dict[str, str]
     tally: Tally
-
-
-@dataclass(frozen=True, slots=True)
-class _About:
-    """What is said of a recording, and is kept when its labels are not: see `Facts`."""
-
-    source: str
-    others: list[str]
-    images: int
-    focal_px: list[float]
-    topics: frozenset[str]
-    findings: list[str]
-    licences: dict[str, str]
-    cameras: dict[str, str]
 
 
 def run(
@@ -173,27 +153,18 @@ def _part(
     if settings.masks and not any(has_masks(path) for path in recordings):
         raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     made = _provenance(recordings, settings)
-    about, held = _read(recordings, settings)
-    sources = {path: one.source for path, one in about.items()}
-    warn_of_others(sources, {path: one.others for path, one in about.items()})
-    split_of = splits_of(
-        recordings,
-        made,
-        split=settings.split,
-        val=settings.val,
-        test_share=settings.test_share,
-        seed=settings.seed,
-        there=before.inputs if before.made else None,
-    )
-    warn_of_lenses([px for one in about.values() for px in one.focal_px])
+    known, held = _read(recordings, settings)
+    sources = {path: one.source for path, one in known.items()}
+    warn_of_others(sources, {path: one.others for path, one in known.items()})
+    warn_of_lenses([px for one in known.values() for px in one.focal_px])
     tally, seen = Tally(), Seen(before.seen())
     found = rows(
         held,
         sources,
-        split_of,
+        _splits(recordings, made, settings, before),
         tally,
         _wanted(settings),
-        total=sum(one.images for one in about.values()),
+        total=sum(one.images for one in known.values()),
         size_px=before.size_px,
         workers=workers,
     )
@@ -207,17 +178,30 @@ def _part(
     manifest = before.manifest.with_part(shards)
     explain(recordings, manifest, tally, settings)
     unused(settings, tally)
-    images = {
-        name: sum(one.rows for one in shards[name]) for name in manifest.splits if name in shards
-    }
-    result = Result(images, {path.name: source for path, source in sources.items()}, tally)
     place = part_folder(folder, before.manifest.parts)
     place.mkdir(parents=True)
     made.write(place)
-    _facts(result, about, seen).write(place)
+    facts_of(known, tally, seen).write(place)
     seen.write(place)
     manifest.write(folder)  # last: from here on the part belongs to the dataset
-    return result
+    images = {
+        name: sum(one.rows for one in shards[name]) for name in manifest.splits if name in shards
+    }
+    return Result(images, {path.name: source for path, source in sources.items()}, tally)
+
+
+def _splits(
+    recordings: Sequence[Path], made: Provenance, settings: Settings, before: Before
+) -> dict[Path, SplitOf]:
+    return splits_of(
+        recordings,
+        made,
+        split=settings.split,
+        val=settings.val,
+        test_share=settings.test_share,
+        seed=settings.seed,
+        there=before.inputs if before.made else None,
+    )
 
 
 def _wanted(settings: Settings) -> Wanted:
@@ -249,50 +233,17 @@ def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
 
 def _read(
     recordings: Sequence[Path], settings: Settings
-) -> tuple[dict[Path, _About], dict[Path, Contents]]:
+) -> tuple[dict[Path, About], dict[Path, Contents]]:
     """What is said of recordings, and the labels of the first, which are not read again."""
-    about: dict[Path, _About] = {}
+    known: dict[Path, About] = {}
     held: dict[Path, Contents] = {}
     images = 0
     for path in recordings:
-        labels = Contents(path, topics.LABELS, topics.CALIBRATION)
-        about[path] = _about(path, labels, settings)
-        images += about[path].images
+        known[path], labels = read_about(path, settings.labels)
+        images += known[path].images
         if images <= HELD_IMAGES:
             held[path] = labels
-    return about, held
-
-
-def _about(path: Path, held: Contents, settings: Settings) -> _About:
-    images = count_images(path)
-    source = label_source(held, settings.labels)
-    return _About(
-        source,
-        sorted(sources_of(held) - {source}),
-        images,
-        focal_lengths(held),
-        frozenset(held.topics),
-        label_findings(held),
-        licences([path]),
-        cameras_of([held]),
-    )
-
-
-def _facts(result: Result, about: Mapping[Path, _About], seen: Seen) -> Facts:
-    """What the card says beside the counts: what is left out, and what to be careful of."""
-    near, compared, outside = seen.near()
-    return Facts(
-        {why: count for why, count in result.tally.left_out().items() if count},
-        result.sources,
-        {path.name: one.others for path, one in about.items() if one.others},
-        {path.name: one.findings for path, one in about.items() if one.findings},
-        dict(sorted(pair for one in about.values() for pair in one.licences.items())),
-        seen.twins(),
-        near,
-        0 if compared == outside else compared,
-        sensors_of({name for one in about.values() for name in one.topics}),
-        {name: words for one in about.values() for name, words in one.cameras.items()},
-    )
+    return known, held
 
 
 DEFAULTS = Settings()

@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from PIL import Image
 import dmrl
 from dmrl import card, plots
 from dmrl.card import write_card
+from dmrl.card.facts import Facts, equipment, told
 from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError, SettingError
 from dmrl.images.codec import encode_png
@@ -284,7 +286,21 @@ def test_it_says_what_limits_it_and_what_it_was_taken_with(built: Path, tmp_path
     text = (tmp_path / "set" / "README.md").read_text()
     assert "of simulated flights: a real camera's look different" in text
     assert "`/{robot}/range/{peer}`" in text
-    assert re.search(r"Camera of `f.mcap: cf1`: 320 x 224 px, fx 183\.7", text)
+    assert re.search(r"Camera of `f.mcap: cf1`, .*: 320 x 224 px, fx 183\.7", text)
+
+
+def test_many_recordings_are_a_few_lines_of_a_card() -> None:
+    names = [f"{k:03d}.mcap" for k in range(100)]
+    cameras = {f"{name}: cf1": "320 x 224 px" for name in names} | {"other.mcap: cf1": "64 x 48 px"}
+    facts = Facts(used=dict.fromkeys(names, "truth"), findings={n: ["a bias"] for n in names})
+    lines = list(equipment(replace(facts, cameras=cameras)))
+    assert lines[1:] == [
+        "- Camera of `000.mcap: cf1`, `001.mcap: cf1`, `002.mcap: cf1` and 97 more: 320 x 224 px.",
+        "- Camera of `other.mcap: cf1`: 64 x 48 px.",
+    ]
+    found = [line for line in told(facts) if "a bias" in line or "more lines" in line]
+    assert len(found) == 21 and found[19] == "- `019.mcap`: a bias."
+    assert found[20] == "- 80 more lines like these: see `facts.json`."
 
 
 def test_without_matplotlib_the_card_has_no_figures_and_says_how_to_get_them(

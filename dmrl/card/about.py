@@ -1,0 +1,78 @@
+"""What is said of the recordings of a dataset once their labels are no longer in memory."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dmrl import topics
+from dmrl.card.facts import Facts
+from dmrl.card.sensors import cameras_of, sensors_of
+from dmrl.datasets.inputs import focal_lengths
+from dmrl.datasets.rows import Tally, count_images, label_source, sources_of
+from dmrl.datasets.seen import Seen
+from dmrl.recording import Contents, label_findings, licences
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What the stage and the card need of one recording: a few short strings; see `Facts`."""
+
+    source: str
+    others: Sequence[str]
+    images: int
+    focal_px: Sequence[float]
+    sensors: Sequence[str]
+    findings: Sequence[str]
+    licences: Mapping[str, str]
+    cameras: Mapping[str, str]
+
+
+def read_about(path: Path, wanted: str) -> tuple[About, Contents]:
+    """What is said of a recording, and its labels, which may be needed again soon.
+
+    Parameters
+    ----------
+    path
+        With images and labels.
+    wanted
+        Whose labels; see `label_source`.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read, or lacks images or labels.
+    SettingError
+        If it has no labels from the source asked for.
+    """
+    held = Contents(path, topics.LABELS, topics.CALIBRATION)
+    images = count_images(path)
+    source = label_source(held, wanted)
+    about = About(
+        source,
+        tuple(sorted(sources_of(held) - {source})),
+        images,
+        tuple(focal_lengths(held)),
+        tuple(sensors_of(held.topics)),
+        tuple(label_findings(held)),
+        licences([path]),
+        cameras_of([held]),
+    )
+    return about, held
+
+
+def facts_of(known: Mapping[Path, About], tally: Tally, seen: Seen) -> Facts:
+    """What the card says beside the counts: what is left out, and what to be careful of."""
+    near, compared, outside = seen.near()
+    sensors = {pattern for one in known.values() for pattern in one.sensors}
+    return Facts(
+        {why: count for why, count in tally.left_out().items() if count},
+        {path.name: one.source for path, one in known.items()},
+        {path.name: one.others for path, one in known.items() if one.others},
+        {path.name: one.findings for path, one in known.items() if one.findings},
+        dict(sorted(pair for one in known.values() for pair in one.licences.items())),
+        seen.twins(),
+        near,
+        0 if compared == outside else compared,
+        [row.pattern for row in topics.TOPICS if row.pattern in sensors],
+        {name: words for one in known.values() for name, words in one.cameras.items()},
+    )
