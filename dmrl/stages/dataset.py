@@ -213,11 +213,13 @@ def _describe(folder: Path) -> None:
     """Write what follows from the manifest and the parts: names, provenance, facts, the card."""
     manifest = read_manifest(folder)
     assert manifest is not None
-    made = made_of(folder, manifest)
-    about = {"description": str(made.settings["title"]), "license": str(made.settings["license"])}
-    write_names(folder, manifest, fingerprint=fingerprint_of(made.to_json()), about=about)
+    made = made_of(folder, manifest).to_json()  # a kilobyte for each recording: once
+    settings = made["settings"]
+    about = {"description": str(settings["title"]), "license": str(settings["license"])}
+    write_names(folder, manifest, fingerprint=fingerprint_of(made), about=about)
+    rewrite(folder / PROVENANCE, made)
+    del made
     parts = [read_facts(part_folder(folder, k)) for k in range(manifest.parts)]
-    rewrite(folder / PROVENANCE, made.to_json())
     rewrite(folder / FACTS, asdict(merged([part for part in parts if part is not None])))
     if isinstance(folder, Remote):
         say(f"{folder}: the card is as it was; a bucket's would be read as a whole for it")
