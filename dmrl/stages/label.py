@@ -1,7 +1,8 @@
 """``dmrl label``: where every robot's peers are, from ranges and odometry, as labels."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,7 +14,9 @@ from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.messages import message
 from dmrl.output import refuse_existing
+from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import is_many, over_folder
+from dmrl.pipeline.spread import spread
 from dmrl.recording import Contents, Timed, provenance, rewrite
 from dmrl.terminal.arguments import On, Workers
 from dmrl.terminal.progress import say, track
@@ -41,6 +44,10 @@ BESIDE = (topics.LABELS, topics.CALIBRATION, *TOLD)
 """What labels are made with, beside what positions are estimated from."""
 PAIRS_AT_ONCE = 15
 """Pairs that are filtered side by side: more are no faster, and need more memory."""
+LEAST_PAIRS = 4
+"""Pairs for a process, at least."""
+WORTH_S = 300.0
+"""Seconds of flight of all pairs that are worth other processes: to begin one takes a second."""
 
 Times = NDArray[np.int64]
 Names = tuple[str, str]
@@ -123,12 +130,17 @@ def run(recording: Path, out: Path, settings: Settings) -> Result:
     OutputError
         If ``out`` exists.
     """
+    return side_by_side(recording, out, settings, 1)
+
+
+def side_by_side(recording: Path, out: Path, settings: Settings, workers: int) -> Result:
+    """`run`, with pairs solved in as many processes as that; changes no byte."""
     refuse_existing(out)
     held = Contents(recording, *SENSED, *BESIDE, *(SEEN if settings.detections else ()))
     logs = _logs(held, settings)
     cameras = {robot: camera_given(held, robot, path) for robot, path in settings.camera.items()}
     look = Look(settings.attitude_std_rad, not settings.undistorted, cameras)
-    estimates = _estimates(logs.pairs, settings)
+    estimates = _estimates(logs.pairs, settings, workers)
     images = {robot: held.times(topics.camera_image(robot)) for robot in logs.robots}
     exposures = {robot: look.exposures_ns(robot, times) for robot, times in images.items()}
     positions = {
@@ -219,29 +231,37 @@ def _oriented(pairs: Mapping[Names, Pair], pair: Names) -> Pair:
     return pairs[pair] if pair in pairs else pairs[pair[::-1]].swapped()
 
 
-def _estimates(pairs: Mapping[Names, Pair], settings: Settings) -> dict[Names, Estimate]:
+def _estimates(
+    pairs: Mapping[Names, Pair], settings: Settings, workers: int
+) -> dict[Names, Estimate]:
     """Of every ordered pair; the batch and the smoother solve each pair once for both."""
     names = list(pairs)
     if settings.method == "ekf":
         names += [(other, one) for one, other in names]
-    groups = [names[k : k + PAIRS_AT_ONCE] for k in range(0, len(names), PAIRS_AT_ONCE)]
+    if sum(pair.time_s[-1] - pair.time_s[0] for pair in pairs.values()) < WORTH_S:
+        workers = 1
+    at_once = min(PAIRS_AT_ONCE, max(-(-len(names) // workers), LEAST_PAIRS))
+    groups = [names[k : k + at_once] for k in range(0, len(names), at_once)]
+    oriented = [[_oriented(pairs, name) for name in group] for group in groups]
+    made = spread(partial(_solved, settings=settings), oriented, workers)
     out: dict[Names, Estimate] = {}
     for group in track(groups, "Estimating"):
-        if settings.method == "ekf":
-            oriented = [_oriented(pairs, pair) for pair in group]
-            made = estimate_ekf(oriented, settings.preset, gate_m=settings.gate_m)
-            out |= dict(zip(group, made, strict=True))
-        else:
-            chosen = [pairs[name] for name in group]
-            method: Literal["batch", "smoother"] = (
-                "smoother" if settings.method == "smoother" else "batch"
-            )
-            both = estimate_pairs(chosen, method, gate_m=settings.gate_m)
-            for name, (here, there) in zip(group, both, strict=True):
-                out[name], out[name[::-1]] = here, there
+        for name, (here, there) in zip(group, next(made), strict=True):
+            out[name] = here
+            if there is not None:
+                out[name[::-1]] = there
     if settings.method == "swarm":
         out = estimate_swarm(pairs, out, gate_m=settings.gate_m)
     return dict(sorted(out.items()))
+
+
+def _solved(pairs: list[Pair], *, settings: Settings) -> Sequence[tuple[Estimate, Estimate | None]]:
+    """Of some pairs: the peer as its observer estimates it, and the other way round."""
+    gate_m = settings.gate_m
+    if settings.method == "ekf":
+        return [(one, None) for one in estimate_ekf(pairs, settings.preset, gate_m=gate_m)]
+    method: Literal["batch", "smoother"] = "smoother" if settings.method == "smoother" else "batch"
+    return estimate_pairs(pairs, method, gate_m=gate_m)
 
 
 def _positions(start_ns: int, pair: Pair, estimate: Estimate, images_ns: Times) -> Positions:
@@ -282,15 +302,15 @@ def command(
         Recording to write: all of IN, positions of peers and labels. Must not exist. For a
         folder: the folder of what is made, under the same names.
     workers
-        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
-        Changes no byte.
+        Recordings of a folder, or pairs of robots of one, at a time, at most. Without it, as many
+        as there are cores. Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
     if is_many(recording) or on is not None:
         over_folder("label", recording, out, settings, workers=workers, on=on, as_json=as_json)
         return
-    result = run(recording, out, settings)
+    result = side_by_side(recording, out, settings, workers or cores())
     for warning in result.warnings:
         say(f"{recording}: {warning}")
     if as_json:

@@ -401,3 +401,17 @@ def test_a_peer_above_is_above_at_each_time_by_the_sensors_of_heights() -> None:
         int(np.searchsorted(made.time_ns, 8 * SECOND_NS + 33))
     ]
     assert (made.time_ns[0], made.time_ns[-1]) == (7_050_000_000, 16_900_000_000)
+
+
+@pytest.mark.heavy
+def test_pairs_in_other_processes_change_no_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = tmp_path / "f.mcap"
+    fly.run(flight, fly.Settings(robots=4, duration_s=8.0, noise="calibrated"))
+    monkeypatch.setattr(label, "WORTH_S", 0.0)
+    for workers in (1, 2):
+        out = tmp_path / f"{workers}.mcap"
+        result = label.side_by_side(flight, out, label.Settings(), workers)
+        assert len(result.pairs) == 12
+    assert (tmp_path / "1.mcap").read_bytes() == (tmp_path / "2.mcap").read_bytes()

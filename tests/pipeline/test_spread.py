@@ -1,0 +1,101 @@
+"""Work spread over processes: order, errors, deaths, and nobody who stays behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import RecordingError, SettingError
+from dmrl.pipeline.spread import spread
+
+pytestmark = pytest.mark.heavy  # a process takes half a second to begin
+
+WAITS = """
+import sys, time
+from pathlib import Path
+from test_spread import wait_there
+from dmrl.pipeline.spread import spread
+
+if __name__ == "__main__":
+    list(spread(wait_there, [Path(sys.argv[1])] * 2, 2))
+"""
+
+
+def twice(value: int) -> tuple[int, int, str]:
+    return 2 * value, os.getpid(), os.environ.get("OMP_NUM_THREADS", "")
+
+
+def refuse(value: int) -> int:
+    if value == 1:
+        raise RecordingError("one.mcap is damaged")
+    return value
+
+
+def die(value: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def wait_there(folder: Path) -> None:
+    (folder / str(os.getpid())).touch()
+    time.sleep(60)
+
+
+def test_results_come_in_order_from_other_processes_of_one_core_each() -> None:
+    found = list(spread(twice, range(5), 2))
+    assert [one[0] for one in found] == [0, 2, 4, 6, 8]
+    assert os.getpid() not in {one[1] for one in found}
+    assert {one[2] for one in found} == {"1"}
+
+
+def test_one_worker_or_one_thing_is_done_here() -> None:
+    for items, workers in ((range(3), 1), (range(1), 4)):
+        assert {one[1] for one in spread(twice, items, workers)} == {os.getpid()}
+
+
+def test_an_error_is_the_callers_own_when_its_turn_comes() -> None:
+    results = spread(refuse, range(4), 2)
+    assert next(results) == 0
+    with pytest.raises(RecordingError, match=r"one\.mcap is damaged"):
+        next(results)
+
+
+def test_a_process_that_was_killed_is_one_line() -> None:
+    with pytest.raises(SettingError, match="Try fewer --workers"):
+        list(spread(die, range(2), 2))
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_no_process_outlives_the_one_that_began_it(number: int, tmp_path: Path) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    script = tmp_path / "waits.py"
+    script.write_text(WAITS)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(there)],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        stderr=subprocess.DEVNULL,
+    )
+    while len(list(there.iterdir())) < 2:
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(number)
+    until_s = time.monotonic() + 20
+    while [p for p in there.iterdir() if _runs(int(p.name))] and time.monotonic() < until_s:
+        time.sleep(0.05)
+    left = [p.name for p in there.iterdir() if _runs(int(p.name))]
+    process.kill()
+    process.wait()
+    assert not left
+
+
+def _runs(number: int) -> bool:
+    try:
+        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
