@@ -3,18 +3,19 @@
     dmrl fly fly_in_view flights/0.mcap --duration-s 8 --seed 0    (and so on: some dozens)
     python benchmarks/bench_cluster.py flights
 
-`dmrl label` of the folder with one process, with one for each core, and as Ray tasks on a cluster
-of this machine alone; then `dmrl trim` of one small recording many times, which is all overhead.
-Wall times are of a machine as busy as it is: the load is printed. CPU is of this process, which
-hands the tasks out, and so bounds how many tasks a second can be begun, wherever they run.
+`dmrl label` of the folder with one process, with one for each core, as Ray tasks on a cluster that
+is begun and ended for it, and on two nodes of a core each that are there already; then `dmrl trim`
+of one small recording many times, which is all overhead. Wall times are of a machine as busy as it
+is: the load is printed. CPU is of this process, which hands the tasks out, and so bounds how many
+tasks a second can be begun, wherever they run.
 """
 
 import argparse
 import os
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
@@ -34,9 +35,27 @@ TASKS = 200
 def spent(work: Callable[[], object]) -> tuple[float, float]:
     """Seconds by the clock, and of this process's CPU."""
     begun_s, begun_cpu_s = time.perf_counter(), time.process_time()
-    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         work()
     return time.perf_counter() - begun_s, time.process_time() - begun_cpu_s
+
+
+@contextmanager
+def nodes(count: int) -> Iterator[None]:
+    """A cluster of nodes with a core each on this machine, which ``--on ray`` finds."""
+    from ray.cluster_utils import Cluster  # noqa: PLC0415 - reads the environment
+
+    node = {"num_cpus": 1, "object_store_memory": 80_000_000, "node_ip_address": "127.0.0.1"}
+    node |= {"include_dashboard": False}
+    cluster = Cluster(initialize_head=True, head_node_args=dict(node))
+    for _ in range(count - 1):
+        cluster.add_node(**node)
+    os.environ["RAY_ADDRESS"] = cluster.address
+    try:
+        yield
+    finally:
+        del os.environ["RAY_ADDRESS"]
+        cluster.shutdown()
 
 
 def labels(flights: Path, out: Path) -> list[tuple[str, float, float]]:
@@ -51,6 +70,10 @@ def labels(flights: Path, out: Path) -> list[tuple[str, float, float]]:
         took[name] = spent(
             lambda name=name, how=how: over_folder("label", flights, out / name, **how)
         )  # type: ignore[misc,arg-type]
+    with nodes(2):
+        took["Ray, two nodes"] = spent(
+            lambda: over_folder("label", flights, out / "nodes", workers=None, on="ray")
+        )
     first_s = took["one process"][0]
     return [(name, wall_s, first_s / wall_s) for name, (wall_s, _) in took.items()]
 
