@@ -205,6 +205,21 @@ def test_renders_of_ones_own_camera_can_be_refined_word_for_word(
     assert capsys.readouterr().out.count("last loss") == 3
 
 
+@pytest.mark.slow
+def test_how_a_camera_is_mounted_is_found_word_for_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    flight = "fly fly_in_view flight.mcap --camera"
+    page = (ROOT / "docs/own_camera.md").read_text(encoding="utf-8")
+    assert f"`dmrl {flight}`" in page
+    app([*flight.split(), "--duration-s", "50"], result_action="return_value")
+    (block,) = re.findall(r"```sh\n(.*?)```", page[page.index("## 4.") :], re.DOTALL)
+    for line in block.replace("refined", "dmrl-nano").splitlines():
+        app(shlex.split(line)[1:], result_action="return_value")
+    assert "median_after_px" in capsys.readouterr().out
+
+
 def test_the_page_on_errors_has_words_of_the_errors() -> None:
     page = (ROOT / "docs/faq.md").read_text(encoding="utf-8")
     quoted = [h for h in re.findall(r"^## (.*)", page, re.MULTILINE) if h[0].islower()]
