@@ -213,7 +213,7 @@ def test_how_a_camera_is_mounted_is_found_word_for_word(
     flight = "fly fly_in_view flight.mcap --camera"
     page = (ROOT / "docs/own_camera.md").read_text(encoding="utf-8")
     assert f"`dmrl {flight}`" in page
-    app([*flight.split(), "--duration-s", "50"], result_action="return_value")
+    app(flight.split(), result_action="return_value")
     (block,) = re.findall(r"```sh\n(.*?)```", page[page.index("## 4.") :], re.DOTALL)
     for line in block.replace("refined", "dmrl-nano").splitlines():
         app(shlex.split(line)[1:], result_action="return_value")
