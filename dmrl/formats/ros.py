@@ -33,6 +33,7 @@ from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 
 SUFFIXES = (".db3", ".bag", ".mcap")
+BEGINNING = b"#ROSBAG V2.0\n"
 NO_PICTURES = (topics.MASKS, topics.DEPTHS)
 """Images that are no pictures of a camera: of a render that was exported."""
 CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
@@ -165,18 +166,23 @@ def _topics(source: Path) -> list[tuple[str, str, int]]:
     return [(topic, kind, count) for (topic, kind), count in found.items()]
 
 
-def _refuse_programs(source: Path) -> None:
+def _refuse_odd(source: Path) -> None:
     """Nothing, if the SQLite files of a bag hold tables alone: a view computes what it likes.
+
+    A ROS 1 bag has to begin as one: rosbags reads its first line, however long it is.
 
     Raises
     ------
     SourceError
-        If one holds anything else.
+        If it is not so.
     """
     for path in sorted(source.glob("*.db3")) if source.is_dir() else [source]:
         with path.open("rb") as stream:
-            if not stream.read(16).startswith(b"SQLite format 3"):
-                continue
+            head = stream.read(16)
+        if path.suffix == ".bag" and not head.startswith(BEGINNING):
+            raise SourceError(f"{path} does not begin as a ROS 1 bag 2.0. Name another file")
+        if not head.startswith(b"SQLite format 3"):
+            continue
         where = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
         with closing(sqlite3.connect(where, uri=True)) as database:
             for kind, text in database.execute("SELECT type, sql FROM sqlite_master"):
@@ -193,7 +199,7 @@ def _guarded(source: Path, of: Any) -> Iterator[Any]:
     try:
         bound = Bounded(size_of(source))
         reader = _reader(source)
-        _refuse_programs(source)
+        _refuse_odd(source)
         with bound:
             reader.open()
         with closing(reader):

@@ -1,6 +1,7 @@
 """ROS bags of strangers: bombs, views that never end, definitions that would be code."""
 
 import bz2
+import os
 import sqlite3
 import struct
 from pathlib import Path
@@ -143,3 +144,13 @@ def test_the_name_of_a_type_is_not_run(tmp_path: Path, kind: str) -> None:
     with pytest.raises(SourceError):
         read(path)
     assert not mark.exists()
+
+
+@pytest.mark.parametrize("begin", [b"", b"#ROSBAG V2.0", b"#ROSBAG V1.2\n"])
+def test_a_line_without_end_is_not_read(tmp_path: Path, begin: bytes) -> None:
+    """rosbags reads the first line of a ROS 1 bag, which may be a gigabyte of zeros."""
+    path = tmp_path / "a.bag"
+    path.write_bytes(begin)
+    os.truncate(path, 1 << 30)
+    with pytest.raises(SourceError, match="does not begin as"):
+        read(path)

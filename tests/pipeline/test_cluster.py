@@ -101,6 +101,27 @@ def test_the_bytes_are_those_of_this_machine_and_each_node_is_told_of(
     assert capfd.readouterr().out.count("was there") == COUNT - 1
 
 
+def test_names_that_a_shell_or_a_line_would_read_otherwise_are_names(
+    nodes: Nodes, tmp_path: Path
+) -> None:
+    nodes.whole()
+    names = {
+        "$(touch victim).mcap",
+        "a'b\"c.mcap",
+        "-rf.mcap",
+        "n\nl.mcap",
+        "\u2028;touch victim.mcap",
+    }
+    for k, name in enumerate(sorted(names)):
+        record(tmp_path / "it's $(touch victim)\n" / name, roll_rad=k)
+    source, out = tmp_path / "it's $(touch victim)\n", tmp_path / "-out\n"
+    over_folder("trim", source, out, KEPT, workers=None, on="ray")
+    assert {path.name for path in out.glob("*.mcap")} == names
+    over_folder("trim", source, tmp_path / "here", KEPT, workers=1)
+    assert bytes_in(out) == bytes_in(tmp_path / "here")
+    assert not list(tmp_path.rglob("victim")) and not Path("victim").exists()
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_node_that_dies_at_any_moment_loses_nothing(
     seed: int, nodes: Nodes, flights: Path, alone: dict[str, bytes], tmp_path: Path

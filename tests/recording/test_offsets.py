@@ -1,0 +1,67 @@
+"""Places in an index that lie past the end, before the start, or in another record; sums right."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+
+from dmrl.recording import recover, summary
+
+from ..faults import parts
+from ..faults.ending import ended
+from ..faults.works import Inputs, cli
+
+pytestmark = pytest.mark.heavy
+FIELDS = {
+    Opcode.CHUNK_INDEX: (16, 24),
+    Opcode.ATTACHMENT_INDEX: (0, 8),
+    Opcode.METADATA_INDEX: (0, 8),
+    Opcode.SUMMARY_OFFSET: (1, 9),
+}
+"""Where in a record a place and a size stand."""
+FOOTER = 9 + 20 + len(parts.MAGIC)
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with chunks, attachments and metadata."""
+    return Inputs(tmp_path_factory.mktemp("inputs")).flight
+
+
+def with_place(data: bytes, opcode: int, at: int, place: int) -> bytes:
+    """The recording with another place in the first record of a kind in its summary."""
+    end = len(data) - FOOTER
+    start = struct.unpack_from("<Q", data, end + 9)[0]
+    records, starts = parts.taken_apart(data, start, end)
+    first = next(s for (kind, _), s in zip(records, starts, strict=True) if kind == opcode)
+    out = bytearray(data)
+    struct.pack_into("<Q", out, first + 9 + at, place)
+    crc = zlib.crc32(out[start : end + 9 + 16])
+    struct.pack_into("<I", out, end + 9 + 16, crc)
+    return bytes(out)
+
+
+@pytest.mark.parametrize("place", ["past", "end", 2**62, 2**64 - 1, 0])
+@pytest.mark.parametrize("opcode", FIELDS, ids=lambda opcode: Opcode(opcode).name)
+def test_a_place_that_is_none_is_one_line_and_nothing_is_lost(
+    opcode: Opcode, place: int | str, sound: Path, tmp_path: Path
+) -> None:
+    data = sound.read_bytes()
+    number = {"past": len(data) + 1000, "end": len(data) - 1}.get(str(place), place)
+    assert isinstance(number, int)
+    bad, out = tmp_path / "bad.mcap", tmp_path / "out.mcap"
+    for at in FIELDS[opcode]:
+        bad.write_bytes(with_place(data, opcode, at, number))
+        for command in ("info", "check"):
+            status, said = ended(lambda c=command: cli(c, bad))
+            assert status == 0 or "bad.mcap" in said
+        status, said = ended(lambda: cli("trim", bad, out))
+        assert (status == 0) == out.exists() and (status == 0 or "dmrl recover" in said), said
+        if status == 0:
+            assert summary(out).topics == summary(sound).topics
+            out.unlink()
+        recover(bad, out)
+        assert summary(out).topics == summary(sound).topics
+        out.unlink()
