@@ -1,0 +1,17 @@
+"""Names of entities: what a robot is called is no order to rerun."""
+
+import re
+
+import pytest
+
+from dmrl.viewer.entity import escaped
+
+
+@pytest.mark.parametrize(
+    "name", ["**", "$origin", "- /x", "+ /**", "a\n- /**", "{x}", "a\\", "..", "x\x1b[2J", "a b"]
+)
+def test_a_name_is_no_pattern_and_no_line_of_a_view_s_contents(name: str) -> None:
+    path = escaped(f"/{name}/camera/image")
+    assert path.startswith("/") and path.endswith("/camera/image")
+    assert path.isprintable() and re.search(r"(?<!\\)[*$+ ]", path) is None
+    assert escaped(f"/{name}x/camera/image") != path
