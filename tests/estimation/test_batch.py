@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from dmrl.estimation import banded
-from dmrl.estimation.batch import SAME_M, Solution, equations_of, evidence, near, solve_batch
+from dmrl.estimation.batch import (
+    SAME_M,
+    WEAK,
+    Solution,
+    damped,
+    equations_of,
+    evidence,
+    near,
+    solve_batch,
+)
 from dmrl.estimation.linear import (
     OWN_SCALE,
     PEER_SCALE,
@@ -16,7 +25,7 @@ from dmrl.estimation.linear import (
 )
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
-from dmrl.estimation.robust import cost_of
+from dmrl.estimation.robust import cost_of, weights_of
 
 from .flights import flown, pair_of, truth_at
 
@@ -234,3 +243,39 @@ def test_a_solve_finds_the_lowest_cost_from_either_side(
         more = 0.05 * NOISE.prior_std() * rng.normal(size=len(GLOBALS))
         beside = linearise(task, NOISE, solution.state + off, solution.constants + more)
         assert cost_of(beside, NOISE, solution.constants + more) > solution.cost
+
+
+def test_equations_are_squares_of_the_slopes_of_every_row(
+    flight: Problem, anywhere: tuple[Array, Array]
+) -> None:
+    state, constants = anywhere
+    linear = linearise(flight, NOISE, state, constants)
+    weights = weights_of(linear, NOISE, constants)
+    keys, globals_ = len(state), len(GLOBALS)
+    rows = np.zeros((6 * (keys - 1) + len(flight.range_m), keys * SIZE + globals_ + 1))
+    for k in range(keys - 1):
+        mine = slice(6 * k, 6 * k + 6)
+        rows[mine, k * SIZE : (k + 2) * SIZE] = linear.steps[k, :, : 2 * SIZE]
+        rows[mine, keys * SIZE :] = linear.steps[k, :, 2 * SIZE :]
+    for n, k in enumerate(flight.range_key):
+        row = rows[6 * (keys - 1) + n]
+        row[k * SIZE + np.array(RANGED)] = linear.ranges[n, :4]
+        row[keys * SIZE : keys * SIZE + 2], row[-1] = linear.ranges[n, 4:6], linear.ranges[n, 6]
+    counts = np.concatenate([weights.step.ravel(), weights.range])
+    products = rows.T @ (counts[:, None] * rows)
+    errors = np.arange(keys) * SIZE + RANGE_ERROR
+    held = weights.free.copy()
+    held[0] += weights.first
+    prior = weights.prior * NOISE.prior_std() ** -2
+    right = products[:-1, -1].copy()
+    right[errors] += held * state[:, RANGE_ERROR]
+    right[keys * SIZE :] += prior * constants
+    wanted = products[:-1, :-1] + np.diag(np.concatenate([np.tile(WEAK, keys), prior]))
+    wanted[errors, errors] += held
+    found = equations_of(flight, NOISE, linear, constants)
+    np.testing.assert_allclose(dense(found), wanted, rtol=1e-9, atol=1e-7)
+    gradient = np.concatenate([found.gradient.ravel(), found.corner_gradient])
+    np.testing.assert_allclose(gradient, right, rtol=1e-9, atol=1e-7)
+    steeper = damped(found, 0.5).diagonal
+    np.testing.assert_allclose(steeper, found.diagonal * (1 + 0.5 * np.eye(SIZE)))
+    assert damped(found, 0.0) is found

@@ -14,10 +14,12 @@ from dmrl.estimation.confidence import (
     restlessness,
     shrunk,
 )
+from dmrl.estimation.estimate import within_reach
+from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.linear import step_variance
 from dmrl.estimation.motion import odometry, rotation
 from dmrl.estimation.pair import Array, Pair, Track
-from dmrl.estimation.problem import JUMP_M, SHIFT_S, Noise, problem, silence
+from dmrl.estimation.problem import GLOBALS, JUMP_M, SHIFT_S, Noise, problem, silence
 
 TIME_S = 3 + np.arange(0, 20.001, 0.01)
 VX, VY, TURN = 0.4, -0.2, 0.5
@@ -204,3 +206,30 @@ def test_a_calm_path_turns_with_the_robots_that_fly_it() -> None:
     back = np.einsum("kij,kj->ki", rotation(heading), calm[:, :2])
     assert np.abs(back - world).max() < 0.35
     assert back.mean(axis=0) == pytest.approx(world.mean(axis=0))
+
+
+def test_nobody_is_farther_than_the_ranges_around_allow() -> None:
+    ranges_s = np.arange(3.0, 23.0, 0.05)
+    range_m = np.where(ranges_s < 13, 2.0, 4.0)
+    range_m[40:-40:9] = 30.0  # single outliers allow nothing
+    task = problem(pair(ranges_s, range_m))
+    count = len(task.key_s)
+    away = np.array([0.6, -0.8])
+    for distance_m, allowed_m in ((1.9, 1.9), (2.49, 2.49), (3.5, 2.5), (9.0, 2.5)):
+        state = np.column_stack([np.tile(distance_m * away, (count, 1)), np.full(count, 0.3)])
+        made = Estimate(
+            task.key_s,
+            state,
+            np.tile(np.eye(3), (count, 1, 1)),
+            np.zeros(count, np.int8),
+            np.zeros(len(GLOBALS)),
+            Noise(),
+        )
+        found, far = within_reach(task, made)
+        early = task.key_s < 11
+        assert found.state[early, :2] == pytest.approx(np.tile(allowed_m * away, (early.sum(), 1)))
+        assert (far[early] == (allowed_m < distance_m)).all()
+        late = task.key_s > 15
+        reach_m = min(distance_m, 4.5)
+        assert found.state[late, :2] == pytest.approx(np.tile(reach_m * away, (late.sum(), 1)))
+        assert (found.state[:, 2] == 0.3).all() and (made.state == state).all()
