@@ -3,8 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.camera_pose import calibrate
-from dmrl.estimation.camera_views import Flight, Noise, PeerPath
+from dmrl.errors import SettingError
+from dmrl.estimation import camera_pose
+from dmrl.estimation.camera_pose import (
+    ASIDE,
+    LIKELY,
+    SAME_S,
+    SAMPLED,
+    _delay_std_s,
+    _refuse_alike,
+    calibrate,
+)
+from dmrl.estimation.camera_views import Flight, Noise, PeerPath, match
+from dmrl.estimation.mount import Mount
 from dmrl.geometry.frames import AIDECK, Camera, inside, pixels_from_horizontal
 
 TRUE = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
@@ -143,3 +154,48 @@ def test_how_far_single_detections_are_off_is_found() -> None:
     assert sharp is not None
     assert blunt is not None
     assert blunt.mount_std_rad == pytest.approx(sharp.mount_std_rad, rel=0.05)
+
+
+def mount_of(values: np.ndarray, std_s: float, cost: float = 5.0) -> Mount:
+    covariance = np.diag([1e-4, 1e-4, 1e-4, std_s**2])
+    return Mount(values, covariance, cost, 2.0)
+
+
+@pytest.mark.parametrize(("true_s", "wanted_s"), [(0.003, 0.003), (0.0004, 0.001)])
+def test_a_delay_is_as_sure_as_others_are_worse(
+    true_s: float, wanted_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The cost beside the best is a parabola here, wider or narrower than the solve says."""
+    values = np.array([0.01, 0.02, -0.03, 0.1])
+    asked = []
+
+    def solve(views: object, camera: object, matched: object, start: np.ndarray, *rest: object,
+              held: bool) -> Mount:  # fmt: skip
+        assert held and start[:3].tolist() == values[:3].tolist() and rest[1] == 2.0
+        asked.append(start[3] - values[3])
+        return mount_of(start, 0.001, 5.0 + 0.5 * (asked[-1] / true_s) ** 2)
+
+    monkeypatch.setattr(camera_pose, "solve", solve)
+    one = flight(0, images=20)
+    views = [(one, one.peers["cf2"])]
+    matched = match(views, TRUE, 30.0, Noise())
+    found = _delay_std_s(views, TRUE, matched, mount_of(values, 0.001), Noise())
+    sample_s = float(np.median(np.diff(one.attitude_s)))
+    assert found == pytest.approx(np.hypot(wanted_s, SAMPLED * sample_s), rel=1e-6)
+    assert np.array(asked) == pytest.approx(0.001 * np.array(ASIDE))
+
+
+def test_two_delays_that_explain_the_images_alike_are_refused() -> None:
+    best = mount_of(np.array([0, 0, 0, 0.05]), 0.001)
+    for apart_s, worse, refused in (
+        (1.01 * SAME_S, 0.99 * LIKELY, True),
+        (-1.01 * SAME_S, 0.99 * LIKELY, True),
+        (0.99 * SAME_S, 0.0, False),
+        (1.01 * SAME_S, 1.01 * LIKELY, False),
+    ):
+        other = mount_of(np.array([0, 0, 0, 0.05 + apart_s]), 0.001, 5.0 + worse)
+        if refused:
+            with pytest.raises(SettingError, match=r"delays of 50 and .* ms explain"):
+                _refuse_alike([best, other])
+        else:
+            _refuse_alike([best, other])

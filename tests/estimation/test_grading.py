@@ -1,13 +1,16 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from dmrl.estimation import grading
 from dmrl.estimation.estimate import estimate_pairs
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK
-from dmrl.estimation.grading import FADING_S
+from dmrl.estimation.grading import FADING_S, ONE, excess
 from dmrl.estimation.pair import Pair
+from dmrl.estimation.problem import Noise
 
 from .flights import flown, pair_of, truth_at
 
@@ -42,3 +45,36 @@ def inside(found: Estimate, error: np.ndarray) -> float:
     information = np.linalg.inv(found.covariance[:, :2, :2])
     squared = np.einsum("ni,nij,nj->n", error, information, error)
     return float((squared[found.time_s > 20.0] < 5.99).mean())
+
+
+@pytest.mark.parametrize(
+    ("alike", "times", "wanted"),
+    [(1, 1.0, 1.0), (5, 1.0, 5**0.5), (10, 1.0, 10**0.5), (1, 0.3, 1.0)],
+)
+def test_errors_that_stay_for_a_second_tell_as_much_less(
+    alike: int, times: float, wanted: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten ranges a second, of which so many in a row have one error, this many sigmas large."""
+    rng = np.random.default_rng(7)
+    seconds = 4000
+    residual = np.repeat(rng.normal(0, 1, seconds * 10 // alike), alike)
+    key_s = np.arange(seconds * 10) / 10 + 3.0
+    flight = SimpleNamespace(key_s=key_s, range_key=np.arange(seconds * 10))
+    monkeypatch.setattr(grading, "linearise", lambda *_: SimpleNamespace(range=times * residual))
+    solution = SimpleNamespace(state=None, constants=None)
+    found = excess(flight, Noise(), solution)  # type: ignore[arg-type]
+    assert found == pytest.approx(wanted, rel=0.06)
+
+
+def test_seconds_of_three_ranges_are_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    for many, found in ((3, 1.0), (4, None)):
+        key_s = np.repeat(np.arange(50.0), many) + np.tile(np.arange(many) / 10, 50)
+        flight = SimpleNamespace(key_s=key_s, range_key=np.arange(len(key_s)))
+        monkeypatch.setattr(
+            grading,
+            "linearise",
+            lambda *_: SimpleNamespace(range=np.full(len(key_s), 2.0)),  # noqa: B023
+        )
+        solution = SimpleNamespace(state=None, constants=None)
+        got = excess(flight, Noise(), solution)  # type: ignore[arg-type]
+        assert got == (found or pytest.approx(2.0 / ONE**0.5, rel=1e-6))
