@@ -103,3 +103,11 @@ def test_inputs_vary_as_velocities_and_as_yaw_rates() -> None:
     assert v != r
     assert np.diag(input_variance(preset)).tolist() == [v, v, r, v, v, r]
     assert np.count_nonzero(input_variance(preset)) == 6
+
+
+def test_presets_are_the_published_noise() -> None:
+    sim, firmware = PRESETS["published-sim"], PRESETS["published-firmware"]
+    assert (sim.velocity_var, sim.yaw_rate_var) == pytest.approx((0.0625, 0.16))
+    assert (sim.range_std_m, sim.initial_var, sim.use_height) == (0.1, (10, 10, 0.1), False)
+    assert (firmware.velocity_var, firmware.yaw_rate_var, firmware.range_std_m) == (1.0, 0.7, 2.0)
+    assert (firmware.initial_var, firmware.use_height) == ((1000, 1000, 1), True)
