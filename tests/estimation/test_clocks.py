@@ -235,3 +235,4 @@ def test_smoothing_keeps_what_is_even_and_spreads_a_point_as_a_bell() -> None:
     assert bell.sum() == pytest.approx(1.0)
     assert (bell * away_s).sum() == pytest.approx(0.0, abs=1e-12)
     assert (bell * away_s**2).sum() ** 0.5 == pytest.approx(0.3, rel=0.01)
+    assert np.abs(away_s[bell > 0]).max() == pytest.approx(4 * 0.3, abs=1.01 * STEP_S)

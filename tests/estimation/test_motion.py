@@ -19,7 +19,7 @@ from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.linear import step_variance
 from dmrl.estimation.motion import odometry, rotation
 from dmrl.estimation.pair import Array, Pair, Track
-from dmrl.estimation.problem import GLOBALS, JUMP_M, SHIFT_S, Noise, problem, silence
+from dmrl.estimation.problem import GLOBALS, JUMP_M, SHIFT_S, Noise, problem, range_levels, silence
 
 TIME_S = 3 + np.arange(0, 20.001, 0.01)
 VX, VY, TURN = 0.4, -0.2, 0.5
@@ -233,3 +233,13 @@ def test_nobody_is_farther_than_the_ranges_around_allow() -> None:
         reach_m = min(distance_m, 4.5)
         assert found.state[late, :2] == pytest.approx(np.tile(reach_m * away, (late.sum(), 1)))
         assert (found.state[:, 2] == 0.3).all() and (made.state == state).all()
+
+
+def test_ranges_are_levelled_in_blocks_from_the_start_of_a_flight() -> None:
+    time_s = 5.03 + np.arange(2001) / 100
+    still = Track(*np.zeros((4, 2001)), np.zeros(2001, bool))
+    ranges_s = time_s[:-1]
+    shadow = (ranges_s >= 5.03 + 4 - 1e-6) & (ranges_s < 5.03 + 8 - 1e-6)
+    flight = Pair(time_s, still, still, ranges_s + 1e-4, 2.0 + 1.0 * shadow)
+    assert range_levels(flight) == pytest.approx(1.0 * shadow)
+    assert range_levels(replace(flight, range_time_s=ranges_s[:0], range_m=ranges_s[:0])).size == 0

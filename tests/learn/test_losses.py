@@ -1,5 +1,5 @@
 import math
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -150,3 +150,16 @@ def test_the_focus_is_an_exponent(focus: float) -> None:
     wrong = abs(0.9 - 1 / (1 + math.exp(-0.5)))
     plain = float(confidence_loss(logit, label, focus=0.0))
     assert float(confidence_loss(logit, label, focus=focus)) == pytest.approx(plain * wrong**focus)
+
+
+def test_what_is_learnt_where_a_recipe_says_nothing() -> None:
+    assert asdict(LossSettings()) == {
+        "confidence_weight": 1.0,
+        "focus": 2.0,
+        "depth_weight": 1.0,
+        "depth_loss": "log",
+        "offset_weight": 0.5,
+        "spread_weight": 0.0,
+        "class_weight": 1.0,
+        "classes": (),
+    }
