@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation import mount
+from dmrl.estimation.camera_pose import ALIKE, REFINED, SAME_S, _apart, _rough, _Try
 from dmrl.estimation.camera_views import Matched, Noise, View, expected, match, mounted, residual
 from dmrl.estimation.mount import (
     CAUCHY,
@@ -180,3 +181,26 @@ def test_a_mount_that_nobody_would_build_is_at_its_limit(monkeypatch: pytest.Mon
     monkeypatch.setattr(mount, "LARGEST", np.array([0.01, 0.35, 0.35, 0.5]))
     found: Array = solve(VIEWS, TRUE, MATCHED, VALUES, NOISE, 3.0).values
     assert abs(found[0]) <= 0.01
+
+
+def test_a_rough_search_comes_near_from_some_degrees_off() -> None:
+    off = np.array([0.03, -0.03, 0.03, 0.08])
+    for sign in (1, -1):
+        found = _rough(VIEWS, TRUE, MATCHED, VALUES + sign * off)
+        assert np.abs(found - VALUES)[:3].max() < 0.012
+        assert abs(found[3] - VALUES[3]) < 0.03
+
+
+def test_of_tries_that_are_about_as_good_one_of_each_delay_is_refined() -> None:
+    def one(delay_s: float, misfit: float) -> _Try:
+        return _Try(np.array([0.0, 0, 0, delay_s]), misfit)
+
+    first, same, other, worse = (
+        one(0.0, 1.0),
+        one(0.99 * SAME_S, 1.0),
+        one(1.01 * SAME_S, 0.99 + ALIKE),
+        one(0.5, 1.01 + ALIKE),
+    )
+    assert [try_.values[3] for try_ in _apart([first, same, other, worse])] == [0.0, 1.01 * SAME_S]
+    many = [one(k * 0.1, 1.0) for k in range(REFINED + 2)]
+    assert _apart(many) == many[:REFINED]
