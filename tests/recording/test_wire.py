@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dmrl.messages import message
-from dmrl.recording.values import WireError
+from dmrl.recording.values import WireError, varint
 from dmrl.recording.wire import decode
 
 F = FieldDescriptorProto
@@ -136,3 +136,24 @@ def test_a_field_of_another_wire_type_is_named() -> None:
     data = np.frombuffer(b"\x08\x05", np.uint8)  # field 1 as a varint; Height has a double
     with pytest.raises(WireError, match=r"dmrl.v1.Height.height_m has wire type 0"):
         decode(data, np.array([0]), np.array([2]), message("Height").DESCRIPTOR)
+
+
+def test_of_a_scalar_that_stands_twice_the_last_counts() -> None:
+    height = message("Height")
+    data = height(height_m=1.0).SerializeToString() + height(height_m=2.5).SerializeToString()
+    array = np.frombuffer(data + data, np.uint8)
+    ends = np.array([len(data), 2 * len(data)])
+    got = decode(array, ends - len(data), ends, height.DESCRIPTOR)
+    assert got["height_m"].to_pylist() == [2.5, 2.5] == [height.FromString(data).height_m] * 2
+
+
+@pytest.mark.parametrize("size", [1, 2, 9, 10, 11])
+def test_a_varint_has_ten_bytes_at_most(size: int) -> None:
+    data = np.frombuffer(b"\x81" * (size - 1) + b"\x01" + bytes(3), np.uint8)
+    if size > 10:
+        with pytest.raises(WireError, match="longer than ten bytes"):
+            varint(data, np.array([0]))
+        return
+    value, at = varint(data, np.array([0]))
+    assert value.tolist() == [sum(1 << 7 * k for k in range(size)) % (1 << 64)]
+    assert at.tolist() == [size]
