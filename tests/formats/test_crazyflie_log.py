@@ -353,3 +353,13 @@ def test_angles_that_were_logged_are_the_turn_of_a_pose(
     found = turn_of([block("a", **logged)])
     assert found is not None
     np.testing.assert_allclose(turned(found.values[0]), body(roll, pitch, yaw), atol=1e-5)
+
+
+def test_quaternions_that_are_whole_come_before_packed_ones() -> None:
+    whole = block("a", stateEstimate__qx=[0.0], stateEstimate__qy=[0.0])
+    rest = {"stateEstimate.qz": np.array([1.0]), "stateEstimate.qw": np.array([0.0])}
+    whole = Block("a", whole.time_ns, {**whole.columns, **rest})
+    packed = Block("z", TIMES[:1], {"stateEstimateZ.quat": np.array([3 << 30])})  # level
+    for blocks, wanted in (([whole, packed], [0, 0, 1, 0]), ([packed], [0, 0, 0, 1])):
+        found = quaternions_of(blocks)
+        assert found is not None and found.values.tolist() == [wanted]
