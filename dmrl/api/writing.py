@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dmrl import topics
 from dmrl.api.recordings import PathLike, Recording
+from dmrl.border import limits
+from dmrl.border.names import topic_part
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
@@ -78,6 +80,8 @@ class Writer:
         ------
         RecordingError
             If dmrl has no such topic, its message no such field, or no recording such a time.
+        UnsafeName
+            If a robot in the topic is called what nobody can be called.
         SettingError
             If the ``with`` block has ended.
         """
@@ -143,13 +147,19 @@ class Writer:
         Raises
         ------
         SettingError
-            If it is no image.
+            If it is no image, or has more pixels than are read again.
         """
         grey = rgb.ndim == 2
         coloured = rgb.ndim == 3 and rgb.shape[2] == 3
         if rgb.dtype != np.uint8 or not (grey or coloured) or not rgb.size:
             raise SettingError(
                 f"image of {robot}: shape {rgb.shape}, type {rgb.dtype}. Give (H, W, 3), uint8"
+            )
+        height_px, width_px = rgb.shape[:2]
+        if max(height_px, width_px) > limits.SIDE_PX or height_px * width_px > limits.PIXELS:
+            raise SettingError(
+                f"image of {robot}: {width_px} x {height_px} px are more than a recording may "
+                "hold. Scale it"
             )
         every = np.repeat(rgb[..., None], 3, axis=2) if grey else rgb
         whole = np.ascontiguousarray(every)
@@ -229,4 +239,6 @@ def _message_of(topic: str) -> str:
         raise RecordingError(
             f"dmrl has no topic {topic} of a known message. Name one of the table in README.md"
         )
+    for what, name in (topics.names(row.pattern, topic) or {}).items():
+        topic_part(name, what)
     return row.message

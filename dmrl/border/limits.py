@@ -36,6 +36,9 @@ HEADER_BYTES = 65_536
 VARIABLES = 1_000
 """Of an event of a log, and columns of a table that is one."""
 
+LINE_CHARACTERS = 100_000
+"""Of a line of numbers in a log: `VARIABLES` and more."""
+
 PIXELS = 64 * MB
 """Of a picture: 8,000 x 8,000. With its copies in other orders that is 0.7 GB."""
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.border import limits
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
@@ -134,6 +135,8 @@ def _of_one_clock(blocks: list[Block]) -> list[Block]:
 
 
 def _row(line: str, width: int) -> list[float] | None:
+    if len(line) > limits.LINE_CHARACTERS:
+        return None  # Python's own error would quote all of it
     try:
         row = [float(cell) for cell in line.split(",")]
     except ValueError:

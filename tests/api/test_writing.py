@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dmrl
-from dmrl.errors import OutputError, RecordingError, SettingError
+from dmrl.errors import OutputError, RecordingError, SettingError, UnsafeName
 from dmrl.geometry.frames import Camera
 
 
@@ -89,3 +89,28 @@ def test_a_message_of_another_recording_is_written_as_it_is(tmp_path: Path) -> N
             out.write("/cf1/height", 0.5, first.message)
     (again,) = dmrl.open(tmp_path / "b.mcap").messages("/cf1/labels")
     assert again.message.SerializeToString() == first.message.SerializeToString()
+
+
+@pytest.mark.parametrize("name", ["a\nb", "\0", "\udcff", "x" * 5000, "\u202ecf2"])
+def test_a_name_that_nobody_would_read_again_is_said(name: str, tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "a.mcap") as out:
+        for write in (
+            lambda: out.write(f"/{name}/height", 1.0, {"height_m": 1.0}),
+            lambda: out.write_columns(f"/cf1/range/{name}", [1.0], {"range_m": [1.0]}),
+            lambda: out.image(name, 1.0, np.zeros((8, 8, 3), np.uint8)),
+        ):
+            with pytest.raises(UnsafeName, match="is called"):
+                write()
+        out.write("/cf1/height", 1.0, {"height_m": 1.0})
+    assert list(dmrl.open(tmp_path / "a.mcap").topics) == ["/cf1/height"]
+
+
+@pytest.mark.parametrize("shape", [(9_000, 9_000, 3), (1, 70_000, 3), (70_000, 70_000)])
+def test_a_picture_that_nobody_would_read_again_is_said(
+    shape: tuple[int, ...], tmp_path: Path
+) -> None:
+    with (
+        dmrl.writer(tmp_path / "a.mcap") as out,
+        pytest.raises(SettingError, match="more than a recording may hold"),
+    ):
+        out.image("cf1", 0.0, np.broadcast_to(np.uint8(0), shape))
