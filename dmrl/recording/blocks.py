@@ -248,7 +248,7 @@ def whole_chunk(
         and set(block.numbers()) <= channels.keys()
     ):
         raise damaged(path, f"index of the chunk at byte {at} is wrong")
-    return record, _within(path, said, block)
+    return record, _within(path, said, of_channels(block, channels, summary.channels))
 
 
 def _within(path: Path, chunk: ChunkIndex, block: Block) -> Block:

@@ -10,7 +10,7 @@ from mcap.writer import IndexType, Writer
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Provenance, RecordingWriter, read_raw, summary
 from dmrl.recording.blocks import blocks, in_file_order, tally
 from dmrl.recording.container import INDEX
 from dmrl.recording.extras import copy_extras, splits
@@ -110,6 +110,24 @@ def test_a_topic_of_two_channels_is_one_topic(indexed: bool, tmp_path: Path) -> 
     assert channel_on(path, "/cf1/height").metadata == (("n", "0"),)
     times = [5, 6, 15, 16, 25, 26, 36]
     assert log_times(path, ["/cf1/height", "/none"]) == {"/cf1/height": pytest.approx(times)}
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+@pytest.mark.parametrize("publish_ns", [2**64 - 1, 2**63])
+def test_a_time_that_no_signed_number_holds_is_said(
+    publish_ns: int, indexed: bool, tmp_path: Path
+) -> None:
+    """By a message index too, where it became -1."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, index_types=IndexType.ALL if indexed else IndexType.NONE)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        writer.add_message(channel, 5, b"", publish_ns)
+        writer.finish()
+    with pytest.raises(RecordingError, match="beyond the year 2262"):
+        list(read_raw(path))
 
 
 def test_log_times_are_half_open(tmp_path: Path) -> None:
