@@ -72,6 +72,7 @@ def test_two_hundred_random_networks_do_so_under_the_sanitizers(seed: int, tmp_p
     assert (result.error, result.mismatches) == ("", 0)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 9))]
 )

@@ -37,6 +37,7 @@ def small(weight: float = 1.0, bias: float = 0.0) -> Graph:
     return Graph((first, head), ((2, 0), (2, 1)))
 
 
+@pytest.mark.heavy
 def test_int8_is_near_float_on_most_random_networks() -> None:
     sqnr_db = []
     for seed in range(60):

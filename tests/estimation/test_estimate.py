@@ -66,6 +66,7 @@ def test_only_sensors_that_look_calibrated_are_taken_to_have_small_scales() -> N
     assert scales[0] < 0.02 <= scales[1] < scales[2]
 
 
+@pytest.mark.heavy
 def test_both_directions_come_from_one_solve() -> None:
     here, there = solved("in_view", "calibrated", 1001)
     assert rmse(there, 1001, own="cf2") < 0.35
@@ -75,6 +76,7 @@ def test_both_directions_come_from_one_solve() -> None:
     assert np.allclose(again.constants, here.constants)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("trajectory", "noise"),
     [
@@ -126,6 +128,7 @@ def test_where_ranges_are_silent_nothing_is_ok_and_nothing_is_out_of_their_reach
     assert np.hypot(*estimate.state[:, :2].T).max() < range_m.max() + 0.5
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("fault", ["shadowed", "own bias", "peer bias", "offset"])
 def test_a_fault_does_not_move_the_flight(fault: str) -> None:
     pair = pair_of(flown("in_view", "calibrated", 1002, LONG_S))

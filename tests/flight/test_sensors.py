@@ -63,6 +63,7 @@ def test_white_noise_and_bias_are_those_of_the_table(
     assert error.mean(axis=1).std() == pytest.approx(getattr(noise, bias), rel=0.2)
 
 
+@pytest.mark.heavy
 def test_velocity_noise_is_white_and_coloured(preset: Preset) -> None:
     noise, pairs = preset
     ideal = np.concatenate([[i.robots[r].vx_mps for r in i.robots] for _, i in pairs])

@@ -52,6 +52,7 @@ def lonely(batch: Batch) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]
     return out
 
 
+@pytest.mark.heavy
 def test_labels_stay_at_the_robots_and_depth_follows_the_zoom() -> None:
     settings = replace(GEOMETRY, mosaic_share=0.0, paste=0.0)
     checked = 0
@@ -67,6 +68,7 @@ def test_labels_stay_at_the_robots_and_depth_follows_the_zoom() -> None:
     assert checked > 100
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("intrinsics", [None, (70.0, 70.0, 80.0, 56.0)])
 def test_pasted_robots_are_labelled_and_covered_ones_are_not(
     intrinsics: tuple[float, float, float, float] | None,

@@ -5,6 +5,7 @@ from torch import nn
 from dmrl.learn.depthwise import Depthwise
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("stride", "dilation", "shape"),
     [(1, 1, (28, 40)), (1, 2, (9, 11)), (1, 4, (28, 40)), (1, 8, (28, 40)), (2, 1, (12, 8))],

@@ -95,6 +95,7 @@ def whole(
     return request.param, folder
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_resumed_training_ends_with_the_same_bytes(
     tmp_path: Path, steps: int, whole: tuple[FitSettings, Path]

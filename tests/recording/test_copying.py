@@ -73,6 +73,7 @@ def unchanged(before: Path, after: Path, topics: list[str]) -> None:
     assert sorted(got) == sorted(ours)
 
 
+@pytest.mark.heavy
 def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,6 +155,7 @@ def foreign(path: Path, fill: Callable[[Writer, int], None], **options: Any) -> 
     return path
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_chunks_of_other_writers_are_copied_in_their_compression(
     tmp_path: Path, compression: CompressionType

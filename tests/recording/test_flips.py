@@ -124,6 +124,7 @@ def test_every_substituted_opcode_is_noticed_or_changes_nothing(tmp_path: Path) 
     unnoticed(path, iter(changes), everything)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
 def test_recover_says_that_nothing_was_lost_only_if_nothing_was(step: int, tmp_path: Path) -> None:
     path = small(tmp_path / "a.mcap")

@@ -206,6 +206,7 @@ def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
         summary(tmp_path)
 
 
+@pytest.mark.heavy
 def test_every_flipped_byte_is_an_error_or_harmless(flight: Path, tmp_path: Path) -> None:
     """No single damaged byte gives another exception than ours, or silently other values."""
     data = flight.read_bytes()

@@ -101,6 +101,7 @@ def rows(messages: list[Any]) -> list[dict[str, Any]]:
     return [{name: lists[name][k] for name in lists} for k in range(len(messages))]
 
 
+@pytest.mark.heavy
 @settings(max_examples=12)
 @given(st.lists(contents(), min_size=1, max_size=5))
 def test_bulk_decoding_equals_protobufs_own(values: list[dict[str, Any]]) -> None:

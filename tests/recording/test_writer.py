@@ -113,6 +113,7 @@ with RecordingWriter(Path(sys.argv[1]), Provenance("test")) as sink:
 """
 
 
+@pytest.mark.heavy
 def test_kill_9_leaves_everything_before_the_open_chunk(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     child = subprocess.Popen(

@@ -139,6 +139,7 @@ def off_px(recording: Path) -> float:
     return float(np.sqrt(np.mean(np.square(off).sum(axis=1))))
 
 
+@pytest.mark.heavy
 def test_what_a_network_saw_makes_labels_better(
     flight: Path, labelled: Path, tmp_path: Path
 ) -> None:

@@ -36,6 +36,7 @@ def dataset(dots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.heavy
 def test_a_run_folder_says_what_was_trained_on_what(dataset: Path, tmp_path: Path) -> None:
     result = run(dataset, tmp_path / "run", SETTINGS)
     assert result.images == 20
