@@ -25,6 +25,12 @@ if __name__ == "__main__":
 """
 
 
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """New processes import this module by its name."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[2])
+
+
 def twice(value: int) -> tuple[int, int, str]:
     return 2 * value, os.getpid(), os.environ.get("OMP_NUM_THREADS", "")
 
