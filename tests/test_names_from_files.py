@@ -7,6 +7,7 @@ Documents of strangers are parsed in `dmrl.border.documents` alone, which knows 
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import dmrl
@@ -85,12 +86,15 @@ MAY_PARSE = {
 }
 
 
-def sources() -> Iterator[tuple[str, ast.Module]]:
-    for path in sorted([*SOURCE.rglob("*.py"), *(SOURCE.parent / "viewer").rglob("*.py")]):
-        yield (
-            path.relative_to(SOURCE.parent).as_posix().removeprefix("dmrl/"),
-            ast.parse(path.read_text(encoding="utf-8")),
+@cache
+def sources() -> dict[str, list[ast.AST]]:
+    """Everything that stands in a module, by its name; parsed and walked through once."""
+    return {
+        path.relative_to(SOURCE.parent).as_posix().removeprefix("dmrl/"): list(
+            ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         )
+        for path in sorted([*SOURCE.rglob("*.py"), *(SOURCE.parent / "viewer").rglob("*.py")])
+    }
 
 
 def _is_path_hint(hint: ast.expr | None) -> bool:
@@ -102,10 +106,10 @@ def _is_path_hint(hint: ast.expr | None) -> bool:
 class Paths:
     """What of a module is a path, as far as its annotations tell."""
 
-    def __init__(self, everywhere: list[ast.Module]) -> None:
+    def __init__(self, everywhere: dict[str, list[ast.AST]]) -> None:
         self.fields, self.functions = {"parent"}, {"Path"}
-        for tree in everywhere:
-            for node in ast.walk(tree):
+        for nodes in everywhere.values():
+            for node in nodes:
                 if isinstance(node, ast.ClassDef):
                     self.fields |= {
                         part.target.id
@@ -117,10 +121,10 @@ class Paths:
                 elif isinstance(node, ast.FunctionDef) and _is_path_hint(node.returns):
                     self.functions.add(node.name)
 
-    def joined(self, tree: ast.Module) -> Iterator[ast.expr]:
+    def joined(self, nodes: list[ast.AST]) -> Iterator[ast.expr]:
         """Everything that a path of a module is joined with."""
-        names = self._names(tree)
-        for node in ast.walk(tree):
+        names = self._names(nodes)
+        for node in nodes:
             if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
                 if self._is_path(node.left, names):
                     yield node.right
@@ -130,15 +134,15 @@ class Paths:
             elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Path":
                 yield from node.args[1:]
 
-    def _names(self, tree: ast.Module) -> set[str]:
-        nodes = list(ast.walk(tree))
+    def _names(self, nodes: list[ast.AST]) -> set[str]:
         found = {
             node.arg
             for node in nodes
             if isinstance(node, ast.arg) and _is_path_hint(node.annotation)
         }
+        named = [node for node in nodes if isinstance(node, ast.Assign | ast.withitem)]
         for _ in range(3):  # names that are made of names
-            for node in nodes:
+            for node in named:
                 if isinstance(node, ast.Assign) and self._is_path(node.value, found):
                     found |= {t.id for t in node.targets if isinstance(t, ast.Name)}
                 elif isinstance(node, ast.withitem) and isinstance(node.optional_vars, ast.Name):
@@ -189,12 +193,11 @@ def _is_ours(node: ast.expr) -> bool:
 
 def joins() -> set[str]:
     """Every place where a path is joined with what may come from a file: file and text."""
-    every = list(sources())
-    paths = Paths([tree for _, tree in every])
+    paths = Paths(sources())
     return {
         f"{name}: {ast.unparse(part)}"
-        for name, tree in every
-        for part in paths.joined(tree)
+        for name, nodes in sources().items()
+        for part in paths.joined(nodes)
         if not _is_ours(part)
     }
 
@@ -208,8 +211,8 @@ def test_a_path_is_joined_with_checked_names_alone() -> None:
 def test_documents_of_strangers_are_parsed_in_one_place() -> None:
     found = {
         name
-        for name, tree in sources()
-        for node in ast.walk(tree)
+        for name, nodes in sources().items()
+        for node in nodes
         if isinstance(node, ast.Call) and ast.unparse(node.func).startswith(PARSERS)
     }
     assert found - MAY_PARSE.keys() == set()
