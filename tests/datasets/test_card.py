@@ -61,6 +61,7 @@ def front_of(folder: Path) -> Any:
     return yaml.safe_load((folder / "README.md").read_text().split("---\n")[1])
 
 
+@pytest.mark.heavy
 def test_the_front_matter_says_what_the_hub_asks(built: Path) -> None:
     front = front_of(built)
     assert front["pretty_name"] == "Two flights: a test"

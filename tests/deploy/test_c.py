@@ -83,6 +83,7 @@ def test_any_integers_will_do_shifts_below_33_and_missing_padding_too(
     assert (result.error, result.mismatches) == ("", 0)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("channels", "phase"), [(3, (0, 0)), (3, (0, 1)), (3, (1, 0)), (3, (1, 1)), (1, (0, 1))]
 )

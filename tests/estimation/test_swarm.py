@@ -57,6 +57,7 @@ def test_all_together_are_as_near_the_truth_as_pair_by_pair(noise: str, share: f
     assert other < share * one
 
 
+@pytest.mark.heavy
 def test_the_ellipses_hold_the_truth_and_what_is_kept_is_good() -> None:
     flight, _, _, swarm = solved("random", "realistic")
     inside, bad, kept = [], 0, 0

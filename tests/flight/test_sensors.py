@@ -117,6 +117,7 @@ def range_errors(flight: Flight) -> tuple[Array, int]:
     return np.concatenate(found), len(flight.ranges)
 
 
+@pytest.mark.heavy
 def test_ranges_have_the_noise_of_the_table(preset: Preset) -> None:
     noise, pairs = preset
     every, whites = [], []

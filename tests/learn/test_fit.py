@@ -107,6 +107,7 @@ def test_a_resumed_training_ends_with_the_same_bytes(
         assert (folder / name).read_bytes() == (tmp_path / "resumed" / name).read_bytes()
 
 
+@pytest.mark.heavy
 def test_same_seed_same_bytes_and_another_seed_others(examples: Examples, tmp_path: Path) -> None:
     weights = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):

@@ -118,6 +118,7 @@ def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> 
     assert "Detections</h2>" in html
 
 
+@pytest.mark.heavy
 def test_what_a_stranger_wants_shown_is_shown_or_says_why(pipeline: Path) -> None:
     """No output is there, one has no picture, one is a folder: a sentence each."""
     (pipeline / "chip.mcap").unlink()

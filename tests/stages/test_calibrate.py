@@ -93,6 +93,7 @@ def _median_px(recording: Path) -> float:
     return float(np.median(apart))
 
 
+@pytest.mark.heavy
 def test_intrinsics_come_from_a_folder_of_boards(boards: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.toml"
     found = calibrate.run([boards], out, Settings(board="7x5"))

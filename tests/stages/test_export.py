@@ -75,6 +75,7 @@ def test_a_float_model_becomes_float_onnx_alone(
     assert len(grids(tmp_path / "export", dots, tmp_path, "onnx")) == 30
 
 
+@pytest.mark.heavy
 def test_same_inputs_same_bytes(quantised: Path, exported: Path, tmp_path: Path) -> None:
     run(quantised, tmp_path / "again", Settings())
     for path in exported.iterdir():

@@ -47,6 +47,7 @@ def recording(blender: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.heavy
 def test_a_recording_holds_images_labels_and_truth(recording: Path) -> None:
     found = summary(recording).topics
     per_image = ("camera/image", "camera/masks", "camera/depth", "labels", "attitude")

@@ -69,6 +69,7 @@ def test_what_the_page_names_is_left_out_and_provenance_says_so(
     assert "2 images were flagged" in (tmp_path / "clean/README.md").read_text()
 
 
+@pytest.mark.heavy
 def test_names_of_recordings_cannot_become_markup(make: Make, tmp_path: Path) -> None:
     odd = make("a<img src=x onerror=alert(1)>.mcap")
     dataset.run([odd], tmp_path / "set", dataset.Settings(split="none", labels="truth"))
