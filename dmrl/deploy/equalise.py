@@ -29,8 +29,9 @@ def equalise(graph: Graph, ranges: Ranges) -> tuple[Graph, Ranges]:
     max-pools on the way to them, read it; a sum needs its two tensors as they are.
     """
     convs = {k: layer for k, layer in enumerate(graph.layers) if isinstance(layer, FloatConv)}
+    alone = [k for k, layer in convs.items() if len(layer.sources) == 1]
     low, high = list(ranges.low), list(ranges.high)
-    for index in convs:
+    for index in alone:
         passed, readers = _followed(graph, index + 1)
         if not readers:
             continue
@@ -52,7 +53,7 @@ def _followed(graph: Graph, tensor: int) -> tuple[list[int], list[int]]:
     for k, layer in enumerate(graph.layers):
         if tensor not in layer.sources:
             continue
-        if isinstance(layer, FloatConv):
+        if isinstance(layer, FloatConv) and tensor not in layer.sources[1:]:
             convs.append(k)
         elif isinstance(layer, FloatPool):
             more, further = _followed(graph, k + 1)

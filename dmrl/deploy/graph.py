@@ -7,6 +7,7 @@ Tensors are numbered as in ``integer``: 0 is the image, layer i writes tensor i 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +23,13 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FloatConv:
-    """Convolution, with ReLU or without. Fields as in ``integer.Conv``, in real numbers."""
+    """Convolution, with ReLU or without. Fields as in ``integer.Conv``, in real numbers.
+
+    A second source is a shortcut: a tensor that is added before the ReLU.
+    """
 
     name: str
-    sources: tuple[int]
+    sources: tuple[int] | tuple[int, int]
     weight: Array
     bias: Array
     stride: int = 1
@@ -205,7 +209,7 @@ class _Builder:
     def _norm(self, op: Op) -> None:
         (tensor,) = self._sources(op)
         layer = self._own(op, tensor)
-        if not isinstance(layer, FloatConv) or layer.relu:
+        if not isinstance(layer, FloatConv) or layer.relu or len(layer.sources) > 1:
             raise Cannot(
                 op.name, "a BatchNorm2d apart from a convolution", "it after a convolution"
             )
@@ -240,6 +244,13 @@ class _Builder:
         a, b = self._sources(op)
         if 0 in (a, b):
             raise Cannot(op.name, "a sum with the image", "a convolution first")
+        parts = ((a, b, op.sources[0]), (b, a, op.sources[1]))
+        for conv, shortcut, name in parts:
+            layer = self.layers[conv - 1]
+            if conv == len(self.layers) and self.users[name] == 1 and takes_shortcut(layer):
+                self.layers[-1] = replace(layer, sources=(layer.sources[0], shortcut))
+                self.tensor_of[op.name] = conv
+                return
         self._put(op, FloatAdd(op.name, (a, b)))
 
     def _concatenate(self, op: Op) -> None:
@@ -249,13 +260,23 @@ class _Builder:
     def _channels_of(self, name: str) -> tuple[tuple[int, int], ...]:
         tensor = self.tensor_of[name]
         layer = self.layers[tensor - 1] if tensor else None
-        if not isinstance(layer, FloatConv) or layer.relu:
+        if not isinstance(layer, FloatConv) or layer.relu or len(layer.sources) > 1:
             raise Cannot(name, "a result that no convolution gives", "a convolution without ReLU")
         return tuple((tensor, channel) for channel in range(len(layer.bias)))
 
     def _output(self, op: Op) -> None:
         (source,) = op.sources
         self.outputs = self.parts.get(source) or self._channels_of(source)
+
+
+def takes_shortcut(layer: FloatLayer) -> TypeGuard[FloatConv]:
+    """Whether a sum with another tensor can be part of a layer: a dense convolution of one size."""
+    return (
+        isinstance(layer, FloatConv)
+        and not layer.relu
+        and len(layer.sources) == layer.groups == layer.stride == 1
+        and layer.padding == layer.dilation * (layer.weight.shape[2] // 2)
+    )
 
 
 def to_input(images: NDArray[np.uint8]) -> Float32:
@@ -277,7 +298,7 @@ def tensors_of(graph: Graph, images: Float32) -> list[Float32]:
     for layer in graph.layers:
         inputs = [tensors[k] for k in layer.sources]
         if isinstance(layer, FloatConv):
-            out = _convolve(layer, inputs[0])
+            out = sum(inputs[1:], _convolve(layer, inputs[0]))
         elif isinstance(layer, FloatAdd):
             out = inputs[0] + inputs[1]
         else:

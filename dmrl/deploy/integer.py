@@ -5,9 +5,9 @@ of uint8, or of int8 where its layer says ``signed``. Its real values are
 ``scale * (q - zero_point)``; the zero point is 0 everywhere but in the image (128, the pixel
 that stands for 0.0) and in the heads.
 
-Every layer ends in one requantisation, of integers alone: ``(x + 2^(shift - 1)) >> shift`` with an
-arithmetic shift (half goes up), then a clamp to the range of the output's type. The clamp of
-an unsigned tensor at 0 is the ReLU.
+Every layer ends in one requantisation, of integers alone: half a step is added, then an arithmetic
+shift rounds down (so half goes up), then comes a clamp to the range of the output's type. The clamp
+of an unsigned tensor at 0 is the ReLU.
 """
 
 from dataclasses import dataclass

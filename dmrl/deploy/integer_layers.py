@@ -4,7 +4,7 @@
 made of it, so neither has to ask whether a sum can overflow.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -20,6 +20,8 @@ Shape = tuple[int, int, int]
 PIXEL_ZERO = 128
 """Pixel that is 0.0 to the network, whose input is ``x / 128 - 1``; images are padded with it."""
 Q_LEVELS = 256
+GAIN_SHIFT = 8
+"""Bits of a shortcut's gain behind the point: a step of the sum may be coarse beside its own."""
 
 
 class Layer(Protocol):
@@ -60,8 +62,10 @@ class Layer(Protocol):
 class Conv:
     """Convolution, and ReLU where the output is unsigned.
 
-    ``acc = bias + sum(weight * x)`` fits in int32 for every input; then, per output channel,
-    ``q = clamp((acc * multiplier + 2^(shift - 1)) >> shift)``, the product in int64.
+    ``acc = bias + sum(weight * x)``, with ``(gain * s) >> GAIN_SHIFT`` of a shortcut, fits in
+    int32 for every input; then, per output channel, ``q = clamp((acc * multiplier) >> shift)``, the
+    product in int64. The half step that rounds is in the bias. With a shift of 32, which is nearly
+    always, q is the high word of the product.
 
     Output row r reads the input rows ``r * stride - padding + dilation * k``, columns likewise;
     what lies outside reads as ``pad_value``. Rows: ``(h + 2 padding - dilation (k - 1) - 1) //
@@ -76,11 +80,11 @@ class Conv:
     weight
         (out, in / groups, k, k) int8, -127 to 127, k is 1 or 3.
     bias
-        (out,) int32. The zero point of the image is folded in.
+        (out,) int32. The zero point of the image and half a step of the output are folded in.
     multiplier
-        (out,) int32, 2^30 to 2^31 - 1.
+        (out,) int32, 1 to 2^31 - 1. The real factor is ``multiplier / 2^shift``.
     shift
-        (out,) int32, 1 to 62. The real factor is ``multiplier / 2^shift``.
+        1 to 32, the same for all channels.
     stride, dilation, padding
         The same both ways.
     groups
@@ -91,6 +95,11 @@ class Conv:
         128 for the image, else 0.
     scale
         Real value of one step of the output; 1 where the output is read by heads alone.
+    shortcut
+        Tensor of the output's shape that is added before the requantisation; -1: none. Then the
+        convolution is dense and leaves the size as it is.
+    gain
+        (out,) int32, 0 to 2^23 - 1, what the shortcut's values are multiplied by; empty without.
     """
 
     kind: ClassVar[str] = "conv"
@@ -99,7 +108,7 @@ class Conv:
     weight: Int8
     bias: Int32
     multiplier: Int32
-    shift: Int32
+    shift: int
     stride: int = 1
     dilation: int = 1
     padding: int = 0
@@ -107,11 +116,13 @@ class Conv:
     signed: bool = False
     pad_value: int = 0
     scale: float = 1.0
+    shortcut: int = -1
+    gain: Int32 = field(default_factory=lambda: np.zeros(0, np.int32))
 
     @property
     def sources(self) -> tuple[int, ...]:
-        """Tensors it reads."""
-        return (self.source,)
+        """Tensors it reads: its own, then the shortcut if there is one."""
+        return (self.source,) if self.shortcut < 0 else (self.source, self.shortcut)
 
     @property
     def kernel(self) -> int:
@@ -146,10 +157,16 @@ class Conv:
             raise unsound(self, f"has {self.groups} groups of {channels} channels")
         # The worst input has the largest value of its type wherever the weight has its sign.
         largest_input = 128 if signed[0] else 255
-        weights = np.abs(self.weight.astype(np.int64)).sum(axis=(1, 2, 3))
-        if (weights * largest_input + np.abs(self.bias.astype(np.int64))).max() >= 2**31:
+        largest = largest_input * np.abs(self.weight.astype(np.int64)).sum(axis=(1, 2, 3))
+        if len(inputs) > 1:
+            if self.depthwise or inputs[1] != self.shape(inputs) or inputs[1][1:] != inputs[0][1:]:
+                raise unsound(self, f"adds {inputs[1]} to {self.shape(inputs)}")
+            if (self.gain < 0).any() or (self.gain >= 2**23).any():
+                raise unsound(self, "has a gain out of range")
+            largest += (128 if signed[1] else 255) * self.gain.astype(np.int64) >> GAIN_SHIFT
+        if (largest + np.abs(self.bias.astype(np.int64))).max() >= 2**31:
             raise unsound(self, "can overflow int32")
-        if (self.multiplier < 2**30).any() or (self.shift < 1).any() or (self.shift > 62).any():
+        if (self.multiplier < 1).any() or not 1 <= self.shift <= 32:
             raise unsound(self, "has a multiplier or shift out of range")
 
 

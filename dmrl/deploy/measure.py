@@ -141,7 +141,7 @@ def rates(network: IntegerNetwork, found: Cost | None, state: int) -> list[tuple
     out = []
     memory = "no waiting for memory"
     if not fits_l1(state):
-        memory += f", though {state:,} bytes of state do not fit the L1 and lie in L2"
+        memory = f"without the waits for L2, where {state:,} bytes of state lie that do not fit L1"
     if found and found.instructions:
         out.append(
             (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.graph import FloatAdd, FloatConv, Graph
 from dmrl.deploy.integer import PIXEL_ZERO, Add, Conv, Head, IntegerNetwork
-from dmrl.deploy.quantise import HEAD_OF
+from dmrl.deploy.quantise import HALF_STEP, HEAD_OF, SHORTCUT_LOSES
 from dmrl.errors import MissingExtra
 
 try:
@@ -100,7 +100,10 @@ def float_onnx(
         if isinstance(layer, FloatConv):
             weight = out.constant(f"{layer.name}.weight", layer.weight.astype(np.float32))
             bias = out.constant(f"{layer.name}.bias", layer.bias.astype(np.float32))
-            value = out.node("Conv", [*inputs, weight, bias], name, **_conv_settings(layer))
+            value = f"{name}.conv" if inputs[1:] else name
+            out.node("Conv", [inputs[0], weight, bias], value, **_conv_settings(layer))
+            if inputs[1:]:
+                value = out.node("Add", [value, inputs[1]], name)
         elif isinstance(layer, FloatAdd):
             value = out.node("Add", inputs, name)
         else:
@@ -134,7 +137,8 @@ def int8_onnx(network: IntegerNetwork) -> bytes:
 
     What runs it may fuse the pairs into integer operations, and may round otherwise than
     ``reference`` by one level. A signed tensor is written as uint8 around 128, since
-    onnxruntime fuses a convolution only where its input and output are of one type.
+    onnxruntime fuses a convolution only where its input and output are of one type. A convolution
+    with a shortcut is not rounded before the sum, as in ``reference``: it runs in float.
     """
     out = _Writer()
     levels = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
@@ -150,6 +154,8 @@ def int8_onnx(network: IntegerNetwork) -> bytes:
             if isinstance(layer, Conv):
                 every = np.arange(len(layer.bias))
                 value = _int8_conv(out, layer, inputs[0], scales[layer.source], every, layer.scale)
+                if inputs[1:]:
+                    value = out.node("Add", [value, inputs[1]], f"{layer.name}.both")
             elif isinstance(layer, Add):
                 value = out.node("Add", inputs, f"{layer.name}.sum")
             else:
@@ -178,11 +184,12 @@ def _int8_conv(
 ) -> str:
     """The convolution of the chosen output channels, on dequantised values."""
     weight = layer.weight[chosen]
-    factor = layer.multiplier[chosen] / 2.0 ** layer.shift[chosen]
+    factor = layer.multiplier[chosen] / 2.0**layer.shift
     bias = layer.bias[chosen].astype(np.int64)
     if layer.source == 0:
         bias += PIXEL_ZERO * weight.astype(np.int64).sum(axis=(1, 2, 3))
-    bias -= np.rint(zero_point / factor).astype(np.int64)
+    lost = SHORTCUT_LOSES * (len(layer.sources) - 1)
+    bias -= np.rint((zero_point + HALF_STEP) / factor + lost).astype(np.int64)
     sum_scale = (factor * out_scale).astype(np.float32)
     name = layer.name + suffix
     levels = out.constant(f"{name}.weight.levels", weight)

@@ -29,6 +29,7 @@ from dmrl.deploy.integer import (
     IntegerNetwork,
     MaxPool,
 )
+from dmrl.deploy.integer_layers import GAIN_SHIFT
 from dmrl.deploy.ranges import Ranges
 from dmrl.deploy.rounding import Moments, rounded
 from dmrl.errors import SettingError
@@ -45,6 +46,10 @@ HEAD_OF = {
 HEAD_ROOM = 0.05
 """Share of its range that a head keeps free at either end, for images not seen before."""
 LEVELS = np.arange(-128.0, 128.0)
+HALF_STEP = 0.5
+"""Of the output: a convolution's bias holds it, and rounding down then rounds to the nearest."""
+SHORTCUT_LOSES = 0.5
+"""Steps of the sum that rounding down a shortcut takes on average; the bias makes that good."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,8 +191,9 @@ def _conv(
     out_scale, zero_point = np.full(outs, scale), np.zeros(outs)
     for head in heads:
         out_scale[head.channel], zero_point[head.channel] = head.scale, head.zero_point
-    weight, bias, factor = _integers(
-        layer, scales[layer.sources[0]], out_scale, zero_point * out_scale, moments
+    in_scales = [scales[source] for source in layer.sources]
+    weight, bias, gain, factor = _integers(
+        layer, in_scales, out_scale, zero_point * out_scale, moments
     )
     # The image alone has a zero point: sum(w * (q - 128)) = sum(w * q) - 128 * sum(w).
     if layer.sources[0] == 0:
@@ -207,44 +213,51 @@ def _conv(
         signed=not layer.relu,
         pad_value=PIXEL_ZERO if layer.sources[0] == 0 else 0,
         scale=scale,
+        shortcut=layer.sources[1] if len(layer.sources) > 1 else -1,
+        gain=gain.astype(np.int32),
     )
 
 
 def _integers(
-    layer: FloatConv, in_scale: float, out_scale: Array, zero: Array, moments: Array | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Weights, bias and the real factor from sum to output, per output channel.
+    layer: FloatConv, in_scales: list[float], out_scale: Array, zero: Array, moments: Array | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
+    """Weights, bias, gain of a shortcut, and the real factor from sum to output, per channel.
 
-    The scale of a channel's weights is set by its largest weight; by its bias, where that would
-    not fit beside the sum; or by the smallest factor that a shift of 62 can express.
+    The bias takes the zero point and the half step that rounds. The scale of a channel's weights
+    is set by its largest weight; by its bias and shortcut, where these would not fit beside the
+    sum; or by the smallest factor whose half step does.
     """
-    # What is left of an int32 for the bias beside the largest sum of weights times inputs.
+    # What is left of an int32 for bias and shortcut beside the largest sum of weights times inputs.
     largest = np.abs(layer.weight).max(axis=(1, 2, 3))
-    room = 2**31 - 1 - 128 * 255 * layer.weight[0].size
-    bias = layer.bias + zero
-    least = 2.0**-31 * out_scale / in_scale
-    weight_scale = np.maximum.reduce([largest / 127, np.abs(bias) / (in_scale * room), least])
+    room = 2**31 - 1 - 128 * 255 * (layer.weight[0].size + 1)
+    in_scale, *beside = in_scales
+    offset = zero + HALF_STEP * out_scale
+    bias = layer.bias + offset
+    more = np.abs(bias) + 2.0**GAIN_SHIFT * 255 * sum(beside)
+    least = 2.0**-30 * out_scale / in_scale
+    weight_scale = np.maximum.reduce([largest / 127, more / (in_scale * room), least])
     if moments is None:
         weight = np.rint(layer.weight / weight_scale[:, None, None, None]).astype(np.int64)
     else:
         weight, suited = rounded(layer, weight_scale, moments)
-        bias = suited + zero
+        bias = suited + offset
     sum_scale = in_scale * weight_scale
-    steps = np.clip(np.rint(bias / sum_scale), -room, room).astype(np.int64)
-    return weight, steps, sum_scale / out_scale
+    lost = SHORTCUT_LOSES * len(beside)
+    steps = np.clip(np.rint(bias / sum_scale + lost), -room, room).astype(np.int64)
+    gains = [np.rint(2.0**GAIN_SHIFT * scale / sum_scale) for scale in beside]
+    gain = np.array(gains).ravel().astype(np.int64)
+    return weight, steps, gain, sum_scale / out_scale
 
 
-def _fixed_point(factor: Array) -> tuple[Int32, Int32]:
-    """Requantisation factors as integers: ``factor = multiplier / 2^shift``, 31 bits each.
+def _fixed_point(factor: Array) -> tuple[Int32, int]:
+    """Requantisation factors as integers, ``multiplier / 2^shift``, the largest in 30 bits.
 
-    Integers, because they round the same on every machine, also on those without floats.
+    Integers, because they round the same on every machine, also on those without floats. The
+    shift is 32 unless a factor is 1/4 or more. A small factor has few bits, but so has what
+    comes of it: a sum of 24 bits is rounded by less than a tenth of a step.
     """
-    mantissa, exponent = np.frexp(factor)
-    multiplier = np.rint(mantissa * 2**31).astype(np.int64)
-    # A mantissa just below 1 rounds up to 2^31, one more than fits: half of it, one shift less.
-    carried = multiplier == 2**31
-    multiplier = np.where(carried, 2**30, multiplier)
-    return multiplier.astype(np.int32), (31 - exponent - carried).astype(np.int32)
+    shift = min(32, 30 - int(np.frexp(factor.max())[1]))
+    return np.maximum(np.rint(factor * 2.0**shift), 1).astype(np.int32), shift
 
 
 def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> Add:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.integer import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
+from dmrl.deploy.integer_layers import GAIN_SHIFT
 from dmrl.deploy.windows import largest_of_blocks, taps_of
 from dmrl.learn.decode import SAME_PX
 
@@ -48,23 +49,21 @@ def tensors_of(network: IntegerNetwork, image: NDArray[np.uint8]) -> Iterator[Qu
 def compute(layer: AnyLayer, *inputs: Quantised) -> Quantised:
     """Output of a layer, (channels, rows, cols)."""
     if isinstance(layer, Conv):
-        return convolve(layer, inputs[0])
+        return convolve(layer, *inputs)
     if isinstance(layer, Add):
         a, b = (x.astype(np.int64) * m for x, m in zip(inputs, layer.multipliers, strict=True))
         return clamp((a + b + (1 << (layer.shift - 1))) >> layer.shift, signed=layer.signed)
     return largest_of_blocks(inputs[0])
 
 
-def convolve(layer: Conv, x: Quantised) -> Quantised:
-    """Output of a convolution, requantised: ``clamp((acc * m + 2^(s - 1)) >> s)``."""
-    acc = accumulate(layer, x)
-    shift = layer.shift.astype(np.int64)[:, None, None]
-    product = acc * layer.multiplier.astype(np.int64)[:, None, None]
-    return clamp((product + (1 << (shift - 1))) >> shift, signed=layer.signed)
+def convolve(layer: Conv, x: Quantised, *shortcut: Quantised) -> Quantised:
+    """Output of a convolution, requantised: ``clamp((acc * multiplier) >> shift)``."""
+    product = accumulate(layer, x, *shortcut) * layer.multiplier.astype(np.int64)[:, None, None]
+    return clamp(product >> layer.shift, signed=layer.signed)
 
 
-def accumulate(layer: Conv, x: Quantised) -> NDArray[np.int64]:
-    """Sums of products and bias, (out, rows, cols), before requantising."""
+def accumulate(layer: Conv, x: Quantised, *shortcut: Quantised) -> NDArray[np.int64]:
+    """Sums of products, bias and shortcut, (out, rows, cols), before requantising."""
     pad = layer.padding
     padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad)), constant_values=layer.pad_value)
     taps = taps_of(padded, layer.kernel, layer.stride, layer.dilation).astype(np.float64)
@@ -75,6 +74,8 @@ def accumulate(layer: Conv, x: Quantised) -> NDArray[np.int64]:
     else:
         sums = (weight @ taps.reshape(weight.shape[1], rows * cols)).reshape(outs, rows, cols)
     acc: NDArray[np.int64] = sums.astype(np.int64) + layer.bias[:, None, None]
+    for beside in shortcut:
+        acc += (beside * layer.gain.astype(np.int64)[:, None, None]) >> GAIN_SHIFT
     return acc
 
 

@@ -18,7 +18,7 @@ from dmrl.errors import ModelError
 
 INTEGER_NAME = "integer.npz"
 """Name of the file in a quantised model and in an export folder."""
-FORMAT = 1
+FORMAT = 2
 KINDS: dict[str, type[AnyLayer]] = {kind.kind: kind for kind in (Conv, MaxPool, Add)}
 HEADS = ("confidence", "depth", "offset_u", "offset_v")
 PLAIN = ("name", "architecture", "channels", "height_px", "width_px", "stride_px", "threshold")
@@ -81,7 +81,8 @@ def load(path: Path) -> IntegerNetwork:
         said = parse_json(arrays.pop("description").tobytes())
         if said["format"] != FORMAT:
             raise ModelError(
-                f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Update dmrl"
+                f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Quantise the "
+                "model again with this dmrl: dmrl quantize"
             )
         return _network(said, arrays)
     except DAMAGES as e:

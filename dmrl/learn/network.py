@@ -188,6 +188,44 @@ class DmrlNanoFine(DmrlNano):
     dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 2, 1, 2, 1, 2), (2, 4, 8))
 
 
+class Widened(nn.Module):
+    """A dilated depthwise 3x3, then 1x1 to more channels and back, beside a shortcut.
+
+    What is wide between the two is needed for a row at a time: it costs a small chip products and
+    no memory (the order of ConvNeXt's blocks, Liu et al. 2022).
+    """
+
+    def __init__(self, width: int, wide: int, dilation: int) -> None:
+        super().__init__()
+        self.depthwise = ConvNorm(width, width, dilation=dilation, depthwise=True)
+        self.expand = ConvNorm(width, wide, 1)
+        self.reduce = ConvNorm(wide, width, 1, relu=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, width, rows, cols) of the same."""
+        return torch.relu(x + self.reduce(self.expand(self.depthwise(x))))
+
+
+class DmrlNanoL1(DmrlNano):
+    """dmrl-nano for the 64 kB of a GAP8's L1: narrower, and with less reach, which rows cost."""
+
+    widths: ClassVar[tuple[int, int, int]] = (12, 24, 32)
+    wide: ClassVar[tuple[int, int]] = (48, 64)
+    dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1,), (1, 2, 4, 1))
+
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__(extra)
+        stem, fine, coarse = self.widths
+        self.body = nn.Sequential(
+            ConvNorm(CHANNELS, stem, stride=2),
+            ConvNorm(stem, fine, stride=2),
+            *(Widened(fine, self.wide[0], dilation) for dilation in self.dilations[0]),
+            ConvNorm(fine, fine, stride=2, depthwise=True),
+            ConvNorm(fine, coarse, 1),
+            *(Widened(coarse, self.wide[1], dilation) for dilation in self.dilations[1]),
+        )
+
+
 class DmrlLarge(DmrlNano):
     """The same, wider: a teacher, too large for a microcontroller."""
 
@@ -197,6 +235,7 @@ class DmrlLarge(DmrlNano):
 ARCHITECTURES: dict[str, type[Network]] = {
     "dmrl-nano": DmrlNano,
     "dmrl-nano-fine": DmrlNanoFine,
+    "dmrl-nano-l1": DmrlNanoL1,
     "dmrl-large": DmrlLarge,
     "locanet": LocaNet,
 }

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from dmrl.deploy.backends import seen_by
-from dmrl.deploy.c import write_c
+from dmrl.deploy.c import L1_FOR_STATE, write_c
 from dmrl.deploy.detector import (
     DESCRIPTION_NAME,
     FLOAT_ONNX_NAME,
@@ -18,6 +18,7 @@ from dmrl.deploy.detector import (
     WEIGHTS_NAME,
 )
 from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.measure import fits_l1, state_bytes
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError
@@ -123,8 +124,17 @@ def _written(path: Path) -> Written:
 
 
 def document(out: Path, written: list[Written]) -> dict[str, Any]:
-    """What was written, as JSON values."""
-    return {"folder": str(out), "files": {each.name: each.size_bytes for each in written}}
+    """What was written, as JSON values; without an int8 network nothing is said of its memory."""
+    said = {"folder": str(out), "files": {each.name: each.size_bytes for each in written}}
+    if (state := _state_bytes(out, written)) is None:
+        return said
+    return {**said, "state_bytes": state, "fits_gap8_l1": fits_l1(state)}
+
+
+def _state_bytes(out: Path, written: list[Written]) -> int | None:
+    """RAM of the C; None: there is none."""
+    int8 = any(each.name == INTEGER_NAME for each in written)
+    return state_bytes(load(out), out) if int8 else None
 
 
 DEFAULTS = Settings()
@@ -156,5 +166,7 @@ def command(
         return
     rows = [(each.name, each.size_bytes, each.what) for each in written]
     print_table(str(out), ("file", "bytes", "what it is"), rows)
-    if any(each.name == INTEGER_NAME for each in written):
+    if (state := _state_bytes(out, written)) is not None:
+        fit = "fits" if fits_l1(state) else "does not fit"
+        print(f"{state:,} bytes of RAM, which {fit} a GAP8's L1: {L1_FOR_STATE:,} beside stacks")
         print(f"prove the C with: dmrl verify {out}")

@@ -1,5 +1,6 @@
 """Random small float networks, and their int8 form by the quantiser."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -61,7 +62,12 @@ class _Growing:
         self.conv(0, 3, depthwise=True, dilation=dilation)
         self.conv(width, 1, relu=False)
         relu = bool(self.rng.random() < 0.7)
-        self.layers.append(FloatAdd(f"add{source}", (source, len(self.layers)), relu))
+        last = self.layers[-1]
+        assert isinstance(last, FloatConv)
+        if self.rng.random() < 0.7:
+            self.layers[-1] = replace(last, sources=(*last.sources[:1], source), relu=relu)
+        else:
+            self.layers.append(FloatAdd(f"add{source}", (source, len(self.layers)), relu))
 
     def grow(self) -> None:
         rng, small = self.rng, min(self.shape[1:]) < 6

@@ -39,7 +39,7 @@ class _Growing:
         self.signed.append(layer.signed)
 
     def conv(self, outs: int, kernel: int, *, depthwise: bool = False, stride: int = 1,
-             dilation: int = 1, signed: bool = False) -> None:  # fmt: skip
+             dilation: int = 1, signed: bool = False, shortcut: int = -1) -> None:  # fmt: skip
         rng, channels = self.rng, self.shape[0]
         outs = channels if depthwise else outs
         ins = 1 if depthwise else channels
@@ -52,20 +52,23 @@ class _Growing:
             weight=rng.integers(-127, 128, (outs, ins, kernel, kernel)).astype(np.int8),
             bias=rng.integers(-20000, 20000, outs).astype(np.int32),
             multiplier=np.full(outs, 2**30, np.int32),
-            shift=np.full(outs, 1, np.int32),
+            shift=1,
             stride=stride,
             dilation=dilation,
             padding=padding,
             groups=channels if depthwise else 1,
             signed=signed,
             pad_value=0 if self.layers else PIXEL_ZERO,
+            shortcut=shortcut,
+            gain=rng.integers(0, 50_000, outs if shortcut >= 0 else 0).astype(np.int32),
         )
-        acc = np.abs(accumulate(draft, self.tensors[-1])).reshape(outs, -1).max(axis=1)
+        inputs = [self.tensors[k] for k in draft.sources]
+        acc = np.abs(accumulate(draft, *inputs)).reshape(outs, -1).max(axis=1)
         factor = rng.uniform(0.5, 1.5, outs) * (127 if signed else 255) / np.maximum(acc, 1)
-        mantissa, exponent = np.frexp(factor)  # factor = mantissa * 2^exponent
-        multiplier = np.minimum(np.round(mantissa * 2**31), 2**31 - 1).astype(np.int32)
+        shift = min(32, 30 - int(np.frexp(factor.max())[1])) - int(rng.choice([0, 0, 2]))
+        multiplier = np.maximum(np.round(factor * 2.0**shift), 1).astype(np.int32)
         fields = {name: getattr(draft, name) for name in draft.__slots__}
-        fields |= {"multiplier": multiplier, "shift": (31 - exponent).astype(np.int32)}
+        fields |= {"multiplier": multiplier, "shift": shift}
         self.grow(Conv(**fields))
 
     def add(self, other: int, *, signed: bool) -> None:
@@ -110,7 +113,9 @@ def _grow_residual(net: _Growing, rng: Rng, dilation: int) -> None:
     """x + f(x), the sum with or without ReLU; f is depthwise, then 1x1."""
     source, shape = len(net.tensors) - 1, net.shape
     net.conv(0, 3, depthwise=True, dilation=dilation)
-    if net.shape == shape:
+    if net.shape == shape and rng.random() < 0.5:
+        net.conv(shape[0], 1, signed=bool(rng.random() < 0.3), shortcut=source)
+    elif net.shape == shape:
         net.conv(shape[0], 1, signed=bool(rng.random() < 0.5))
         net.add(source, signed=bool(rng.random() < 0.3))
 

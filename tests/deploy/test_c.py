@@ -9,18 +9,19 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.deploy.bayer import demosaic
-from dmrl.deploy.c import c_name, write_c
+from dmrl.deploy.c import L1_FOR_STATE, c_name, write_c
 from dmrl.deploy.c.harness import answers
 from dmrl.deploy.c.source import source
 from dmrl.deploy.c.text import names_of
 from dmrl.deploy.compiled import Compiled
 from dmrl.deploy.graph import graph_of
 from dmrl.deploy.integer import Conv, IntegerNetwork
+from dmrl.deploy.measure import cost
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.deploy.reference import decode, run
 from dmrl.deploy.targets import RISCV_FLAGS, SANITIZERS, Build, Target
-from dmrl.deploy.toolchain import RISCV
+from dmrl.deploy.toolchain import EMULATOR, RISCV, missing
 from dmrl.deploy.verification import TargetResult, expected, prove
 from dmrl.errors import ModelError, SettingError, ToolError
 from dmrl.learn.network import build
@@ -267,15 +268,41 @@ def test_without_a_compiler_the_package_to_install_is_named(
         Compiled(quantised_network(0))
 
 
-@pytest.mark.parametrize(
-    ("name", "bytes_"), [("locanet", 32_000), ("dmrl-nano", 128_000), ("dmrl-nano-fine", 164_000)]
-)
-def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
+def untrained(name: str) -> IntegerNetwork:
+    """An architecture in int8, of 320 x 224 pixels."""
     with torch.random.fork_rng(devices=[]):
         network = build(name).eval()
     graph = graph_of(operations(network))
     images = np.random.default_rng(0).integers(0, 256, (1, 224, 320, 3), np.uint8)
     about = About(name, name, network.stride_px, network.channels, 0.3)
-    integers = quantise(graph, calibrate(graph, [images]), about)
+    return quantise(graph, calibrate(graph, [images]), about)
+
+
+@pytest.mark.parametrize(
+    ("name", "bytes_"),
+    [
+        ("locanet", 25_000),
+        ("dmrl-nano", 116_000),
+        ("dmrl-nano-fine", 151_000),
+        ("dmrl-nano-l1", L1_FOR_STATE),
+    ],
+)
+def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
+    integers = untrained(name)
     made = source(integers, names_of(integers), bayer=False)
-    assert made.state_bytes + made.bayer_bytes <= bytes_
+    assert made.state_bytes <= bytes_
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(("name", "most"), [("locanet", 2.7), ("dmrl-nano", 2.85)])
+def test_a_product_takes_few_instructions_of_a_riscv(
+    name: str, most: float, tmp_path: Path
+) -> None:
+    if missing(RISCV, EMULATOR):
+        pytest.skip("no RISC-V tools")
+    integers = untrained(name)
+    write_c(integers, tmp_path, [])
+    found = cost(integers, tmp_path, noise(integers, 1)[0])
+    assert found is not None
+    assert found.instructions is not None
+    assert found.instructions / integers.macs < most

@@ -28,7 +28,7 @@ needs_riscv = pytest.mark.skipif(bool(missing(RISCV, EMULATOR)), reason="no RISC
     "backend", ["integer", "onnx-int8", "c", pytest.param("riscv32", marks=needs_riscv)]
 )
 def test_an_int8_network_says_the_same_by_every_backend(backend: str, tmp_path: Path) -> None:
-    network = replace(quantised_network(0), threshold=0.37)
+    network = replace(quantised_network(11), threshold=0.37)
     save(network, tmp_path / INTEGER_NAME)
     shape = (2, network.height_px, network.width_px, 3)
     images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)

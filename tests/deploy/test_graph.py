@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dmrl.deploy.graph import (
+    FloatAdd,
     Graph,
     graph_of,
     grey_of,
@@ -42,7 +43,7 @@ def outputs(graph: Graph, images: np.ndarray) -> np.ndarray:
     return outputs_of(graph, tensors_of(graph, to_input(images)))
 
 
-@pytest.mark.parametrize("name", ["locanet", "dmrl-nano", "dmrl-nano-fine"])
+@pytest.mark.parametrize("name", ["locanet", "dmrl-nano", "dmrl-nano-fine", "dmrl-nano-l1"])
 def test_the_layers_compute_what_torch_computes(name: str) -> None:
     network = settled(name)
     with torch.no_grad():
@@ -117,6 +118,41 @@ def test_heads_may_be_convolutions_of_their_own() -> None:
     network = TwoHeads().eval()
     graph = graph_of(operations(network))
     assert graph.outputs == ((2, 0), (3, 0))
+    with torch.no_grad():
+        wanted = network(torch_input(IMAGES)).numpy()
+    np.testing.assert_allclose(outputs(graph, IMAGES), wanted, atol=1e-5)
+
+
+class Summed(Network):
+    """A sum of two branches, one of which may be read elsewhere too."""
+
+    def __init__(self, branch: nn.Module, *, twice: bool = False) -> None:
+        super().__init__()
+        self.first, self.branch, self.twice = nn.Conv2d(3, 4, 3, padding=1), branch, twice
+        self.last = nn.Conv2d(4, 2, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        x = self.first(images).relu()
+        y = self.branch(x)
+        both = (x + y).relu()
+        out: Tensor = self.last(both + y if self.twice else both)
+        return out
+
+
+@pytest.mark.parametrize(
+    ("network", "sums"),
+    [
+        (Summed(nn.Conv2d(4, 4, 1)), 0),
+        (Summed(nn.Conv2d(4, 4, 3, padding=2, dilation=2)), 0),
+        (Summed(nn.Conv2d(4, 4, 3, padding=1, groups=4)), 1),
+        (Summed(nn.Sequential(nn.Conv2d(4, 4, 1), nn.ReLU())), 1),
+        (Summed(nn.Conv2d(4, 4, 1), twice=True), 2),
+    ],
+)
+def test_a_sum_is_part_of_the_dense_convolution_before_it(network: Network, sums: int) -> None:
+    network.eval()
+    graph = graph_of(operations(network))
+    assert sum(isinstance(layer, FloatAdd) for layer in graph.layers) == sums
     with torch.no_grad():
         wanted = network(torch_input(IMAGES)).numpy()
     np.testing.assert_allclose(outputs(graph, IMAGES), wanted, atol=1e-5)

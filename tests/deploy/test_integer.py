@@ -19,7 +19,7 @@ def conv(outs: int = 2, kernel: int = 3, ins: int = 3, **more: Any) -> Conv:
         "weight": np.ones((outs, ins, kernel, kernel), np.int8),
         "bias": np.zeros(outs, np.int32),
         "multiplier": np.full(outs, 2**30, np.int32),
-        "shift": np.full(outs, 30, np.int32),
+        "shift": 30,
     }
     return Conv("conv", **{"source": 0, **full, **more})
 
@@ -47,14 +47,38 @@ def test_a_sum_may_be_as_large_as_int32(signed: bool) -> None:
     [
         ("shift", 0, False),
         ("shift", 1, True),
-        ("shift", 62, True),
-        ("shift", 63, False),
-        ("multiplier", 2**30 - 1, False),
-        ("multiplier", 2**31 - 1, True),
+        ("shift", 32, True),
+        ("shift", 33, False),
+        ("multiplier", np.array([0, 9]), False),
+        ("multiplier", np.array([1, 2**31 - 1]), True),
     ],
 )
-def test_factors_are_of_31_bits_and_a_shift(field: str, value: int, good: bool) -> None:
-    assert sound(conv(**{field: np.array([value, 2**30 if field != "shift" else 9])})) == good
+def test_factors_are_of_31_bits_and_a_shift(field: str, value: Any, good: bool) -> None:
+    assert sound(conv(**{field: value})) == good
+
+
+def test_a_shortcut_is_of_the_outputs_shape_and_beside_a_convolution_that_keeps_the_size() -> None:
+    both, gain = (False, True), np.full(2, 7 << 8, np.int32)
+
+    def beside(shape: tuple[int, int, int], **more: Any) -> bool:
+        layer = conv(**{"padding": 1, "shortcut": 1, "gain": gain, **more})
+        return sound(layer, SHAPE, shape, signed=both)
+
+    assert beside((2, 8, 10))
+    assert not beside((3, 8, 10))
+    assert not beside((2, 8, 9))
+    assert not beside((2, 6, 8), padding=0)
+    assert not beside((2, 4, 5), stride=2)
+    assert not beside((3, 8, 10), outs=3, ins=1, groups=3, gain=np.full(3, 7 << 8, np.int32))
+    assert beside((2, 8, 10), gain=gain * 0 + 2**23 - 1)
+    assert not beside((2, 8, 10), gain=gain * 0 + 2**23)
+    assert not beside((2, 8, 10), gain=-gain)
+    most = 2**31 - 1 - 27 * 255
+    for signed, largest in ((False, 255), (True, 128)):
+        for left, good in ((0, True), (-1, False)):
+            bias = np.array([0, most - 7 * largest - left], np.int32)
+            layer = conv(padding=1, shortcut=1, gain=gain, bias=bias)
+            assert sound(layer, SHAPE, (2, 8, 10), signed=(False, signed)) == good
 
 
 def test_weights_fit_the_channels_they_read() -> None:

@@ -51,7 +51,8 @@ def test_int8_onnx_is_the_reference_but_for_rounding() -> None:
         beside.append(steps(wanted, got, seed))
     every = np.concatenate(beside)
     assert (every < 0.5).mean() > 0.97
-    assert (every < 1.5).mean() > 0.999
+    # A bias in whole steps of the sum, of which some of these networks have two to an output's.
+    assert (every < 1.5).mean() > 0.997
 
 
 def test_the_same_network_gives_the_same_bytes() -> None:

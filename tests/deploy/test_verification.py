@@ -88,8 +88,10 @@ def test_rates_are_images_a_second() -> None:
     )
     assert len(rates(network, Cost(1, 2, None), 1)) == len(rates(network, None, 1)) == 1
     assert not any("L1" in assumed for _, assumed in both)
-    over = rates(network, Cost(1, 2, 3), 125_512)
-    assert all("125,512 bytes of state do not fit the L1 and lie in L2" in said for _, said in over)
+    over = rates(network, Cost(1, 2, 3), 114_810)
+    assert all(
+        "L2, where 114,810 bytes of state lie that do not fit L1" in said for _, said in over
+    )
 
 
 def test_the_header_states_the_bytes_of_the_state(tmp_path: Path) -> None:

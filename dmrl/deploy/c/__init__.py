@@ -13,8 +13,8 @@ from dmrl.deploy.integer import IntegerNetwork
 
 __all__ = ["c_name", "write_c"]
 
-L1_FOR_STATE = 48 * 1024
-"""Bytes of the GAP8's 64 kB of L1 that a state may take: the cores' stacks lie there too."""
+L1_FOR_STATE = 64 * 1024 - 8 * 1024
+"""Bytes of the GAP8's L1 that a state may take, beside eight cores' stacks of a kilobyte each."""
 
 
 def write_c(

@@ -187,7 +187,7 @@ def _pools_to_fuse(network: IntegerNetwork) -> set[int]:
         before = network.layers[index - 1]
         readers = sum(other.sources.count(index) for other in network.layers)
         alone = isinstance(layer, MaxPool) and layer.source == index and readers == 1
-        if alone and isinstance(before, Conv) and not before.depthwise:
+        if alone and isinstance(before, Conv) and not before.depthwise and before.shortcut < 0:
             out.add(index)
     return out
 
@@ -272,9 +272,15 @@ def _deepest_ready(steps: list[Step], rows: list[int], done: list[int]) -> int |
     return None
 
 
+def along(conv: Conv) -> bool:
+    """Whether a convolution's C slides along the row, and needs no columns of padding there."""
+    same = conv.stride == 1 and conv.padding == conv.dilation
+    return conv.depthwise and conv.kernel == 3 and same
+
+
 def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
     channels, rows, cols = shape
-    convs = [s.layer for s in steps if index in s.sources and isinstance(s.layer, Conv)]
+    convs = [s.layer for s in steps if index == s.sources[0] and isinstance(s.layer, Conv)]
     name = steps[index - 1].name if index else "image"
     return Buffer(
         name=name,
@@ -282,7 +288,7 @@ def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
         channels=channels,
         rows=rows,
         cols=cols,
-        gap=max((conv.padding for conv in convs), default=0),
+        gap=max((conv.padding for conv in convs if not along(conv)), default=0),
         pad_value=convs[0].pad_value if convs else 0,
         above=any(c.padding for c in convs),
         ring=ring,

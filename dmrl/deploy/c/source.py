@@ -2,19 +2,20 @@
 
 from dataclasses import dataclass, replace
 
+from dmrl.deploy.c.convolutions import shared_kernels
 from dmrl.deploy.c.layers import (
     constants,
     declarations,
     kernels,
     longest_zero_row,
-    one_row,
     require_carried,
     row_function,
-    slot,
 )
+from dmrl.deploy.c.places import one_row, slot
 from dmrl.deploy.c.plan import Buffer, Plan, plan
 from dmrl.deploy.c.text import array, fill
 from dmrl.deploy.integer import SUBPIXEL, Head, IntegerNetwork
+from dmrl.deploy.integer_layers import GAIN_SHIFT
 from dmrl.learn.decode import SAME_PX
 
 STACK_BYTES = 512
@@ -97,7 +98,11 @@ def _code(
     planned: Plan, names: dict[str, str], weights: str, tables: dict[str, Head], zeros: int
 ) -> str:
     image, steps, prefix = planned.buffers[0], planned.steps, names["prefix"]
-    parts = [fill("prelude.c", **names), kernels(planned)]
+    parts = [
+        fill("prelude.c", **names, gain_shift=GAIN_SHIFT),
+        kernels(planned),
+        shared_kernels(planned),
+    ]
     parts.append("/* Defined at the end of the file. */\n" + declarations(planned))
     parts += [f"static const {_table_type(n)} {n}[256];\n" for n in tables]
     if zeros:
@@ -142,9 +147,11 @@ def _row_access(buffer: Buffer, prefix: str) -> str:
 def _schedule(planned: Plan, names: dict[str, str]) -> str:
     table, cases = "", ""
     for k, step in enumerate(planned.steps):
+        readers = [n for n, other in enumerate(planned.steps) if k + 1 in other.sources]
         numbers = (
             step.sources[0],
             step.sources[-1],
+            max(readers, default=k),
             step.stride,
             step.last,
             planned.buffers[step.sources[0]].rows,
@@ -153,8 +160,11 @@ def _schedule(planned: Plan, names: dict[str, str]) -> str:
         table += f"    {{{', '.join(map(str, numbers))}}}, /* {step.name} */\n"
         cases += f"    case {k}: make_{step.name}(net, row); break;\n"
     image, pads = planned.buffers[0], ""
-    if image.pad_value and image.gap:
-        pads = f"    fill(net->image, {image.pad_value}, sizeof net->image);\n"
+    for buffer in planned.buffers:
+        if buffer.gap:
+            pads += (
+                f"    fill(net->{buffer.home}, {buffer.pad_value}, sizeof net->{buffer.home});\n"
+            )
     if _has_pad(image):
         pads += f"    fill(net->image_pad, {image.pad_value}, sizeof net->image_pad);\n"
     return fill(

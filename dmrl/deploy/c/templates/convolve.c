@@ -1,25 +1,47 @@
-/* One output row of a convolution. The arguments but the first five are constants of the layer. */
-INLINE void convolve_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
-                        const scale_t *scales, int cols, int taps, int run, int step, int outs,
-                        int low, int high, int wide)
+/* One output row of a convolution, with a shortcut that is added or without. Blocks of four channels and
+ * four pixels; the last block of a row, or of the channels, begins where it ends with them, and
+ * makes some values twice. */
+INLINE void convolve_$suffixes(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
+                        const scale_t *scales, const uint8_t *shortcut, const int32_t *gains,
+                        int adds, int cols, int taps, int run, int step, int outs, int low,
+                        int high, int shift)
 {
-    const int filter = taps * run, pairs = cols / 2 * 2, fours = outs / 4 * 4;
-    for (int o = 0; o < fours; o += 4) {
-        for (int x = 0; x < pairs; x += 2) {
-            int32_t sum[8];
-            dot_2x4_$suffix(sum, in, weights + o * filter, taps, run, x * step, step);
-            for (int k = 0; k < 4; k++) {
-                const scale_t *scale = &scales[o + k];
-                out[x * outs + o + k] = clamp(scaled(sum[k], scale, wide), low, high);
-                out[(x + 1) * outs + o + k] = clamp(scaled(sum[k + 4], scale, wide), low, high);
+    const int filter = taps * run;
+    if (cols < 4 || outs < 4) {
+        for (int x = 0; x < cols; x++) {
+            for (int o = 0; o < outs; o++) {
+                int32_t sum = dot_$suffix(scales[o].bias, in, weights + o * filter, taps, run,
+                                     x * step);
+                if (adds)
+                    sum += gained(gains[o], ((const $other *)shortcut)[x * outs + o]);
+                out[x * outs + o] = scaled(sum, scales[o].multiplier, shift, low, high);
             }
         }
+        return;
     }
-    /* What is left: a last column, and channels beyond the last four. */
-    for (int x = 0; x < cols; x++) {
-        for (int o = x < pairs ? fours : 0; o < outs; o++) {
-            const int32_t sum = dot_$suffix(in, weights + o * filter, taps, run, x * step);
-            out[x * outs + o] = clamp(scaled(sum, &scales[o], wide), low, high);
+    for (int next = 0; next < outs; next += 4) {
+        const int o = smallest(next, outs - 4);
+        const scale_t *scale = scales + o;
+        for (int after = 0; after < cols; after += 4) {
+            const int x = smallest(after, cols - 4);
+            uint8_t *place = out + x * outs + o;
+            int32_t sum[16];
+            AS_IT_IS(place);
+            block_$suffix(sum, scale, in, weights + o * filter, taps, run, x * step, step, 0);
+            if (adds) {
+                const $other *s = (const $other *)shortcut + x * outs + o;
+                const int32_t g[4] = {gains[o], gains[o + 1], gains[o + 2], gains[o + 3]};
+                for (int k = 0; k < 16; k++) {
+                    sum[k] += gained(g[k % 4], s[k / 4 * outs + k % 4]);
+                    AS_IT_IS(sum[k]);
+                }
+            }
+            const int32_t m[4] = {scale[0].multiplier, scale[1].multiplier, scale[2].multiplier,
+                                  scale[3].multiplier};
+            int32_t most = high;
+            AS_IT_IS(most); /* once a block, not once a value */
+            for (int k = 0; k < 16; k++)
+                place[k / 4 * outs + k % 4] = scaled(sum[k], m[k % 4], shift, low, most);
         }
     }
 }

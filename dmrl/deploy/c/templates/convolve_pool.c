@@ -2,28 +2,29 @@
  * so that only it is scaled. The upper row reads in[0 ... taps - 1], the lower one the next. */
 INLINE void convolve_pool_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
                              const scale_t *scales, int cols, int taps, int run, int step,
-                             int outs, int low, int high, int wide)
+                             int outs, int low, int high, int shift)
 {
-    const int filter = taps * run, fours = outs / 4 * 4;
-    for (int o = 0; o < fours; o += 4) {
+    const int filter = taps * run;
+    for (int next = 0; outs >= 4 && next < outs; next += 4) {
+        const int o = smallest(next, outs - 4);
         for (int x = 0; x < cols; x++) {
-            int32_t upper[8], lower[8];
-            dot_2x4_$suffix(upper, in, weights + o * filter, taps, run, 2 * x * step, step);
-            dot_2x4_$suffix(lower, in + taps, weights + o * filter, taps, run, 2 * x * step, step);
-            for (int k = 0; k < 4; k++) {
-                const int32_t sum = largest(largest(upper[k], upper[k + 4]),
-                                            largest(lower[k], lower[k + 4]));
-                out[x * outs + o + k] = clamp(scaled(sum, &scales[o + k], wide), low, high);
-            }
+            const scale_t *scale = scales + o;
+            int32_t sum[16];
+            block_$suffix(sum, scale, in, weights + o * filter, taps, run, 2 * x * step, step, 1);
+            for (int k = 0; k < 4; k++)
+                out[x * outs + o + k] = scaled(
+                    largest(largest(sum[k], sum[k + 4]), largest(sum[k + 8], sum[k + 12])),
+                    scale[k].multiplier, shift, low, high);
         }
     }
-    for (int o = fours; o < outs; o++) {
+    for (int o = 0; outs < 4 && o < outs; o++) {
         for (int x = 0; x < cols; x++) {
             int32_t sum = INT32_MIN;
             for (int k = 0; k < 4; k++)
-                sum = largest(sum, dot_$suffix(in + k / 2 * taps, weights + o * filter, taps, run,
+                sum = largest(sum, dot_$suffix(scales[o].bias, in + k / 2 * taps,
+                                          weights + o * filter, taps, run,
                                           (2 * x + k % 2) * step));
-            out[x * outs + o] = clamp(scaled(sum, &scales[o], wide), low, high);
+            out[x * outs + o] = scaled(sum, scales[o].multiplier, shift, low, high);
         }
     }
 }

@@ -1,38 +1,90 @@
 /* Sum of products of one output channel at one pixel: `taps` runs of `run` values side by side,
  * the one of tap t starting at in[t] + at. */
-INLINE int32_t dot_$suffix(const uint8_t *const *in, const int8_t *weights, int taps, int run, int at)
+INLINE int32_t dot_$suffix(int32_t sum, const uint8_t *const *in, const int8_t *weights, int taps,
+                      int run, int at)
 {
-    int32_t sum = 0;
     for (int t = 0; t < taps; t++) {
         const $type *x = (const $type *)in[t] + at;
         const int8_t *w = weights + t * run;
-        UNROLL
         for (int i = 0; i < run; i++)
             sum += x[i] * w[i];
     }
     return sum;
 }
 
-/* The same for four output channels at two pixels, `step` values apart: eight products for six
- * loads, and few enough sums for the registers of any core. */
-INLINE void dot_2x4_$suffix(int32_t sum[8], const uint8_t *const *in, const int8_t *weights,
-                       int taps, int run, int at, int step)
+/* The products of value i of a run: four output channels, `filter` weights apart, at two pixels. */
+#define PAIR_$suffix(i, first, second, a, b)                                   \
+    {                                                                     \
+        const int32_t w0 = w[i], w1 = w[(i) + filter];                    \
+        const int32_t w2 = w[(i) + 2 * filter], w3 = w[(i) + 3 * filter]; \
+        int32_t v = first;                                                \
+        a##0 += v * w0, a##1 += v * w1, a##2 += v * w2, a##3 += v * w3;   \
+        v = second;                                                       \
+        b##0 += v * w0, b##1 += v * w1, b##2 += v * w2, b##3 += v * w3;   \
+    }
+
+#ifdef SMALL_CORE
+/* At all four pixels: sixteen products for eight loads. Sixteen sums, what is loaded and the
+ * pointers fit the registers of a 32-bit RISC-V. */
+#define FOUR_$suffix(i)                                                        \
+    {                                                                     \
+        PAIR_$suffix(i, x[i], x[(i) + step], a, b)                             \
+        PAIR_$suffix(i, y[i], y[(i) + step], c, d)                             \
+        IN_ORDER;                                                         \
+    }
+
+/* The sums of four output channels at four pixels: four side by side, `step` values apart, the
+ * first at in[t] + at; or two of each of two rows, where a 2x2 max-pool follows. */
+INLINE void block_$suffix(int32_t sum[16], const scale_t *scales, const uint8_t *const *in,
+                     const int8_t *weights, int taps, int run, int at, int step, int pooled)
+{
+    const int filter = taps * run;
+    int32_t a0 = scales[0].bias, a1 = scales[1].bias, a2 = scales[2].bias, a3 = scales[3].bias;
+    int32_t b0 = a0, b1 = a1, b2 = a2, b3 = a3, c0 = a0, c1 = a1, c2 = a2, c3 = a3;
+    int32_t d0 = a0, d1 = a1, d2 = a2, d3 = a3;
+    for (int t = 0; t < taps; t++) {
+        const $type *x = (const $type *)in[t] + at;
+        const $type *y = pooled ? (const $type *)in[t + taps] + at : x + 2 * step;
+        const int8_t *w = weights + t * run;
+        for (const int8_t *end = w + run / 8 * 8; w != end; x += 8, y += 8, w += 8) {
+            if (!pooled)
+                y = x + 2 * step;
+            FOUR_$suffix(0) FOUR_$suffix(1) FOUR_$suffix(2) FOUR_$suffix(3)
+            FOUR_$suffix(4) FOUR_$suffix(5) FOUR_$suffix(6) FOUR_$suffix(7)
+        }
+        for (int i = 0; i < run % 8; i++)
+            FOUR_$suffix(i)
+    }
+    sum[0] = a0, sum[1] = a1, sum[2] = a2, sum[3] = a3;
+    sum[4] = b0, sum[5] = b1, sum[6] = b2, sum[7] = b3;
+    sum[8] = c0, sum[9] = c1, sum[10] = c2, sum[11] = c3;
+    sum[12] = d0, sum[13] = d1, sum[14] = d2, sum[15] = d3;
+}
+#else
+/* Large cores take several values of a run at once, and two pixels fill their registers. */
+INLINE void pair_$suffix(int32_t sum[8], const scale_t *scales, const uint8_t *const *in,
+                    const int8_t *weights, int taps, int run, int at, int step)
 {
     const int filter = taps * run;
     int32_t a0 = 0, a1 = 0, a2 = 0, a3 = 0, b0 = 0, b1 = 0, b2 = 0, b3 = 0;
     for (int t = 0; t < taps; t++) {
         const $type *x = (const $type *)in[t] + at;
         const int8_t *w = weights + t * run;
-        UNROLL
-        for (int i = 0; i < run; i++) {
-            const int32_t a = x[i], b = x[i + step];
-            const int32_t w0 = w[i], w1 = w[i + filter];
-            const int32_t w2 = w[i + 2 * filter], w3 = w[i + 3 * filter];
-            a0 += a * w0, a1 += a * w1, a2 += a * w2, a3 += a * w3;
-            b0 += b * w0, b1 += b * w1, b2 += b * w2, b3 += b * w3;
-        }
+        for (int i = 0; i < run; i++)
+            PAIR_$suffix(i, x[i], x[i + step], a, b)
     }
     sum[0] = a0, sum[1] = a1, sum[2] = a2, sum[3] = a3;
     sum[4] = b0, sum[5] = b1, sum[6] = b2, sum[7] = b3;
+    for (int k = 0; k < 8; k++)
+        sum[k] += scales[k % 4].bias;
 }
+
+INLINE void block_$suffix(int32_t sum[16], const scale_t *scales, const uint8_t *const *in,
+                     const int8_t *weights, int taps, int run, int at, int step, int pooled)
+{
+    pair_$suffix(sum, scales, in, weights, taps, run, at, step);
+    pair_$suffix(sum + 8, scales, pooled ? in + taps : in, weights, taps, run,
+            pooled ? at : at + 2 * step, step);
+}
+#endif
 

@@ -2,7 +2,7 @@
  * weights held while the row passes. `across` values lie between two taps of a row. */
 INLINE void depthwise_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
                          const scale_t *scales, int cols, int across, int step, int channels,
-                         int low, int high, int wide)
+                         int low, int high, int shift)
 {
     for (int c = 0; c < channels; c++) {
         const int8_t *w = weights + 9 * c;
@@ -12,10 +12,10 @@ INLINE void depthwise_$suffix(const uint8_t *const *in, uint8_t *out, const int8
         const $type *p = (const $type *)in[0] + c, *q = (const $type *)in[1] + c,
                     *r = (const $type *)in[2] + c;
         for (int x = 0; x < cols; x++) {
-            const int32_t sum = p[0] * w0 + p[across] * w1 + p[2 * across] * w2
+            const int32_t sum = scale.bias + p[0] * w0 + p[across] * w1 + p[2 * across] * w2
                                 + q[0] * w3 + q[across] * w4 + q[2 * across] * w5
                                 + r[0] * w6 + r[across] * w7 + r[2 * across] * w8;
-            out[x * channels + c] = clamp(scaled(sum, &scale, wide), low, high);
+            out[x * channels + c] = scaled(sum, scale.multiplier, shift, low, high);
             p += step, q += step, r += step;
         }
     }

@@ -14,25 +14,31 @@
 
 #if defined(__GNUC__)
 #define INLINE static inline __attribute__((always_inline))
+#define APART static __attribute__((noinline))
 #else
 #define INLINE static inline
+#define APART static
 #endif
 
-/* Small cores gain from unrolling, and lose by carrying loads over to the next round;
- * compilers for large ones know better what to do. */
-#if defined(__GNUC__) && !defined(__clang__) && (defined(__riscv) || defined(__arm__))
-#pragma GCC optimize("no-predictive-commoning")
-#define UNROLL _Pragma("GCC unroll 3")
+/* The sums of a block fill the registers of a 32-bit RISC-V: nothing may be loaded ahead of its
+ * turn. Compilers for large cores know better what to do. */
+#if defined(__GNUC__) && !defined(__clang__) && defined(__riscv)
+#pragma GCC optimize("no-predictive-commoning", "no-schedule-insns", "no-tree-coalesce-vars")
+#define SMALL_CORE
+#define IN_ORDER __asm__ volatile("" ::: "memory")
+#define AS_IT_IS(value) __asm__ volatile("" : "+r"(value)) /* to be computed, not to be reasoned about */
 #else
-#define UNROLL
+#define IN_ORDER ((void)0)
+#define AS_IT_IS(value) ((void)0)
 #endif
 
 typedef char shifts_round_down[(-1 >> 1) == -1 ? 1 : -1];
 typedef char state_is_as_stated[sizeof(${prefix}_t) == ${PREFIX}_STATE_BYTES ? 1 : -1];
 
-/* How the sums of one output channel become its values. */
+/* How the sums of one output channel become its values: they begin at the bias, which holds the
+ * half step that rounds. */
 typedef struct {
-    int32_t bias, multiplier, shift;
+    int32_t bias, multiplier;
 } scale_t;
 
 INLINE int32_t smallest(int32_t a, int32_t b)
@@ -40,24 +46,31 @@ INLINE int32_t smallest(int32_t a, int32_t b)
     return a < b ? a : b;
 }
 
-/* Most values need no clamping: one comparison tells. */
-INLINE uint8_t clamp(int32_t value, int32_t low, int32_t high)
+/* Half of what a ReLU sees is negative; other values seldom need clamping, and one comparison
+ * tells. */
+INLINE int32_t clamp(int32_t value, int32_t low, int32_t high)
 {
-    if ((uint32_t)(value - low) <= (uint32_t)(high - low))
-        return (uint8_t)value;
-    return (uint8_t)(value < low ? low : high);
+    if (low == 0 && value < 0)
+        return 0;
+    if ((uint32_t)(value - low) > (uint32_t)(high - low))
+        return value < low ? low : high;
+    return value;
 }
 
-/* (sum * multiplier + 2^(shift - 1)) >> shift. Where every shift of the layer is above 32 the low
- * word of the product has no say, and a multiplication that keeps the high word will do; `wide`
- * layers have others too. */
-INLINE int32_t scaled(int32_t sum, const scale_t *scale, int wide)
+/* What a value of a shortcut adds to a sum. */
+INLINE int32_t gained(int32_t gain, int32_t value)
 {
-    const int64_t product = (int64_t)(sum + scale->bias) * scale->multiplier;
-    if (wide) {
-        const int64_t value = (product + ((int64_t)1 << (scale->shift - 1))) >> scale->shift;
-        return value < -32768 ? -32768 : value > 32767 ? 32767 : (int32_t)value;
-    }
-    return ((int32_t)(product >> 32) + (1 << (scale->shift - 33))) >> (scale->shift - 32);
+    return (gain * value) >> $gain_shift;
+}
+
+/* A value of a sum. `shift` is nearly always 32: a multiplication that keeps the high word. */
+INLINE uint8_t scaled(int32_t sum, int32_t multiplier, int shift, int32_t low, int32_t high)
+{
+    const int64_t value = ((int64_t)sum * multiplier) >> shift;
+    if (shift < 32)
+        return (uint8_t)(value < low ? low : value > high ? high : value);
+    int32_t clamped = clamp((int32_t)value, low, high);
+    AS_IT_IS(clamped);
+    return (uint8_t)clamped;
 }
 

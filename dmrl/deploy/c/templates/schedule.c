@@ -1,6 +1,7 @@
 /* Output row r of a layer needs rows up to r * stride + last of what it reads. */
 typedef struct {
     uint8_t source, other; /* both tensors of a sum; the same one twice otherwise */
+    uint8_t reader;        /* the deepest layer that reads what it makes, or itself */
     int16_t stride, last, rows_in, rows_out;
 } layer_t;
 
@@ -22,7 +23,8 @@ static int ready(const ${prefix}_t *net, int index)
            && net->done[layer->other] > needed;
 }
 
-/* Makes every output row that can be made. */
+/* Makes every output row that can be made: of all layers that are ready the deepest first. Those
+ * below were not before a row was made; those that read the row may be now. */
 static void advance(${prefix}_t *net)
 {
     int layer = $count - 1;
@@ -30,7 +32,7 @@ static void advance(${prefix}_t *net)
         if (ready(net, layer)) {
             compute(net, layer, net->done[layer + 1]);
             net->done[layer + 1]++;
-            layer = $count - 1;
+            layer = layers[layer].reader;
         } else {
             layer--;
         }
@@ -49,12 +51,17 @@ static void fill(uint8_t *out, uint8_t value, size_t count)
 static void copy(uint8_t *out, const uint8_t *values, int count)
 {
     volatile uint8_t *to = out;
+    for (; count >= 4; count -= 4, to += 4, values += 4)
+        to[0] = values[0], to[1] = values[1], to[2] = values[2], to[3] = values[3];
     for (int i = 0; i < count; i++)
         to[i] = values[i];
 }
 
 void ${prefix}_init(${prefix}_t *net)
 {
-    fill((uint8_t *)net, 0, sizeof *net);
+    fill((uint8_t *)net->done, 0, sizeof net->done);
+#if ${PREFIX}_BAYER
+    net->raw_rows = 0;
+#endif
 $pads}
 

@@ -1,0 +1,154 @@
+"""The C of convolutions: which kernel computes a step, and on which rows."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from dmrl.deploy.c.places import RANGES, TYPES, body, plus, read, suffixes, target, values
+from dmrl.deploy.c.plan import Buffer, Plan, Step, along
+from dmrl.deploy.integer import Conv
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """A kernel and the constants of a layer: layers that agree in both share its machine code.
+
+    Parameters
+    ----------
+    name
+        Of the kernel, as its template calls it.
+    shortcut
+        Whether it adds one.
+    constants
+        The arguments that say the layer's shape.
+    """
+
+    name: str
+    shortcut: bool
+    constants: str
+
+
+def templates_of(step: Step, conv: Conv) -> list[str]:
+    """Files of the kernel of a step."""
+    if conv.depthwise:
+        return ["depthwise_along.c" if along(conv) else "depthwise.c"]
+    return ["dense.c", "convolve_pool.c" if step.pooled else "convolve.c"]
+
+
+def shared_kernels(plan: Plan) -> str:
+    """C functions of the kernels, each with its constants."""
+    text = ""
+    for number, kernel in enumerate(_kernels(plan)):
+        kinds = ["const uint8_t *const *in", "uint8_t *out", "const int8_t *weights"]
+        kinds += ["const scale_t *scales"]
+        words = ["in", "out", "weights", "scales"]
+        if kernel.shortcut:
+            kinds += ["const uint8_t *shortcut", "const int32_t *gains"]
+            words += ["shortcut", "gains"]
+        text += (
+            f"APART void convolution_{number}({', '.join(kinds[:3])},\n"
+            f"    {', '.join(kinds[3:])})\n{{\n"
+            f"    {kernel.name}({', '.join(words)},\n        {kernel.constants});\n}}\n\n"
+        )
+    return text
+
+
+def _kernels(plan: Plan) -> list[Kernel]:
+    """Every kernel that some step needs, each once."""
+    return list(dict.fromkeys(kernel for _, kernel in _convolutions(plan)))
+
+
+def _convolutions(plan: Plan) -> Iterator[tuple[int, Kernel]]:
+    for index, step in enumerate(plan.steps):
+        if isinstance(step.layer, Conv):
+            yield index, _kernel(plan, index, step, step.layer)
+
+
+def _kernel(plan: Plan, index: int, step: Step, conv: Conv) -> Kernel:
+    inputs, out = [plan.buffers[k] for k in step.sources], plan.buffers[index + 1]
+    outs, width = conv.weight.shape[0], inputs[0].channels
+    name, stride = TYPES[inputs[0].signed][0], conv.stride * width
+    if conv.depthwise and along(conv):
+        name = f"depthwise_along_{name}"
+        shape = f"/* channels */ {width}, /* dilation */ {conv.dilation}, "
+        shape += f"/* pad */ {conv.pad_value}"
+    elif conv.depthwise:
+        name = f"depthwise_{name}"
+        shape = f"/* across */ {conv.dilation * width}, /* step */ {stride}, /* channels */ {width}"
+    else:
+        name = f"convolve{'_pool' if step.pooled else ''}_{suffixes([b.signed for b in inputs])}"
+        taps = _taps(conv)
+        run = width if taps == conv.kernel**2 else width * conv.kernel
+        shape = f"/* taps */ {taps}, /* run */ {run}, /* step */ {stride}, /* outs */ {outs}"
+    adds = "/* adds */ 1, " if inputs[1:] else "0, 0, /* adds */ 0, "
+    plain = conv.depthwise or step.pooled
+    numbers = f"{'' if plain else adds}/* cols */ {out.cols}, {shape},\n        "
+    numbers += f"/* range */ {RANGES[conv.signed]}, /* shift */ {conv.shift}"
+    return Kernel(name, bool(inputs[1:]), numbers)
+
+
+def _taps(conv: Conv) -> int:
+    """Pointers of a convolution.
+
+    A pointer leads to one row of the kernel, whose columns stand side by side in memory; with
+    dilation they do not, and each weight of the kernel has a pointer of its own.
+    """
+    spread = conv.dilation > 1 and not conv.depthwise and conv.kernel > 1
+    return conv.kernel**2 if spread else conv.kernel
+
+
+def row_of_convolution(plan: Plan, index: int) -> str:
+    """Pointers to what the kernel reads, then its call.
+
+    A pooled step makes two rows at once and so has twice as many pointers.
+    """
+    step, out = plan.steps[index], plan.buffers[index + 1]
+    inputs, conv = [plan.buffers[k] for k in step.sources], step.layer
+    assert isinstance(conv, Conv)
+    source, taps = inputs[0], _taps(conv)
+    count = taps * (2 if step.pooled else 1)
+    row = _row(step.stride, _row_of_pointer(step, conv, taps))
+    padding = 0 if along(conv) else conv.padding
+    start = plus((source.gap - padding) * source.channels)
+    spread = conv.dilation * source.channels
+    column = f" + k % {conv.kernel} * {spread}" if taps > conv.kernel else ""
+    place = f"{read(source, row)}{start}{column}"
+    lines = [f"const uint8_t *const in[1] = {{{place}}};"]
+    if count > 1:
+        lines = [
+            f"const uint8_t *in[{count}];",
+            f"for (int k = 0; k < {count}; k++)",
+            f"    in[k] = {place};",
+        ]
+    return body([*lines, *_call(plan, index, inputs, out)])
+
+
+def _call(plan: Plan, index: int, inputs: list[Buffer], out: Buffer) -> list[str]:
+    name, kernel = plan.steps[index].name, dict(_convolutions(plan))[index]
+    number = _kernels(plan).index(kernel)
+    call = f"convolution_{number}(in, {target(out)}, {name}_weights, {name}_scales"
+    if kernel.shortcut:
+        return [f"{call},", f"    {values(inputs[1])}, {name}_gains);"]
+    return [f"{call});"]
+
+
+def _row(factor: int, offset: str) -> str:
+    """Input row of output row ``row``."""
+    return (f"{factor} * row" if factor > 1 else "row") + offset
+
+
+def _row_of_pointer(step: Step, conv: Conv, taps: int) -> str:
+    """Input row of pointer ``k``, counted from the first row under the kernel."""
+    terms = [f" - {conv.padding}"] if conv.padding else []
+    within = f"k % {taps}" if step.pooled else "k"
+    if taps > conv.kernel:
+        terms.append(f" + {within} / {conv.kernel} * {conv.dilation}")
+    elif conv.kernel > 1:
+        terms.append(f" + {within}{_times(conv.dilation)}")
+    if step.pooled:
+        output = f"k / {taps}" if taps > 1 else "k"
+        terms.append(f" + {output}{_times(conv.stride)}")
+    return "".join(terms)
+
+
+def _times(factor: int) -> str:
+    return f" * {factor}" if factor > 1 else ""

@@ -1,0 +1,49 @@
+/* The sum of nine products: three columns of three rows. */
+#define NINE(a, b, c)                                                             \
+    (bias + (a##0 * w0 + b##0 * w1 + c##0 * w2) + (a##1 * w3 + b##1 * w4 + c##1 * w5) \
+     + (a##2 * w6 + b##2 * w7 + c##2 * w8))
+
+/* One output row of a depthwise 3x3 convolution of stride 1, with as much padding as dilation.
+ * Every channel is convolved alone, its nine weights held while the row passes, and so are two of
+ * the three columns: of columns `dilation` apart each is loaded once. What lies left and right
+ * of the row reads as `pad`. */
+INLINE void depthwise_along_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
+                               const scale_t *scales, int cols, int channels, int dilation,
+                               int pad, int low, int high, int shift)
+{
+    const int step = dilation * channels;
+    for (int c = 0; c < channels; c++) {
+        const int8_t *w = weights + 9 * c;
+        const int32_t w0 = w[0], w1 = w[1], w2 = w[2], w3 = w[3], w4 = w[4], w5 = w[5], w6 = w[6],
+                      w7 = w[7], w8 = w[8];
+        const int32_t bias = scales[c].bias, multiplier = scales[c].multiplier;
+        for (int first = 0; first < dilation && first < cols; first++) {
+            const int at = first * channels + c;
+            const $type *p = (const $type *)in[0] + at, *q = (const $type *)in[1] + at,
+                        *r = (const $type *)in[2] + at;
+            uint8_t *to = out + at;
+            int32_t a0 = pad, a1 = pad, a2 = pad, b0 = p[0], b1 = q[0], b2 = r[0], c0, c1, c2;
+            int left = (cols - 1 - first) / dilation; /* columns to the right of b */
+            for (; left >= 3; left -= 3) {
+                p += 3 * step, q += 3 * step, r += 3 * step, to += 3 * step;
+                AS_IT_IS(p); AS_IT_IS(q); AS_IT_IS(r); AS_IT_IS(to);
+                c0 = p[-2 * step], c1 = q[-2 * step], c2 = r[-2 * step];
+                to[-3 * step] = scaled(NINE(a, b, c), multiplier, shift, low, high);
+                a0 = p[-step], a1 = q[-step], a2 = r[-step];
+                to[-2 * step] = scaled(NINE(b, c, a), multiplier, shift, low, high);
+                b0 = p[0], b1 = q[0], b2 = r[0];
+                to[-step] = scaled(NINE(c, a, b), multiplier, shift, low, high);
+            }
+            for (; left >= 0; left--) {
+                p += step, q += step, r += step;
+                c0 = c1 = c2 = pad;
+                if (left)
+                    c0 = p[0], c1 = q[0], c2 = r[0];
+                to[0] = scaled(NINE(a, b, c), multiplier, shift, low, high);
+                a0 = b0, a1 = b1, a2 = b2, b0 = c0, b1 = c1, b2 = c2;
+                to += step;
+            }
+        }
+    }
+}
+
