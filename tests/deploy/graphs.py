@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from dmrl.deploy.equalise import equalise
@@ -13,6 +14,7 @@ from dmrl.deploy.graph import (
     FloatLayer,
     FloatPool,
     Graph,
+    graph_of,
     tensors_of,
     to_input,
 )
@@ -20,6 +22,8 @@ from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.deploy.rounding import moments_of
+from dmrl.learn.network import build
+from dmrl.learn.trace import operations
 
 SUB_CELL = ("log_depth", "confidence", "offset_u", "offset_v")
 
@@ -109,3 +113,13 @@ def quantised_network(seed: int) -> IntegerNetwork:
     graph, ranges = equalise(graph, calibrate(graph, [rgb]))
     about = About("random", "random", 8, channels, 0.3)
     return quantise(graph, ranges, about, moments_of(graph, rgb))
+
+
+def untrained(name: str, width_px: int = 320, height_px: int = 224) -> IntegerNetwork:
+    """An architecture in int8."""
+    with torch.random.fork_rng(devices=[]):
+        network = build(name).eval()
+    graph = graph_of(operations(network))
+    images = np.random.default_rng(0).integers(0, 256, (1, height_px, width_px, 3), np.uint8)
+    about = About(name, name, network.stride_px, network.channels, 0.3)
+    return quantise(graph, calibrate(graph, [images]), about)

@@ -161,6 +161,23 @@ def test_the_shift_is_32_where_the_high_word_will_do(
     assert (multiplier, shift) == wanted
 
 
+@pytest.mark.parametrize("shortcut", [False, True])
+def test_sums_are_rounded_to_the_nearest_level(shortcut: bool) -> None:
+    """By half a level at most and not to one side, but for what weights of 8 bits lose."""
+    first, head = small().layers
+    assert isinstance(first, FloatConv)
+    sources = (1, 1) if shortcut else (1,)
+    second = FloatConv("second", sources, np.eye(4)[:, :, None, None], np.zeros(4), relu=True)
+    graph = Graph((first, second, replace(head, sources=(2,))), ((3, 0), (3, 1)))
+    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
+    _, before, after, _ = reference.tensors_of(network, NOISE[0])
+    one, two = network.layers[:2]
+    wanted = before * one.scale * (2 if shortcut else 1) / two.scale
+    beside = (after - wanted)[(after > 0) & (after < 255)]
+    assert np.abs(beside).max() < 0.6
+    assert abs(beside.mean()) < 0.05
+
+
 def test_the_largest_value_that_was_seen_has_the_last_level() -> None:
     """Unsigned tensors use all of 0 to 255, signed ones -127 to 127."""
     rng = np.random.default_rng(2)

@@ -88,9 +88,9 @@ def test_rates_are_images_a_second() -> None:
     )
     assert len(rates(network, Cost(1, 2, None), 1)) == len(rates(network, None, 1)) == 1
     assert not any("L1" in assumed for _, assumed in both)
-    over = rates(network, Cost(1, 2, 3), 114_810)
+    over = rates(network, Cost(1, 2, 3), 102_138)
     assert all(
-        "L2, where 114,810 bytes of state lie that do not fit L1" in said for _, said in over
+        "L2, where 102,138 bytes of state lie that do not fit L1" in said for _, said in over
     )
 
 

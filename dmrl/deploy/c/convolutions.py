@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from dmrl.deploy.c.places import RANGES, TYPES, body, plus, read, suffixes, target, values
-from dmrl.deploy.c.plan import Buffer, Plan, Step, along
+from dmrl.deploy.c.plan import Buffer, Plan, along
+from dmrl.deploy.c.rings import Step
 from dmrl.deploy.integer import Conv
 
 

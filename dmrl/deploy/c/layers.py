@@ -6,7 +6,8 @@ import numpy as np
 
 from dmrl.deploy.c.convolutions import row_of_convolution, templates_of
 from dmrl.deploy.c.places import RANGES, TYPES, body, plus, read, suffixes, target, values
-from dmrl.deploy.c.plan import Buffer, Plan, Step
+from dmrl.deploy.c.plan import Buffer, Plan
+from dmrl.deploy.c.rings import Step
 from dmrl.deploy.c.text import array, fill
 from dmrl.deploy.integer import Add, Conv, MaxPool
 from dmrl.errors import ModelError

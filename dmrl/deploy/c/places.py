@@ -20,7 +20,11 @@ def slot(buffer: Buffer) -> str:
     """Where row ``row`` begins in a ring, its padding first."""
     if buffer.ring == 1:
         return f"net->{buffer.home}"
-    place = "row" if buffer.ring >= buffer.rows else f"row % {buffer.ring}"
+    place = f"row % {buffer.ring}"
+    if buffer.shift:
+        place = f"(row + {buffer.shift}) % {buffer.ring}"
+    elif buffer.ring >= buffer.rows:
+        place = "row"
     return f"net->{buffer.home} + {place} * {buffer.row_bytes}"
 
 

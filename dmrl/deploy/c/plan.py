@@ -1,14 +1,14 @@
-"""What the C of a network does row by row: its steps, its buffers, and how many rows each holds.
+"""What the C of a network does row by row: its steps, its buffers, and where these lie.
 
 A convolution that only a max-pool reads becomes one step with it. Every tensor between two
-steps is a ring of its newest rows. After each row of the image the deepest step that has the
-rows it needs makes one output row, until none has: `play` plays this through and counts.
+steps is a ring of its newest rows, see `rings`.
 """
 
 import re
 from dataclasses import dataclass, replace
 
-from dmrl.deploy.integer import AnyLayer, Conv, IntegerNetwork, MaxPool, Shape
+from dmrl.deploy.c.rings import Step, Write, needed_together, play, rows_held, shared_ring
+from dmrl.deploy.integer import Conv, IntegerNetwork, MaxPool, Shape
 from dmrl.errors import ModelError
 
 LONGEST_SIDE = 4096
@@ -38,6 +38,8 @@ class Buffer:
         Rows held at a time.
     signed
         Whether it holds int8.
+    shift
+        Place in the ring of row 0: several buffers may take turns in one.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Buffer:
     above: bool
     ring: int
     signed: bool
+    shift: int = 0
 
     @property
     def row_bytes(self) -> int:
@@ -60,48 +63,6 @@ class Buffer:
     def size(self) -> int:
         """Bytes of the whole ring."""
         return self.ring * self.row_bytes + self.gap * self.channels
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One output row at a time of a layer, or of a convolution and the max-pool after it.
-
-    Parameters
-    ----------
-    name
-        C identifier.
-    layer
-        What is computed.
-    pooled
-        Whether a 2x2 max-pool follows within the step.
-    sources
-        Buffers it reads; it writes the buffer after its own index.
-    """
-
-    name: str
-    layer: AnyLayer
-    pooled: bool
-    sources: tuple[int, ...]
-
-    @property
-    def stride(self) -> int:
-        """Input rows between two output rows."""
-        if isinstance(self.layer, Conv):
-            return self.layer.stride * (2 if self.pooled else 1)
-        return 2 if isinstance(self.layer, MaxPool) else 1
-
-    @property
-    def first(self) -> int:
-        """First input row that output row 0 reads; negative in the padding."""
-        return -self.layer.padding if isinstance(self.layer, Conv) else 0
-
-    @property
-    def last(self) -> int:
-        """Last input row that output row 0 reads."""
-        if isinstance(self.layer, Conv):
-            rows = self.layer.dilation * (self.layer.kernel - 1) - self.layer.padding
-            return rows + (self.layer.stride if self.pooled else 0)
-        return 1 if isinstance(self.layer, MaxPool) else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,15 +100,51 @@ def plan(network: IntegerNetwork) -> Plan:
     steps, tensors = _steps(network)
     shapes = [network.shapes[tensors.index(k)] for k in range(len(steps) + 1)]
     whole = {tensors[h.tensor] for h in network.heads.values()}
-    played = play(steps, [rows for _, rows, _ in shapes])
-    drafts = [_buffer(k, shapes[k], played.rings[k], steps) for k in range(len(shapes))]
+    writes = play(steps, [rows for _, rows, _ in shapes])
+    rings = rows_held(writes, len(shapes))
+    drafts = [_buffer(k, shapes[k], rings[k], steps) for k in range(len(shapes))]
     drafts = [replace(d, ring=d.rows) if k in whole else d for k, d in enumerate(drafts)]
     passing = [
         k for k, d in enumerate(drafts) if k and k not in whole and d.ring == 1 and not d.gap
     ]
-    homes = _homes(passing, played.together)
+    homes = _homes(passing, needed_together(writes))
     buffers = [replace(d, home=homes.get(k, d.name)) for k, d in enumerate(drafts)]
+    for chain in _chains(steps, buffers, whole):
+        buffers = _joined(buffers, chain, writes)
     return Plan(network, tuple(steps), tuple(buffers), tuple(tensors))
+
+
+def _chains(steps: list[Step], buffers: list[Buffer], whole: set[int]) -> list[list[int]]:
+    """Buffers whose rows may lie in one ring: each is written by a step that reads the one before.
+
+    Their rows are of one size. Where a step has a shortcut, that is the one before.
+    """
+    chains: list[list[int]] = []
+    for out, step in enumerate(steps, start=1):
+        source = step.sources[-1]
+        pair = [buffers[source], buffers[out]]
+        sizes = {(b.channels, b.rows, b.cols, b.pad_value) for b in pair}
+        if len(sizes) > 1 or source == 0 or out in whole or min(b.ring for b in pair) < 2:
+            continue
+        chain = next((c for c in chains if c[-1] == source), None)
+        if chain is None and not any(source in c for c in chains):
+            chains.append(chain := [source])
+        if chain is not None:
+            chain.append(out)
+    return chains
+
+
+def _joined(buffers: list[Buffer], chain: list[int], writes: list[Write]) -> list[Buffer]:
+    """The buffers, those of a chain in one ring if that is smaller."""
+    ring, shifts = shared_ring(chain, writes)
+    gap, first = max(buffers[k].gap for k in chain), buffers[chain[0]]
+    joined = {
+        k: replace(buffers[k], home=first.home, gap=gap, ring=ring, shift=shift)
+        for k, shift in zip(chain, shifts, strict=True)
+    }
+    if joined[chain[0]].size >= sum(buffers[k].size for k in chain):
+        return buffers
+    return [joined.get(k, b) for k, b in enumerate(buffers)]
 
 
 def _homes(passing: list[int], together: set[tuple[int, int]]) -> dict[int, str]:
@@ -210,66 +207,6 @@ struct switch typedef union unsigned void volatile while
 """Words of C, and other members of the state."""
 SHARED = "passing_"
 """How members begin that several buffers share."""
-
-
-@dataclass(frozen=True, slots=True)
-class Played:
-    """What became of the buffers while the rows of an image came.
-
-    Parameters
-    ----------
-    rings
-        Rows that each must hold at a time: from the oldest still needed to the newest.
-    together
-        (a, b): the newest row of b was still needed when a row of a was written.
-    """
-
-    rings: list[int]
-    together: set[tuple[int, int]]
-
-
-def play(steps: list[Step], rows: list[int]) -> Played:
-    """Play an image through, row by row.
-
-    Parameters
-    ----------
-    steps
-        The steps; step i writes buffer i + 1.
-    rows
-        Rows of every buffer's tensor.
-    """
-    done = [0] * len(rows)
-    readers = [[k for k, s in enumerate(steps) if b in s.sources] for b in range(len(rows))]
-    played = Played([1] * len(rows), set())
-
-    def oldest_needed(buffer: int) -> int:
-        """First row that a reader has yet to read; as many as there are: none."""
-        pending = [k for k in readers[buffer] if done[k + 1] < rows[k + 1]]
-        starts = [done[k + 1] * steps[k].stride + steps[k].first for k in pending]
-        return max(min(starts, default=rows[buffer]), 0)
-
-    def write(buffer: int) -> None:
-        needed = {b for b in range(1, len(rows)) if oldest_needed(b) < done[b]}
-        played.together.update((buffer, b) for b in needed - {buffer})
-        done[buffer] += 1
-        held = done[buffer] - oldest_needed(buffer)
-        played.rings[buffer] = max(played.rings[buffer], held)
-
-    for _ in range(rows[0]):
-        write(0)
-        while (step := _deepest_ready(steps, rows, done)) is not None:
-            write(step + 1)
-    return played
-
-
-def _deepest_ready(steps: list[Step], rows: list[int], done: list[int]) -> int | None:
-    for index in range(len(steps) - 1, -1, -1):
-        step, row = steps[index], done[index + 1]
-        if row < rows[index + 1] and all(
-            done[k] > min(row * step.stride + step.last, rows[k] - 1) for k in step.sources
-        ):
-            return index
-    return None
 
 
 def along(conv: Conv) -> bool:

@@ -160,11 +160,9 @@ def _schedule(planned: Plan, names: dict[str, str]) -> str:
         table += f"    {{{', '.join(map(str, numbers))}}}, /* {step.name} */\n"
         cases += f"    case {k}: make_{step.name}(net, row); break;\n"
     image, pads = planned.buffers[0], ""
-    for buffer in planned.buffers:
-        if buffer.gap:
-            pads += (
-                f"    fill(net->{buffer.home}, {buffer.pad_value}, sizeof net->{buffer.home});\n"
-            )
+    padded = {b.home: b.pad_value for b in planned.buffers if b.gap}
+    for home, value in padded.items():
+        pads += f"    fill(net->{home}, {value}, sizeof net->{home});\n"
     if _has_pad(image):
         pads += f"    fill(net->image_pad, {image.pad_value}, sizeof net->image_pad);\n"
     return fill(
@@ -246,8 +244,11 @@ def _members(planned: Plan) -> str:
     lines += ["#if @_BAYER", "    int16_t raw_rows;", "    uint8_t raw[3][@_WIDTH];", "#endif"]
     for name, size in planned.homes.items():
         held = [b for b in planned.buffers if b.home == name]
-        shared = f"rows of {len(held)} layers, each read at once by the next"
-        text = _columns(held[0]) if len(held) == 1 else shared
+        text = _columns(held[0])
+        if len(held) > 1 and held[0].ring > 1:
+            text = f"{held[0].ring} rows of {len(held)} layers, which take turns"
+        elif len(held) > 1:
+            text = f"rows of {len(held)} layers, each read at once by the next"
         lines.append(f"    uint8_t {name}[{size}]; /* {text} */")
     if _has_pad(planned.buffers[0]):
         lines.append(f"    uint8_t image_pad[{_pad_bytes(planned)}];")

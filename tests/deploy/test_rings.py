@@ -1,0 +1,55 @@
+"""Where the C keeps its rows."""
+
+import pytest
+
+from dmrl.deploy.c.plan import plan
+from dmrl.deploy.c.rings import Step, play, rows_held, shared_ring
+from dmrl.deploy.integer import Conv
+
+from .graphs import quantised_network, untrained
+from .networks import random_network
+
+NETWORKS = [*map(random_network, range(12)), *map(quantised_network, range(24))]
+
+
+@pytest.mark.heavy
+def test_what_is_still_needed_is_never_overwritten() -> None:
+    joined = 0
+    for network in [*NETWORKS, untrained("dmrl-nano", 64, 96), untrained("dmrl-nano-l1", 64, 96)]:
+        planned = plan(network)
+        buffers = planned.buffers
+        joined += sum(b.shift > 0 for b in buffers)
+        held: dict[tuple[str, int], tuple[int, int]] = {}
+        for write in play(list(planned.steps), [b.rows for b in buffers]):
+            b = buffers[write.buffer]
+            held[b.home, (write.row + b.shift) % b.ring] = (write.buffer, write.row)
+            for k, other in enumerate(buffers):
+                last = write.done[k] + (k == write.buffer)
+                for row in range(write.oldest[k], last):
+                    assert held[other.home, (row + other.shift) % other.ring] == (k, row)
+    assert joined > 5
+
+
+def conv(**more: int) -> Conv:
+    """Of a 3x3 kernel; its numbers do not matter."""
+    layer = next(c for n in NETWORKS for c in n.layers if isinstance(c, Conv) and c.kernel == 3)
+    fields = {name: getattr(layer, name) for name in layer.__slots__}
+    return Conv(**{**fields, "stride": 1, "dilation": 1, "padding": 1, **more})
+
+
+@pytest.mark.parametrize("dilation", [1, 2, 5])
+def test_a_convolution_reads_what_it_would_overwrite_so_two_in_a_row_gain_nothing(
+    dilation: int,
+) -> None:
+    spread = conv(dilation=dilation, padding=dilation)
+    steps = [Step(f"s{k}", spread, pooled=False, sources=(k,)) for k in range(3)]
+    writes = play(steps, [20] * 4)
+    assert rows_held(writes, 4)[1:3] == [2 * dilation + 1] * 2
+    assert shared_ring([1, 2], writes) == (4 * dilation + 2, [0, 3 * dilation + 1])
+
+
+def test_rows_are_made_as_soon_as_they_can_be() -> None:
+    writes = play([Step("s", conv(stride=2), pooled=False, sources=(0,))], [6, 3])
+    assert [(w.buffer, w.row) for w in writes] == [
+        (0, 0), (0, 1), (1, 0), (0, 2), (0, 3), (1, 1), (0, 4), (0, 5), (1, 2),
+    ]  # fmt: skip
