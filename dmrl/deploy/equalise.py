@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.graph import FloatConv, FloatPool, Graph
+from dmrl.deploy.graph import FloatConv, Graph
 from dmrl.deploy.ranges import Ranges
 
 Array = NDArray[np.float64]
@@ -25,51 +25,46 @@ MOST = 32.0
 def equalise(graph: Graph, ranges: Ranges) -> tuple[Graph, Ranges]:
     """The same network with like ranges of channels, and its ranges.
 
-    Channels of a tensor are scaled where a convolution gives it and convolutions alone, or
-    max-pools on the way to them, read it; a sum needs its two tensors as they are.
+    Tensors that a sum or a max-pool ties together are divided by the same factors, which the
+    convolutions that read them make good. The image and the results stay as they are, and so does
+    what is tied to them.
     """
     convs = {k: layer for k, layer in enumerate(graph.layers) if isinstance(layer, FloatConv)}
-    alone = [k for k, layer in convs.items() if len(layer.sources) == 1]
     low, high = list(ranges.low), list(ranges.high)
-    for index in alone:
-        passed, readers = _followed(graph, index + 1)
-        if not readers:
+    fixed = {0, *(tensor for tensor, _ in graph.outputs)}
+    for tensors in _tied(graph):
+        readers = [k for k, layer in convs.items() if layer.sources[0] in tensors]
+        if fixed & tensors or not readers:
             continue
-        factor = _factor(high[index + 1] - low[index + 1], [convs[k] for k in readers])
-        convs[index] = _output_divided(convs[index], factor)
+        spans = [high[tensor] - low[tensor] for tensor in sorted(tensors)]
+        factor = _factor(spans, [convs[k] for k in readers])
+        for tensor in tensors:
+            low[tensor], high[tensor] = low[tensor] / factor, high[tensor] / factor
+            if tensor - 1 in convs:
+                convs[tensor - 1] = _output_divided(convs[tensor - 1], factor)
         for k in readers:
             convs[k] = _input_multiplied(convs[k], factor)
-        for tensor in passed:
-            low[tensor], high[tensor] = low[tensor] / factor, high[tensor] / factor
     layers = [convs.get(k, layer) for k, layer in enumerate(graph.layers)]
     return replace(graph, layers=tuple(layers)), replace(ranges, low=tuple(low), high=tuple(high))
 
 
-def _followed(graph: Graph, tensor: int) -> tuple[list[int], list[int]]:
-    """The tensor and its pooled forms, and the convolutions that read them; none if others do."""
-    if any(tensor == output for output, _ in graph.outputs):
-        return [], []
-    passed, convs = [tensor], []
-    for k, layer in enumerate(graph.layers):
-        if tensor not in layer.sources:
-            continue
-        if isinstance(layer, FloatConv) and tensor not in layer.sources[1:]:
-            convs.append(k)
-        elif isinstance(layer, FloatPool):
-            more, further = _followed(graph, k + 1)
-            if not further:
-                return [], []
-            passed += more
-            convs += further
-        else:
-            return [], []
-    return passed, convs
+def _tied(graph: Graph) -> list[set[int]]:
+    """All tensors, in sets whose channels must have the same factors, in the order of computing."""
+    sets = [{tensor} for tensor in range(len(graph.layers) + 1)]
+    for tensor, layer in enumerate(graph.layers, start=1):
+        for other in layer.sources[1:] if isinstance(layer, FloatConv) else layer.sources:
+            if sets[other] is not sets[tensor]:
+                sets[tensor] |= sets[other]
+                for member in sets[tensor]:
+                    sets[member] = sets[tensor]
+    return [each for tensor, each in enumerate(sets) if tensor == min(each)]
 
 
-def _factor(span: Array, readers: list[FloatConv]) -> Array:
+def _factor(spans: list[Array], readers: list[FloatConv]) -> Array:
     """(channels,) what each channel is divided by; its largest channel stays as it is."""
     read = np.max([_read_by(layer) for layer in readers], axis=0)
-    ratio = _relative(span) ** SHARE / _relative(read) ** (1 - SHARE)
+    span = np.max([_relative(span) for span in spans], axis=0)
+    ratio = span**SHARE / _relative(read) ** (1 - SHARE)
     factor: Array = np.clip(ratio, 1 / MOST, MOST)
     return factor
 

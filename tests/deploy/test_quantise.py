@@ -71,6 +71,23 @@ def test_equalising_changes_nothing_but_the_ranges() -> None:
     assert moved > 20
 
 
+def test_channels_along_a_residual_block_have_like_ranges() -> None:
+    rng = np.random.default_rng(0)
+    size = np.array([1, 0.1, 0.01, 0.3])
+    first = FloatConv("first", (0,), size[:, None, None, None] * rng.normal(0, 1, (4, 3, 3, 3)),
+                      np.zeros(4), padding=1, relu=True)  # fmt: skip
+    block = FloatConv("block", (1, 1), size[:, None, None, None] * rng.normal(0, 1, (4, 4, 1, 1)),
+                      np.zeros(4), relu=True)  # fmt: skip
+    head = FloatConv("head", (2,), rng.normal(0, 0.5, (2, 4, 1, 1)), np.zeros(2))
+    graph = Graph((first, block, head), ((3, 0), (3, 1)))
+    ranges = calibrate(graph, [NOISE])
+    _, even = equalise(graph, ranges)
+    for tensor in (1, 2):
+        before, after = (np.ptp(np.log(each.high[tensor])) for each in (ranges, even))
+        assert before > 4
+        assert after < before / 3
+
+
 def test_a_bias_that_outweighs_its_channel_still_fits() -> None:
     graph = small(weight=1e-7, bias=3.0)
     network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
