@@ -85,7 +85,7 @@ def test_channels_along_a_residual_block_have_like_ranges() -> None:
     for tensor in (1, 2):
         before, after = (np.ptp(np.log(each.high[tensor])) for each in (ranges, even))
         assert before > 4
-        assert after < before / 3
+        assert after < before / 2
 
 
 def test_a_bias_that_outweighs_its_channel_still_fits() -> None:
