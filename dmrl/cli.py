@@ -4,6 +4,7 @@ A command's flags and help come from the function that the table names; errors a
 act on become one line and exit status 1.
 """
 
+import gc
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -132,6 +133,7 @@ def main() -> NoReturn:
 
 def help_of(name: str) -> None:
     """Print a command's help; load nothing that only its work needs."""
+    gc.disable()  # it prints a page and ends: what it loads is not worth looking through
     standins.install()
     app.help_print([name])
 
