@@ -15,19 +15,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from dmrl.learn.batches import BOX, DEPTH, FIELDS, Batch, Examples, Robots, U, V
 from dmrl.learn.windows import (
     CORNERS,
     Intrinsics,
+    Opacity,
+    Pixels,
     Point,
     Rect,
     Rng,
     Window,
+    blended,
+    defocused,
     feather,
     flat,
+    grained,
+    greyed,
     inside,
+    levelled,
     moved,
     parts,
     present,
@@ -46,7 +52,6 @@ FOCUS_SHARE = 0.8
 """Share of mosaic windows that hold a robot of their image; the rest fall where they may."""
 LEAST_AHEAD = 0.25
 """Least over greatest depth, along the source's axis, of what a turned camera's corners see."""
-LUMA = torch.tensor([0.299, 0.587, 0.114])
 DEPTH_SLACK = 1.1
 """How far beyond the nearest and the farthest label zooming may bring a robot."""
 
@@ -128,12 +133,8 @@ class Augmenter:
             else (0.0, math.inf)
         )
         self._pasteable = np.argwhere(there & np.isfinite(robots[..., BOX]).all(axis=-1))
-        self._grain = torch.empty(0)
-        if settings.noise:
-            grain = np.random.default_rng([seed, 1]).standard_normal(
-                2 * self._height * self._width * 3, np.float32
-            )
-            self._grain = torch.from_numpy(grain)
+        numbers = 2 * self._height * self._width * 3 if settings.noise else 0
+        self._grain = np.random.default_rng([seed, 1]).standard_normal(numbers, np.float32)
 
     def batch(self, chosen: Sequence[int] | NDArray[np.int64], *, epoch: int, index: int) -> Batch:
         """An augmented batch: one canvas for each of the chosen images.
@@ -146,15 +147,14 @@ class Augmenter:
             The epoch, and the batch's place in it.
         """
         rng = np.random.default_rng([self._seed, epoch, index])
-        canvas = torch.empty(len(chosen), self._height, self._width, 3)
+        canvas = np.empty((len(chosen), self._height, self._width, 3), np.uint8)
         robots = np.full((len(chosen), MAX_ROBOTS, len(FIELDS)), np.nan, np.float32)
         for slot, number in enumerate(chosen):
             found = self._draw(canvas[slot], int(number), rng)
             robots[slot, : min(len(found), MAX_ROBOTS)] = found[:MAX_ROBOTS]
-        pixels = canvas.clamp_(0, 255).to(torch.uint8)
-        return Batch(pixels.permute(0, 3, 1, 2), torch.from_numpy(robots))
+        return Batch(torch.from_numpy(canvas).permute(0, 3, 1, 2), torch.from_numpy(robots))
 
-    def _draw(self, canvas: Tensor, number: int, rng: Rng) -> Robots:
+    def _draw(self, canvas: Pixels, number: int, rng: Rng) -> Robots:
         """Fill a canvas (H, W, 3); returns (n, 11) the robots in it."""
         robots = np.empty((0, len(FIELDS)), np.float32)
         whole = (0, 0, self._width, self._height)
@@ -168,7 +168,7 @@ class Augmenter:
         self._spoil(canvas, rng)
         return robots
 
-    def _layer(self, canvas: Tensor, rect: Rect, source: int, robots: Robots, rng: Rng) -> Robots:
+    def _layer(self, canvas: Pixels, rect: Rect, source: int, robots: Robots, rng: Rng) -> Robots:
         """Show a window of a source in a rectangle; the robots of the canvas after it."""
         width, height = rect[2] - rect[0], rect[3] - rect[1]
         mine = present(self._examples.robots[source])
@@ -190,7 +190,7 @@ class Augmenter:
         window = self._window(turn, zoom, seen, shown, rect)
         return self._show(canvas, rect, source, window, mine, robots, rng)
 
-    def _patch(self, canvas: Tensor, robots: Robots, rng: Rng) -> Robots:
+    def _patch(self, canvas: Pixels, robots: Robots, rng: Rng) -> Robots:
         """Paste a robot of another image, or as much without one.
 
         Along its mask where that is known, else with what is close around it. Without patches
@@ -220,7 +220,8 @@ class Augmenter:
             opacity = feather(int(size[1]), int(size[0]))
         else:
             about = self._window(turn, zoom, middle, size / 2, rect)
-            opacity = sample(255 * mask, about, (int(size[1]), int(size[0]))) / 255
+            shown = sample(255 * mask, about, (int(size[1]), int(size[0])))
+            opacity = np.asarray(shown / np.float32(255), np.float32)
         mine = present(self._examples.robots[source])
         return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
 
@@ -250,30 +251,27 @@ class Augmenter:
             corner = np.array(rect[:2], float)
             matrix = turned(camera, turn, seen, shown, corner)
             size = np.array([rect[2] - rect[0], rect[3] - rect[1]])
-            ahead = np.column_stack([CORNERS * size, np.ones(4)]) @ matrix[2]
+            ahead = CORNERS * size @ matrix[2, :2] + matrix[2, 2]
             if ahead.min() > LEAST_AHEAD * ahead.max():
                 return Window(matrix, zoom, camera)
         return Window(flat(turn, seen, shown), zoom)
 
     def _show(
         self,
-        canvas: Tensor,
+        canvas: Pixels,
         rect: Rect,
         source: int,
         window: Window,
         mine: Robots,
         robots: Robots,
         rng: Rng,
-        opacity: Tensor | None = None,
+        opacity: Opacity | None = None,
     ) -> Robots:
         left, top, right, bottom = rect
         pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
-        self._tint(pixels, rng)
+        pixels = self._tinted(pixels, rng)
         place = canvas[top:bottom, left:right]
-        if opacity is None:
-            place.copy_(pixels)
-        else:
-            place.lerp_(pixels, opacity)
+        place[:] = pixels if opacity is None else blended(place, pixels, opacity)
         seen = moved(mine, window, rect)
         kept = robots[~under(robots, rect, opacity)]
         return np.concatenate([kept, seen[under(seen, rect, opacity) & self._in_source(mine)]])
@@ -281,24 +279,21 @@ class Augmenter:
     def _in_source(self, robots: Robots) -> NDArray[np.bool_]:
         return inside(robots, (0, 0, self._width, self._height))
 
-    def _tint(self, pixels: Tensor, rng: Rng) -> None:
-        """Other contrast, brightness and white balance, in place; 0 to 255."""
-        if spread := self._settings.colour:
-            gain = np.exp(rng.normal(0, spread, 1) + rng.normal(0, spread / 2, 3))
-            lift = 128 * (1 - gain) + rng.normal(0, 128 * spread, 1)
-            pixels.mul_(torch.from_numpy(gain.astype(np.float32)))
-            pixels.add_(torch.from_numpy(lift.astype(np.float32)))
+    def _tinted(self, pixels: Pixels, rng: Rng) -> Pixels:
+        """With other contrast, brightness and white balance."""
+        spread = self._settings.colour
+        if not spread:
+            return pixels
+        gain = np.exp(rng.normal(0, spread, 1) + rng.normal(0, spread / 2, 3))
+        return levelled(pixels, gain, 128 * (1 - gain) + rng.normal(0, 128 * spread, 1))
 
-    def _spoil(self, canvas: Tensor, rng: Rng) -> None:
+    def _spoil(self, canvas: Pixels, rng: Rng) -> None:
         """Defocus, sensor noise and the loss of colours, in place."""
         if rng.random() < self._settings.blur_share:
-            share = rng.uniform(0.1, 1 / 3)
-            for lines in (canvas, canvas.transpose(0, 1)):
-                beside = lines[:-2] + lines[2:]
-                lines[1:-1].mul_(1 - 2 * share).add_(beside, alpha=share)
+            canvas[:] = defocused(canvas, rng.uniform(0.1, 1 / 3))
         if self._settings.noise:
-            at = int(rng.integers(len(self._grain) - canvas.numel()))
-            grain = self._grain[at : at + canvas.numel()].view(canvas.shape)
-            canvas.add_(grain, alpha=255 * self._settings.noise * rng.random())
+            at = int(rng.integers(len(self._grain) - canvas.size))
+            grain = self._grain[at : at + canvas.size]
+            canvas[:] = grained(canvas, grain, 255 * self._settings.noise * rng.random())
         if self._settings.grey_share and rng.random() < self._settings.grey_share:
-            canvas.copy_((canvas @ LUMA)[..., None].expand_as(canvas))
+            canvas[:] = greyed(canvas)

@@ -5,9 +5,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from dmrl.learn.batches import BOX, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, Robots, U, V
 
@@ -18,9 +16,14 @@ CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 _HOW = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
 _BEYOND = cv2.BORDER_REPLICATE
 _MIDDLE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+_CHANNELS = np.arange(3)
+_TO_MIDDLE = np.linalg.inv(_MIDDLE)
 cv2.setNumThreads(1)  # a window is small, and the cores are torch's
 
 Rng = np.random.Generator
+Pixels = NDArray[np.uint8]
+Opacity = NDArray[np.float32]
+"""(h, w, 1), 0 to 1."""
 Point = NDArray[np.float64]
 """(2,) u and v, pixels."""
 Rect = tuple[int, int, int, int]
@@ -75,10 +78,11 @@ def turned(
     """
     fx, fy, cx, cy = camera
     k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    rays_of = np.array([[1 / fx, 0, -cx / fx], [0, 1 / fy, -cy / fy], [0, 0, 1.0]])
     about = np.eye(3)
     about[:2, :2] = turn
     rays = facing(camera, seen) @ about @ facing(camera, shown + corner).T
-    return np.asarray(k @ rays @ np.linalg.inv(k) @ flat(np.eye(2), corner, np.zeros(2)))
+    return np.asarray(k @ rays @ rays_of @ flat(np.eye(2), corner, np.zeros(2)))
 
 
 def facing(camera: Intrinsics, uv: Point) -> NDArray[np.float64]:
@@ -99,22 +103,55 @@ def slant(camera: Intrinsics, uv: NDArray[Any]) -> NDArray[Any]:
 
 def through(matrix: NDArray[Any], points: NDArray[Any]) -> NDArray[np.float64]:
     """(n, 2) where a homography takes points (n, 2); NaN behind the camera."""
-    u, v, w = matrix @ np.column_stack([points, np.ones(len(points))]).T
+    u, v, w = matrix[:, :2] @ points.T + matrix[:, 2:]
     ahead = np.where(w > 0, w, np.nan)
     return np.column_stack([u / ahead, v / ahead])
 
 
-def sample(raw: NDArray[np.uint8], window: Window, shape: tuple[int, int]) -> Tensor:
-    """(h, w, C) float32 pixels that a rectangle of this shape shows of an image (H, W[, C]).
+def sample(raw: Pixels, window: Window, shape: tuple[int, int]) -> Pixels:
+    """(h, w, C) pixels that a rectangle of this shape shows of an image (H, W[, C]).
 
     What lies beyond the image is as its border.
     """
     if shape != raw.shape[:2] or (window.matrix != np.eye(3)).any():
         # OpenCV counts pixels from their middles.
-        matrix = np.linalg.inv(_MIDDLE) @ window.matrix @ _MIDDLE
+        matrix = _TO_MIDDLE @ window.matrix @ _MIDDLE
         seen = cv2.warpPerspective(raw, matrix, shape[::-1], flags=_HOW, borderMode=_BEYOND)
         raw = np.asarray(seen, np.uint8)
-    return torch.from_numpy(raw.reshape(*shape, -1).astype(np.float32))
+    return raw.reshape(*shape, -1)
+
+
+def levelled(pixels: Pixels, gain: NDArray[Any], lift: NDArray[Any]) -> Pixels:
+    """(h, w, 3) every channel times ``gain`` (3,) plus ``lift`` (3,), rounded, within 0 and 255."""
+    # OpenCV works by the pixel; NumPy and torch are slow at arrays that end in a side of 3.
+    matrix = np.zeros((3, 4))
+    matrix[_CHANNELS, _CHANNELS], matrix[:, 3] = gain, lift
+    return np.asarray(cv2.transform(pixels, matrix), np.uint8)
+
+
+def blended(below: Pixels, above: Pixels, opacity: Opacity) -> Pixels:
+    """(h, w, 3) one over the other, rounded."""
+    under = below.astype(np.float32)
+    return np.asarray(under + opacity * (above - under) + np.float32(0.5)).astype(np.uint8)
+
+
+def defocused(pixels: Pixels, share: float) -> Pixels:
+    """(h, w, 3) as much of each of the two pixels beside in place of a pixel, down and across."""
+    line = np.array([share, 1 - 2 * share, share])
+    return np.asarray(cv2.sepFilter2D(pixels, -1, line, line, borderType=_BEYOND), np.uint8)
+
+
+def grained(pixels: Pixels, grain: NDArray[np.float32], sigma: float) -> Pixels:
+    """(h, w, 3) with noise: ``sigma`` times so many numbers of ``grain``."""
+    levels = grain * np.float32(sigma)
+    levels += pixels.ravel()
+    levels += np.float32(0.5)
+    return np.clip(levels, 0, 255, out=levels).astype(np.uint8).reshape(pixels.shape)
+
+
+def greyed(pixels: Pixels) -> Pixels:
+    """(h, w, 1) luma."""
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)[..., None]
 
 
 def parts(whole: Rect, rng: Rng) -> list[Rect]:
@@ -142,18 +179,20 @@ def inside(robots: Robots, rect: Rect) -> NDArray[np.bool_]:
     return within
 
 
-def under(robots: Robots, rect: Rect, opacity: Tensor | None) -> NDArray[np.bool_]:
+def under(robots: Robots, rect: Rect, opacity: Opacity | None) -> NDArray[np.bool_]:
     """(n,) which robots have their centres under a layer (h, w, 1), None: opaque."""
     within = inside(robots, rect)
     if opacity is not None:
         u, v = (robots[within][:, [U, V]] - rect[:2]).astype(int).T
-        within[within] = opacity[v, u, 0].numpy() > 0.5
+        within[within] = opacity[v, u, 0] > 0.5
     return within
 
 
 def moved(robots: Robots, window: Window, rect: Rect) -> Robots:
     """Robots of a source where a window puts them on the canvas."""
     out = robots.copy()
+    if not len(out):
+        return out
     out[:, BOX] = np.nan  # not carried along: nothing asks for it
     before = robots[:, [U, V]]
     out[:, [U, V]] = through(np.linalg.inv(window.matrix), before) + np.array(rect[:2])
@@ -165,10 +204,10 @@ def moved(robots: Robots, window: Window, rect: Rect) -> Robots:
     return out
 
 
-def feather(height: int, width: int) -> Tensor:
+def feather(height: int, width: int) -> Opacity:
     """(h, w, 1) opacity: 1 within, falling to 0 over the border."""
     down, across = (
-        ((torch.minimum(r, n - 1 - r) + 1) / (FEATHER_PX + 1)).clamp(max=1)
-        for n, r in ((n, torch.arange(n, dtype=torch.float32)) for n in (height, width))
+        np.minimum((np.minimum(r, n - 1 - r) + 1) / np.float32(FEATHER_PX + 1), 1)
+        for n, r in ((n, np.arange(n, dtype=np.float32)) for n in (height, width))
     )
-    return (down[:, None] * across)[..., None]
+    return np.asarray((down[:, None] * across)[..., None], np.float32)
