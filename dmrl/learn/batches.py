@@ -118,7 +118,12 @@ class Examples:
 
 
 def order(
-    count: int, *, seed: int, epoch: int, shares: NDArray[np.float64] | None = None
+    count: int,
+    *,
+    seed: int,
+    epoch: int,
+    shares: NDArray[np.float64] | None = None,
+    images: int = 0,
 ) -> NDArray[np.int64]:
     """The images in this epoch's order, keyed by seed and epoch alone.
 
@@ -128,21 +133,23 @@ def order(
     Parameters
     ----------
     count
-        Images of an epoch.
+        Images that there are.
     seed, epoch
         What the order is drawn from.
     shares
-        (count,) how often each image shall come in an epoch, 1 on average. Whole parts come
-        surely, the rest by chance. None: each comes once.
+        (count,) how often each image shall come in an epoch, in proportion. Whole parts come
+        surely, the rest by chance. None: all as often.
+    images
+        Images of an epoch. 0: as many as there are.
     """
     rng = np.random.default_rng([seed, epoch])
-    if shares is None and count > WINDOW:
-        return _by_windows(count, rng)
-    if shares is None:
-        return rng.permutation(count)
+    images = images or count
+    if shares is None and images == count:
+        return _by_windows(count, rng) if count > WINDOW else rng.permutation(count)
+    shares = np.ones(count) if shares is None else shares
     # Systematic sampling: every image comes floor or ceil of its share, and the sum is exact.
-    ticks = np.floor(np.cumsum(shares[rng.permutation(count)]) * count / shares.sum() + 1e-9)
-    ticks[-1] = count  # not one less, as a sum of floats may have it
+    ticks = np.floor(np.cumsum(shares[rng.permutation(count)]) * images / shares.sum() + 1e-9)
+    ticks[-1] = images  # not one less, as a sum of floats may have it
     times = np.diff(ticks, prepend=0).astype(np.int64)
     rng = np.random.default_rng([seed, epoch])
     return rng.permutation(np.repeat(rng.permutation(count), times))

@@ -139,7 +139,8 @@ class Training:
         self._settings, self._folder = settings, folder
         self._optimizer = new_optimizer(network, settings.optimizer, settings.weight_decay)
         self._average = Average(network, settings.ema_steps) if settings.ema_steps else None
-        self._steps_per_epoch = batch_count(len(examples), settings.batch_size)
+        self._epoch_images = settings.epoch_images or len(examples)
+        self._steps_per_epoch = batch_count(self._epoch_images, settings.batch_size)
         run = {**asdict(settings), "data": identity}
         self._state = State(run)
         if resume:
@@ -205,7 +206,9 @@ class Training:
 
     def _batches(self, epoch: int, shares: Shares) -> Iterator[Batch]:
         size, seed = self._settings.batch_size, self._settings.seed
-        indices = order(len(self._examples), seed=seed, epoch=epoch, shares=shares)
+        indices = order(
+            len(self._examples), seed=seed, epoch=epoch, shares=shares, images=self._epoch_images
+        )
         augmentation = self._settings.augmentation(epoch)
         augmenter = (
             None if augmentation.is_nothing else Augmenter(self._examples, augmentation, seed=seed)
@@ -235,7 +238,7 @@ class Training:
         for index, batch in enumerate(ahead(self._batches(epoch, shares)), start=1):
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
-            whole = min(size, len(self._examples) - (index - 1) * size)
+            whole = min(size, self._epoch_images - (index - 1) * size)
             parts = self._step(batch, rate, whole)
             if self._average:
                 self._average.update(step)
@@ -249,7 +252,7 @@ class Training:
                 total += recent.sum(dim=0)
                 seen.clear()
             yield Step(epoch + 1, loss)
-        means = (total / len(self._examples)).tolist()
+        means = (total / self._epoch_images).tolist()
         return {"loss": sum(means), **dict(zip(LOSSES, means, strict=True))}
 
     def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:

@@ -20,7 +20,9 @@ class FitSettings(LossSettings):
     architecture
         Name of the network.
     epochs
-        Times that as many images are seen as there are.
+        Times that ``epoch_images`` are seen.
+    epoch_images
+        Images of an epoch: a few come often, of many some. 0: as many as there are.
     batch_size
         Images per step.
     optimizer
@@ -107,6 +109,7 @@ class FitSettings(LossSettings):
 
     architecture: str = "dmrl-nano"
     epochs: int = 60
+    epoch_images: int = 0
     batch_size: int = 16
     optimizer: OptimizerName = "muon"
     learning_rate: float = 4e-3
@@ -191,6 +194,7 @@ SHARES = (
 )
 AT_LEAST_ONE = ("epochs", "batch_size", "processes")
 NOT_NEGATIVE = (
+    "epoch_images",
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
     *(term.weight for term in TERMS),
     *("rotation_deg", "paste"),

@@ -12,6 +12,7 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
 from dmrl.rendering.backdrops import panorama_view, smeared
+from dmrl.rendering.crazyflie import CRAZYFLIE
 from dmrl.rendering.lens import Picture
 from dmrl.rendering.onboard import View
 from dmrl.rendering.randomise import HIGHLIGHTS, random_paint, random_sensor
@@ -71,7 +72,7 @@ class Flight:
         """Colours of a robot, and the first angle and speed of its rotors."""
         rng = np.random.default_rng((self._seed, 1, *name.encode()))
         wear = float(rng.uniform(*self._settings.wear))
-        return random_paint(rng, wear, self._settings.colour_spread)
+        return random_paint(rng, CRAZYFLIE, wear, self._settings.colour_spread)
 
     def _scene(self, camera: Camera, view: View) -> Scene:
         seed, number, _ = view.key

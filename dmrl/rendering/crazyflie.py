@@ -4,33 +4,21 @@
 metres, the origin in the middle of the bounding box.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array
-
-MATERIALS = (
-    "board",
-    "deck",
-    "battery",
-    "label",
-    "motor",
-    "mount",
-    "pins",
-    "header",
-    "chip",
-    "connector",
-    "wire",
-    "antenna",
-    "lens",
-    "red",
-    "green",
-    "blue",
-    "rotor",
+from dmrl.rendering.solids import (
+    ROTOR,
+    Colour,
+    Design,
+    Finish,
+    Part,
+    box,
+    cylinder,
+    rounded,
+    turned,
 )
 
 ARM_M = 0.046
@@ -42,108 +30,34 @@ BETWEEN_ROTORS_RAD = 1.7
 """How much further each rotor has turned than the one before."""
 BOARD_Z_M = -0.0035
 MOTOR_ANGLES_RAD = np.pi / 4 + np.pi / 2 * np.arange(4)
-CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
 
-Part = tuple[str, Array, NDArray[np.int64]]
-
-
-@dataclass(frozen=True, slots=True)
-class Mesh:
-    """A robot's surface.
-
-    Parameters
-    ----------
-    vertices
-        (V, 3) metres, body frame.
-    faces
-        (F, 3) vertices of triangles, anticlockwise from outside.
-    material
-        (F,) number in MATERIALS.
-    rotor
-        (V, 3) of points of rotors: x and y from the hub, metres, and the rotor's number.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    material: NDArray[np.int64]
-    rotor: Array
-
-
-@cache
-def mesh() -> Mesh:
-    """The whole robot. The same arrays every time: do not write into them."""
-    vertices, faces, material, rotor = [], [], [], []
-    count = 0
-    numbered = [(0, part) for part in _body()] + list(enumerate(_rotors()))
-    for number, (name, points, triangles) in numbered:
-        vertices.append(points)
-        faces.append(triangles + count)
-        material.append(np.full(len(triangles), MATERIALS.index(name)))
-        hub = points.mean(axis=0) if name == "rotor" else points
-        rotor.append(np.column_stack([(points - hub)[:, :2], np.full(len(points), float(number))]))
-        count += len(points)
-    parts = (vertices, faces, material, rotor)
-    return Mesh(*(np.concatenate(part) for part in parts))
-
-
-def _prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.int64]]:
-    """A convex outline (K, 2), anticlockwise from above, stretched from low to high."""
-    count = len(outline)
-    points = np.concatenate(
-        [np.column_stack([outline, np.full(count, z)]) for z in (low, high)], axis=0
-    )
-    k = np.arange(count)
-    after = (k + 1) % count
-    fan = np.column_stack([np.zeros(count - 2, int), k[1:-1], k[2:]])
-    sides = np.concatenate(
-        [
-            np.column_stack([k, after, after + count]),
-            np.column_stack([k, after + count, k + count]),
-        ]
-    )
-    return points, np.concatenate([fan[:, ::-1], fan + count, sides])
-
-
-def _box(name: str, centre: tuple[float, float, float], size: tuple[float, float, float]) -> Part:
-    x, y, z = centre
-    outline = CORNERS * np.array(size[:2]) / 2 + (x, y)
-    return name, *_prism(outline, z - size[2] / 2, z + size[2] / 2)
-
-
-def _round(
-    name: str, xy: tuple[float, float], radius: float, low: float, high: float, sides: int = 14
-) -> Part:
-    turn = 2 * np.pi * np.arange(sides) / sides
-    outline = np.column_stack([np.cos(turn), np.sin(turn)]) * radius + xy
-    return name, *_prism(outline, low, high)
-
-
-def _turned(part: Part, angle: float) -> Part:
-    """The part turned about the z axis."""
-    name, points, faces = part
-    c, s = np.cos(angle), np.sin(angle)
-    return name, points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), faces
-
-
-def _rounded(
-    name: str, centre: tuple[float, float, float], size: tuple[float, float, float], cut: float
-) -> Part:
-    """A box with its upright edges cut, as circuit boards have."""
-    x, y, z = centre
-    half_x, half_y = size[0] / 2, size[1] / 2
-    outline = np.array(
-        [
-            (half_x, -half_y + cut),
-            (half_x, half_y - cut),
-            (half_x - cut, half_y),
-            (-half_x + cut, half_y),
-            (-half_x, half_y - cut),
-            (-half_x, -half_y + cut),
-            (-half_x + cut, -half_y),
-            (half_x - cut, -half_y),
-        ]
-    )
-    return name, *_prism(outline + np.array([x, y]), z - size[2] / 2, z + size[2] / 2)
+PAINT: Mapping[str, Finish] = {
+    "board": ((0.012, 0.012, 0.014), 0.45, 0.0, 0.0),
+    "deck": ((0.012, 0.014, 0.020), 0.45, 0.0, 0.0),
+    "battery": ((0.45, 0.46, 0.48), 0.35, 0.3, 0.0),
+    "label": ((0.50, 0.48, 0.40), 0.5, 0.0, 0.0),
+    "motor": ((0.50, 0.50, 0.50), 0.3, 0.9, 0.0),
+    "mount": ((0.015, 0.015, 0.015), 0.5, 0.0, 0.0),
+    "pins": ((0.60, 0.42, 0.15), 0.35, 0.9, 0.0),
+    "header": ((0.010, 0.010, 0.010), 0.5, 0.0, 0.0),
+    "chip": ((0.010, 0.010, 0.010), 0.4, 0.0, 0.0),
+    "connector": ((0.55, 0.55, 0.55), 0.4, 0.5, 0.0),
+    "wire": ((0.25, 0.02, 0.02), 0.5, 0.0, 0.0),
+    "antenna": ((0.45, 0.45, 0.45), 0.35, 0.8, 0.0),
+    "lens": ((0.003, 0.003, 0.004), 0.1, 0.0, 0.0),
+    "red": ((1.0, 0.04, 0.02), 0.4, 0.0, 4.0),
+    "green": ((0.04, 1.0, 0.1), 0.4, 0.0, 4.0),
+    "blue": ((0.05, 0.15, 1.0), 0.4, 0.0, 4.0),
+    "rotor": ((0.012, 0.012, 0.012), 0.4, 0.0, 0.0),
+}
+# Colours that the parts are sold in, beside those above.
+OTHERS: Mapping[str, tuple[Colour, ...]] = {
+    "deck": ((0.01, 0.02, 0.08), (0.01, 0.05, 0.02)),
+    "battery": ((0.02, 0.02, 0.02), (0.05, 0.08, 0.3), (0.6, 0.6, 0.6)),
+    "label": ((0.6, 0.1, 0.05), (0.05, 0.2, 0.5), (0.02, 0.02, 0.02)),
+    "mount": ((0.5, 0.5, 0.5), (0.25, 0.25, 0.25)),
+    "rotor": ((0.5, 0.5, 0.5), (0.3, 0.3, 0.3), (0.5, 0.25, 0.02)),
+}
 
 
 def _body() -> Iterator[Part]:
@@ -152,13 +66,13 @@ def _body() -> Iterator[Part]:
     yield from _headers()
     for k, angle in enumerate(MOTOR_ANGLES_RAD):
         for part in _arm(k):
-            yield _turned(part, angle)
+            yield turned(part, angle)
 
 
 def _frame() -> Iterator[Part]:
     """The main board with its parts."""
     z = BOARD_Z_M
-    yield _rounded("board", (0, 0, z), (0.030, 0.030, 0.0010), 0.005)
+    yield rounded("board", (0, 0, z), (0.030, 0.030, 0.0010), 0.005)
     for x, y, width, depth, height in (
         (0.002, 0.000, 0.0072, 0.0072, 0.0009),
         (-0.008, 0.004, 0.0050, 0.0050, 0.0009),
@@ -166,59 +80,59 @@ def _frame() -> Iterator[Part]:
         (-0.003, -0.009, 0.0040, 0.0030, 0.0011),
         (0.006, 0.009, 0.0028, 0.0020, 0.0012),
     ):
-        yield _box("chip", (x, y, z + 0.0005 + height / 2), (width, depth, height))
-        yield _box("chip", (-y, x, z - 0.0005 - height / 2), (depth, width, height))
-    yield _box("connector", (0.0125, 0.0, z + 0.0018), (0.0052, 0.0075, 0.0026))  # USB
-    yield _box("connector", (-0.0135, 0.004, z + 0.0022), (0.0040, 0.0060, 0.0034))  # battery's
-    yield _box("antenna", (-0.0150, -0.006, z + 0.0009), (0.0030, 0.0080, 0.0008))
+        yield box("chip", (x, y, z + 0.0005 + height / 2), (width, depth, height))
+        yield box("chip", (-y, x, z - 0.0005 - height / 2), (depth, width, height))
+    yield box("connector", (0.0125, 0.0, z + 0.0018), (0.0052, 0.0075, 0.0026))  # USB
+    yield box("connector", (-0.0135, 0.004, z + 0.0022), (0.0040, 0.0060, 0.0034))  # battery's
+    yield box("antenna", (-0.0150, -0.006, z + 0.0009), (0.0030, 0.0080, 0.0008))
 
 
 def _stack() -> Iterator[Part]:
     """What the headers hold: flow deck below, battery, UWB and AI decks above."""
-    yield _rounded("deck", (0, 0, -0.0100), (0.0285, 0.0280, 0.0009), 0.004)
-    yield _box("chip", (0.003, 0, -0.0113), (0.006, 0.006, 0.0018))
-    yield _round("lens", (0.003, 0.0), 0.0017, -0.0130, -0.0122, 10)
-    yield _box("chip", (-0.006, 0, -0.0110), (0.0045, 0.0025, 0.0010))
-    yield _box("battery", (0.0, 0.0, 0.0018), (0.0330, 0.0170, 0.0068))
-    yield _box("label", (0.0, 0.0, 0.0018), (0.0200, 0.01715, 0.00695))
-    yield _box("wire", (-0.0172, 0.0030, 0.0005), (0.0016, 0.0012, 0.0060))
-    yield _box("wire", (-0.0172, 0.0048, 0.0005), (0.0016, 0.0012, 0.0060))
-    yield _rounded("deck", (0, 0, 0.0075), (0.0300, 0.0275, 0.0009), 0.003)
-    yield _box("antenna", (-0.0105, 0.0, 0.0092), (0.0090, 0.0130, 0.0026))
-    yield _box("chip", (-0.0020, 0.0060, 0.0085), (0.0060, 0.0060, 0.0010))
-    yield _rounded("board", (0.0030, 0, 0.0108), (0.0300, 0.0275, 0.0009), 0.003)
-    yield _box("antenna", (-0.0060, 0.0, 0.0122), (0.0120, 0.0160, 0.0020))
-    yield _box("chip", (0.0065, 0.0050, 0.0119), (0.0070, 0.0070, 0.0012))
-    yield _box("lens", (0.0180, 0.0, 0.0108), (0.0030, 0.0062, 0.0062))
-    yield _box("chip", (0.0160, 0.0, 0.0108), (0.0022, 0.0080, 0.0072))
+    yield rounded("deck", (0, 0, -0.0100), (0.0285, 0.0280, 0.0009), 0.004)
+    yield box("chip", (0.003, 0, -0.0113), (0.006, 0.006, 0.0018))
+    yield cylinder("lens", (0.003, 0.0), 0.0017, -0.0130, -0.0122, 10)
+    yield box("chip", (-0.006, 0, -0.0110), (0.0045, 0.0025, 0.0010))
+    yield box("battery", (0.0, 0.0, 0.0018), (0.0330, 0.0170, 0.0068))
+    yield box("label", (0.0, 0.0, 0.0018), (0.0200, 0.01715, 0.00695))
+    yield box("wire", (-0.0172, 0.0030, 0.0005), (0.0016, 0.0012, 0.0060))
+    yield box("wire", (-0.0172, 0.0048, 0.0005), (0.0016, 0.0012, 0.0060))
+    yield rounded("deck", (0, 0, 0.0075), (0.0300, 0.0275, 0.0009), 0.003)
+    yield box("antenna", (-0.0105, 0.0, 0.0092), (0.0090, 0.0130, 0.0026))
+    yield box("chip", (-0.0020, 0.0060, 0.0085), (0.0060, 0.0060, 0.0010))
+    yield rounded("board", (0.0030, 0, 0.0108), (0.0300, 0.0275, 0.0009), 0.003)
+    yield box("antenna", (-0.0060, 0.0, 0.0122), (0.0120, 0.0160, 0.0020))
+    yield box("chip", (0.0065, 0.0050, 0.0119), (0.0070, 0.0070, 0.0012))
+    yield box("lens", (0.0180, 0.0, 0.0108), (0.0030, 0.0062, 0.0062))
+    yield box("chip", (0.0160, 0.0, 0.0108), (0.0022, 0.0080, 0.0072))
 
 
 def _headers() -> Iterator[Part]:
     """Two rows of ten pins, 2 mm apart, through all decks."""
     for y in (-0.0110, 0.0110):
-        yield _box("header", (0, y, -0.0068), (0.0200, 0.0021, 0.0045))
-        yield _box("header", (0, y, 0.0040), (0.0200, 0.0021, 0.0060))
+        yield box("header", (0, y, -0.0068), (0.0200, 0.0021, 0.0045))
+        yield box("header", (0, y, 0.0040), (0.0200, 0.0021, 0.0060))
         for k in range(10):
-            yield _box("pins", (-0.009 + 0.002 * k, y, 0.0007), (0.0005, 0.0005, 0.0270))
+            yield box("pins", (-0.009 + 0.002 * k, y, 0.0007), (0.0005, 0.0005, 0.0270))
 
 
 def _arm(number: int) -> Iterator[Part]:
     """Arm, motor and LED along +x."""
     inner, z = 0.014, BOARD_Z_M
-    yield _box("board", ((inner + ARM_M) / 2, 0, z), (ARM_M - inner, 0.0068, 0.0010))
+    yield box("board", ((inner + ARM_M) / 2, 0, z), (ARM_M - inner, 0.0068, 0.0010))
     mount = ((0.0047, -0.0145, -0.0105), (0.0053, -0.0105, -0.0015), (0.0046, -0.0015, 0.0010))
     for radius, low, high in mount:
-        yield _round("mount", (ARM_M, 0.0), radius, low, high)
-    yield _box("mount", (ARM_M - 0.0075, 0, z - 0.0014), (0.009, 0.0080, 0.0018))
-    yield _round("motor", (ARM_M, 0.0), 0.0035, -0.0125, 0.0105)
-    yield _round("mount", (ARM_M, 0.0), 0.0024, 0.0105, HEIGHT_M / 2, 10)
-    yield _box("wire", (ARM_M - 0.014, 0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
-    yield _box("wire", (ARM_M - 0.014, -0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
+        yield cylinder("mount", (ARM_M, 0.0), radius, low, high)
+    yield box("mount", (ARM_M - 0.0075, 0, z - 0.0014), (0.009, 0.0080, 0.0018))
+    yield cylinder("motor", (ARM_M, 0.0), 0.0035, -0.0125, 0.0105)
+    yield cylinder("mount", (ARM_M, 0.0), 0.0024, 0.0105, HEIGHT_M / 2, 10)
+    yield box("wire", (ARM_M - 0.014, 0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
+    yield box("wire", (ARM_M - 0.014, -0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
     # As on the Crazyflie: blue behind, red and green in front.
     colour = ("green", "blue", "blue", "red")[number]
     for side in (-1, 1):
         at = (0.0245, 0.0, z + side * 0.0010)
-        yield _box(colour, at, (0.0020, 0.0016, 0.0010))
+        yield box(colour, at, (0.0020, 0.0016, 0.0010))
 
 
 def _rotors() -> Iterator[Part]:
@@ -233,6 +147,9 @@ def _rotors() -> Iterator[Part]:
         yield "rotor", np.column_stack([points, np.full(sides + 1, ROTOR_Z_M)]), fan
 
 
+CRAZYFLIE = Design(PAINT, OTHERS, lambda: (*_body(), *_rotors()))
+
+
 def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
     """(N, 3) points that reach as far as what is seen of a robot: body, and swept blades.
 
@@ -245,8 +162,10 @@ def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
     sweep_rad
         How far all rotors turn until it closes.
     """
-    whole = mesh()
-    body = whole.vertices[np.unique(whole.faces[whole.material != MATERIALS.index("rotor")])]
+    whole = CRAZYFLIE.mesh()
+    body = whole.vertices[
+        np.unique(whole.faces[whole.material != CRAZYFLIE.materials.index(ROTOR)])
+    ]
     radius = np.linspace(0.004, ROTOR_RADIUS_M, 12)
     half = BLADE_HALF_WIDTH_M / radius
     rim = np.linspace(-half[-1], min(sweep_rad, np.pi) + half[-1], 60)

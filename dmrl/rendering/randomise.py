@@ -1,6 +1,6 @@
 """Poses and looks drawn at random from the ranges of the settings."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,46 +10,18 @@ from scipy.spatial.transform import Rotation
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.rendering.backdrops import Photos, panorama_view, smeared
-from dmrl.rendering.crazyflie import MATERIALS
+from dmrl.rendering.crazyflie import CRAZYFLIE
 from dmrl.rendering.lens import Picture, pinhole_from_image
 from dmrl.rendering.sensor import Sensor, blur
 from dmrl.rendering.settings import Range, Settings
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch import Pose
+from dmrl.rendering.solids import Design
 
 TRIES = 30
 # Of panoramas, whose suns and lamps would leave nothing else to see; photos end below.
 HIGHLIGHTS = 3.0
 BEHIND_THE_CAMERA = np.array([-1.0, 0.0, 0.0])
-
-# Base colour, roughness, metallic, glow of every material; linear light.
-PALETTE: Mapping[str, tuple[tuple[float, float, float], float, float, float]] = {
-    "board": ((0.012, 0.012, 0.014), 0.45, 0.0, 0.0),
-    "deck": ((0.012, 0.014, 0.020), 0.45, 0.0, 0.0),
-    "battery": ((0.45, 0.46, 0.48), 0.35, 0.3, 0.0),
-    "label": ((0.50, 0.48, 0.40), 0.5, 0.0, 0.0),
-    "motor": ((0.50, 0.50, 0.50), 0.3, 0.9, 0.0),
-    "mount": ((0.015, 0.015, 0.015), 0.5, 0.0, 0.0),
-    "pins": ((0.60, 0.42, 0.15), 0.35, 0.9, 0.0),
-    "header": ((0.010, 0.010, 0.010), 0.5, 0.0, 0.0),
-    "chip": ((0.010, 0.010, 0.010), 0.4, 0.0, 0.0),
-    "connector": ((0.55, 0.55, 0.55), 0.4, 0.5, 0.0),
-    "wire": ((0.25, 0.02, 0.02), 0.5, 0.0, 0.0),
-    "antenna": ((0.45, 0.45, 0.45), 0.35, 0.8, 0.0),
-    "lens": ((0.003, 0.003, 0.004), 0.1, 0.0, 0.0),
-    "red": ((1.0, 0.04, 0.02), 0.4, 0.0, 4.0),
-    "green": ((0.04, 1.0, 0.1), 0.4, 0.0, 4.0),
-    "blue": ((0.05, 0.15, 1.0), 0.4, 0.0, 4.0),
-    "rotor": ((0.012, 0.012, 0.012), 0.4, 0.0, 0.0),
-}
-# Colours that the parts are sold in, beside those above.
-OTHERS: Mapping[str, tuple[tuple[float, float, float], ...]] = {
-    "deck": ((0.01, 0.02, 0.08), (0.01, 0.05, 0.02)),
-    "battery": ((0.02, 0.02, 0.02), (0.05, 0.08, 0.3), (0.6, 0.6, 0.6)),
-    "label": ((0.6, 0.1, 0.05), (0.05, 0.2, 0.5), (0.02, 0.02, 0.02)),
-    "mount": ((0.5, 0.5, 0.5), (0.25, 0.25, 0.25)),
-    "rotor": ((0.5, 0.5, 0.5), (0.3, 0.3, 0.3), (0.5, 0.25, 0.02)),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +42,8 @@ class World:
         Gives a panorama's picture.
     photos
         Backgrounds; None: the panoramas.
+    design
+        The robot whose parts are painted.
     """
 
     settings: Settings
@@ -78,6 +52,7 @@ class World:
     lights: tuple[str, ...]
     panorama: Callable[[str], Picture]
     photos: Photos | None
+    design: Design = CRAZYFLIE
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +82,7 @@ def draw_scene(world: World, index: int) -> Drawn:
     roll, pitch = rng.uniform(-tilt_rad, tilt_rad, 2).tolist()
     shutter_s = _between(rng, settings.shutter_s)
     poses = _poses(world, rng, camera_from_horizontal(roll, pitch))
-    robots = tuple(_robot(settings, rng, pose, shutter_s) for pose in poses)
+    robots = tuple(_robot(world, rng, pose, shutter_s) for pose in poses)
     look = _look(world, rng, (roll, pitch), shutter_s)
     low, high = settings.jpeg_quality
     return Drawn(roll, pitch, robots, look, int(rng.integers(low, high + 1)))
@@ -162,40 +137,44 @@ def _attitude(settings: Settings, rng: Generator) -> Array:
     return np.asarray(turns.as_matrix())
 
 
-def _robot(settings: Settings, rng: Generator, pose: Pose, shutter_s: float) -> Robot:
+def _robot(world: World, rng: Generator, pose: Pose, shutter_s: float) -> Robot:
+    settings, design = world.settings, world.design
     velocity = rng.normal(size=3)
     velocity *= settings.speed_max_mps * rng.random() / np.linalg.norm(velocity)
     stopped = rng.random() < settings.rotors_stopped_share
     # Without a shutter time, rotors are as at 10 ms: a disc.
     open_s = shutter_s or 0.01
     sweep = 0.0 if stopped else 2 * np.pi * _between(rng, settings.rotor_speed_rps) * open_s
-    paint = random_paint(rng, _between(rng, settings.wear), settings.colour_spread)
+    paint = random_paint(rng, design, _between(rng, settings.wear), settings.colour_spread)
     painted = bool(settings.painted_share) and rng.random() < settings.painted_share
     if painted:
-        paint |= strong_colours(rng)
+        paint |= strong_colours(rng, design)
     paint |= {"rotor_first_rad": float(rng.uniform(0, np.pi)), "rotor_sweep_rad": float(sweep)}
     return Robot(pose, paint, velocity * shutter_s, "painted" if painted else "cf")
 
 
-def random_paint(rng: Generator, wear: float, spread: float) -> dict[str, Any]:
+def random_paint(rng: Generator, design: Design, wear: float, spread: float) -> dict[str, Any]:
     """Colour and finish of every material, as the worker's shaders read them.
 
     Parameters
     ----------
     rng
         Where the randomness comes from.
+    design
+        What is painted.
     wear
         0: new; 1: grey and dull.
     spread
         How far colours vary, 0 to 1.
     """
-    parts = len(MATERIALS)
+    parts = len(design.materials)
     other, which, dust, glow = rng.random((4, parts))
-    base, roughness, metallic, light = zip(*(PALETTE[name] for name in MATERIALS), strict=True)
+    base, roughness, metallic, light = zip(*design.paint.values(), strict=True)
     colour = np.array(base)
-    for k, name in enumerate(MATERIALS):
-        if name in OTHERS and other[k] < spread:
-            colour[k] = OTHERS[name][int(which[k] * len(OTHERS[name]))]
+    for k, name in enumerate(design.materials):
+        sold = design.others.get(name, ())
+        if sold and other[k] < spread:
+            colour[k] = sold[int(which[k] * len(sold))]
     dust = wear * dust
     tint, shade = spread * rng.standard_normal((parts, 3)), spread * rng.standard_normal(parts)
     colour *= np.exp(0.5 * tint + shade[:, None])
@@ -207,17 +186,20 @@ def random_paint(rng: Generator, wear: float, spread: float) -> dict[str, Any]:
     return paint | {f"finish_{k}": finishes[k] for k in range(parts)}
 
 
-def strong_colours(rng: Generator) -> dict[str, Any]:
+def strong_colours(rng: Generator, design: Design) -> dict[str, Any]:
     """Two colours at random over all parts that do not glow, as of a drone of another make.
 
     Parameters
     ----------
     rng
         Where the randomness comes from.
+    design
+        What is painted.
     """
+    parts = len(design.materials)
     two = rng.random((2, 3)) ** 2  # linear light: rather dark and vivid than pale
-    shades = two[rng.integers(2, size=len(MATERIALS))] * rng.uniform(0.6, 1.4, (len(MATERIALS), 1))
-    dull = (k for k, name in enumerate(MATERIALS) if not PALETTE[name][3])
+    shades = two[rng.integers(2, size=parts)] * rng.uniform(0.6, 1.4, (parts, 1))
+    dull = (k for k, finish in enumerate(design.paint.values()) if not finish[3])
     return {f"colour_{k}": np.clip(shades[k], 0, 1).tolist() for k in dull}
 
 

@@ -15,11 +15,12 @@ import numpy as np
 
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import Array, Camera
-from dmrl.rendering import crazyflie
 from dmrl.rendering.compose import compose
+from dmrl.rendering.crazyflie import BETWEEN_ROTORS_RAD, BLADE_HALF_WIDTH_M, CRAZYFLIE
 from dmrl.rendering.lens import Picture
 from dmrl.rendering.pool import Pool, Start, Worker
 from dmrl.rendering.shot import Layer, Look, Robot, Shot, requests
+from dmrl.rendering.solids import Design
 
 MODEL_KINDS = (".blend", ".glb", ".gltf", ".obj", ".stl")
 SMALLEST_M, LARGEST_M = 0.01, 3.0
@@ -36,19 +37,22 @@ class Model:
     Parameters
     ----------
     path
-        .blend, .glb, .obj or .stl; None: the Crazyflie that dmrl draws.
+        .blend, .glb, .obj or .stl; None: ``design``.
     scale
         Metres per unit of the file; of the drawn one, times its life size.
     up
         Axis of the file that points up; auto: y of .obj and .glb, z of .stl and .blend.
     centre
         What labels are about: the middle of the model's box, or the file's origin.
+    design
+        What dmrl draws where there is no file.
     """
 
     path: Path | None = None
     scale: float = 1.0
     up: Literal["auto", "y", "z"] = "auto"
     centre: Literal["box", "origin"] = "box"
+    design: Design = CRAZYFLIE
 
 
 def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> Start:
@@ -60,13 +64,13 @@ def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> S
         "model_scale": model.scale,
         "model_up": model.up,
         "model_centre": model.centre,
-        "materials": crazyflie.MATERIALS,
-        "blade_half_width_m": crazyflie.BLADE_HALF_WIDTH_M,
-        "between_rotors_rad": crazyflie.BETWEEN_ROTORS_RAD,
+        "materials": model.design.materials,
+        "blade_half_width_m": BLADE_HALF_WIDTH_M,
+        "between_rotors_rad": BETWEEN_ROTORS_RAD,
     }
     if model.path is not None:
         return Start(python, head)
-    mesh = crazyflie.mesh()
+    mesh = model.design.mesh()
     arrays = {"vertices": mesh.vertices * model.scale, "faces": mesh.faces}
     return Start(python, head, {**arrays, "material": mesh.material, "rotor": mesh.rotor})
 
@@ -197,7 +201,7 @@ def _why_not(model: Model, size_m: float) -> str:
     limits = f"they must be {SMALLEST_M:g} to {LARGEST_M:g} m"
     if model.path is None:
         return (
-            f"the Crazyflie that dmrl draws, {model.scale:g} times life size, is {size_m:.3g} m; "
+            f"the robot that dmrl draws, {model.scale:g} times life size, is {size_m:.3g} m; "
             f"{limits}. Give the --model that this scale is for, or --scale 1"
         )
     return (

@@ -72,8 +72,11 @@ class Settings:
         file as ``dmrl calibrate`` writes, of any size; its mount and delay are left out.
     distorted
         Whether images have the camera's lens distortion.
+    design
+        The robot that dmrl draws. crazyflie: with its decks. violet: a bare one in the colours of
+        the published renders.
     model
-        .blend, .glb, .obj or .stl of the robot. Without it, the Crazyflie that dmrl draws.
+        .blend, .glb, .obj or .stl of a robot, in place of the drawn one.
     model_up
         Axis of the model's file that points up. auto: as is usual for its kind, y of .obj and
         .glb, z of .stl and .blend.
@@ -179,6 +182,7 @@ class Settings:
     samples: int = 8
     camera: Path = Path("aideck")
     distorted: bool = True
+    design: Literal["crazyflie", "violet"] = "crazyflie"
     model: Path | None = None
     model_up: Literal["auto", "y", "z"] = "auto"
     model_centre: Literal["box", "origin"] = "box"

@@ -31,6 +31,7 @@ from dmrl.recording import (
     licence_words,
     provenance,
 )
+from dmrl.rendering.designs import DESIGNS
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.interiors import ROOMS
 from dmrl.rendering.lens import canvas_of
@@ -128,7 +129,8 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     camera = camera_of(settings)
     photos = None if settings.backgrounds is None else photos_of(settings.backgrounds)
     lights = None if settings.lights is None else _panoramas(settings.lights)
-    model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre)
+    design = DESIGNS[settings.design]
+    model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre, design)
     with ExitStack() as stack:
         renderer = stack.enter_context(
             Renderer(
@@ -153,6 +155,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
             tuple(renderer.lights),
             cache(renderer.panorama),
             photos,
+            design,
         )
         _render(world, renderer, sink, done)
     before.forget()

@@ -46,7 +46,7 @@ class Painters:
 
     def __init__(self, start: Start, count: int) -> None:
         self.version = "0"
-        self.points = np.asarray(crazyflie.mesh().vertices, float)
+        self.points = np.asarray(crazyflie.CRAZYFLIE.mesh().vertices, float)
 
     def call(self, job: Callable[[Painter], Any]) -> Any:
         """What ``job`` makes of a painter."""

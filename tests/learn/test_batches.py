@@ -136,6 +136,18 @@ def test_shares_come_to_whole_images_at_the_border() -> None:
         assert drawn.sum() == 4 and drawn[2] == 2 and drawn[3] == 1 and drawn[:2].sum() == 1
 
 
+def test_an_epoch_has_as_many_images_as_it_is_asked_for() -> None:
+    """A few come often and alike, of many each comes once at most, and all come in time."""
+    often = np.bincount(order(3, seed=0, epoch=0, images=10), minlength=3)
+    assert often.sum() == 10 and set(often.tolist()) == {3, 4}
+    shares = np.array([3.0, 1.0, 0.0])
+    assert np.bincount(order(3, seed=0, epoch=0, shares=shares, images=8)).tolist() == [6, 2]
+    some = [order(1000, seed=0, epoch=epoch, images=100) for epoch in range(60)]
+    assert all(len(one) == len(set(one.tolist())) == 100 for one in some)
+    assert len(set(np.concatenate(some).tolist())) > 990
+    assert sorted(order(50, seed=1, epoch=2, images=50)) == list(range(50))
+
+
 def test_a_robot_at_the_rim_has_a_mask_within_the_image() -> None:
     robots = np.full((1, 4, len(FIELDS)), np.nan, np.float32)
     robots[0, :, :2] = (0.0, 0.0), (7.9, 3.9), (3.0, 4.0), (8.0, 2.0)

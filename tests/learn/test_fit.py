@@ -389,6 +389,19 @@ def test_every_epoch_has_an_order_of_its_own(examples: Examples, tmp_path: Path)
     assert not torch.equal(seen[0], seen[2])
 
 
+def test_an_epoch_of_so_many_images_takes_as_many_steps_of_few(
+    examples: Examples, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, epochs=2, epoch_images=3 * SETTINGS.batch_size + 1)
+    few = examples.select(np.arange(len(examples)) < 5)
+    training = Training(new_network(settings, few), few, settings, tmp_path)
+    assert training.steps_left == 8
+    sizes = [len(batch.images) for batch in training._batches(0, None)]
+    assert sizes == [settings.batch_size] * 3 + [1]
+    assert [step.epoch for step in training.steps()] == [1] * 4 + [2] * 4
+    assert all(np.isfinite(epoch["loss"]) for epoch in training.history)
+
+
 def test_the_loss_that_is_shown_is_the_mean_over_the_images_since_the_last(
     examples: Examples, tmp_path: Path
 ) -> None:

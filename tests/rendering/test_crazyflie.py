@@ -2,29 +2,29 @@
 
 import numpy as np
 
-from dmrl.rendering.crazyflie import MATERIALS, mesh, outline
+from dmrl.rendering.crazyflie import CRAZYFLIE, outline
 
 
 def test_it_is_life_size_about_the_middle_of_its_box() -> None:
-    points = mesh().vertices
+    points = CRAZYFLIE.mesh().vertices
     assert np.allclose(points.min(axis=0), -points.max(axis=0), atol=1e-3)
     assert np.isclose(np.ptp(points[:, 2]), 0.029)
-    motor = mesh().faces[mesh().material == MATERIALS.index("motor")]
+    motor = CRAZYFLIE.mesh().faces[CRAZYFLIE.mesh().material == CRAZYFLIE.materials.index("motor")]
     corners = points[np.unique(motor)]
     radius = np.hypot(corners[:, 0], corners[:, 1])
     assert np.isclose((radius.max() + radius.min()) / 2, 0.046, atol=2e-4)
 
 
 def test_every_part_has_a_surface_and_every_face_an_area() -> None:
-    whole = mesh()
-    assert set(whole.material.tolist()) == set(range(len(MATERIALS)))
+    whole = CRAZYFLIE.mesh()
+    assert set(whole.material.tolist()) == set(range(len(CRAZYFLIE.materials)))
     a, b, c = np.moveaxis(whole.vertices[whole.faces], 1, 0)
     assert (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0).all()
 
 
 def test_solid_parts_are_closed_and_face_outwards() -> None:
-    whole = mesh()
-    solid = whole.faces[whole.material != MATERIALS.index("rotor")]
+    whole = CRAZYFLIE.mesh()
+    solid = whole.faces[whole.material != CRAZYFLIE.materials.index("rotor")]
     a, b, c = np.moveaxis(whole.vertices[solid], 1, 0)
     assert np.allclose(np.cross(b - a, c - a).sum(axis=0), 0, atol=1e-12)
     volume_m3 = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
@@ -32,7 +32,7 @@ def test_solid_parts_are_closed_and_face_outwards() -> None:
 
 
 def test_whirling_blades_reach_as_far_as_their_discs() -> None:
-    whole = mesh().vertices
+    whole = CRAZYFLIE.mesh().vertices
     whirling = outline(1.0, 0.3, 10.0)
     assert np.allclose(whirling.max(axis=0), whole.max(axis=0), atol=5e-4)
     # Standing still, no blade points along x: the robot is narrower.

@@ -10,8 +10,8 @@ import pytest
 from dmrl.geometry.frames import PUBLISHED_RENDER, Camera, project
 from dmrl.images.codec import encode_png
 from dmrl.rendering.backdrops import photos_in
-from dmrl.rendering.crazyflie import MATERIALS
-from dmrl.rendering.randomise import PALETTE, World, draw_scene, strong_colours
+from dmrl.rendering.crazyflie import CRAZYFLIE
+from dmrl.rendering.randomise import World, draw_scene, strong_colours
 from dmrl.rendering.sensor import expose
 from dmrl.rendering.settings import PRESETS, Settings
 
@@ -20,8 +20,10 @@ SMALL = Camera(40, 28, 15.0, 15.0, 20.0, 14.0)
 
 
 def test_strong_colours_are_two_hues_over_every_part_that_does_not_glow() -> None:
-    paint = strong_colours(np.random.default_rng(3))
-    dull = {f"colour_{k}" for k, name in enumerate(MATERIALS) if not PALETTE[name][3]}
+    paint = strong_colours(np.random.default_rng(3), CRAZYFLIE)
+    dull = {
+        f"colour_{k}" for k, name in enumerate(CRAZYFLIE.materials) if not CRAZYFLIE.paint[name][3]
+    }
     assert paint.keys() == dull
     hues = {tuple(np.round(np.array(c) / max(c), 6)) for c in paint.values() if max(c) < 1}
     assert len(hues) == 2
@@ -29,7 +31,7 @@ def test_strong_colours_are_two_hues_over_every_part_that_does_not_glow() -> Non
 
 def test_two_robots_are_not_painted_alike() -> None:
     rng = np.random.default_rng(3)
-    assert strong_colours(rng) != strong_colours(rng)
+    assert strong_colours(rng, CRAZYFLIE) != strong_colours(rng, CRAZYFLIE)
 
 
 def world(settings: Settings, folder: Path, camera: Camera = PUBLISHED_RENDER) -> World:

@@ -1,0 +1,161 @@
+"""Solids of which dmrl draws robots: boxes, prisms and rounds, each a part of one material."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.geometry.frames import Array
+
+CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+
+Part = tuple[str, Array, NDArray[np.int64]]
+"""Material, (V, 3) points in metres, (F, 3) triangles, anticlockwise from outside."""
+ROTOR = "rotor"
+"""The material whose parts are rotors, numbered in their order."""
+Colour = tuple[float, float, float]
+"""Red, green, blue; linear light, 0 to 1."""
+Finish = tuple[Colour, float, float, float]
+"""Base colour, roughness, metallic, glow."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A robot's surface.
+
+    Parameters
+    ----------
+    vertices
+        (V, 3) metres, body frame.
+    faces
+        (F, 3) vertices of triangles, anticlockwise from outside.
+    material
+        (F,) number of the material.
+    rotor
+        (V, 3) of points of rotors: x and y from the hub, metres, and the rotor's number.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    material: NDArray[np.int64]
+    rotor: Array
+
+
+@dataclass(frozen=True)
+class Design:
+    """A robot that dmrl draws.
+
+    Parameters
+    ----------
+    paint
+        Finish of every material.
+    others
+        Colours that parts are sold in, beside those of ``paint``.
+    parts
+        Makes its parts at life size, body frame.
+    """
+
+    paint: Mapping[str, Finish]
+    others: Mapping[str, tuple[Colour, ...]]
+    parts: Callable[[], Iterable[Part]]
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names in the order of the mesh's numbers."""
+        return tuple(self.paint)
+
+    def mesh(self) -> Mesh:
+        """The whole robot. The same arrays every time: do not write into them."""
+        return _mesh(self.parts, self.materials)
+
+
+@cache
+def _mesh(parts: Callable[[], Iterable[Part]], materials: tuple[str, ...]) -> Mesh:
+    return joined(parts(), materials)
+
+
+def joined(parts: Iterable[Part], materials: tuple[str, ...]) -> Mesh:
+    """Parts as one surface.
+
+    Parameters
+    ----------
+    parts
+        Of a robot, body frame.
+    materials
+        Their names, in the order of the mesh's numbers.
+    """
+    vertices, faces, material, rotor = [], [], [], []
+    count = rotors = 0
+    for name, points, triangles in parts:
+        vertices.append(points)
+        faces.append(triangles + count)
+        material.append(np.full(len(triangles), materials.index(name)))
+        hub, number = (points.mean(axis=0), rotors) if name == ROTOR else (points, 0)
+        rotor.append(np.column_stack([(points - hub)[:, :2], np.full(len(points), float(number))]))
+        rotors += name == ROTOR
+        count += len(points)
+    return Mesh(*(np.concatenate(one) for one in (vertices, faces, material, rotor)))
+
+
+def prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.int64]]:
+    """A convex outline (K, 2), anticlockwise from above, stretched from low to high."""
+    count = len(outline)
+    points = np.concatenate(
+        [np.column_stack([outline, np.full(count, z)]) for z in (low, high)], axis=0
+    )
+    k = np.arange(count)
+    after = (k + 1) % count
+    fan = np.column_stack([np.zeros(count - 2, int), k[1:-1], k[2:]])
+    sides = np.concatenate(
+        [
+            np.column_stack([k, after, after + count]),
+            np.column_stack([k, after + count, k + count]),
+        ]
+    )
+    return points, np.concatenate([fan[:, ::-1], fan + count, sides])
+
+
+def box(name: str, centre: tuple[float, float, float], size: tuple[float, float, float]) -> Part:
+    """A box, its sides along the axes, metres."""
+    x, y, z = centre
+    outline = CORNERS * np.array(size[:2]) / 2 + (x, y)
+    return name, *prism(outline, z - size[2] / 2, z + size[2] / 2)
+
+
+def cylinder(
+    name: str, xy: tuple[float, float], radius: float, low: float, high: float, sides: int = 14
+) -> Part:
+    """An upright cylinder about ``xy``, from ``low`` to ``high``, metres."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    outline = np.column_stack([np.cos(turn), np.sin(turn)]) * radius + xy
+    return name, *prism(outline, low, high)
+
+
+def turned(part: Part, angle: float) -> Part:
+    """The part turned about the z axis."""
+    name, points, faces = part
+    c, s = np.cos(angle), np.sin(angle)
+    return name, points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), faces
+
+
+def rounded(
+    name: str, centre: tuple[float, float, float], size: tuple[float, float, float], cut: float
+) -> Part:
+    """A box with its upright edges cut, as circuit boards have."""
+    x, y, z = centre
+    half_x, half_y = size[0] / 2, size[1] / 2
+    outline = np.array(
+        [
+            (half_x, -half_y + cut),
+            (half_x, half_y - cut),
+            (half_x - cut, half_y),
+            (-half_x + cut, half_y),
+            (-half_x, half_y - cut),
+            (-half_x, -half_y + cut),
+            (-half_x + cut, -half_y),
+            (half_x - cut, -half_y),
+        ]
+    )
+    return name, *prism(outline + np.array([x, y]), z - size[2] / 2, z + size[2] / 2)
