@@ -10,6 +10,8 @@ from dmrl.learn.optimizer import OptimizerName
 from dmrl.learn.targets import LabelNoise
 from dmrl.learn.windows import Intrinsics
 
+DEFAULT, AUTO = "dmrl-nano", "auto"
+
 
 @dataclass(frozen=True, slots=True)
 class FitSettings(LossSettings):
@@ -18,7 +20,7 @@ class FitSettings(LossSettings):
     Parameters
     ----------
     architecture
-        Name of the network.
+        Name of the network. auto: that of the model to start from or, without one, dmrl-nano.
     epochs
         Times that ``epoch_images`` are seen.
     epoch_images
@@ -107,7 +109,7 @@ class FitSettings(LossSettings):
         threads. As many give the same weights, byte for byte. torchrun says how many itself.
     """
 
-    architecture: str = "dmrl-nano"
+    architecture: str = DEFAULT
     epochs: int = 60
     epoch_images: int = 0
     batch_size: int = 16

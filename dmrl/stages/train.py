@@ -37,7 +37,7 @@ try:
         with_channels,
     )
     from dmrl.learn.network import Network
-    from dmrl.learn.settings import FitSettings
+    from dmrl.learn.settings import AUTO, DEFAULT, FitSettings
     from dmrl.learn.threshold import best_threshold
     from dmrl.learn.validate import scores
 except ModuleNotFoundError as e:
@@ -102,8 +102,16 @@ def run(
     if settings.init_share and init is None:
         raise SettingError("init_share: there is nothing to keep a share of. Give --init MODEL")
     given = Given(init and resolved(init), teacher and resolved(teacher))
+    settings = _with_architecture(settings, given.init)
     processes = settings.processes if device_of(settings.device).type == "cpu" else 1
     return in_group(processes, partial(_run, dataset, out, settings, given, resume=resume))
+
+
+def _with_architecture(settings: Settings, init: Path | None) -> Settings:
+    """Settings whose network is named: of "auto", that of ``init`` or the default one."""
+    if settings.architecture != AUTO:
+        return settings
+    return replace(settings, architecture=load_model(init).architecture if init else DEFAULT)
 
 
 class Given(NamedTuple):

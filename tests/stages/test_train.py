@@ -89,6 +89,18 @@ def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) 
 
 
 @pytest.mark.heavy
+def test_auto_takes_the_network_of_init(dataset: Path, tmp_path: Path) -> None:
+    auto = replace(SETTINGS, architecture="auto", epochs=1, epoch_images=4)
+    run(dataset, tmp_path / "fine", replace(auto, architecture="dmrl-nano-fine"))
+    run(dataset, tmp_path / "on", auto, init=tmp_path / "fine")
+    run(dataset, tmp_path / "new", auto)
+    named = [load_model(tmp_path / name).architecture for name in ("on", "new")]
+    assert named == ["dmrl-nano-fine", "dmrl-nano"]
+    made = json.loads((tmp_path / "on" / "provenance.json").read_text())
+    assert made["settings"]["architecture"] == "dmrl-nano-fine"
+
+
+@pytest.mark.heavy
 def test_a_teacher_is_learnt_from_and_named(dataset: Path, tmp_path: Path) -> None:
     taught = replace(SETTINGS, distill_share=1.0)
     run(dataset, tmp_path / "teacher", replace(SETTINGS, architecture="dmrl-large"))

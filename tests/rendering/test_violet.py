@@ -1,0 +1,52 @@
+"""The violet robot drawn by code, and the names of all that are drawn."""
+
+from typing import get_args, get_type_hints
+
+import numpy as np
+
+from dmrl.rendering.designs import DESIGNS
+from dmrl.rendering.settings import Settings
+from dmrl.rendering.violet import FITTED_SIZE, FITTED_Z_M, VIOLET
+
+
+def test_it_has_four_motors_as_far_apart_as_fitted() -> None:
+    mesh = VIOLET.mesh()
+    motor = mesh.vertices[np.unique(mesh.faces[mesh.material == VIOLET.materials.index("motor")])]
+    side = np.sign(motor[:, :2])
+    each = np.unique(side, axis=0)
+    hubs = np.array([motor[(side == one).all(axis=1), :2].mean(axis=0) for one in each])
+    np.testing.assert_allclose(np.hypot(*hubs.T), 0.046 * FITTED_SIZE, atol=1e-6)
+    np.testing.assert_allclose(np.abs(hubs), 0.046 * FITTED_SIZE / np.sqrt(2), atol=1e-6)
+
+
+def test_feet_are_below_and_blades_above_the_board() -> None:
+    mesh = VIOLET.mesh()
+    height = {
+        name: np.sort(mesh.vertices[np.unique(mesh.faces[mesh.material == k])][:, 2])
+        for k, name in enumerate(VIOLET.materials)
+    }
+    board = height["board"].mean()
+    assert board == FITTED_Z_M
+    assert height["mount"][0] < board - 0.012 < board + 0.008 < height["blade"][0]
+    assert height["frame"][-1] < height["motor"][-1] < height["blade"][-1]
+
+
+def test_blades_are_opposite_each_other_and_pitched_the_way_they_turn() -> None:
+    mesh = VIOLET.mesh()
+    faces = mesh.faces[mesh.material == VIOLET.materials.index("blade")]
+    a, b, c = np.moveaxis(mesh.vertices[faces], 1, 0)
+    normal, middle = np.cross(b - a, c - a), (a + b + c) / 3
+    hub = np.sign(middle[:, :2]) * 0.046 * FITTED_SIZE / np.sqrt(2)
+    out = middle[:, :2] - hub
+    blade = (np.hypot(*out.T) > 0.004) & (np.abs(normal[:, 2]) > 1e-9)
+    slope = normal[blade, :2] / normal[blade, 2:]
+    # A blade rises against the way its rotor turns; neighbours turn the other way.
+    ways = np.sign(out[blade, 0] * slope[:, 1] - out[blade, 1] * slope[:, 0])
+    clockwise = np.sign(np.prod(middle[blade, :2], axis=1))
+    assert set((ways * clockwise).tolist()) in ({1.0}, {-1.0})
+
+
+def test_every_design_is_a_setting_and_the_other_way_round() -> None:
+    named = get_args(get_type_hints(Settings)["design"])
+    assert set(named) == set(DESIGNS)
+    assert DESIGNS[Settings().design].materials[0] == "board"
