@@ -14,6 +14,7 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "examples/README.md": "examples.md",
     "dmrl/learn/pretrained/dmrl-nano/README.md": "networks/dmrl-nano.md",
+    "dmrl/learn/pretrained/dmrl-nano-violet/README.md": "networks/dmrl-nano-violet.md",
 }
 """Pages of the repository, and what they are called on the site."""
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]*)(#[^)\s]*)?\)")
