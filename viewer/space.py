@@ -69,7 +69,7 @@ def attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
 
 def body(robot: str) -> Iterator[Entity]:
     """A robot's shape, axes and name."""
-    mesh = crazyflie.mesh()
+    mesh = crazyflie.CRAZYFLIE.mesh()
     shape = rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
