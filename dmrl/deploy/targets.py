@@ -39,7 +39,9 @@ class Build:
     bayer: bool = False
     emulated: bool = False
 
-    def program(self, network: IntegerNetwork, folder: Path, build: Path) -> list[str | Path]:
+    def program(
+        self, network: IntegerNetwork, folder: Path, build: Path, *, refine: bool = False
+    ) -> list[str | Path]:
         """Compile the C of an export folder; how to call what comes of it.
 
         Parameters
@@ -50,6 +52,8 @@ class Build:
             The export folder.
         build
             Folder for what is compiled.
+        refine
+            The program that learns on, not the one that finds.
 
         Raises
         ------
@@ -61,7 +65,10 @@ class Build:
         name = c_name(network)
         mode = f"-D{name.upper()}_BAYER={int(self.bayer)}"
         flags: tuple[str | Path, ...] = (*self.flags, mode, "-iquote", folder)
-        sources = (harness_c, folder / f"{name}.c")
+        sources = [harness_c, folder / f"{name}.c"]
+        if refine:
+            flags = (*flags, "-DHARNESS_REFINE")
+            sources.append(folder / f"{name}_refine.c")
         last: tuple[str, ...] = ("-lgcc",) if self.emulated else ()
         what = f"{self.compiler} {self.label}"
         run((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)

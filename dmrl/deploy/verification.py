@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 from dmrl.deploy.bayer import demosaic, mosaic
 from dmrl.deploy.c.harness import MOST, Answer, answers
 from dmrl.deploy.c.source import STACK_BYTES
+from dmrl.deploy.c.text import c_name
 from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.reference import decode
+from dmrl.deploy.reference import decode, tensors_of
 from dmrl.deploy.reference import run as reference_run
+from dmrl.deploy.refine import Seen, learn, start
 from dmrl.deploy.targets import Build, Target
 from dmrl.deploy.toolchain import run
 from dmrl.errors import ToolError
 
 Image = NDArray[np.uint8]
+LEARNT_IMAGES, LEARNING_RATE = 5, 3277
+"""Images that a build learns on, and how fast: 0.05."""
 BAYER_IMAGES = 4
 """Images that a build for raw mosaics is tried on: it differs in the first rows of code alone."""
 
@@ -131,6 +135,8 @@ def prove(
         on_build(f"{target.name} {build.label}")
         try:
             result.builds.append(_try(network, folder, build, wanted))
+            if learns(network, folder) and not build.bayer:
+                result.builds.append(_try_learning(network, folder, build, wanted.images))
         except ToolError as e:
             return TargetResult(target.name, result.builds, error=str(e))
     return result
@@ -156,6 +162,40 @@ def _try(network: IntegerNetwork, folder: Path, build: Build, wanted: Expected) 
         )
     wrong = sum(not same(a, b) for a, b in zip(found, right, strict=True))
     return BuildResult(build.label, len(images), wrong, stack_bytes)
+
+
+def learns(network: IntegerNetwork, folder: Path) -> bool:
+    """Whether an export folder has the C that learns on."""
+    return (folder / f"{c_name(network)}_refine.c").is_file()
+
+
+def _try_learning(
+    network: IntegerNetwork, folder: Path, build: Build, images: Sequence[Image]
+) -> BuildResult:
+    """Learn on image after image: every weight after every step."""
+    few = images[:LEARNT_IMAGES]
+    steps = [(*_made_up(network, k), LEARNING_RATE) for k in range(len(few))]
+    pairs = zip(few, steps, strict=True)
+    data = b"".join(i.tobytes() + np.array(step, "<i4").tobytes() for i, step in pairs)
+    with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
+        command = build.program(network, folder, Path(place), refine=True)
+        said = run(command, f"{build.compiler} {build.label}, learning", data=data)
+    learned, wanted = start(network), []
+    for image, (*seen, rate) in zip(few, steps, strict=True):
+        *_, features, _ = tensors_of(network, image)
+        learned = learn(network, learned, features, Seen(*seen), rate)
+        wanted.append(np.concatenate([learned.weight.ravel(), learned.bias]))
+    got = np.frombuffer(said[: len(said) // 4 * 4], "<i4").reshape(len(few), -1)
+    wrong = sum(not np.array_equal(a, b) for a, b in zip(got, wanted, strict=True))
+    return BuildResult(f"{build.label}, learning", len(few), wrong, 0)
+
+
+def _made_up(network: IntegerNetwork, number: int) -> Seen:
+    """Somebody somewhere in an image; in every third nobody."""
+    if number % 3 == 2:
+        return Seen(0, 0, 0)
+    u_px, v_px = (37 + 61 * number) % network.width_px, (23 + 41 * number) % network.height_px
+    return Seen(16 * u_px + 5, 16 * v_px + 3, 400 + 300 * number)
 
 
 def same(a: Answer, b: Answer) -> bool:

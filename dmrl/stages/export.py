@@ -38,9 +38,13 @@ class Settings:
     bayer
         The C takes raw colour mosaics, as the AI-deck's camera gives them, unless it is compiled
         otherwise.
+    refine
+        Write C that learns on in the last layer too, from images of which it is told who is in
+        view. The state then holds all that the last layer reads.
     """
 
     bayer: bool = False
+    refine: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +119,7 @@ def _write_int8(network: IntegerNetwork, model: Path, folder: Path, settings: Se
     for name in (INTEGER_NAME, SAMPLES_NAME):
         shutil.copyfile(model / name, folder / name)
     images = [seen_by(network, image) for image in load_samples(model)]
-    write_c(network, folder, images, bayer=settings.bayer)
+    write_c(network, folder, images, bayer=settings.bayer, refine=settings.refine)
 
 
 def _written(path: Path) -> Written:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.deploy.c.refinement import refinement
 from dmrl.deploy.c.source import source
 from dmrl.deploy.c.text import c_name, fill, names_of
 from dmrl.deploy.c.vectors import MOST, vectors
@@ -23,6 +24,7 @@ def write_c(
     images: Sequence[NDArray[np.uint8]],
     *,
     bayer: bool = False,
+    refine: bool = False,
 ) -> list[str]:
     """Write the C of a network into a folder.
 
@@ -37,6 +39,8 @@ def write_c(
         of the self-test, beside one of noise.
     bayer
         Whether the C takes raw colour mosaics unless compiler flags say otherwise.
+    refine
+        Write the C that learns on as well, see `refinement`.
 
     Returns
     -------
@@ -49,8 +53,9 @@ def write_c(
         If the C cannot carry the network; the layer is named.
     """
     names, name = names_of(network), c_name(network)
-    made = source(network, names, bayer=bayer)
-    files = {
+    made = source(network, names, bayer=bayer, features=refine)
+    files = refinement(network, names) if refine else {}
+    files |= {
         f"{name}.c": made.code,
         f"{name}.h": made.header,
         f"{name}_vectors.h": vectors(network, images, names, bayer=bayer),

@@ -84,8 +84,15 @@ class Plan:
         }
 
 
-def plan(network: IntegerNetwork) -> Plan:
+def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
     """How the C of a network works.
+
+    Parameters
+    ----------
+    network
+        What is computed.
+    features
+        Hold all that the last layer reads, as the heads are held.
 
     Raises
     ------
@@ -100,6 +107,8 @@ def plan(network: IntegerNetwork) -> Plan:
     steps, tensors = _steps(network)
     shapes = [network.shapes[tensors.index(k)] for k in range(len(steps) + 1)]
     whole = {tensors[h.tensor] for h in network.heads.values()}
+    if features:
+        whole |= {k for step in steps[-1:] for k in step.sources}
     writes = play(steps, [rows for _, rows, _ in shapes])
     rings = rows_held(writes, len(shapes))
     drafts = [_buffer(k, shapes[k], rings[k], steps) for k in range(len(shapes))]

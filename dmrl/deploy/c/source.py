@@ -46,7 +46,9 @@ class Source:
     stack_bytes: int = STACK_BYTES
 
 
-def source(network: IntegerNetwork, names: dict[str, str], *, bayer: bool) -> Source:
+def source(
+    network: IntegerNetwork, names: dict[str, str], *, bayer: bool, features: bool = False
+) -> Source:
     """The C file and the header of a network.
 
     Parameters
@@ -57,13 +59,15 @@ def source(network: IntegerNetwork, names: dict[str, str], *, bayer: bool) -> So
         As ``text.names_of`` gives them.
     bayer
         Whether images are raw colour mosaics unless the user's compiler flags say otherwise.
+    features
+        Whether the state holds all that the last layer reads, for `refinement`.
 
     Raises
     ------
     ModelError
         If the C does not carry the network; the layer is named.
     """
-    planned = plan(network)
+    planned = plan(network, features=features)
     require_carried(planned)
     weights, weight_bytes = constants(planned)
     tables = {f"{name}_table": head for name, head in network.heads.items()}
@@ -192,6 +196,9 @@ def _decode(planned: Plan, names: dict[str, str]) -> str:
         f"    case {_head_name(names, name)}: return {_cell(planned, head)};\n"
         for name, head in heads.items()
     )
+    meanings = "".join(
+        f"    case {_head_name(names, name)}: return {name}_table[value + 128];\n" for name in heads
+    )
     step, sub_cell = network.stride_px * SUBPIXEL, "offset_u" in heads
     places = {}
     for axis, side in (("u", "col"), ("v", "row")):
@@ -205,7 +212,15 @@ def _decode(planned: Plan, names: dict[str, str]) -> str:
     near = int(SAME_PX * SUBPIXEL)
     doubles = fill("doubles.c", **names, near=near) if sub_cell else ""
     count = "without_doubles(found, count)" if sub_cell else "count"
-    return fill("decode.c", **names, **places, cases=cases, doubles=doubles, count=count)
+    return fill(
+        "decode.c",
+        **names,
+        **places,
+        cases=cases,
+        meanings=meanings,
+        doubles=doubles,
+        count=count,
+    )
 
 
 def _head_name(names: dict[str, str], head: str) -> str:

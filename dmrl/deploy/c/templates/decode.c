@@ -5,6 +5,13 @@ $cases    default: return 0;
     }
 }
 
+int32_t ${prefix}_meaning(int head, int8_t value)
+{
+    switch (head) {
+$meanings    default: return 0;
+    }
+}
+
 /* Confidence in a cell, in steps; below every cell outside the grid. */
 static int confidence_at(const ${prefix}_t *net, int row, int col)
 {

@@ -40,11 +40,12 @@ static uint8_t image[${PREFIX}_IMAGE_BYTES];
 static ${prefix}_detection_t found[MOST];
 static int8_t grids[${PREFIX}_HEADS * ${PREFIX}_ROWS * ${PREFIX}_COLS];
 
-static int take_image(void)
+static int take(void *data, size_t count)
 {
+    uint8_t *to = data;
     size_t there = 0;
-    while (there < sizeof image) {
-        const long more = read(0, image + there, sizeof image - there);
+    while (there < count) {
+        const long more = read(0, to + there, count - there);
         if (more <= 0)
             return 0;
         there += (size_t)more;
@@ -94,9 +95,28 @@ static int32_t unpainted(void)
 }
 #endif
 
+#ifdef HARNESS_REFINE
+#include "${prefix}_refine.h"
+
+static ${prefix}_head_t head;
+static int32_t seen[4]; /* u, v, depth, rate */
+
+/* An image and who is in it, again and again; answers with the learned weights. */
 int main(void)
 {
-    while (take_image()) {
+    ${prefix}_head_init(&head);
+    while (take(image, sizeof image) && take(seen, sizeof seen)) {
+        ${prefix}_run(&net, image, found, MOST);
+        ${prefix}_head_apply(&head, &net);
+        ${prefix}_head_learn(&head, &net, seen[0], seen[1], seen[2], seen[3]);
+        give(&head, sizeof head);
+    }
+    return 0;
+}
+#else
+int main(void)
+{
+    while (take(image, sizeof image)) {
         paint();
         const int32_t count = harness_run(image, grids, found, MOST);
         const int32_t stack = unpainted();
@@ -107,6 +127,7 @@ int main(void)
     }
     return 0;
 }
+#endif
 
 #if defined(__riscv)
 void _start(void)

@@ -74,6 +74,10 @@ int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int m
 /* After the last row: the network's own output in a cell, in its steps. */
 int8_t ${prefix}_output(const ${prefix}_t *net, int head, int row, int col);
 
+/* What a value of an output means: confidence (65535 is 1), millimetres, 1/16 px from the cell's left
+ * or top edge. */
+int32_t ${prefix}_meaning(int head, int8_t value);
+
 /* All of it for an image that lies in memory, ${PREFIX}_IMAGE_BYTES bytes from the top left. */
 int ${prefix}_run(${prefix}_t *net, const uint8_t *image, ${prefix}_detection_t *found, int most);
 

@@ -1,0 +1,45 @@
+"""C that learns on in the last layer, beside the network's own; see `dmrl.deploy.refine`."""
+
+import numpy as np
+
+from dmrl.deploy.c.plan import plan
+from dmrl.deploy.c.text import fill, wrapped
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.refine import gains, last_layer
+
+
+def refinement(network: IntegerNetwork, names: dict[str, str]) -> dict[str, str]:
+    """Names and texts of the files.
+
+    Raises
+    ------
+    ModelError
+        If the last layer is not such as can be learned on.
+    """
+    layer, planned = last_layer(network), plan(network, features=True)
+    features, grid = planned.buffers[planned.steps[-1].sources[0]], planned.buffers[-1]
+    rows = [head.channel for head in network.heads.values()]
+    weights = [f"{w}," for w in layer.weight[rows].ravel().tolist()]
+    numbers = np.column_stack([layer.bias[rows], layer.multiplier[rows], *gains(network)])
+    offsets = "h == {}_OFFSET_U ? u_q4 % step : v_q4 % step".format(names["PREFIX"])
+    size = {"features": features.channels}
+    return {
+        f"{names['prefix']}_refine.h": fill("refine.h", **names, **size),
+        f"{names['prefix']}_refine.c": fill(
+            "refine.c",
+            **names,
+            weights="\n".join(wrapped(weights, "    ")),
+            heads="".join(f"    {{{', '.join(map(str, each))}}},\n" for each in numbers.tolist()),
+            member=features.home,
+            row_bytes=features.row_bytes,
+            start=features.gap * features.channels,
+            set="".join(
+                f"    case {names['PREFIX']}_{name.upper()}: net->{grid.home}"
+                f"[row * {grid.row_bytes} + col * {grid.channels} + {head.channel}] = "
+                "(uint8_t)value; break;\n"
+                for name, head in network.heads.items()
+            ),
+            shift=layer.shift,
+            place=f"({offsets})" if network.offset_u is not None else "0",
+        ),
+    }
