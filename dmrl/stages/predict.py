@@ -278,7 +278,8 @@ def command(
     ----------
     model
         A run folder of dmrl train, a .safetensors, a Keras .h5, a quantised model, an export
-        folder, or dmrl-nano, which ships with dmrl.
+        folder, or one that ships with dmrl: dmrl-nano for a real camera, dmrl-nano-violet for
+        the published images.
     recording
         Recording with images; or a folder of recordings.
     out
