@@ -90,15 +90,20 @@ def float_onnx(
     out = _Writer()
     planes = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
     pixels = out.node("Cast", [planes], "pixels", to=TensorProto.FLOAT)
-    scale = out.constant("pixel_scale", np.array(1 / PIXEL_ZERO, np.float32))
-    one = out.constant("one", np.array(1, np.float32))
-    scaled = out.node("Mul", [pixels, scale], "pixels_scaled")
-    tensors = [out.node("Sub", [scaled, one], "input")]
+    zero = out.constant("pixel_zero", np.array(PIXEL_ZERO, np.float32))
+    centred = out.node("Sub", [pixels, zero], "pixels_centred")
+    tensors = [centred]
+    if not _weights_scale(graph):
+        scale = out.constant("pixel_scale", np.array(1 / PIXEL_ZERO, np.float32))
+        tensors = [out.node("Mul", [centred, scale], "input")]
     for layer in graph.layers:
         inputs = [tensors[k] for k in layer.sources]
         name = f"{layer.name}.sum" if layer.relu else layer.name
         if isinstance(layer, FloatConv):
-            weight = out.constant(f"{layer.name}.weight", layer.weight.astype(np.float32))
+            weights = layer.weight.astype(np.float32)
+            if inputs[0] == centred:
+                weights /= np.float32(PIXEL_ZERO)  # a power of two: the same bits as of the pixels
+            weight = out.constant(f"{layer.name}.weight", weights)
             bias = out.constant(f"{layer.name}.bias", layer.bias.astype(np.float32))
             value = f"{name}.conv" if inputs[1:] else name
             out.node("Conv", [inputs[0], weight, bias], value, **_conv_settings(layer))
@@ -116,6 +121,13 @@ def float_onnx(
             names[channel] = out.node("Gather", [tensors[tensor], at], OUTPUT_OF[channel], axis=1)
     image = (*size_px, graph.channels)
     return out.model("float", image, dict.fromkeys(names.values(), grid_shape))
+
+
+def _weights_scale(graph: Graph) -> bool:
+    """Whether only convolutions take the image, so that their weights can scale it."""
+    takes = [layer for layer in graph.layers if 0 in layer.sources]
+    convolved = all(isinstance(one, FloatConv) and 0 not in one.sources[1:] for one in takes)
+    return convolved and all(tensor for tensor, _ in graph.outputs)
 
 
 def _conv_settings(layer: FloatConv | Conv) -> dict[str, Any]:
