@@ -49,7 +49,10 @@ def plain_loops(model: Path, recording: Path) -> tuple[int, dict[str, Callable[[
         for k in range(0, len(images), size):
             session.run(None, {"image": images[k : k + size]})
 
-    loops = {PLAIN: partial(run, BATCH), "onnxruntime, plain loop, one by one": partial(run, 1)}
+    loops: dict[str, Callable[[], object]] = {
+        PLAIN: partial(run, BATCH),
+        "onnxruntime, plain loop, one by one": partial(run, 1),
+    }
     return len(images), loops
 
 
