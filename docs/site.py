@@ -15,7 +15,6 @@ PAGES = {
     "examples/README.md": "examples.md",
     "dmrl/learn/pretrained/dmrl-nano/README.md": "networks/dmrl-nano.md",
     "dmrl/learn/pretrained/dmrl-nano-violet/README.md": "networks/dmrl-nano-violet.md",
-    "dmrl/learn/pretrained/dmrl-nano-violet/README.md": "networks/dmrl-nano-violet.md",
 }
 """Pages of the repository, and what they are called on the site."""
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]*)(#[^)\s]*)?\)")
