@@ -78,3 +78,17 @@ def test_seconds_of_three_ranges_are_not_asked(monkeypatch: pytest.MonkeyPatch) 
         solution = SimpleNamespace(state=None, constants=None)
         got = excess(flight, Noise(), solution)  # type: ignore[arg-type]
         assert got == (found or pytest.approx(2.0 / ONE**0.5, rel=1e-6))
+
+
+def test_seconds_are_counted_from_the_flight_s_first_keyframe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Eight ranges a second have one error. A clock that began elsewhere tells the same."""
+    residual = np.repeat(np.random.default_rng(9).normal(0, 1, 50), 8)
+    monkeypatch.setattr(grading, "linearise", lambda *_: SimpleNamespace(range=residual))
+    solution, key = SimpleNamespace(state=None, constants=None), np.arange(len(residual))
+    found = set()
+    for began in (0.0, 0.5, 77.25):
+        flight = SimpleNamespace(key_s=key / 8 + began, range_key=key)
+        found.add(excess(flight, Noise(), solution))  # type: ignore[arg-type]
+    assert len(found) == 1 and found.pop() > 2
