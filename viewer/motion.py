@@ -17,6 +17,8 @@ from dmrl.viewer.entity import WORLD, horizontal_frame
 
 Times = NDArray[np.int64]
 Names = tuple[str, str]
+MOST = 1e9
+"""Metres, or parts of a quaternion, that are drawn; a recording may say what it likes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,20 +184,32 @@ def poses_of(batch: pa.RecordBatch) -> dict[str, Poses]:
     for frame in dict.fromkeys(children):
         own = np.flatnonzero(children == frame)
         parent = parts.field("parent_frame_id")[int(own[0])].as_py()
-        out[frame] = Poses(parent, time_ns[own], xyz[own], xyzw[own])
+        out[frame] = Poses(parent, time_ns[own], xyz[own], _unit(xyzw[own]))
     return out
+
+
+def _unit(xyzw: Array) -> Array:
+    """Quaternions of length one; NaN where there is no direction."""
+    length = np.linalg.norm(xyzw, axis=1, keepdims=True)
+    return xyzw / np.where(length > 0, length, np.nan)
+
+
+def _drawable(values: Array) -> Array:
+    """The values; NaN where they cannot be drawn."""
+    return np.where(abs(values) < MOST, values, np.nan)
 
 
 def positions_of(batch: pa.RecordBatch) -> Positions:
     """Columns of PeerPosition."""
     xyz = np.stack([batch[axis].to_numpy() for axis in "xyz"], axis=1)
     covariance = covariances(batch["covariance"])
-    return Positions(batch["log_time"].to_numpy(), xyz, covariance, batch["status"].to_numpy())
+    time_ns, status = (batch[name].to_numpy() for name in ("log_time", "status"))
+    return Positions(time_ns, _drawable(xyz), covariance, status)
 
 
 def ranges_of(batch: pa.RecordBatch) -> Ranges:
     """Columns of UwbRange."""
-    return Ranges(batch["log_time"].to_numpy(), batch["range_m"].to_numpy())
+    return Ranges(batch["log_time"].to_numpy(), _drawable(batch["range_m"].to_numpy()))
 
 
 def covariances(column: pa.ListArray) -> Array:
@@ -203,9 +217,9 @@ def covariances(column: pa.ListArray) -> Array:
     given = column.value_lengths().to_numpy() == 9
     out = np.full((len(column), 3, 3), np.nan)
     out[given] = column.filter(pa.array(given)).flatten().to_numpy().reshape(-1, 3, 3)
-    return out
+    return _drawable(out)
 
 
 def vectors(column: pa.StructArray, axes: str) -> Array:
-    """(N, k) of a column of structs with these fields."""
-    return np.stack([column.field(axis).to_numpy() for axis in axes], axis=1)
+    """(N, k) of a column of structs with these fields; NaN where they cannot be drawn."""
+    return _drawable(np.stack([column.field(axis).to_numpy() for axis in axes], axis=1))

@@ -17,6 +17,8 @@ from dmrl.recording.check_units import unit_doubts
 LEAST_S = 5.0
 """Shortest common stretch of two logs that is worth estimating."""
 LEAST_RANGES = 20
+MOST = 1e6
+"""No sensor says so many metres, radians or metres per second; their squares are no numbers."""
 SENSED = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE)
 """What positions are estimated from."""
 
@@ -150,14 +152,16 @@ def _robot(held: Contents, name: str, warnings: list[str]) -> RobotLog | None:
 def _signals(
     held: Contents, topic: str, fields: tuple[str, ...], warnings: list[str]
 ) -> Signals | None:
-    """Finite samples of a topic; None, with a warning, where there is none."""
+    """Samples of a topic that can be computed with; None, with a warning, where there is none."""
     table = held.table(topic, fields)
     warnings += [f"{topic}: {doubt}" for doubt in unit_doubts(topic, table)]
     values = np.column_stack([table[field].to_numpy() for field in fields]).astype(float)
     time_ns, received_ns = (table[c].to_numpy() for c in ("log_time", "publish_time"))
-    good = np.isfinite(values).all(axis=1)
+    good = (abs(values) < MOST).all(axis=1)
     if bad := int((~good).sum()):
-        warnings.append(f"{topic}: {bad} of {len(good)} samples are not finite; left out")
+        warnings.append(
+            f"{topic}: {bad} of {len(good)} samples are not finite, or {MOST:g} and more; left out"
+        )
     # Messages are in log-time order, but the order they came in tells of a clock that was set back.
     if back := int((np.diff(received_ns) < -1_000_000_000).sum()):
         warnings.append(f"{topic}: its clock goes back {back} times; samples overlap there")

@@ -195,13 +195,14 @@ def test_who_has_a_log_and_no_pair_is_flying_and_said_so(tmp_path: Path) -> None
 
 def test_samples_that_are_no_numbers_and_clocks_that_go_back_are_said(tmp_path: Path) -> None:
     def bad(write: Write) -> None:
-        write(8.0, topics.height("cf1"), message("Height")(height_m=float("nan")))
+        for time_s, height_m in ((8.0, float("nan")), (8.01, -1e300)):
+            write(time_s, topics.height("cf1"), message("Height")(height_m=height_m))
         write(8.0, topics.uwb_range("cf1", "cf2"), message("UwbRange")(range_m=70.0))
 
     path = tmp_path / "a.mcap"
     found = logs(path, flight, ranges, bad)
     assert found.warnings == [
-        "/cf1/height: 1 of 161 samples are not finite; left out",
+        "/cf1/height: 2 of 162 samples are not finite, or 1e+06 and more; left out",
         "cf1-cf2: 1 of 41 ranges are not in (0, 60] m; left out",
     ]
     with RecordingWriter(tmp_path / "b.mcap", Provenance("test")) as sink:

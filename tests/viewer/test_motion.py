@@ -1,0 +1,55 @@
+"""What is drawn of poses and positions that a recording may say."""
+
+import warnings
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from dmrl.viewer.motion import poses_of, positions_of, ranges_of
+
+HOSTILE = [float("nan"), float("inf"), -float("inf"), 1e300, -1e300]
+
+
+def transforms(xyz: list[list[float]], xyzw: list[list[float]]) -> pa.RecordBatch:
+    parts = [
+        {
+            "parent_frame_id": "map",
+            "child_frame_id": "cf1",
+            "translation": dict(zip("xyz", place, strict=True)),
+            "rotation": dict(zip("xyzw", turn, strict=True)),
+        }
+        for place, turn in zip(xyz, xyzw, strict=True)
+    ]
+    return pa.RecordBatch.from_pydict(
+        {"log_time": np.arange(len(parts)) * 10, "transforms": [[part] for part in parts]}
+    )
+
+
+@pytest.mark.parametrize("bad", [*HOSTILE, 0.0])
+def test_poses_that_cannot_be_drawn_are_left_out_without_a_word(bad: float) -> None:
+    """A pose of numbers that are none, or a turn of length zero, between two sound ones."""
+    still, turn = [1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        places, turns = [still, [bad] * 3, still, still], [turn, [bad] * 4, turn, turn]
+        found = poses_of(transforms(places, turns))["cf1"]
+        seen = found.applied(np.array([[0.5, 0.0, 0.0]] * 4), np.array([-5, 5, 10, 35]))
+    assert seen[[0, 3]].tolist() == [[1.5, 2.0, 3.0]] * 2
+    assert np.isnan(seen[[1, 2]]).all()
+
+
+def test_turns_have_length_one() -> None:
+    found = poses_of(transforms([[0.0] * 3], [[0.0, 0.0, 2.0, 2.0]]))["cf1"]
+    assert found.xyzw[0] == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
+
+
+@pytest.mark.parametrize("bad", HOSTILE)
+def test_positions_and_ranges_that_cannot_be_drawn_are_no_numbers(bad: float) -> None:
+    columns = {"log_time": [0, 10], "x": [1.0, bad], "y": [2.0, 2.0], "z": [3.0, 3.0]}
+    columns |= {"covariance": [[1.0] * 9, [bad] * 9], "status": np.zeros(2, np.int32)}
+    found = positions_of(pa.RecordBatch.from_pydict(columns))
+    assert found.xyz[0].tolist() == [1, 2, 3] and np.isnan(found.xyz[1, 0])
+    assert (found.covariance[0] == 1).all() and np.isnan(found.covariance[1]).all()
+    heard = pa.RecordBatch.from_pydict({"log_time": [0, 10], "range_m": [1.5, bad]})
+    assert np.isnan(ranges_of(heard).range_m).tolist() == [False, True]
