@@ -157,7 +157,7 @@ def _signals(
     warnings += [f"{topic}: {doubt}" for doubt in unit_doubts(topic, table)]
     values = np.column_stack([table[field].to_numpy() for field in fields]).astype(float)
     time_ns, received_ns = (table[c].to_numpy() for c in ("log_time", "publish_time"))
-    good = (abs(values) < MOST).all(axis=1)
+    good = np.asarray((abs(values) < MOST).all(axis=1))
     if bad := int((~good).sum()):
         warnings.append(
             f"{topic}: {bad} of {len(good)} samples are not finite, or {MOST:g} and more; left out"
