@@ -100,6 +100,8 @@ def decode(data: bytes, what: object = "the image") -> Rgb:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
+                if image.mode == "P" and image.palette is None:  # Pillow only asserts it
+                    raise ValueError("its palette is missing")
                 return np.asarray(image.convert("RGB"))
         except BROKEN as e:
             why = " ".join(str(e).split())

@@ -58,6 +58,26 @@ def test_what_is_no_picture_is_named(bad: bytes) -> None:
             function(bad, "a.png")
 
 
+def test_a_picture_of_indexed_colours_without_their_palette_is_named(rgb: codec.Rgb) -> None:
+    stream = BytesIO()
+    Image.fromarray(rgb).convert("P").save(stream, "PNG")
+    assert codec.decode(stream.getvalue()).shape == rgb.shape
+    without = stream.getvalue().replace(b"PLTE", b"pLTE")  # a chunk that may be skipped
+    with pytest.raises(SourceError, match=r"a\.png cannot be decoded: its palette is missing"):
+        codec.decode(_with_sums(without), "a.png")
+
+
+def _with_sums(png: bytes) -> bytes:
+    """A PNG whose chunks have their check sums."""
+    out, at = png[:8], 8
+    while at < len(png):
+        (size,) = struct.unpack_from(">I", png, at)
+        named = png[at + 4 : at + 8 + size]
+        out += png[at : at + 4] + named + struct.pack(">I", zlib.crc32(named))
+        at += 12 + size
+    return out
+
+
 def test_the_part_that_is_scaled_is_the_one_named() -> None:
     rgb = np.zeros((40, 60, 3), np.uint8)
     rgb[10:30, 20:40] = 200
