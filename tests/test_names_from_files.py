@@ -35,6 +35,7 @@ REASONS = {
     "deploy/measure.py: f'{name}.c'": "named by c_name",
     "deploy/measure.py: f'{name}.o'": "named by c_name",
     "deploy/targets.py: f'{name}.c'": "named by c_name",
+    "deploy/targets.py: f'{name}_refine.c'": "named by c_name",
     "evaluation/report.py: name": OURS,
     "export/ros2.py: path.name": LISTED,
     "export/tables.py: name": "a number, and one of two endings",

@@ -31,6 +31,8 @@ STRIDE_PX = 8
 
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 CELL_COLOUR = (255, 255, 255)
+BELIEVED = 0.05
+"""Confidence below which a cell's depth is left dark: it is no robot's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +145,9 @@ def grids(
 ) -> Iterator[Entity]:
     """Heat maps of confidence and depth, and the cell with the highest confidence.
 
+    Depth is 0, the darkest colour, where no robot is believed to be: a network says some depth
+    in every cell, and has learned it near robots alone.
+
     Parameters
     ----------
     path, frame
@@ -164,7 +169,12 @@ def grids(
     names = batch["channels"][0].as_py()
     for index, channel in enumerate(names):
         if channel in scales:
-            buffers = [_share(data, index, len(names)) for data in batch["data"].to_pylist()]
+            grids = batch["data"].to_pylist()
+            buffers = [_share(data, index, len(names)) for data in grids]
+            if channel == "depth_m" and "confidence" in names:
+                at = names.index("confidence")
+                beliefs = (_share(data, at, len(names)) for data in grids)
+                buffers = [_dimmed(*two) for two in zip(buffers, beliefs, strict=True)]
             columns = rr.DepthImage.columns(buffer=buffers, format=formats)
             yield map_entity(
                 channel_path(path, channel),
@@ -226,6 +236,12 @@ def map_style(scale: Scale, *, smooth: bool = False) -> rr.DepthImage:
 def _share(data: bytes, index: int, parts: int) -> bytes:
     size = len(data) // parts
     return data[index * size : (index + 1) * size]
+
+
+def _dimmed(depth: bytes, confidence: bytes) -> bytes:
+    """A map of depths, 0 where the confidence is under ``BELIEVED``."""
+    believed = np.frombuffer(confidence, "<f4") >= BELIEVED
+    return np.where(believed, np.frombuffer(depth, "<f4"), np.float32(0)).tobytes()
 
 
 def rows_of(column: pa.ListArray) -> NDArray[np.intp]:

@@ -48,6 +48,8 @@ def _messages(robot: str, k: int) -> dict[str, Any]:
     peers = [{**truth, "box_px": [16, 8, 28, 18]}, {**truth, "u_px": 30, "source": "published"}]
     cell = np.zeros((2, ROWS, COLS), "<f4")
     cell[0, 1, 2], cell[1, 1, 2] = 0.9, 1.2
+    cell[0, 3, 4], cell[1, 3, 4] = 0.04, 2.0  # nobody believes in this one
+    cell[0, 4, 4], cell[1, 4, 4] = 0.06, 1.8
     found = [
         {"u_px": 21, "v_px": 13, "depth_m": 1.2, "confidence": 0.9},
         {"u_px": 50, "v_px": 40, "depth_m": 2.0, "confidence": 0.1},

@@ -96,7 +96,10 @@ def test_maps_have_fixed_ranges_and_cells_of_eight_pixels(make: Make, rrd: Path)
     assert ranges == {"confidence": [[[0.0, 1.0]]], "depth_m": [[[0.0, 2.5]]]}
     assert column(rrd, f"{grid}/depth_m", "Transform3D:scale") == [[[8.0, 8.0, 1.0]]]
     cells = np.frombuffer(bytes(column(rrd, f"{grid}/depth_m", "DepthImage:buffer")[0][0]), "<f4")
-    assert cells.reshape(6, 8)[1, 2] == np.float32(1.2)
+    cells = cells.reshape(6, 8)
+    assert cells[1, 2] == np.float32(1.2)
+    # Dark where nobody is believed to be.
+    assert cells[3, 4] == 0 and cells[4, 4] == np.float32(1.8)
 
 
 def test_a_single_robot_gets_four_panels_and_two_get_three_each(make: Make, tmp_path: Path) -> None:
