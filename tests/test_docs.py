@@ -147,7 +147,7 @@ def test_the_page_on_python_runs_as_it_stands(
 
 
 STOP = re.compile(
-    r"dmrl (view|render|dataset renders|train dataset (model$|refined)|train .*-renders)"
+    r"dmrl (view|render|dataset renders|train dataset (model$|few|refined)|train .*-renders)"
 )
 """Needs a window, Blender, or long; a slow walk takes the last three."""
 
@@ -202,7 +202,7 @@ def test_renders_of_ones_own_camera_can_be_refined_word_for_word(
     monkeypatch.chdir(tmp_path)
     app(["sketch", "shots", "--images", "40"], result_action="return_value")
     walk(ROOT / "docs/own_camera.md", "## 4.", re.compile("dmrl view"))
-    assert capsys.readouterr().out.count("last loss") == 3
+    assert capsys.readouterr().out.count("last loss") == 4
 
 
 @pytest.mark.slow
