@@ -22,7 +22,8 @@ def mined(
     """How often each image shall come in the next epoch, 1 on average.
 
     Images without a robot make up ``hard_share`` of it, each in proportion to the square of the
-    greatest confidence that the network has in it; the others keep their proportions.
+    greatest confidence that the network has in it; the others keep their proportions. An image
+    that has no share gets none.
 
     Parameters
     ----------
@@ -37,11 +38,12 @@ def mined(
     """
     before = np.ones(len(examples)) if shares is None else shares
     empty = empties(examples)
-    if not empty.any() or empty.all() or not before[~empty].sum():
+    wanted = empty & (before > 0)  # what has no share is not to be learned from
+    if not wanted.any() or not before[~empty].sum():
         return shares
-    weight = np.maximum(beliefs(network, examples, np.flatnonzero(empty)), LEAST) ** 2
+    weight = np.maximum(beliefs(network, examples, np.flatnonzero(wanted)), LEAST) ** 2
     out = before.copy()
-    out[empty] = hard_share * weight / weight.sum()
+    out[wanted] = hard_share * weight / weight.sum()
     out[~empty] *= (1 - hard_share) / before[~empty].sum()
     return np.asarray(out * len(examples))
 

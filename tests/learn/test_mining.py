@@ -43,10 +43,17 @@ def test_what_the_network_believes_comes_more_often() -> None:
 
 
 def test_images_with_a_robot_keep_their_proportions() -> None:
-    shares = mined(Bright(), examples(), np.array([1.0, 3.0, 1.0, 0.0, 0.0]), 0.2)
+    shares = mined(Bright(), examples(), np.array([1.0, 3.0, 1.0, 0.5, 0.5]), 0.2)
     assert shares is not None
     assert shares[1] == pytest.approx(3 * shares[0])
     assert shares[:2].sum() / shares.sum() == pytest.approx(0.8)
+
+
+def test_an_image_without_a_share_is_not_mined() -> None:
+    shares = mined(Bright(), examples(), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 0.4)
+    assert shares is not None
+    assert shares[4] == 0
+    assert shares[2:].sum() / shares.sum() == pytest.approx(0.4)
 
 
 def test_without_images_of_either_kind_nothing_changes() -> None:
