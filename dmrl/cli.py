@@ -26,7 +26,7 @@ from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
 from dmrl.border.names import without_middle
-from dmrl.storage.names import path_of
+from dmrl.storage import path_of
 from dmrl.terminal import standins
 
 _convert._converters[Path] = path_of  # so that every argument may be s3://bucket/key

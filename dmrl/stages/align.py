@@ -27,7 +27,7 @@ from dmrl.recording import (
     splits,
     summary,
 )
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
@@ -217,14 +217,14 @@ DEFAULTS = Settings()
 
 
 def command(
-    recording: Annotated[Path, Parameter(name="IN")],
+    recording: In,
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Set clocks by each other: from ranges of pairs, images, or motion capture.
 

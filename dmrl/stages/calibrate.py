@@ -17,6 +17,7 @@ from dmrl.geometry.frames import Camera
 from dmrl.images.codec import decode
 from dmrl.output import partial_file, refuse_existing
 from dmrl.recording import Contents, read, summary
+from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -226,8 +227,8 @@ def command(
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    settings: Flat[Settings] = DEFAULTS,
+    as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera: intrinsics from a chessboard, mount and delay from a flight.
 

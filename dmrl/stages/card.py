@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from dmrl.card import write_card
 from dmrl.output import partial_folder
+from dmrl.terminal.arguments import Flat
 from dmrl.terminal.tables import print_line
 
 
@@ -61,7 +59,7 @@ def command(
     dataset: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
 ) -> None:
     """Write a dataset's card and figures again; your own words below its last line stay.
 

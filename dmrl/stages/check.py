@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from dmrl.errors import SettingError
 from dmrl.pipeline.executors import Executor, executor
@@ -13,7 +11,7 @@ from dmrl.pipeline.folders import Task, all_recordings, end, is_many, outcomes, 
 from dmrl.pipeline.job import Answer, failed
 from dmrl.recording import Finding, summary
 from dmrl.recording import check as findings_of
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, In, On, Workers
 from dmrl.terminal.tables import print_json, print_line
 
 
@@ -40,10 +38,10 @@ def run(recording: Path) -> Checked:
 
 
 def command(
-    *recordings: Annotated[Path, Parameter(name="IN")],
+    *recordings: In,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> int:
     """Check a recording: schemas, times, gaps, calibration, labels.
 

@@ -34,7 +34,7 @@ from dmrl.recording import (
     time_slices,
 )
 from dmrl.samples.sample import Sample
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, Flat, On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -228,10 +228,10 @@ def command(
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Convert a foreign file or folder into a recording, or a recording into files.
 

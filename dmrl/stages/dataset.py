@@ -35,7 +35,7 @@ from dmrl.recording import Contents, Provenance, provenance
 from dmrl.recording.inputs import input_of
 from dmrl.recording.provenance import FILE_NAME as PROVENANCE
 from dmrl.storage import Remote
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, Flat, On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -256,12 +256,12 @@ def command(
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     from_index: str | None = None,
     into: Annotated[bool, Parameter(name="--add", negative=())] = False,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Build an Arrow dataset and its card from recordings.
 

@@ -1,19 +1,17 @@
 """``dmrl demo``: the whole pipeline, small, on what ships with dmrl."""
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from dmrl.evaluation.report import report
 from dmrl.page import write
 from dmrl.pipeline import run as pipeline
+from dmrl.terminal.arguments import AsJson
 
 
 def command(
     *,
     out: Path = Path("demo"),
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run the whole pipeline, small, on pictures that dmrl draws itself.
 

@@ -13,14 +13,13 @@ from ctypes.util import find_library
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
 from packaging.requirements import Requirement
 
 from dmrl.deploy import toolchain
 from dmrl.errors import SettingError, ToolError
 from dmrl.rendering import environment
+from dmrl.terminal.arguments import AsJson
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 EXTRAS = {
@@ -77,7 +76,7 @@ def parts() -> list[Part]:
     return [*_machine(), *_packages(), *_programs(), _vulkan(), _blender(), _gpu()]
 
 
-def command(*, as_json: Annotated[bool, Parameter(name="--json", negative=())] = False) -> None:
+def command(*, as_json: AsJson = False) -> None:
     """Say what is installed, what it is for, and how to get what is missing.
 
     Parameters

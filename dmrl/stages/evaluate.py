@@ -22,7 +22,7 @@ from dmrl.output import partial_folder, refuse_existing
 from dmrl.pipeline.folders import all_recordings
 from dmrl.pipeline.once import done_on
 from dmrl.recording import input_of, summary
-from dmrl.terminal.arguments import On
+from dmrl.terminal.arguments import AsJson, Flat, On
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -315,10 +315,10 @@ def command(
     recordings: Annotated[list[Path], Parameter(name="IN")],
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     plots_to: Annotated[Path | None, Parameter(name="--plots")] = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Judge detections against labels; tracks and positions against the truth.
 

@@ -5,9 +5,7 @@ import shutil
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from dmrl.deploy.backends import seen_by
 from dmrl.deploy.c import L1_FOR_STATE, write_c
@@ -25,6 +23,7 @@ from dmrl.errors import MissingExtra, ModelError
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import provenance
+from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
@@ -149,8 +148,8 @@ def command(
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    settings: Flat[Settings] = DEFAULTS,
+    as_json: AsJson = False,
 ) -> None:
     """Write a network as ONNX and as C.
 

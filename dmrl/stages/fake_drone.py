@@ -22,6 +22,7 @@ from dmrl.live.fake_crazyflie import FakeCrazyflie
 from dmrl.live.fake_flight import FakeFlight, Faults, FlightClock, Pictures
 from dmrl.live.log_plan import number_of
 from dmrl.recording import read, read_table, summary
+from dmrl.terminal.arguments import Flat
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_table
 
@@ -257,7 +258,7 @@ def command(
     flight: Path,
     uri: Annotated[list[str], Parameter(negative=())],
     camera: Annotated[list[int] | None, Parameter(negative=())] = None,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
 ) -> None:
     """Send a simulated flight as Crazyflies and AI-decks do, to try record with.
 

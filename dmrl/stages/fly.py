@@ -29,7 +29,7 @@ from dmrl.rendering.sketch import Sketch
 from dmrl.samples import flight as samples
 from dmrl.samples.flight import Times, in_order, nanoseconds
 from dmrl.samples.sample import Sample, calibration, image, labels
-from dmrl.terminal.arguments import AsJson, On, Seed
+from dmrl.terminal.arguments import AsJson, Flat, On, Seed
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -301,7 +301,7 @@ def command(
     out: Path,
     /,
     *,
-    flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
+    flags: Flat[Flags] = NO_FLAGS,
     on: On = None,
     as_json: AsJson = False,
 ) -> None:

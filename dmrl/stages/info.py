@@ -1,19 +1,17 @@
 """``dmrl info``: what a recording holds and where it comes from."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from dmrl.recording import Provenance, Summary, log_times, summary
+from dmrl.terminal.arguments import AsJson
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 
-def command(
-    recording: Path, /, *, as_json: Annotated[bool, Parameter(name="--json", negative=())] = False
-) -> None:
+def command(recording: Path, /, *, as_json: AsJson = False) -> None:
     """Show what a recording holds and where it comes from.
 
     Parameters

@@ -18,7 +18,7 @@ from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.pipeline.spread import spread
 from dmrl.recording import Contents, Timed, provenance, rewrite
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -283,14 +283,14 @@ DEFAULTS = Settings()
 
 
 def command(
-    recording: Annotated[Path, Parameter(name="IN")],
+    recording: In,
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Find every robot's peers from ranges and odometry, and label the images with them.
 

@@ -23,6 +23,7 @@ from dmrl.rendering import settings as looks
 from dmrl.rendering.fitting import KNOBS, fitted, pictures
 from dmrl.rendering.interiors import ROOMS
 from dmrl.rendering.likeness import FIGURES, Likeness, likeness
+from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -228,8 +229,8 @@ def command(
     out: Annotated[Path, Parameter(name="OUT.toml")],
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    settings: Flat[Settings] = DEFAULTS,
+    as_json: AsJson = False,
 ) -> None:
     """Fit a render recipe to one's own frames, and show both beside each other.
 

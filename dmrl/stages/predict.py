@@ -37,7 +37,7 @@ from dmrl.recording import (
     summary,
 )
 from dmrl.recording.inputs import sha256_of_file
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -263,14 +263,14 @@ DEFAULTS = Settings()
 
 def command(
     model: Path,
-    recording: Annotated[Path, Parameter(name="IN")],
+    recording: In,
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run a network on every image of a recording.
 

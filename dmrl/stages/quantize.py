@@ -28,6 +28,7 @@ from dmrl.learn.metrics import DEFINITIONS
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import provenance
+from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -324,8 +325,8 @@ def command(
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    settings: Flat[Settings] = DEFAULTS,
+    as_json: AsJson = False,
 ) -> None:
     """Quantise a network to int8, and say what that costs.
 

@@ -25,6 +25,7 @@ from dmrl.live.table import LiveTable
 from dmrl.messages import message
 from dmrl.output import partial_of, refuse_existing
 from dmrl.recording import RecordingWriter, provenance
+from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.ending import ended_by_signal
 from dmrl.terminal.tables import print_json, print_table
 
@@ -234,9 +235,9 @@ def command(
     /,
     *,
     robot: Annotated[list[str], Parameter(negative=())],
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     view: Annotated[bool, Parameter(negative=())] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Record the logs and cameras of Crazyflies in flight, until Ctrl-C.
 

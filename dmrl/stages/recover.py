@@ -2,13 +2,10 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Recovery, recover
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.tables import print_json, print_line
 
 
@@ -24,7 +21,7 @@ def command(
     *,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Bring back the messages of a recording that was cut short.
 

@@ -40,7 +40,7 @@ from dmrl.rendering.randomise import Drawn, World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer, Scene
 from dmrl.rendering.settings import Settings, filled
 from dmrl.samples.sample import Sample, calibration, intervals
-from dmrl.terminal.arguments import On
+from dmrl.terminal.arguments import AsJson, On
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -253,7 +253,7 @@ def command(
     resume: Annotated[bool, Parameter(negative=())] = False,
     setup: Annotated[bool, Parameter(negative=())] = False,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Render images of robots with exact labels, as a recipe says, into a recording.
 

@@ -1,11 +1,9 @@
 """``dmrl report``: a folder of recordings, models and evaluations as one page."""
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from dmrl.page import write
+from dmrl.terminal.arguments import AsJson
 from dmrl.terminal.tables import print_json, print_line
 
 
@@ -19,7 +17,7 @@ def command(
     out: Path | None = None,
     /,
     *,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show what a folder comes to, as one HTML page that needs nothing else.
 

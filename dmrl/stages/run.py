@@ -9,7 +9,7 @@ from cyclopts import Parameter, validators
 from dmrl.errors import MissingExtra
 from dmrl.evaluation.report import report
 from dmrl.pipeline import run as pipeline
-from dmrl.terminal.arguments import On
+from dmrl.terminal.arguments import AsJson, On
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_line
 
@@ -28,7 +28,7 @@ def command(
     data: Path | None = None,
     workers: Annotated[int | None, Parameter(validator=validators.Number(gte=1))] = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run the steps of a pipeline recipe whose outputs are not up to date, side by side.
 

@@ -22,7 +22,7 @@ from dmrl.output import partial_folder
 from dmrl.recording import provenance
 from dmrl.rendering.scene import random_look, random_poses
 from dmrl.rendering.sketch import Sketch, draw
-from dmrl.terminal.arguments import AsJson, Seed, Share
+from dmrl.terminal.arguments import AsJson, Flat, Seed, Share
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -147,7 +147,7 @@ def command(
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     as_json: AsJson = False,
 ) -> None:
     """Draw a folder of pictures of small drones, with exact labels.

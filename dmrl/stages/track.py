@@ -15,7 +15,7 @@ from dmrl.messages import message
 from dmrl.output import refuse_existing
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite, summary
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -178,14 +178,14 @@ DEFAULTS = Settings()
 
 
 def command(
-    recording: Annotated[Path, Parameter(name="IN")],
+    recording: In,
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     workers: Workers = None,
     on: On = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Follow detected peers over time: 3D tracks with covariance.
 

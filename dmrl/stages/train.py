@@ -16,6 +16,7 @@ from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, partial_of, refuse_existing
 from dmrl.recording import provenance
+from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -313,8 +314,8 @@ def command(
     init: Path | None = None,
     teacher: Path | None = None,
     resume: bool = False,
-    flags: Annotated[Flags, Parameter(name="*")] = NO_FLAGS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    flags: Flat[Flags] = NO_FLAGS,
+    as_json: AsJson = False,
 ) -> None:
     """Train a network on a dataset.
 

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from dmrl.errors import SettingError
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Provenance, provenance, summary, trim
-from dmrl.terminal.arguments import On, Workers
+from dmrl.terminal.arguments import Flat, On, Workers
 from dmrl.terminal.tables import print_line
 
 LONGEST_S = 9e9
@@ -91,7 +91,7 @@ def command(
     out: Path,
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    settings: Flat[Settings] = DEFAULTS,
     workers: Workers = None,
     on: On = None,
 ) -> None:

@@ -22,6 +22,7 @@ from dmrl.deploy.targets import targets
 from dmrl.deploy.verification import TargetResult, expected, prove
 from dmrl.errors import DatasetError, SettingError, ToolError
 from dmrl.output import partial_file
+from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -279,8 +280,8 @@ def command(
     folder: Annotated[Path, Parameter(name="OUT_DIR")],
     /,
     *,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    settings: Flat[Settings] = DEFAULTS,
+    as_json: AsJson = False,
 ) -> int:
     """Prove that the C of an export computes the int8 network, bit for bit.
 

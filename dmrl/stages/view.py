@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Group, Parameter, validators
 
 from dmrl.errors import SettingError
+from dmrl.terminal.arguments import Flat
 from dmrl.viewer import Settings, Web, flag, save, screenshot, serve, view
 
 DEFAULTS = Settings()
@@ -44,8 +45,8 @@ def command(
     serve_web: Annotated[bool, Parameter(name="--serve", negative="", group=OUTPUT)] = False,
     time_s: Annotated[float | None, Parameter(name=["--time-s", "--time"])] = None,
     rank: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1,
-    web: Annotated[Web, Parameter(name="*")] = WEB,
-    settings: Annotated[Settings, Parameter(name="*")] = DEFAULTS,
+    web: Flat[Web] = WEB,
+    settings: Flat[Settings] = DEFAULTS,
 ) -> None:
     """Show recordings in rerun, or save what it would show.
 

@@ -4,8 +4,7 @@
 as a path does. Who opens one by its name, as a library does, gets a copy on this machine.
 """
 
-from dmrl.storage.names import SCHEMES, path_of
-from dmrl.storage.remote import Remote
+from dmrl.storage.remote import SCHEMES, Remote, path_of
 from dmrl.storage.whole import added_files, uploaded_file, uploaded_folder
 
 __all__ = ["SCHEMES", "Remote", "added_files", "path_of", "uploaded_file", "uploaded_folder"]

@@ -17,10 +17,11 @@ from typing import Any
 
 from dmrl.border.names import inside
 from dmrl.errors import StorageError
-from dmrl.storage.names import SCHEMES
 from dmrl.storage.ranges import STEP_BYTES, Ranged
 from dmrl.storage.system import system, told
 
+SCHEMES = ("s3", "gs", "gcs", "az", "abfs", "http", "https")
+"""What a name begins with, before ``://``."""
 UNFINISHED = ".dmrl-unfinished"
 """Stands in a folder while it is written: what has it is not whole, and not there."""
 VERSION = "?versionId="
@@ -221,6 +222,12 @@ class Remote(PosixPath):
         return target
 
     rename = replace
+
+
+def path_of(name: str) -> Path:
+    """The path that a name stands for: of ``s3://bucket/key`` a `Remote`, else a plain one."""
+    scheme, mark, _ = name.partition("://")
+    return Remote(name) if mark and scheme in SCHEMES else Path(name)
 
 
 @cache

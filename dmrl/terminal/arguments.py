@@ -1,9 +1,15 @@
 """Kinds of arguments that several commands take."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, TypeVar
 
 from cyclopts import Parameter, validators
 
+T = TypeVar("T")
+In = Annotated[Path, Parameter(name="IN")]
+"""What is read, called IN in the help."""
+Flat = Annotated[T, Parameter(name="*")]
+"""A dataclass, ``Flat[Settings]``: each of its fields is a flag."""
 AsJson = Annotated[bool, Parameter(name="--json", negative=())]
 """Whether one JSON document is printed in place of the table."""
 Seed = Annotated[int, Parameter(validator=validators.Number(gte=0))]
