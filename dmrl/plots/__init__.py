@@ -2,6 +2,7 @@
 
 from dmrl.plots.datasets import depth_histogram, peers_per_image, position_heat
 from dmrl.plots.errors import error_by_distance, error_trace, error_violins, trade_offs
+from dmrl.plots.models import Side, model_sides
 from dmrl.plots.pictures import Circled, Example, MapPair, examples, gallery, map_pairs
 from dmrl.plots.style import save
 
@@ -9,6 +10,7 @@ __all__ = [
     "Circled",
     "Example",
     "MapPair",
+    "Side",
     "depth_histogram",
     "error_by_distance",
     "error_trace",
@@ -16,6 +18,7 @@ __all__ = [
     "examples",
     "gallery",
     "map_pairs",
+    "model_sides",
     "peers_per_image",
     "position_heat",
     "save",

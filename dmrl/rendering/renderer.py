@@ -23,6 +23,7 @@ from dmrl.rendering.shot import Layer, Look, Robot, Shot, requests
 from dmrl.rendering.solids import Design
 
 MODEL_KINDS = (".blend", ".glb", ".gltf", ".obj", ".stl")
+PANORAMA_KINDS = (".exr", ".hdr")
 SMALLEST_M, LARGEST_M = 0.01, 3.0
 SAMPLES = 8
 BOUNCES = 2
@@ -115,7 +116,9 @@ class Renderer:
         self._pool = Pool(_start(python, model, self.lights, samples), workers or _cores())
         self.version = self._pool.version
         self.points = _outermost(self._pool.points)
-        size_m = float(np.ptp(self._pool.points, axis=0).max())
+        self.box = np.array([self._pool.points.min(axis=0), self._pool.points.max(axis=0)])
+        """(2, 3) lowest and highest x, y and z of the robot, body frame, metres."""
+        size_m = float(np.ptp(self.box, axis=0).max())
         if not SMALLEST_M <= size_m <= LARGEST_M:
             self._pool.__exit__()
             raise SettingError(_why_not(model, size_m))
@@ -194,6 +197,23 @@ def shipped_lights(python: Path) -> list[Path]:
         "lib/python*/site-packages/bpy/*/datafiles/studiolights/world"
     )
     return sorted(path for folder in found for path in folder.glob("*.exr"))
+
+
+def panoramas_in(folder: Path) -> list[Path]:
+    """Panoramas of a folder, sorted.
+
+    Raises
+    ------
+    SettingError
+        If there is no folder, or no panorama in it.
+    """
+    if not folder.is_dir():
+        raise SettingError(f"no folder {folder} of panoramas. Check lights")
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PANORAMA_KINDS)
+    if not found:
+        kinds = ", ".join(PANORAMA_KINDS)
+        raise SettingError(f"{folder} holds no panorama ({kinds}). Choose another for lights")
+    return found
 
 
 def _why_not(model: Model, size_m: float) -> str:

@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -14,11 +14,11 @@ from cyclopts import Parameter, validators
 from dmrl import recipe as recipes
 from dmrl import topics
 from dmrl.datasets.backgrounds import photos_of
-from dmrl.errors import RecipeError, SettingError
+from dmrl.errors import OutputError, RecipeError, SettingError
 from dmrl.geometry.camera_file import KNOWN, camera_named
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
-from dmrl.output import refuse_existing
+from dmrl.output import partial_file, refuse_existing
 from dmrl.pipeline.once import done_on
 from dmrl.recording import (
     LICENCES_METADATA,
@@ -37,14 +37,14 @@ from dmrl.rendering.interiors import ROOMS
 from dmrl.rendering.lens import canvas_of
 from dmrl.rendering.messages import ROBOT, samples
 from dmrl.rendering.randomise import Drawn, World, draw_scene
-from dmrl.rendering.renderer import Model, Renderer, Scene
+from dmrl.rendering.renderer import Model, Renderer, Scene, panoramas_in
 from dmrl.rendering.settings import Settings, filled
 from dmrl.samples.sample import Sample, calibration, intervals
 from dmrl.terminal.arguments import AsJson, On
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
-PANORAMA_KINDS = (".exr", ".hdr")
+PREVIEW_SAMPLES = 64
 
 Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
@@ -128,19 +128,8 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     before = interrupted(out, resume=resume, pictured=True)
     camera = camera_of(settings)
     photos = None if settings.backgrounds is None else photos_of(settings.backgrounds)
-    lights = None if settings.lights is None else _panoramas(settings.lights)
-    design = DESIGNS[settings.design]
-    model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre, design)
     with ExitStack() as stack:
-        renderer = stack.enter_context(
-            Renderer(
-                ensure(say),
-                model,
-                lights=lights,
-                workers=settings.workers,
-                samples=settings.samples,
-            )
-        )
+        renderer = stack.enter_context(_renderer(settings))
         made = _provenance(settings, renderer.version)
         before.check(made)
         sink = stack.enter_context(RecordingWriter(out, made, keep_on_error=True))
@@ -155,12 +144,61 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
             tuple(renderer.lights),
             cache(renderer.panorama),
             photos,
-            design,
+            DESIGNS[settings.design],
         )
         _render(world, renderer, sink, done)
     before.forget()
     broken = photos.broken if photos is not None else 0
     return Result(settings.images, *_counts(out), broken, done)
+
+
+def _renderer(settings: Settings) -> Renderer:
+    """Blender with the settings' robot and panoramas."""
+    lights = None if settings.lights is None else panoramas_in(settings.lights)
+    design = DESIGNS[settings.design]
+    model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre, design)
+    return Renderer(
+        ensure(say), model, lights=lights, workers=settings.workers, samples=settings.samples
+    )
+
+
+def look_at(out: Path, settings: Settings) -> dict[str, float]:
+    """Picture of the robot alone, with its axes, its box and its size: what labels are about.
+
+    Parameters
+    ----------
+    out
+        PNG to write. Must not exist.
+    settings
+        See `Settings`: robot, its scale, axis, centre, and the camera.
+
+    Returns
+    -------
+    dict
+        Size along x, y and z, metres, and how many pixels wide the robot is 1 m before the camera.
+
+    Raises
+    ------
+    OutputError
+        If ``out`` exists, or is not named .png.
+    SettingError
+        If model or scale cannot be used.
+    SourceError
+        If the camera's file cannot be read.
+    BlenderError
+        If Blender cannot be set up, or does not start.
+    """
+    refuse_existing(out)
+    if out.suffix.lower() != ".png":
+        raise OutputError(f"{out} is not named .png. With --preview OUT is a picture: NAME.png")
+    from dmrl.rendering.preview import preview  # noqa: PLC0415 - an extra
+
+    with _renderer(replace(settings, workers=1, samples=PREVIEW_SAMPLES)) as renderer:
+        seen = preview(renderer, settings, camera_of(settings))
+    with partial_file(out) as partial:
+        partial.write_bytes(seen.png)
+    sizes = {f"{axis}_m": round(size, 4) for axis, size in zip("xyz", seen.size_m, strict=True)}
+    return {**sizes, "px_wide_at_1_m": round(seen.px_wide_at_1_m, 1)}
 
 
 def _counts(out: Path) -> tuple[int, int]:
@@ -206,16 +244,6 @@ def _time_ns(settings: Settings, index: int) -> int:
     return round(index * 1e9 / settings.rate_hz)
 
 
-def _panoramas(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise SettingError(f"no folder {folder} of panoramas. Check lights")
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PANORAMA_KINDS)
-    if not found:
-        kinds = ", ".join(PANORAMA_KINDS)
-        raise SettingError(f"{folder} holds no panorama ({kinds}). Choose another for lights")
-    return found
-
-
 def _render(world: World, renderer: Renderer, sink: RecordingWriter, done: int) -> None:
     """Write every image from number ``done`` on, in order, as it arrives."""
     settings, camera = world.settings, world.camera
@@ -252,6 +280,7 @@ def command(
     scale: float | None = None,
     resume: Annotated[bool, Parameter(negative=())] = False,
     setup: Annotated[bool, Parameter(negative=())] = False,
+    preview: Annotated[bool, Parameter(negative=())] = False,
     on: On = None,
     as_json: AsJson = False,
 ) -> None:
@@ -262,7 +291,7 @@ def command(
     recipe
         A TOML file, or the name of a shipped recipe, such as synthetic_first_look.
     out
-        Recording to write. Must not exist.
+        Recording to write, or with --preview a picture. Must not exist.
     images
         Images to render. Without it, as the recipe says; so for all that follow.
     seed
@@ -282,6 +311,9 @@ def command(
         Go on with an interrupted OUT.
     setup
         Set up Blender, if it is not, and do nothing else if no recipe is given.
+    preview
+        Look at the robot first: OUT is a picture, NAME.png, of it from four sides, with its axes,
+        its box and its size.
     as_json
         Print one JSON document in place of the table.
     """
@@ -301,11 +333,16 @@ def command(
         model=model,
         scale=scale,
     )
-    if on is None:
+    result: Mapping[str, Any]
+    if preview:
+        if on is not None or resume:
+            raise SettingError("--preview is one picture, made here. Leave out --on and --resume")
+        result = look_at(out, settings)
+    elif on is None:
         result = asdict(run(out, settings, resume=resume))
     else:
         result = done_on(on, "render", out, {}, settings) or {}
     rows = {name.replace("_", " "): value for name, value in result.items()}
     if as_json:
-        return print_json({"recording": str(out), **rows})
-    return print_table(str(out), ("what", "count"), list(rows.items()))
+        return print_json({"picture" if preview else "recording": str(out), **rows})
+    return print_table(str(out), ("what", "value" if preview else "count"), list(rows.items()))

@@ -1,5 +1,6 @@
 """Rendering to recordings, by Blender. Skips where that is not set up."""
 
+import json
 import os
 import signal
 import subprocess
@@ -20,11 +21,12 @@ from dmrl.recording import check, licences, read, read_table, summary
 from dmrl.rendering import crazyflie
 from dmrl.rendering.lens import image_from_pinhole
 from dmrl.rendering.messages import quaternion
+from dmrl.rendering.preview import views
 from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot
-from dmrl.stages.render import camera_of, run, settings_of
+from dmrl.stages.render import camera_of, command, run, settings_of
 
 SMALL = Settings(
     images=6,
@@ -212,6 +214,12 @@ def test_a_lens_that_cannot_fill_its_image_is_refused(tmp_path: Path) -> None:
 CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
     "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
 )
+# 1 by 3 by 2; as .obj files are: y up.
+TOWER = "".join(
+    f"v {words[1]} {3 * int(words[2])} {2 * int(words[3])}\n" if words[0] == "v" else f"{line}\n"
+    for line in CUBE.splitlines()
+    for words in [line.split()]
+)
 
 
 @pytest.mark.heavy
@@ -219,14 +227,61 @@ CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1
 def test_an_obj_stands_upright(
     blender: Path, tmp_path: Path, up: Literal["auto", "y", "z"], height_m: float
 ) -> None:
-    path = tmp_path / "tower.obj"  # as .obj files are: y up
-    tower = [line.split() for line in CUBE.splitlines() if line.startswith("v")]
-    places = "".join(f"v {x} {3 * int(y)} {2 * int(z)}\n" for _, x, y, z in tower)
-    path.write_text(places + "".join(f"{line}\n" for line in CUBE.splitlines() if line[0] == "f"))
+    path = tmp_path / "tower.obj"
+    path.write_text(TOWER)
     with Renderer(blender, Model(path, 0.1, up), workers=1) as renderer:
         sides = np.ptp(renderer.points, axis=0)
     assert sides[2] == pytest.approx(height_m, abs=1e-6)
     assert sorted(sides) == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_the_box_of_a_preview_is_about_what_it_shows(
+    blender: Path, tmp_path: Path, up: Literal["y", "z"]
+) -> None:
+    path = tmp_path / "tower.obj"
+    path.write_text(TOWER)
+    with Renderer(blender, Model(path, 0.1, up), workers=1, samples=4) as renderer:
+        sides = {side.name: side for side in views(renderer, crazyflie.CRAZYFLIE)}
+        size_m = np.ptp(renderer.box, axis=0)
+    for side in sides.values():
+        rows, cols = np.nonzero(np.abs(side.rgb.astype(int) - side.rgb[0, 0]).max(axis=2) > 3)
+        seen = [cols.min(), rows.min(), cols.max() + 1, rows.max() + 1]
+        ends = side.edges_px.reshape(-1, 2)
+        # Where the camera looks at an edge, the outermost pixels are covered by a hair.
+        assert seen == pytest.approx([*ends.min(axis=0), *ends.max(axis=0)], abs=2.5)
+    start, end = np.moveaxis(sides["from the front"].axes_px, 1, 0)
+    assert end[1, 0] > start[1, 0] + 50  # y to the left of the robot: to the right seen from before
+    assert end[2, 1] < start[2, 1] - 50  # z up
+    start, end = np.moveaxis(sides["from its left"].axes_px, 1, 0)
+    assert end[0, 0] < start[0, 0] - 50
+    assert size_m == pytest.approx([0.1, 0.2, 0.3] if up == "y" else [0.1, 0.3, 0.2], abs=1e-6)
+
+
+@pytest.mark.heavy
+def test_a_preview_is_a_picture_that_says_the_size(
+    blender: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "robot.png"
+    command("synthetic_first_look", out, preview=True, as_json=True)
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["picture"] == str(out)
+    vertices = crazyflie.CRAZYFLIE.mesh().vertices
+    assert [shown[f"{axis} m"] for axis in "xyz"] == pytest.approx(
+        np.ptp(vertices, axis=0), abs=1e-4
+    )
+    assert shown["px wide at 1 m"] == pytest.approx(183.73 * np.ptp(vertices[:, 1]), abs=0.1)
+    assert decode(out.read_bytes()).std() > 10
+    assert [path.name for path in tmp_path.iterdir()] == ["robot.png"]
+
+
+def test_a_preview_is_refused_under_another_name_and_on_a_cluster(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"With --preview OUT is a picture: NAME\.png"):
+        command("synthetic_first_look", tmp_path / "out.mcap", preview=True)
+    with pytest.raises(SettingError, match="Leave out --on and --resume"):
+        command("synthetic_first_look", tmp_path / "out.png", preview=True, resume=True)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.heavy

@@ -1,0 +1,131 @@
+"""The robot alone from four sides, with what is needed to lay its axes and its box over it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmrl.geometry.frames import Array, Camera, project
+from dmrl.plots import Side, model_sides
+from dmrl.rendering.designs import DESIGNS
+from dmrl.rendering.randomise import random_paint
+from dmrl.rendering.renderer import Renderer
+from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.settings import Settings
+from dmrl.rendering.shot import Light, Look, Robot
+from dmrl.rendering.sketch import Pose
+from dmrl.rendering.solids import Design
+
+SIDE_PX = 480
+DISTANCE = 12.0
+"""Of the camera, in radii of the robot: sides that lie one behind the other look alike long."""
+FILLED = 0.68
+"""Share of the picture that a ball about the robot fills: the rest is for the axes."""
+AXIS = 1.1
+"""Length of the axes, in halves of the box's longest side."""
+GREY = 0.5
+VIEWS = (
+    ("from the front, its left and above", (1.6, 1.1, 1.0), (0.0, 0.0, 1.0)),
+    ("from its left", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    ("from the front", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ("from above", (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+)
+"""What each is called, where the camera stands, and what is up in the picture; body frame."""
+EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
+"""Corners of a box, by the bits of x, y and z, that an edge joins."""
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """What a robot is, before any is rendered.
+
+    Parameters
+    ----------
+    png
+        Picture of it from `VIEWS`, with its axes, its box and its size.
+    size_m
+        Of its box along x, y and z, metres.
+    px_wide_at_1_m
+        Its width 1 m before the camera.
+    """
+
+    png: bytes
+    size_m: tuple[float, float, float]
+    px_wide_at_1_m: float
+
+
+def preview(renderer: Renderer, settings: Settings, camera: Camera) -> Preview:
+    """The settings' robot from all sides, with its size.
+
+    Parameters
+    ----------
+    renderer
+        With that robot.
+    settings
+        Of the renders.
+    camera
+        Whose renders they are.
+    """
+    words = f"{settings.design}, scale {settings.scale:g}"
+    if settings.model is not None:
+        words = f"{settings.model.name}, scale {settings.scale:g}, model_up {settings.model_up}"
+    x_m, y_m, z_m = np.ptp(renderer.box, axis=0).tolist()
+    sides = list(views(renderer, DESIGNS[settings.design]))
+    png = model_sides(sides, words, (x_m, y_m, z_m))
+    return Preview(png, (x_m, y_m, z_m), camera.fx_px * y_m)
+
+
+def views(renderer: Renderer, design: Design) -> Iterator[Side]:
+    """The robot of a renderer, from four sides.
+
+    Parameters
+    ----------
+    renderer
+        With the model.
+    design
+        Whose paint the drawn robot has.
+    """
+    box = renderer.box
+    middle, radius_m = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
+    focal_px = FILLED * SIDE_PX / 2 * DISTANCE
+    camera = Camera(SIDE_PX, SIDE_PX, focal_px, focal_px, SIDE_PX / 2, SIDE_PX / 2)
+    poses = [_pose(side, up, middle, DISTANCE * radius_m) for _, side, up in VIEWS]
+    corners = np.array([[box[k >> axis & 1, axis] for axis in range(3)] for k in range(8)])
+    edges = np.array([corners[list(pair)] for pair in EDGES])
+    length_m = AXIS * float((box[1] - box[0]).max()) / 2
+    axes = np.stack([np.zeros((3, 3)), length_m * np.eye(3)], axis=1)
+    paint = random_paint(np.random.default_rng(0), design, wear=0.0, spread=0.0)
+    paint |= {"rotor_first_rad": 0.6, "rotor_sweep_rad": 0.0}
+    look = _look(renderer.lights[0])
+    shots = renderer.shots((camera, [Robot(pose, paint)], look) for pose in poses)
+    for (name, *_), pose, shot in zip(VIEWS, poses, shots, strict=True):
+        yield Side(name, shot.rgb, _pixels(axes, pose, camera), _pixels(edges, pose, camera))
+
+
+def _pose(
+    towards: tuple[float, float, float],
+    upright: tuple[float, float, float],
+    middle: Array,
+    distance_m: float,
+) -> Pose:
+    """The robot's pose before a camera that looks at the middle of its box."""
+    forward = -np.array(towards) / np.linalg.norm(towards)
+    left = np.cross(upright, forward)
+    left /= np.linalg.norm(left)
+    camera_from_body = np.array([forward, left, np.cross(forward, left)])
+    return Pose(np.array([distance_m, 0.0, 0.0]) - camera_from_body @ middle, camera_from_body)
+
+
+def _pixels(points: Array, pose: Pose, camera: Camera) -> Array:
+    """(..., 2) pixels of (..., 3) points of the body."""
+    xyz = points.reshape(-1, 3) @ pose.camera_from_body.T + pose.xyz_camera
+    uv, _ = project(xyz, camera.image_from_optical)
+    return np.asarray(uv.reshape(*points.shape[:-1], 2))
+
+
+def _look(light: str) -> Look:
+    """A grey wall, and a lamp above the camera's shoulder: shapes show, and nothing is random."""
+    backdrop = np.full((SIDE_PX, SIDE_PX, 3), GREY, np.float32)
+    sun = np.array([-1.0, 0.5, 1.0]) / 1.5
+    shine = Light(light, (0.0, 0.0, 0.0), 0.5, sun, 2.0, (1.0, 1.0, 1.0), 0.1)
+    return Look(backdrop, shine, Sensor(brightness=None))
