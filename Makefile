@@ -41,7 +41,7 @@ mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. A
 	$(BIN)/python tests/mutants.py $(ARGS)
 
 test-faults: $(VENV)/.dev ## Break disks, processes and files in every way; prints what came of it.
-	$(PYTEST) -m "slow or not slow" --timeout 3600 tests/faults tests/recording/test_flips.py tests/recording/test_budgets.py tests/formats/test_fuzz.py $(ARGS)
+	$(PYTEST) -m "slow or not slow" --timeout 3600 tests/faults tests/recording/test_flips.py tests/recording/test_renames.py tests/recording/test_budgets.py tests/formats/test_fuzz.py $(ARGS)
 
 check: format lint types imports spell ## Check format, lint, types, imports and spelling.
 

@@ -35,6 +35,15 @@ def test_a_module_opens_with_what_it_is_for_and_is_short(path: Path) -> None:
     assert len(text.splitlines()) <= LINES
 
 
+def test_files_beside_the_package_are_short_too() -> None:
+    beside = [
+        path for name in ("tests", "benchmarks", "docs") for path in (ROOT / name).rglob("*.py")
+    ]
+    lines = {name_of(path): len(path.read_text(encoding="utf-8").splitlines()) for path in beside}
+    assert len(lines) > 300
+    assert {name: count for name, count in lines.items() if count > LINES} == {}
+
+
 def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """Lines of a function from its name to its end, without those of its docstring."""
     first, last = function.body[0], function.end_lineno or function.lineno

@@ -16,7 +16,6 @@ import dmrl
 from dmrl import card, plots
 from dmrl.card import write_card
 from dmrl.card.facts import Facts, equipment, told
-from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.stages import convert
@@ -24,9 +23,8 @@ from dmrl.stages.card import Settings as CardSettings
 from dmrl.stages.card import run as run_card
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import Record, peer, pixels_of, recorder
+from .conftest import Record, peer, recorder
 
-mlcroissant = pytest.importorskip("mlcroissant", reason="mlcroissant is not installed")
 huggingface_hub = pytest.importorskip("huggingface_hub")
 yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
 datasets = pytest.importorskip("datasets", reason="datasets is not installed")
@@ -235,38 +233,6 @@ def test_its_code_runs(record: Record, tmp_path: Path, options: dict[str, bool])
         exec(code.replace("DATASET", str(tmp_path / "out")), names)
         shown = names["rgb"] if "rgb" in names else names["table"]
         assert shown.shape[0] in (48, 6)
-
-
-THEIRS = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-"""Of the libraries that read Croissant."""
-
-
-@THEIRS
-@pytest.mark.parametrize("parquet", [False, True])
-def test_croissant_is_valid_and_names_every_column(
-    record: Record, tmp_path: Path, parquet: bool
-) -> None:
-    spans = {"train": "[[0, 250000000]]", "test": "[[300000000, 900000000]]"}
-    run([record(split=spans)], tmp_path / "out", Settings(parquet=parquet, license="cc0-1.0"))
-    found = mlcroissant.Dataset(jsonld=str(tmp_path / "out" / "croissant.json"))
-    assert not found.metadata.ctx.issues.errors
-    assert [one.name for one in found.metadata.record_sets] == ["train", "test"]
-    opened = open_dataset(tmp_path / "out").split("train")
-    names = [field.name for field in found.metadata.record_sets[0].fields]
-    assert names == opened.table.schema.names
-    assert all(field.description for field in found.metadata.record_sets[0].fields)
-    assert found.metadata.license == ["cc0-1.0"]
-
-
-@THEIRS
-def test_croissant_loads_the_rows_of_parquet(record: Record, tmp_path: Path) -> None:
-    run([record()], tmp_path / "out", Settings(split="none", parquet=True))
-    found = mlcroissant.Dataset(jsonld=str(tmp_path / "out" / "croissant.json"))
-    rows = list(found.records("train"))
-    assert len(rows) == 6
-    assert np.array_equal(np.asarray(rows[3]["train/image"]), pixels_of(3))
-    assert rows[3]["train/peers"][0]["train/peers/u_px"] == 20.5
-    assert rows[3]["train/log_time"] == 300_000_000
 
 
 def test_the_hub_reads_the_front_matter(built: Path) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 from .broken import Broken
 from .disk import Ending, Fault, Orders, small_files
 from .ending import ended
-from .works import Inputs, work_named
+from .inputs import Inputs
+from .works import work_named
 
 HANG_S = 300
 

@@ -2,8 +2,6 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dmrl.formats import cpx
 from dmrl.formats.cpx import Image, ImageReader
@@ -12,13 +10,14 @@ from dmrl.formats.cpx_packets import (
     APP,
     GAP8,
     HOST,
-    PACKET_MAX_BYTES,
     STREAMER,
     Packet,
     PacketReader,
     pack_packet,
 )
-from dmrl.formats.cpx_state import State, compressed, pack_state, quaternion, unpack_state
+from dmrl.formats.cpx_state import State, compressed, quaternion
+
+from .test_cpx_packets import app_packet
 
 RNG = np.random.default_rng(8)
 JPEG = b"\xff\xd8" + RNG.bytes(3000) + b"\xff\xd9"
@@ -141,36 +140,6 @@ def test_quaternions_come_back_to_a_quarter_of_a_degree() -> None:
         assert angle_rad < np.deg2rad(0.25)
 
 
-def test_every_part_of_a_state_has_its_place_and_unit() -> None:
-    level, packed = (0.0, 0.0, 0.0, 1.0), compressed((0.0, 0.0, 0.0, 1.0))
-    state = State(
-        2**32 + 7, 8, (0.001, -0.002, 0.0034), (4, 5, 6), (7, 8, 9), level, (0.01, -0.011, 0.012)
-    )
-    values = (7, 1, -2, 3, 4000, 5000, 6000, 7000, 8000, 9000, packed, 10, -11, 12)
-    assert pack_state(state) == values
-    back = unpack_state(values, 2**32 + 7, 8)
-    assert (back.robot_ms, back.received_us) == (2**32 + 7, 8)
-    assert (back.position_m, back.velocity_mps) == ((0.001, -0.002, 0.003), (4, 5, 6))
-    assert (back.acceleration_mps2, back.turning_radps) == ((7, 8, 9), (0.01, -0.011, 0.012))
-    assert back.quaternion_xyzw == level
-    assert pack_state(State(0, 0, (32.766, -32.768, 99.0)))[1:4] == (32766, -32768, 32767)
-    assert pack_state(State(0, 0, (-99.0, 0.0006, 0.0004)))[1:4] == (-32768, 1, 0)
-
-
-def test_compressed_quaternions_are_bits_of_the_firmware_s() -> None:
-    half = 0.5**0.5
-    assert compressed((0.0, 0.0, 0.0, 1.0)) == (3 << 30) - (1 << 32)
-    assert compressed((1.0, 0.0, 0.0, 0.0)) == 0
-    assert compressed((0.0, 0.0, -1.0, 0.0)) == (2 << 30 | 1 << 29 | 1 << 19 | 1 << 9) - (1 << 32)
-    # The largest part is positive, so the others change their signs with it.
-    near = compressed((-half - 1e-9, half, 0.0, 0.0))
-    assert near == 1 << 29 | 511 << 20 | 1 << 19 | 1 << 9
-    assert quaternion(1 << 29 | 511 << 20) == pytest.approx((half, -half, 0, 0))
-    assert quaternion(3 << 20 | 5 << 10 | 512 + 7) == pytest.approx(
-        ((1 - (3**2 + 5**2 + 7**2) * 0.5 / 511**2) ** 0.5, *(n * half / 511 for n in (3, 5, -7)))
-    )
-
-
 def test_what_a_camera_does_not_tell_is_sent_as_nothing() -> None:
     bare = raw(8, 8)
     (streamed,), _ = read(pack_image(bare, "streamer"))
@@ -211,28 +180,6 @@ def test_a_robot_s_time_is_the_camera_s_by_when_it_last_told_it() -> None:
 def test_a_picture_s_side_is_4096_pixels_at_most(size: tuple[int, int], whole: bool) -> None:
     got, reader = read(pack_image(raw(*size)))
     assert (len(got), reader.broken) == (whole, not whole)
-
-
-@pytest.mark.parametrize(("function", "counted"), [(APP, 2), (STREAMER, 0)])
-def test_a_packet_has_a_longest_length(function: int, counted: int) -> None:
-    most = PACKET_MAX_BYTES - counted
-    packet = Packet(GAP8, HOST, function, bytes(most), last=False)
-    data = pack_packet(packet)
-    assert struct.unpack_from("<HBB", data) == (PACKET_MAX_BYTES, 3 | 4 << 3, function)
-    follower = pack_packet(Packet(GAP8, HOST, function, b"x"))
-    assert next(PacketReader().feed(data + follower)) == packet
-    with pytest.raises(ValueError, match=f"a packet of {PACKET_MAX_BYTES + 1} bytes"):
-        pack_packet(Packet(GAP8, HOST, function, bytes(most + 1)))
-
-
-def test_bytes_between_packets_are_counted_and_the_rest_at_the_end() -> None:
-    packet = pack_packet(Packet(GAP8, HOST, APP, b"abc"))
-    reader = PacketReader()
-    got = list(reader.feed(packet + b"\0" * 7 + packet * 2))
-    assert (len(got), reader.skipped_bytes) == (3, 7)
-    assert list(reader.feed(packet[:-1])) == []
-    assert reader.finish() and reader.skipped_bytes == 7 + len(packet) - 1
-    assert not reader.finish()
 
 
 def test_an_image_cut_at_the_end_is_broken_once() -> None:
@@ -294,10 +241,6 @@ def test_streamer_images_of_many_packets_come_back(width: int) -> None:
     assert pixels[:width] == sent[0].data and 0 <= len(pixels) - width < 4
 
 
-def app_packet(data: bytes) -> bytes:
-    return pack_packet(Packet(GAP8, HOST, APP, data))
-
-
 @pytest.mark.parametrize("layout", ["plain", "stamped", "streamer"])
 def test_what_others_send_amid_an_image_does_not_break_it(layout: cpx.Layout) -> None:
     image = raw(90, 100, time_us=9000, frame_id=1)
@@ -340,24 +283,6 @@ def test_streamer_metadata_is_of_version_10_and_of_as_many_pixels(
 
 
 @pytest.mark.parametrize(
-    ("header", "broken"),
-    [
-        ((10, 10, 1, 0, 100), 0),
-        ((10, 10, 1, 2, 100), 1),  # no such encoding
-        ((0, 10, 1, 0, 0), 1),
-        ((10, 0, 1, 0, 0), 1),
-        ((10, 10, 1, 1, 0), 1),
-        ((10, 10, 1, 1, 1 << 22), 0),
-        ((10, 10, 1, 1, (1 << 22) + 1), 1),
-    ],
-)
-def test_where_a_header_ends_to_be_one(header: tuple[int, ...], broken: int) -> None:
-    reader = ImageReader()
-    list(reader.feed(app_packet(cpx.HEADER.pack(cpx.MAGIC, *header))))
-    assert reader.broken == broken
-
-
-@pytest.mark.parametrize(
     ("kind", "size", "broken"),
     [(1, 149, 0), (1, 148, 1), (1, 1 << 22, 0), (1, (1 << 22) + 1, 1), (2, 200, 0)],
 )
@@ -383,53 +308,6 @@ def test_a_stamp_s_milliseconds_wrap() -> None:
     sent = [raw(8, 8, time_us=(2**32 - 2 + k) * 1000) for k in range(4)]
     got, _ = read(b"".join(pack_image(image, "stamped") for image in sent))
     assert [image.time_us for image in got] == [image.time_us for image in sent]
-
-
-def plain_packets(data: bytes) -> tuple[list[bytes], int]:
-    """Packets of a whole stream and the bytes beside them, looked for byte by byte."""
-
-    def size(at: int) -> int | None:
-        if at + 4 > len(data):
-            return None
-        length, route, function = struct.unpack_from("<HBB", data, at)
-        to, of, last = route & 7, route >> 3 & 7, route >> 6
-        known = (
-            to == 3
-            and (of, last) in {(k, last) for k in (1, 2, 4) for last in (0, 1)}
-            and function in (*range(1, 7), 14, 15)
-        )
-        return length - 2 if known and 2 <= length <= 4094 else -1
-
-    found, at, skipped, in_step = [], 0, 0, True
-    while (here := size(at)) is not None:
-        if here >= 0 and not in_step:
-            after = size(at + 4 + here)
-            if after is None:
-                break
-            here = here if after >= 0 else -1
-        if here < 0:
-            at, skipped, in_step = at + 1, skipped + 1, False
-            continue
-        if at + 4 + here > len(data):
-            break
-        found.append(data[at + 4 : at + 4 + here])
-        at, in_step = at + 4 + here, True
-    return found, skipped + len(data) - at
-
-
-NOISE = st.sampled_from([b"", bytes(3), b"\0\0\x63\5", b"\2\0\x63", b"\6\0\x63\5\0", b"\x0b\1"])
-
-
-@given(st.lists(st.tuples(NOISE, st.integers(0, 5)), max_size=9), st.integers(1, 9))
-def test_packets_amid_noise_are_those_of_a_search_byte_by_byte(
-    parts: list[tuple[bytes, int]], step: int
-) -> None:
-    data = b"".join(noise + app_packet(bytes(range(size))) for noise, size in parts)
-    reader = PacketReader()
-    pieces = [data[k : k + step] for k in range(0, len(data), step)]
-    got = [packet.data for piece in pieces for packet in reader.feed(piece)]
-    reader.finish()
-    assert (got, reader.skipped_bytes) == plain_packets(data)
 
 
 def test_a_streamer_packet_without_pixels_breaks_nothing() -> None:

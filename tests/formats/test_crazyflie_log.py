@@ -278,27 +278,6 @@ def test_a_beam_of_8_m_and_more_saw_no_floor() -> None:
     assert [s.fields["height_m"] for s in found] == pytest.approx([7.999, 0.001])
 
 
-GROWING = st.lists(st.integers(0, 9), min_size=1, max_size=6).map(sorted)
-
-
-@given(GROWING, GROWING)
-def test_a_pose_takes_the_turn_of_its_own_time_or_the_next_one(
-    places: list[int], turns: list[int]
-) -> None:
-    place = Series(np.array(places), np.arange(3.0 * len(places)).reshape(-1, 3))
-    turn = Series(np.array(turns), -1 - np.arange(4.0 * len(turns)).reshape(-1, 4))
-    found = _pose(place, turn)
-    assert found is not None
-    if both := sorted(set(places) & set(turns)):
-        wanted = [(t, places.index(t), turns.index(t)) for t in both]
-    else:
-        later = [sum(t < at for t in turns) for at in places]
-        wanted = [(t, k, min(later[k], len(turns) - 1)) for k, t in enumerate(places)]
-    assert found[0].tolist() == [t for t, _, _ in wanted]
-    rows = [[*place.values[a], *turn.values[b]] for _, a, b in wanted]
-    assert found[1].tolist() == rows
-
-
 def test_frames_and_poses_turn_as_what_was_logged() -> None:
     (quaternion,) = quaternion_zyx(np.array([[0.3, -0.2, 1.1]]))
     names = [f"locSrv.{n}" for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]

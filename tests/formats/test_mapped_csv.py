@@ -1,20 +1,15 @@
 """CSV files of others, by tables that say what their columns are."""
 
 from pathlib import Path
-from textwrap import dedent
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
 from dmrl.formats import mapped_csv
-from dmrl.formats.column_map import QUANTITIES, read_map
+from dmrl.formats.column_map import QUANTITIES
 from dmrl.formats.format import Options
 from dmrl.formats.known import format_of
-from dmrl.formats.log_block import Series
-from dmrl.geometry.frames import camera_from_horizontal
 from dmrl.geometry.turns import euler_zyx, quaternion_zyx
 from dmrl.samples.sample import Sample
 
@@ -98,59 +93,6 @@ def test_velocities_of_other_frames_are_turned(frame: str, table: Path) -> None:
     (cr, cp), (sr, sp) = np.cos(np.radians((10, -20))), np.sin(np.radians((10, -20)))
     level = [cp + sp * cr * 0.5, -sr * 0.5, -sp + cp * cr * 0.5]
     assert [fields[f"v{axis}_mps"] for axis in "xyz"] == pytest.approx(level)
-
-
-def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "map.toml"
-    path.write_text(
-        dedent("""
-        rate = 5
-        [rol]
-        name = "phi"
-        [pitch]
-        name = 5
-        unit = "degrees"
-        sign = 2
-        colour = "red"
-        [vx]
-        name = "vx"
-        unit = "m/s"
-        frame = "earth"
-        [height]
-        name = "h"
-        unit = "m"
-        frame = "world"
-        [range.cf2]
-        name = "d"
-        unit = "s"
-        """)
-    )
-    with pytest.raises(SourceError) as e:
-        read_map(path)
-    text = str(e.value)
-    assert "\n" not in text and "map.toml" in text
-    for fault in (
-        "[rate]: no such quantity",
-        "[rol]: no such quantity, did you mean roll?",
-        "[pitch] name: not the name of a column",
-        "[pitch] unit: not one of rad, deg",
-        "[pitch] sign: not 1 or -1",
-        "[pitch] colour: no such key",
-        "[vx] frame: not one of world, horizontal, body",
-        "[height] frame: of velocities only",
-        "[range.cf2] unit: not one of m, cm, mm",
-        "no [time]",
-        "[vx] wants [vy] too",
-        "[pitch] wants [roll] too",
-    ):
-        assert fault in text
-
-
-@pytest.mark.parametrize("text", ["time = ", "range = 5\n", "time = 5\n", "vx = 5\n"])
-def test_what_is_no_table_is_one_line(text: str, tmp_path: Path) -> None:
-    (tmp_path / "map.toml").write_text(text)
-    with pytest.raises(SourceError, match=r"map\.toml"):
-        read_map(tmp_path / "map.toml")
 
 
 @pytest.mark.parametrize(
@@ -241,19 +183,6 @@ def test_flights_of_nanobench_are_known_and_agree_with_vicon(
     assert np.ptp(place[:, 0]) > 1
 
 
-def test_units_are_what_they_are_called() -> None:
-    degree = np.pi / 180
-    for quantity, units in {
-        "yaw": {"rad": 1, "deg": degree},
-        "gyro_z": {"rad/s": 1, "deg/s": degree},
-        "height": {"m": 1, "cm": 0.01, "mm": 0.001},
-        "vx": {"m/s": 1, "cm/s": 0.01, "mm/s": 0.001},
-        "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1},
-        "qw": {"1": 1},
-    }.items():
-        assert QUANTITIES[quantity] == pytest.approx(units)
-
-
 def turning(table: Path, told: float, slope: float, count: int = 50) -> None:
     """A log whose gyroscope tells a turn, deg/s, and whose yaw turns, rad/s, at 100 Hz."""
     rows = [f"{1000 + 10 * k};0;0;{slope * k / 100};{told};0;0;0;0;x" for k in range(count)]
@@ -330,76 +259,6 @@ def test_a_folder_is_a_robot_per_file_by_its_name(table: Path) -> None:
     (folder / "notes.txt").write_text("x")
     found = samples(folder, Options(columns=table, names={"a": "left"}))
     assert {topic.split("/")[1] for topic in found} - {"tf"} == {"left", "b"}
-
-
-@pytest.mark.parametrize(
-    ("was", "now", "fault"),
-    [
-        ('name = "phi"', 'name = ""', "[roll] name: not the name of a column"),
-        ('name = "phi"', "name = 5", "[roll] name: not the name of a column"),
-        ("sign = -1", "sign = true", "[pitch] sign: not 1 or -1"),
-        ("sign = -1", "sign = 0", "[pitch] sign: not 1 or -1"),
-        ('unit = "deg/s"', 'unit = "deg"', "[yaw_rate] unit: not one of rad/s, deg/s"),
-        (
-            '[vy]\nname = "vy"\nunit = "cm/s"\nframe = "world"',
-            '[vy]\nname = "vy"\nunit = "cm/s"\nframe = "body"',
-            "velocities of several frames",
-        ),
-        ("[height]", '[z]\nname = "h"\nunit = "m"\n[height]', "leave one out"),
-        ("[range.cf2]", "[range.cf2]\nsign = 2", "[range.cf2] sign: not 1 or -1"),
-    ],
-)
-def test_one_fault_of_a_table_is_said_and_no_other(
-    was: str, now: str, fault: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "map.toml"
-    path.write_text(TABLE)
-    read_map(path)
-    assert was in TABLE
-    path.write_text(TABLE.replace(was, now, 1))
-    with pytest.raises(SourceError) as e:
-        read_map(path)
-    assert fault in str(e.value)
-
-
-ANGLE = st.floats(-1.4, 1.4)
-
-
-@given(ANGLE, ANGLE, st.floats(-3, 3), st.lists(st.floats(-2, 2), min_size=3, max_size=3))
-def test_a_velocity_of_any_frame_is_turned_into_the_world_s(
-    roll: float, pitch: float, yaw: float, v: list[float]
-) -> None:
-    time_ns = np.arange(3)
-    attitude = Series(time_ns, np.tile([roll, pitch, yaw], (3, 1)))
-    values = {f"v{axis}": np.full(3, part) for axis, part in zip("xyz", v, strict=True)}
-    c, s = np.cos(yaw), np.sin(yaw)
-    heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    level = {"world": heading.T, "horizontal": np.eye(3)}
-    level["body"] = camera_from_horizontal(roll, pitch).T
-    for frame, turned in level.items():
-        found = mapped_csv._world_velocity(Path("a"), time_ns, values, frame, attitude)
-        assert list(found) == [f"stateEstimate.v{axis}" for axis in "xyz"]
-        got = np.array(list(found.values()))
-        assert got == pytest.approx(np.tile((heading @ turned @ v)[:, None], 3), abs=1e-9)
-
-
-def test_a_velocity_that_cannot_be_turned_says_what_it_wants() -> None:
-    at, still = np.arange(3), np.zeros(3)
-    level = Series(at, np.zeros((3, 3)))
-    values = {"vx": still, "vy": still}
-    for frame, attitude, wanted in (
-        ("body", level, r"body wants \[vz\], \[roll\]"),
-        ("body", None, r"body wants \[vz\], \[roll\]"),
-        ("horizontal", None, "horizontal wants an attitude"),
-    ):
-        with pytest.raises(SourceError, match=wanted):
-            mapped_csv._world_velocity(Path("a"), at, values, frame, attitude)
-    for frame, attitude in (("world", None), ("horizontal", level)):
-        found = mapped_csv._world_velocity(Path("a"), at, values, frame, attitude)
-        assert len(found) == 2
-    with pytest.raises(SourceError, match="body wants"):
-        mapped_csv._world_velocity(Path("a"), at, {**values, "vz": still}, "body", None)
-    assert mapped_csv._world_velocity(Path("a"), at, {**values, "vz": still}, "body", level)
 
 
 def test_a_column_that_stands_twice_is_refused(table: Path) -> None:

@@ -11,7 +11,7 @@ from dmrl.recording import recover, summary
 
 from ..faults import parts
 from ..faults.ending import ended
-from ..faults.works import Inputs, cli
+from ..faults.inputs import Inputs, cli
 
 pytestmark = pytest.mark.heavy
 FIELDS = {

@@ -13,7 +13,7 @@ from dmrl.learn.model import Model, save_model
 from dmrl.learn.network import build, to_input
 from dmrl.messages import message
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
-from dmrl.stages import dataset, quantize
+from dmrl.stages import dataset, fly, quantize
 from dmrl.topics import attitude, camera_image, labels
 
 STEP_NS = 100_000_000
@@ -87,4 +87,15 @@ def quantised(settled: Path, dots_dataset: Path, tmp_path_factory: pytest.TempPa
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quantize, "plots", None)
         quantize.run(settled, dots_dataset, out, quantize.Settings())
+    return out
+
+
+@pytest.fixture(scope="session")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Thirty seconds of two robots with good sensors; cf1 has a camera."""
+    out = tmp_path_factory.mktemp("label") / "flight.mcap"
+    settings = fly.Settings(
+        2, 30.0, noise="calibrated", seed=1001, camera=True, cameras_max=1, camera_rate_hz=2.0
+    )
+    fly.run(out, settings)
     return out

@@ -25,7 +25,7 @@ from dmrl.rendering.likeness import FIGURES, Likeness
 from dmrl.stages.likeness import Settings, run
 from dmrl.stages.render import settings_of
 
-from ..faults.works import Inputs
+from ..faults.inputs import Inputs
 
 SIZE_PX = (128, 96)
 CAMERAS = {

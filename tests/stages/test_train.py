@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl import card, recipe
+from dmrl import recipe
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.datasets.for_training import examples_of, material
@@ -20,25 +20,15 @@ from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
 from dmrl.learn import fit
 from dmrl.learn.batches import FIELDS
 from dmrl.learn.model import load_model
-from dmrl.stages import dataset as dataset_stage
 from dmrl.stages import train
 from dmrl.stages.train import Flags, Settings, run
 
-SETTINGS = Settings(epochs=2, batch_size=4, device="cpu", validation_share=0.0)
-
-
-@pytest.fixture(scope="session")
-def dataset(dots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("dataset") / "dots"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(card, "plots", None)  # figures take longer than the rest
-        dataset_stage.run([dots], out, dataset_stage.Settings())
-    return out
+from .trainings import SETTINGS
 
 
 @pytest.mark.heavy
-def test_a_run_folder_says_what_was_trained_on_what(dataset: Path, tmp_path: Path) -> None:
-    result = run(dataset, tmp_path / "run", SETTINGS)
+def test_a_run_folder_says_what_was_trained_on_what(dots_dataset: Path, tmp_path: Path) -> None:
+    result = run(dots_dataset, tmp_path / "run", SETTINGS)
     assert result.images == 20
     model = load_model(tmp_path / "run")
     assert (model.width_px, model.height_px, model.label_source) == (64, 48, "truth")
@@ -53,19 +43,19 @@ def test_a_run_folder_says_what_was_trained_on_what(dataset: Path, tmp_path: Pat
 
 
 @pytest.mark.heavy
-def test_same_inputs_same_weights(dataset: Path, tmp_path: Path) -> None:
+def test_same_inputs_same_weights(dots_dataset: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        run(dataset, tmp_path / name, SETTINGS)
+        run(dots_dataset, tmp_path / name, SETTINGS)
     for name in ("model.safetensors", "model.json", "provenance.json"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 @pytest.mark.heavy
-def test_a_share_of_the_first_weights_is_kept(dataset: Path, tmp_path: Path) -> None:
-    run(dataset, tmp_path / "a", SETTINGS)
+def test_a_share_of_the_first_weights_is_kept(dots_dataset: Path, tmp_path: Path) -> None:
+    run(dots_dataset, tmp_path / "a", SETTINGS)
     for share in (0.0, 0.25, 1.0):
         more = replace(SETTINGS, init_share=share, seed=1)
-        run(dataset, tmp_path / f"b{share}", more, init=tmp_path / "a")
+        run(dots_dataset, tmp_path / f"b{share}", more, init=tmp_path / "a")
     first, trained, mixed, back = (
         load_model(tmp_path / name).network.state_dict()["body.0.0.weight"]
         for name in ("a", "b0.0", "b0.25", "b1.0")
@@ -74,14 +64,14 @@ def test_a_share_of_the_first_weights_is_kept(dataset: Path, tmp_path: Path) -> 
     np.testing.assert_allclose(back, first, atol=1e-6)
     np.testing.assert_allclose(mixed, 0.25 * first + 0.75 * trained, atol=1e-6)
     with pytest.raises(SettingError, match="Give --init"):
-        run(dataset, tmp_path / "c", replace(SETTINGS, init_share=0.5))
+        run(dots_dataset, tmp_path / "c", replace(SETTINGS, init_share=0.5))
 
 
 @pytest.mark.heavy
-def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) -> None:
+def test_init_starts_from_the_weights_of_a_model(dots_dataset: Path, tmp_path: Path) -> None:
     slow = replace(SETTINGS, learning_rate=1e-9, final_learning_rate=0.0)
-    run(dataset, tmp_path / "a", SETTINGS)
-    run(dataset, tmp_path / "b", slow, init=tmp_path / "a")
+    run(dots_dataset, tmp_path / "a", SETTINGS)
+    run(dots_dataset, tmp_path / "b", slow, init=tmp_path / "a")
     first, second = (load_model(tmp_path / name).network.state_dict() for name in ("a", "b"))
     np.testing.assert_allclose(first["head.weight"], second["head.weight"], atol=1e-6)
     made = json.loads((tmp_path / "b" / "provenance.json").read_text())
@@ -89,11 +79,11 @@ def test_init_starts_from_the_weights_of_a_model(dataset: Path, tmp_path: Path) 
 
 
 @pytest.mark.heavy
-def test_auto_takes_the_network_of_init(dataset: Path, tmp_path: Path) -> None:
+def test_auto_takes_the_network_of_init(dots_dataset: Path, tmp_path: Path) -> None:
     auto = replace(SETTINGS, architecture="auto", epochs=1, epoch_images=4)
-    run(dataset, tmp_path / "fine", replace(auto, architecture="dmrl-nano-fine"))
-    run(dataset, tmp_path / "on", auto, init=tmp_path / "fine")
-    run(dataset, tmp_path / "new", auto)
+    run(dots_dataset, tmp_path / "fine", replace(auto, architecture="dmrl-nano-fine"))
+    run(dots_dataset, tmp_path / "on", auto, init=tmp_path / "fine")
+    run(dots_dataset, tmp_path / "new", auto)
     named = [load_model(tmp_path / name).architecture for name in ("on", "new")]
     assert named == ["dmrl-nano-fine", "dmrl-nano"]
     made = json.loads((tmp_path / "on" / "provenance.json").read_text())
@@ -101,11 +91,11 @@ def test_auto_takes_the_network_of_init(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_teacher_is_learnt_from_and_named(dataset: Path, tmp_path: Path) -> None:
+def test_a_teacher_is_learnt_from_and_named(dots_dataset: Path, tmp_path: Path) -> None:
     taught = replace(SETTINGS, distill_share=1.0)
-    run(dataset, tmp_path / "teacher", replace(SETTINGS, architecture="dmrl-large"))
-    run(dataset, tmp_path / "a", taught, teacher=tmp_path / "teacher")
-    run(dataset, tmp_path / "b", taught)
+    run(dots_dataset, tmp_path / "teacher", replace(SETTINGS, architecture="dmrl-large"))
+    run(dots_dataset, tmp_path / "a", taught, teacher=tmp_path / "teacher")
+    run(dots_dataset, tmp_path / "b", taught)
     first, second = (load_model(tmp_path / name).network.state_dict() for name in ("a", "b"))
     assert not np.allclose(first["head.weight"], second["head.weight"])
     made = json.loads((tmp_path / "a" / "provenance.json").read_text())
@@ -113,16 +103,16 @@ def test_a_teacher_is_learnt_from_and_named(dataset: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.heavy
-def test_classes_are_patterns_of_peer_names(dataset: Path, tmp_path: Path) -> None:
+def test_classes_are_patterns_of_peer_names(dots_dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, classes=("cf9", "cf*"), spread_weight=1.0)
     with pytest.raises(SettingError, match=r"classes: cf9 is left no peer .* Choose among cf2$"):
-        run(dataset, tmp_path / "run", settings)
+        run(dots_dataset, tmp_path / "run", settings)
     settings = replace(settings, classes=("cf2", "cf*"))
     with pytest.raises(SettingError, match=r"classes: cf\* is left no peer"):
-        run(dataset, tmp_path / "run", settings)
-    run(dataset, tmp_path / "plain", SETTINGS)
+        run(dots_dataset, tmp_path / "run", settings)
+    run(dots_dataset, tmp_path / "plain", SETTINGS)
     settings = replace(settings, classes=("cf2",))
-    run(dataset, tmp_path / "more", settings, init=tmp_path / "plain")
+    run(dots_dataset, tmp_path / "more", settings, init=tmp_path / "plain")
     outputs = json.loads((tmp_path / "more" / "model.json").read_text())["outputs"]
     assert outputs[4:] == ["log_spread", "class_0"]
 
@@ -149,7 +139,7 @@ run(
 
 @pytest.mark.heavy
 def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, partial = tmp_path / "run", tmp_path / "run.partial"
     steps, step = count(), fit.train_step
@@ -161,13 +151,13 @@ def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(fit, "train_step", interrupted)
-        run(dataset, out, SETTINGS)
+        run(dots_dataset, out, SETTINGS)
     assert partial.is_dir()
     assert not out.exists()
     with pytest.raises(OutputError, match=r"holds an interrupted training\. Go on with --resume"):
-        run(dataset, out, SETTINGS)
-    run(dataset, out, SETTINGS, resume=True)
-    run(dataset, tmp_path / "whole", SETTINGS)
+        run(dots_dataset, out, SETTINGS)
+    run(dots_dataset, out, SETTINGS, resume=True)
+    run(dots_dataset, tmp_path / "whole", SETTINGS)
     assert not partial.exists()
     weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "whole")]
     assert weights[0] == weights[1]
@@ -175,11 +165,11 @@ def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same
 
 @pytest.mark.slow
 def test_a_killed_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
-    dataset: Path, tmp_path: Path
+    dots_dataset: Path, tmp_path: Path
 ) -> None:
     settings = replace(SETTINGS, epochs=4)
     out, partial = tmp_path / "run", tmp_path / "run.partial"
-    process = subprocess.Popen([sys.executable, "-c", KILLED, str(dataset), str(out)])
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(dots_dataset), str(out)])
     while not (partial / "checkpoint.json").exists():
         assert process.poll() is None, "it ended before it could be killed"
         time.sleep(0.02)
@@ -188,43 +178,45 @@ def test_a_killed_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes
     assert partial.is_dir()
     assert not out.exists()
     with pytest.raises(OutputError, match=r"holds an interrupted training\. Go on with --resume"):
-        run(dataset, out, settings)
-    run(dataset, out, settings, resume=True)
-    run(dataset, tmp_path / "whole", settings)
+        run(dots_dataset, out, settings)
+    run(dots_dataset, out, settings, resume=True)
+    run(dots_dataset, tmp_path / "whole", settings)
     assert not partial.exists()
     weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "whole")]
     assert weights[0] == weights[1]
 
 
 @pytest.mark.heavy
-def test_a_training_killed_in_its_first_epoch_starts_over(dataset: Path, tmp_path: Path) -> None:
+def test_a_training_killed_in_its_first_epoch_starts_over(
+    dots_dataset: Path, tmp_path: Path
+) -> None:
     (tmp_path / "run.partial" / "tensorboard").mkdir(parents=True)
-    run(dataset, tmp_path / "run", SETTINGS, resume=True)
+    run(dots_dataset, tmp_path / "run", SETTINGS, resume=True)
     (tmp_path / "again.partial" / "tensorboard").mkdir(parents=True)
-    run(dataset, tmp_path / "again", SETTINGS)
+    run(dots_dataset, tmp_path / "again", SETTINGS)
     weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "again")]
     assert weights[0] == weights[1]
 
 
-def test_what_cannot_be_trained_is_said_in_one_line(dataset: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_trained_is_said_in_one_line(dots_dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"to resume\. Train without --resume"):
-        run(dataset, tmp_path / "run", SETTINGS, resume=True)
+        run(dots_dataset, tmp_path / "run", SETTINGS, resume=True)
     with pytest.raises(DatasetError, match="dmrl dataset"):
         run(tmp_path / "nothing", tmp_path / "run", SETTINGS)
     with pytest.raises(ModelError, match="no model"):
-        run(dataset, tmp_path / "run", SETTINGS, init=tmp_path / "nothing")
+        run(dots_dataset, tmp_path / "run", SETTINGS, init=tmp_path / "nothing")
     with pytest.raises(SettingError, match="is a dmrl-nano, not the locanet to train"):
         run(
-            dataset,
+            dots_dataset,
             tmp_path / "run",
             replace(SETTINGS, architecture="locanet"),
             init=Path("dmrl-nano"),
         )
     with pytest.raises(SettingError, match="no architecture resnet"):
-        run(dataset, tmp_path / "run", replace(SETTINGS, architecture="resnet"))
+        run(dots_dataset, tmp_path / "run", replace(SETTINGS, architecture="resnet"))
     (tmp_path / "taken").mkdir()
     with pytest.raises(OutputError, match="exists"):
-        run(dataset, tmp_path / "taken", SETTINGS)
+        run(dots_dataset, tmp_path / "taken", SETTINGS)
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
@@ -239,18 +231,18 @@ def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers()
 
 
 @pytest.mark.heavy
-def test_the_threshold_is_chosen_on_images_held_out(dataset: Path, tmp_path: Path) -> None:
+def test_the_threshold_is_chosen_on_images_held_out(dots_dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, validation_share=0.2)
-    run(dataset, tmp_path / "run", settings)
+    run(dots_dataset, tmp_path / "run", settings)
     model = load_model(tmp_path / "run")
     assert model.training["images"] == 16
     assert "validation_ap_16_px" in model.training["history"][0]
-    run(dataset, tmp_path / "given", replace(settings, threshold=0.45))
+    run(dots_dataset, tmp_path / "given", replace(settings, threshold=0.45))
     assert load_model(tmp_path / "given").threshold == 0.45
 
 
-def test_examples_carry_every_peer_with_its_box(dataset: Path) -> None:
-    split = open_dataset(dataset).split("train")
+def test_examples_carry_every_peer_with_its_box(dots_dataset: Path) -> None:
+    split = open_dataset(dots_dataset).split("train")
     examples = examples_of(split)
     for robots, peers in zip(examples.robots, split.table.column("peers").to_pylist(), strict=True):
         found = robots[np.isfinite(robots[:, 0])]
@@ -261,85 +253,31 @@ def test_examples_carry_every_peer_with_its_box(dataset: Path) -> None:
                 np.testing.assert_allclose(robot[6:], peer["box_px"], rtol=1e-6)
 
 
-def test_the_last_images_of_a_recording_are_held_out(dataset: Path) -> None:
-    every = examples_of(open_dataset(dataset).split("train"))
-    found = material(open_dataset(dataset), Settings(validation_share=0.25))
+def test_the_last_images_of_a_recording_are_held_out(dots_dataset: Path) -> None:
+    every = examples_of(open_dataset(dots_dataset).split("train"))
+    found = material(open_dataset(dots_dataset), Settings(validation_share=0.25))
     assert (len(found.examples), found.shares) == (15, None)
     assert found.held_out is not None
     joined = np.concatenate([found.examples.robots, found.held_out.robots])
     np.testing.assert_array_equal(joined, every.robots)
     np.testing.assert_array_equal(found.held_out.image(0), every.image(15))
-    assert material(open_dataset(dataset), Settings(validation_share=0.0)).held_out is None
+    assert material(open_dataset(dots_dataset), Settings(validation_share=0.0)).held_out is None
 
 
-def test_shares_are_of_recordings_by_name(dataset: Path, tmp_path: Path) -> None:
-    run(dataset, tmp_path / "run", replace(SETTINGS, shares={"dots*": 0.7}))
+def test_shares_are_of_recordings_by_name(dots_dataset: Path, tmp_path: Path) -> None:
+    run(dots_dataset, tmp_path / "run", replace(SETTINGS, shares={"dots*": 0.7}))
     with pytest.raises(SettingError, match=r"no images left for flight-\*.*are dots\.mcap"):
-        run(dataset, tmp_path / "a", replace(SETTINGS, shares={"flight-*": 1.0, "*": 1.0}))
+        run(dots_dataset, tmp_path / "a", replace(SETTINGS, shares={"flight-*": 1.0, "*": 1.0}))
     with pytest.raises(SettingError, match=r"shares: all are 0"):
-        run(dataset, tmp_path / "b", replace(SETTINGS, shares={"*": 0.0}))
+        run(dots_dataset, tmp_path / "b", replace(SETTINGS, shares={"*": 0.0}))
 
 
-TORCHRUN = """
-import sys
-from pathlib import Path
-from dmrl.stages.train import Settings, run
-run(
-    Path(sys.argv[1]),
-    Path(sys.argv[2]),
-    Settings(epochs=2, batch_size=4, device="cpu", validation_share=0.2),
-)
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_train_one_network(dataset: Path, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, validation_share=0.2)
-    for name in ("a", "b"):
-        run(dataset, tmp_path / name, replace(settings, processes=2))
-    first, second = ((tmp_path / n / "model.safetensors").read_bytes() for n in ("a", "b"))
-    assert first == second
-    run(dataset, tmp_path / "alone", settings)
-    histories = [load_model(tmp_path / n).training["history"] for n in ("a", "alone")]
-    # The same batches, but other augmentation and statistics of half a batch each.
-    assert histories[0][-1]["loss"] == pytest.approx(histories[1][-1]["loss"], rel=0.3)
-    assert histories[0][-1]["loss"] != histories[1][-1]["loss"]
-
-
-@pytest.mark.slow
-def test_torchrun_trains_what_two_processes_train(dataset: Path, tmp_path: Path) -> None:
-    script = tmp_path / "two.py"
-    script.write_text(TORCHRUN)
-    words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    done = subprocess.run(
-        [sys.executable, *words, str(dataset), str(tmp_path / "a")],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    run(dataset, tmp_path / "b", replace(SETTINGS, validation_share=0.2, processes=2))
-    first, second = ((tmp_path / n / "model.safetensors").read_bytes() for n in ("a", "b"))
-    assert first == second
-
-
-@pytest.mark.heavy
-def test_an_error_of_two_processes_is_said_once(
-    dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SettingError, match=r"shares: all are 0"):
-        run(dataset, tmp_path / "run", replace(SETTINGS, processes=2, shares={"*": 0.0}))
-    assert capfd.readouterr().err == ""
-    assert not (tmp_path / "run").exists()
-
-
-def test_flags_win_over_the_recipe(dataset: Path, tmp_path: Path) -> None:
+def test_flags_win_over_the_recipe(dots_dataset: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine.toml"
     mine.write_text(
         'kind = "train"\nepochs = 7\nbatch_size = 10\nwarmup_epochs = 0\ndevice = "cpu"\n'
     )
-    words = ["train", str(dataset), str(tmp_path / "run"), "--recipe", str(mine)]
+    words = ["train", str(dots_dataset), str(tmp_path / "run"), "--recipe", str(mine)]
     app([*words, "--epochs", "1", "--seed", "0"], result_action="return_value")
     said = load_model(tmp_path / "run").training["settings"]
     assert (said["epochs"], said["batch_size"], said["warmup_epochs"]) == (1, 10, 0)
@@ -351,9 +289,9 @@ def test_a_flag_out_of_range_is_one_line() -> None:
 
 
 def test_json_names_the_model(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dots_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train.command(dataset, tmp_path / "run", flags=Flags(epochs=1, device="cpu"), as_json=True)
+    train.command(dots_dataset, tmp_path / "run", flags=Flags(epochs=1, device="cpu"), as_json=True)
     said = json.loads(capsys.readouterr().out)
     assert said["model"] == str(tmp_path / "run")
     assert said["images"] == 18  # two are held out, to choose the threshold on

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 from dmrl import boundary, topics
-from dmrl import recipe as recipes
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.errors import OutputError, StorageError, UnsafeName
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.output import partial_file, partial_folder, rewritten_file
-from dmrl.pipeline import run as pipeline
 from dmrl.pipeline.folders import recordings_in, tasks_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
 from dmrl.recording.blocks import place_of
@@ -210,64 +208,6 @@ def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
     again = said(capsys, 0, "dataset", second, "s3://lab/grows/set", "--add")
     assert "1 of 1 recordings are in" in again.err
     assert len(open_dataset(path_of("s3://lab/grows/set")).split("train")) == 600
-
-
-CHAIN = """
-kind = "pipeline"
-[[step]]
-stage = "sketch"
-out = "pictures"
-images = 2
-[[step]]
-stage = "convert"
-source = "pictures"
-out = "pictures.mcap"
-[[step]]
-stage = "trim"
-recording = "pictures.mcap"
-to_s = 5.0
-out = "short.mcap"
-"""
-
-
-@pytest.mark.heavy
-def test_a_pipeline_keeps_its_folder_in_a_bucket(lab: Any, tmp_path: Path) -> None:
-    recipe = tmp_path / "chain.toml"
-    recipe.write_text(CHAIN)
-    pipeline.run(recipe, tmp_path / "here", workers=1)
-    made = pipeline.run(recipe, path_of("s3://lab/chain"), workers=1)
-    assert not any(one.skipped for one in made)
-    for name in ("pictures.mcap", "short.mcap"):
-        assert lab.cat_file(f"lab/chain/{name}") == (tmp_path / "here" / name).read_bytes()
-    assert all(one.skipped for one in pipeline.run(recipe, path_of("s3://lab/chain"), workers=1))
-    assert not [name for name in lab.find("lab/chain") if "unfinished" in name]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_the_demo_s_pipeline_with_all_it_makes_in_a_bucket_is_that_of_here(
-    lab: Any, tmp_path: Path
-) -> None:
-    """Every step that ships but the picture of rerun, on fewer drawn pictures."""
-    text = recipes.text("demo").replace("images = 600", "images = 20")
-    text = text.replace("epochs = 12", "epochs = 1")
-    recipe = tmp_path / "small.toml"
-    recipe.write_text(text[: text.index("[[step]]   # needs a Vulkan driver")])
-    there = path_of("s3://lab/demo")
-    pipeline.run(recipe, tmp_path / "here", workers=1)
-    made = pipeline.run(recipe, there, workers=1)
-    assert [one.stage for one in made] == [
-        *("sketch", "convert", "dataset", "train", "predict", "evaluate")
-    ]
-    here, compared = tmp_path / "here", 0
-    for path in sorted(p for p in here.rglob("*") if p.is_file()):
-        name = path.relative_to(here).as_posix()
-        if path.name.startswith((".", "pipeline")) or "tensorboard" in name:
-            continue  # when it ran, and where
-        assert lab.cat_file(f"lab/demo/{name}") == path.read_bytes(), name
-        compared += 1
-    assert compared > 35
-    assert all(one.skipped for one in pipeline.run(recipe, there, workers=1))
 
 
 @pytest.mark.heavy

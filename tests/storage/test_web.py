@@ -16,7 +16,7 @@ from dmrl.storage import path_of
 from dmrl.storage.system import system
 
 from ..faults.ending import ended
-from ..faults.works import Inputs, cli
+from ..faults.inputs import Inputs, cli
 
 pytest.importorskip("aiohttp")
 pytestmark = pytest.mark.filterwarnings("ignore")  # of aiohttp and of broken connections

@@ -1,0 +1,143 @@
+"""How exact renders are: edges against boxes, and the grain of few samples."""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.geometry.frames import Array, Camera, project
+from dmrl.rendering import crazyflie
+from dmrl.rendering.backdrops import photos_in
+from dmrl.rendering.environment import ensure
+from dmrl.rendering.lens import Picture, image_from_pinhole
+from dmrl.rendering.randomise import World, draw_scene
+from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.shot import Shot
+from dmrl.rendering.sketch import Pose
+from dmrl.stages.render import camera_of, settings_of
+from dmrl.terminal.progress import say
+
+MANY_SAMPLES = 512
+
+
+def mesh_box(camera: Camera, pose: Pose, points: Array) -> Array:
+    """Left, top, right, bottom of a mesh's corners in the image, clipped to it.
+
+    Parameters
+    ----------
+    camera
+        Takes the image.
+    pose
+        Of the robot.
+    points
+        (N, 3) corners, body frame.
+    """
+    xyz = points @ pose.camera_from_body.T + pose.xyz_camera
+    uv, _ = project(xyz[xyz[:, 0] > 0.01], camera.image_from_optical)
+    uv = image_from_pinhole(uv, camera)
+    box = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+    return np.clip(box, 0, (camera.width_px, camera.height_px) * 2)
+
+
+def reprojection(recipe: str, images: int) -> dict[str, float]:
+    """Distance of alpha boxes' edges from the mesh's, pixels, robots that nothing hides.
+
+    Parameters
+    ----------
+    recipe
+        Preset to draw from.
+    images
+        How many.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recipe.toml"
+        path.write_text(f'kind = "render"\npreset = "{recipe}"\nempty_share = 0.0\n')
+        settings = settings_of(str(path), images=images)
+    camera = camera_of(settings)
+    model = Model(settings.model, settings.scale, settings.model_up)
+    errors, middles = [], []
+    with Renderer(ensure(say), model) as renderer:
+        world = World(
+            settings, camera, renderer.radius_m, tuple(renderer.lights), renderer.panorama, None
+        )
+        world = replace(world, panorama=_grey)
+        scenes = [draw_scene(world, k) for k in range(images)]
+        shots = renderer.shots((camera, scene.robots, scene.look) for scene in scenes)
+        for scene, shot in zip(scenes, shots, strict=True):
+            for k, robot in enumerate(scene.robots):
+                if shot.visible_share[k] < 1 or np.isnan(shot.box_px[k]).any():
+                    continue
+                turn = (robot.paint["rotor_first_rad"], robot.paint["rotor_sweep_rad"])
+                points = crazyflie.outline(settings.scale, *turn)
+                box = mesh_box(camera, robot.pose, points)
+                errors.append(shot.box_px[k] - box)
+                middles.append((shot.box_px[k] - box).reshape(2, 2).mean(axis=0))
+    edges = np.array(errors)
+    return {
+        "robots": len(edges),
+        "median_px": float(np.median(np.abs(edges))),
+        "p95_px": float(np.percentile(np.abs(edges), 95)),
+        **{
+            f"median_{name}_px": float(value)
+            for name, value in zip(
+                ("left", "top", "right", "bottom"), np.median(edges, axis=0), strict=True
+            )
+        },
+        "median_middle_px": float(np.median(np.abs(middles))),
+    }
+
+
+def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
+    """What light paths leave of noise on robots, and the sensor's own, grey levels of 256.
+
+    Standard deviations, over pixels that a robot covers wholly, of the difference from a picture
+    of many paths; the sensor is noiseless but where its noise is told.
+
+    Parameters
+    ----------
+    recipe
+        Name of a recipe.
+    images
+        How many.
+    backgrounds
+        Folder of photos.
+    """
+    settings = settings_of(recipe, images=images, robots_max=1, empty_share=0.0)
+    photos = photos_in(backgrounds)
+    camera = camera_of(settings)
+    shots: dict[str, list[Shot]] = {}
+    for samples in (MANY_SAMPLES, 4, 8, 16):
+        model = Model(None, settings.scale)
+        with Renderer(ensure(say), model, workers=1, samples=samples) as renderer:
+            world = World(
+                settings, camera, renderer.radius_m, tuple(renderer.lights), _grey, photos
+            )
+            drawn = [draw_scene(world, k) for k in range(images)]
+            calm = [replace(d.look, sensor=_noiseless(d.look.sensor)) for d in drawn]
+            scenes = [(camera, d.robots, look) for d, look in zip(drawn, calm, strict=True)]
+            shots[f"paths_{samples}"] = list(renderer.shots(scenes))
+            if samples == MANY_SAMPLES:
+                noisy = [(camera, d.robots, d.look) for d in drawn]
+                shots["sensor"] = list(renderer.shots(noisy))
+    exact = shots.pop(f"paths_{MANY_SAMPLES}")
+    return {name: _difference(found, exact) for name, found in shots.items()}
+
+
+def _grey(name: str) -> Picture:
+    """(8, 16, 3) a panorama of nothing."""
+    return np.full((8, 16, 3), 0.3, np.float32)
+
+
+def _noiseless(sensor: Sensor) -> Sensor:
+    return replace(sensor, shot_noise=0.0, read_noise=0.0)
+
+
+def _difference(found: list[Shot], exact: list[Shot]) -> float:
+    """Standard deviation where a robot covers pixels wholly."""
+    apart = [
+        (one.rgb.astype(float) - other.rgb)[(other.opacity == 255).any(axis=0)].ravel()
+        for one, other in zip(found, exact, strict=True)
+    ]
+    return float(np.std(np.concatenate(apart)))

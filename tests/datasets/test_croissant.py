@@ -1,0 +1,43 @@
+"""The card's Croissant block: valid, and it loads the rows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.datasets import open_dataset
+from dmrl.stages.dataset import Settings, run
+
+from .conftest import Record, pixels_of
+
+mlcroissant = pytest.importorskip("mlcroissant", reason="mlcroissant is not installed")
+THEIRS = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+"""Of the libraries that read Croissant."""
+
+
+@THEIRS
+@pytest.mark.parametrize("parquet", [False, True])
+def test_croissant_is_valid_and_names_every_column(
+    record: Record, tmp_path: Path, parquet: bool
+) -> None:
+    spans = {"train": "[[0, 250000000]]", "test": "[[300000000, 900000000]]"}
+    run([record(split=spans)], tmp_path / "out", Settings(parquet=parquet, license="cc0-1.0"))
+    found = mlcroissant.Dataset(jsonld=str(tmp_path / "out" / "croissant.json"))
+    assert not found.metadata.ctx.issues.errors
+    assert [one.name for one in found.metadata.record_sets] == ["train", "test"]
+    opened = open_dataset(tmp_path / "out").split("train")
+    names = [field.name for field in found.metadata.record_sets[0].fields]
+    assert names == opened.table.schema.names
+    assert all(field.description for field in found.metadata.record_sets[0].fields)
+    assert found.metadata.license == ["cc0-1.0"]
+
+
+@THEIRS
+def test_croissant_loads_the_rows_of_parquet(record: Record, tmp_path: Path) -> None:
+    run([record()], tmp_path / "out", Settings(split="none", parquet=True))
+    found = mlcroissant.Dataset(jsonld=str(tmp_path / "out" / "croissant.json"))
+    rows = list(found.records("train"))
+    assert len(rows) == 6
+    assert np.array_equal(np.asarray(rows[3]["train/image"]), pixels_of(3))
+    assert rows[3]["train/peers"][0]["train/peers/u_px"] == 20.5
+    assert rows[3]["train/log_time"] == 300_000_000

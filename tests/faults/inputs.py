@@ -1,0 +1,284 @@
+"""Inputs of every command, made once, as small as they can be."""
+
+import pickle
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from pkgutil import resolve_name
+
+import numpy as np
+
+from dmrl.cli import app
+from dmrl.images.codec import encode_png
+from dmrl.messages import message
+from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
+from dmrl.topics import attitude, camera_image, labels, uwb_range
+
+from ..stages.detector import with_detections
+
+STEP_NS = 100_000_000
+STAND_INS = {
+    "render": (
+        ("dmrl.rendering.renderer:", "Pool", "Painters"),
+        ("dmrl.rendering.renderer:", "shipped_lights", "sky"),
+        ("dmrl.stages.render:", "ensure", "no_python"),
+    ),
+    "run": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
+    "trim": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
+    "evaluate": (("matplotlib.figure:Figure", "draw", "blank"),),
+    "likeness": tuple(("dmrl.rendering.fitting:", name, "FEW") for name in ("PICTURES", "ROUNDS")),
+    "index": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
+    "report": (("matplotlib.figure:Figure", "draw", "blank"),),
+    "dataset": (("dmrl.card:", "plots", "nothing"),),
+    "card": (("dmrl.card:", "plots", "nothing"),),
+    "quantize": (("dmrl.stages.quantize:", "plots", "nothing"),),
+}
+"""By command: where, what, and the name in stand_ins.py of what takes its place."""
+SHORT = """
+kind = "train"
+architecture = "locanet"
+epochs = 1
+batch_size = 4
+validation_share = 0.0
+"""
+SCENE = """
+kind = "render"
+images = 2
+robots_max = 2
+empty_share = 0.0
+workers = 1
+seed = 3
+"""
+PIPELINE = """
+kind = "pipeline"
+[[step]]
+stage = "sketch"
+out = "pictures"
+images = 2
+[[step]]
+stage = "convert"
+source = "pictures"
+out = "pictures.mcap"
+[[step]]
+stage = "trim"
+recording = "pictures.mcap"
+to_s = 0.5
+out = "short.mcap"
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Whole inputs in one folder, each made when it is first asked for. No stage may change one."""
+
+    folder: Path
+
+    def made(self, name: str, make: Callable[[Path], object]) -> Path:
+        """The input of that name."""
+        path = self.folder / name
+        if not path.exists():
+            make(path)
+        return path
+
+    @property
+    def dots(self) -> Path:
+        """A recording of twelve small images with labels."""
+        return self.made("dots.mcap", _dots)
+
+    @property
+    def cut(self) -> Path:
+        """Two thirds of it."""
+        whole = self.dots.read_bytes()
+        return self.made("cut.mcap", lambda path: path.write_bytes(whole[: 2 * len(whole) // 3]))
+
+    @property
+    def pictures(self) -> Path:
+        """Three sketches."""
+        return self.made("pictures", lambda path: cli("sketch", path, "--images", 3))
+
+    @property
+    def flight(self) -> Path:
+        """Eight seconds of two robots."""
+        flags = "--duration-s", 8, "--seed", 1
+        return self.made("flight.mcap", lambda path: cli("fly", "fly_in_view", path, *flags))
+
+    @property
+    def moment(self) -> Path:
+        """A second of it."""
+        return self.made("moment.mcap", lambda path: cli("trim", self.flight, path, "--to-s", 1))
+
+    @property
+    def flights(self) -> Path:
+        """A folder with two recordings."""
+        return self.made("flights", lambda path: flights(self, path))
+
+    @property
+    def indexed(self) -> Path:
+        """The same with a catalogue."""
+        return self.made("indexed", lambda path: (flights(self, path), cli("index", path)))
+
+    @property
+    def seen(self) -> Path:
+        """The same with detections."""
+        return self.made("seen.mcap", lambda path: with_detections(self.flight, path))
+
+    @property
+    def pair(self) -> Path:
+        """Half a minute of two robots' ranges; the clock of one is ahead."""
+        return self.made("pair.mcap", _pair)
+
+    @property
+    def boards(self) -> Path:
+        """Pictures of a chessboard."""
+        return self.made("boards", _boards)
+
+    @property
+    def camera(self) -> Path:
+        """A camera file."""
+        flags = "--board", "7x5"
+        return self.made("camera.toml", lambda path: cli("calibrate", self.boards, path, *flags))
+
+    @property
+    def chain(self) -> Path:
+        """A pipeline."""
+        return self.made("chain.toml", lambda path: path.write_text(PIPELINE))
+
+    @property
+    def short(self) -> Path:
+        """A training of one epoch."""
+        return self.made("short.toml", lambda path: path.write_text(SHORT))
+
+    @property
+    def scene(self) -> Path:
+        """Two renders."""
+        return self.made("scene.toml", lambda path: path.write_text(SCENE))
+
+    @property
+    def set(self) -> Path:
+        """The dataset of ``dots``."""
+        return self.made("set", lambda path: cli("dataset", self.dots, path))
+
+    @property
+    def more(self) -> Path:
+        """Twelve other images."""
+        return self.made("more.mcap", lambda path: _dots(path, seed=1))
+
+    @property
+    def packed(self) -> Path:
+        """A dataset of ``dots`` in Parquet."""
+        return self.made("packed", lambda path: cli("dataset", self.dots, path, "--parquet"))
+
+    @property
+    def saved(self) -> Path:
+        """``set`` without a manifest, as if `datasets` had saved it."""
+        return self.made("saved", self._saved)
+
+    def _saved(self, path: Path) -> None:
+        shutil.copytree(self.set, path, ignore=shutil.ignore_patterns("manifest.json", "parts"))
+
+    @property
+    def model(self) -> Path:
+        """A network of one epoch."""
+        return self.made("model", lambda path: cli("train", self.set, path, *self.training))
+
+    @property
+    def training(self) -> tuple[object, ...]:
+        """Flags of that training."""
+        return "--recipe", self.short, "--device", "cpu"
+
+    @property
+    def found(self) -> Path:
+        """``dots`` with its detections."""
+        return self.made("found.mcap", lambda path: cli("predict", self.model, self.dots, path))
+
+    @property
+    def int8(self) -> Path:
+        """Its int8 form."""
+        return self.made("int8", lambda path: cli("quantize", self.model, self.set, path))
+
+    @property
+    def proof(self) -> Path:
+        """What `dmrl verify` found in it."""
+        return self.made("proof", lambda path: tried(self, path))
+
+    @property
+    def c(self) -> Path:
+        """Its C."""
+        return self.made("c", lambda path: cli("export", self.int8, path))
+
+
+def cli(*words: object) -> None:
+    """A command line.
+
+    Raises
+    ------
+    SystemExit
+        With its exit status, unless that is 0.
+    """
+    for place, name, other in STAND_INS.get(str(words[0]), ()):
+        stand_in = getattr(import_module(".stand_ins", __package__), other)
+        setattr(resolve_name(place), name, stand_in)
+    try:
+        app([str(word) for word in words])
+    except SystemExit as e:
+        if e.code:
+            raise
+
+
+def _dots(path: Path, seed: int = 0) -> None:
+    """Twelve images of a bright square on dark noise, in chunks of a few, with labels."""
+    rng = np.random.default_rng(seed)
+    with RecordingWriter(path, Provenance("test")) as sink:
+        sink.add_metadata(
+            SPLIT_METADATA,
+            {"train": f"[[0, {7 * STEP_NS}]]", "test": f"[[{8 * STEP_NS}, {11 * STEP_NS}]]"},
+        )
+        for k in range(12):
+            rgb = rng.integers(0, 40, (48, 64, 3), np.uint8)
+            row, col = int(rng.integers(1, 5)), int(rng.integers(1, 7))
+            rgb[8 * row + 1 : 8 * row + 7, 8 * col + 1 : 8 * col + 7] = 250
+            picture = message("CompressedImage")(data=encode_png(rgb), format="png")
+            truth = {"peer": "cf2", "u_px": 8 * col + 4, "v_px": 8 * row + 4, "depth_m": 1.2}
+            sink.write(k * STEP_NS, camera_image("cf1"), picture)
+            sink.write(
+                k * STEP_NS,
+                labels("cf1"),
+                message("PeerLabels")(peers=[{**truth, "source": "truth"}]),
+            )
+            sink.write(k * STEP_NS + 1, attitude("cf1"), message("Attitude")(roll_rad=k))
+            if k % 4 == 3:
+                sink.flush()
+
+
+def flights(inputs: Inputs, folder: Path) -> None:
+    folder.mkdir()
+    for name in "ab":
+        shutil.copy(inputs.dots, folder / f"{name}.mcap")
+
+
+def _pair(path: Path) -> None:
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.03, 0.05, 700))
+    measured = 3 + 0.5 * np.sin(time) + 0.4 * np.sin(1.7 * time) + rng.normal(0, 0.05, len(time))
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for at_s, value in zip(time.tolist(), measured.tolist(), strict=True):
+            ranged = message("UwbRange")(range_m=value)
+            sink.write(round(at_s * 1e9), uwb_range("cf1", "cf2"), ranged)
+            sink.write(round((at_s + 0.08) * 1e9), uwb_range("cf2", "cf1"), ranged)
+
+
+def _boards(folder: Path) -> None:
+    boards = import_module("..estimation.boards", __package__)
+    rng = np.random.default_rng(0)
+    folder.mkdir()
+    for k in range(7):
+        grey = boards.picture(*boards.pose(rng))
+        (folder / f"{k}.png").write_bytes(encode_png(np.repeat(grey[..., None], 3, axis=2)))
+
+
+def tried(i: Inputs, out: Path) -> None:
+    verify = import_module("dmrl.stages.verify")
+    settings = verify.Settings(images=1, noise=1, targets=("gcc",))
+    out.write_bytes(pickle.dumps(verify.run(i.c, settings)))

@@ -1,0 +1,12 @@
+"""Images to learn from."""
+
+import pytest
+
+from dmrl.learn.batches import Examples
+
+from .fitting import dots
+
+
+@pytest.fixture
+def examples() -> Examples:
+    return dots(20)

@@ -1,0 +1,56 @@
+"""Small trainings on images of a dot."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dmrl import recipe
+from dmrl.learn.batches import FIELDS, Examples
+from dmrl.learn.checkpoint import remove_checkpoint
+from dmrl.learn.fit import Training, new_network
+from dmrl.learn.model import Model, save_model
+from dmrl.learn.network import Network
+from dmrl.learn.settings import FitSettings
+
+PUBLISHED = recipe.load("locanet", "train", FitSettings)
+SETTINGS = replace(PUBLISHED, epochs=4, batch_size=3, warmup_epochs=1, device="cpu")
+EVERYTHING = FitSettings(
+    epochs=3,
+    batch_size=4,
+    warmup_epochs=1,
+    ema_steps=20,
+    paste=1.0,
+    plain_epochs=1,
+    frozen_norm_epochs=1,
+    label_noise="weight",
+    precision="bfloat16",
+    device="cpu",
+)
+
+
+def dots(count: int) -> Examples:
+    """Dark images with one bright square, labelled at its centre, depth 1.5 m."""
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 40, (count, 32, 48, 3), np.uint8)
+    robots = np.zeros((count, 1, len(FIELDS)), np.float32)
+    for k, cell in enumerate(rng.integers(0, 24, count)):
+        row, col = divmod(int(cell), 6)
+        pixels[k, 8 * row + 2 : 8 * row + 6, 8 * col + 2 : 8 * col + 6] = 250
+        box = (8 * col + 2, 8 * row + 2, 8 * col + 6, 8 * row + 6)
+        robots[k, 0] = (8 * col + 4, 8 * row + 4, 1.5, 0, 0, 0, *box, k % 2)
+    return Examples([pixels[:7], pixels[7:]], robots)
+
+
+def trained(
+    examples: Examples, folder: Path, settings: FitSettings = SETTINGS, *, resume: bool = False
+) -> tuple[Training, Network]:
+    folder.mkdir(exist_ok=True)
+    network = new_network(settings, examples)
+    training = Training(network, examples, settings, folder, identity="dots", resume=resume)
+    for _ in training.steps():
+        pass
+    kept = Model(training.network, settings.architecture, training={"history": training.history})
+    save_model(kept, folder)
+    remove_checkpoint(folder)
+    return training, training.network

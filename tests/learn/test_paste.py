@@ -1,0 +1,186 @@
+"""Robots pasted into other images, and images beside each other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from dmrl.learn import augment
+from dmrl.learn.augment import Augmentation, Augmenter
+from dmrl.learn.batches import FIELDS, Examples
+from dmrl.learn.windows import feather, through
+
+from .squares import GEOMETRY, augmenter, batches, squares
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("intrinsics", [None, (70.0, 70.0, 80.0, 56.0)])
+def test_pasted_robots_are_labelled_and_covered_ones_are_not(
+    intrinsics: tuple[float, float, float, float] | None,
+) -> None:
+    for batch in batches(replace(GEOMETRY, rotation_deg=0.0, paste=2.0, intrinsics=intrinsics)):
+        bright = batch.images[:, 0].numpy()
+        for image, robots in zip(bright, batch.robots.numpy(), strict=True):
+            for robot in robots[np.isfinite(robots[:, 0])]:
+                u, v = np.clip(robot[:2].astype(int), 0, (159, 111))
+                near = image[max(v - 2, 0) : v + 3, max(u - 2, 0) : u + 3]
+                assert near.max() > 120
+
+
+def test_a_robot_with_a_mask_is_pasted_without_what_was_around_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.0)
+    plain = squares()
+    grey = np.maximum(plain.pixels[0], 60)
+    masks = (grey[..., 0] == 255).astype(np.uint8)
+    settings = replace(Augmentation(), paste=1.0)
+    canvases = []
+    for known in ([], [masks, np.zeros_like(masks)]):
+        examples = Examples([grey, np.zeros_like(grey)], squares_and_nothing(plain), known)
+        canvases.append(
+            Augmenter(examples, settings, seed=0).batch(range(24, 48), epoch=0, index=0)
+        )
+    around, cut = (batch.images[:, 0].numpy() for batch in canvases)
+    assert ((around > 50) & (around < 70)).sum() > 500
+    # Between robot and canvas there is only the pixel of the mask's edge.
+    assert ((cut > 50) & (cut < 70)).sum() < 0.1 * (cut > 200).sum()
+    for image, robots in zip(cut, canvases[1].robots.numpy(), strict=True):
+        for robot in robots[np.isfinite(robots[:, 0])]:
+            assert image[int(robot[1]), int(robot[0])] > 200
+
+
+def squares_and_nothing(plain: Examples) -> NDArray[np.float32]:
+    return np.concatenate([plain.robots, np.full_like(plain.robots, np.nan)])
+
+
+def test_no_more_robots_than_there_is_room_for_are_labelled() -> None:
+    crowd = squares(1)
+    robots = np.repeat(crowd.robots[:, :1], augment.MAX_ROBOTS + 3, axis=1)
+    maker = Augmenter(Examples(crowd.pixels, robots), Augmentation(flip_share=0.5), seed=0)
+    batch = maker.batch([0], epoch=0, index=0)
+    assert batch.robots.shape == (1, augment.MAX_ROBOTS, len(FIELDS))
+    assert torch.isfinite(batch.robots[..., 0]).all()
+
+
+class Patches:
+    """Patches that one augmenter would show: rectangle, source, window and opacity of each."""
+
+    def __init__(self, maker: Augmenter, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.rects: list[tuple[int, int, int, int]] = []
+        self.sources: list[int] = []
+        self.middles: list[NDArray[np.float64]] = []
+        self.zooms: list[float] = []
+        self.mine: list[NDArray[np.float32]] = []
+
+        def show(*given: object) -> object:
+            _, rect, source, window, mine, robots, _, opacity = given
+            left, top, right, bottom = rect  # type: ignore[misc]
+            self.rects.append((left, top, right, bottom))
+            self.sources.append(source)  # type: ignore[arg-type]
+            size = np.array([[right - left, bottom - top]])
+            self.middles.append(through(window.matrix, size / 2)[0])  # type: ignore[attr-defined]
+            self.zooms.append(window.zoom)  # type: ignore[attr-defined]
+            self.mine.append(mine)  # type: ignore[arg-type]
+            if len(self.rects) < 20:
+                np.testing.assert_array_equal(opacity, feather(bottom - top, right - left))
+            return robots
+
+        monkeypatch.setattr(maker, "_show", show)
+        rng = np.random.default_rng(9)
+        before, canvas = np.empty((0, len(FIELDS)), np.float32), np.empty((112, 160, 3), np.uint8)
+        for _ in range(300):
+            maker._patch(canvas, before, rng)
+
+
+def boxed() -> Examples:
+    """Two images; only in the second is a robot whose box is known, 24 x 10 px about (70, 33)."""
+    robots = np.full((2, 2, len(FIELDS)), np.nan, np.float32)
+    robots[0, 0, :6] = 30, 30, 2, 0, 0, 0
+    robots[1, 1, :10] = 71, 30, 2, 0, 0, 0, 58, 28, 82, 38
+    return Examples([np.zeros((2, 112, 160, 3), np.uint8)], robots)
+
+
+def test_a_patch_is_a_quarter_larger_than_its_robot_and_lies_anywhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.0)
+    found = Patches(Augmenter(boxed(), Augmentation(zoom=(0.5, 2.0)), seed=0), monkeypatch)
+    assert len(found.rects) == 300 and set(found.sources) == {1}
+    assert (min(found.zooms), max(found.zooms)) == pytest.approx((1 / 1.1, 1.1), abs=0.004)
+    rects, zooms = np.array(found.rects), np.array(found.zooms)[:, None]
+    size = rects[:, 2:] - rects[:, :2]
+    assert (size == np.ceil(zooms * 1.25 * np.array([24, 10])) + 8).all()
+    room = np.array([160, 112]) - size
+    assert (rects[:, :2] >= 0).all() and (rects[:, :2] <= room).all()
+    place = rects[:, :2] / room
+    assert (place.min(axis=0).max(), place.max(axis=0).min()) == pytest.approx((0, 1), abs=0.02)
+    assert place.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.05)
+    away = np.array(found.middles) - [70, 33]
+    assert away.min(axis=0) == pytest.approx([-2, -2], abs=0.1)
+    assert away.max(axis=0) == pytest.approx([2, 2], abs=0.1)
+    assert all(len(mine) == 1 and mine[0, 0] == 71 for mine in found.mine)
+
+
+def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 1.0)
+    found = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
+    assert np.mean(found.sources) == pytest.approx(0.5, abs=0.06)
+    assert {
+        (source, mine[0, 0]) for source, mine in zip(found.sources, found.mine, strict=True)
+    } == {
+        (0, 30.0),
+        (1, 71.0),
+    }
+    middles = np.array(found.middles)
+    assert middles.min(axis=0) == pytest.approx([0, 0], abs=2)
+    assert middles.max(axis=0) == pytest.approx([160, 112], abs=2)
+    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.25)
+    shares = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
+    assert np.mean(shares.sources) == pytest.approx(1 - 0.25 / 2, abs=0.06)
+
+
+def test_a_robot_too_large_for_the_canvas_is_not_pasted(monkeypatch: pytest.MonkeyPatch) -> None:
+    for width, count in ((121.6, 300), (121.7, 0)):  # a quarter more, and eight
+        examples = boxed()
+        examples.robots[1, 1, 6:10] = 0, 20, width, 40
+        assert len(Patches(Augmenter(examples, Augmentation(), seed=0), monkeypatch).rects) == count
+
+
+def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    maker = Augmenter(squares(5), Augmentation(mosaic_share=0.5), seed=0)
+    rng, shown = np.random.default_rng(3), []
+    monkeypatch.setattr(
+        maker, "_layer", lambda _, rect, source, *rest: shown.append((rect, source))
+    )
+    monkeypatch.setattr(maker, "_spoil", lambda *_: None)
+    counts = []
+    for _ in range(300):
+        shown.clear()
+        maker._draw(np.empty((112, 160, 3), np.uint8), 4, rng)
+        counts.append(len(shown))
+        assert shown[0][1] == 4
+        area = sum((r - left) * (b - top) for (left, top, r, b), _ in shown)
+        assert area == 160 * 112
+        assert all(0 <= source < 5 for _, source in shown)
+    assert set(counts) == {1, 2, 4}
+    assert np.mean([count == 1 for count in counts]) == pytest.approx(0.5, abs=0.08)
+
+
+def test_patches_come_as_often_as_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    maker, rng, asked = augmenter(paste=1.5), np.random.default_rng(3), []
+    monkeypatch.setattr(maker, "_patch", lambda canvas, robots, _: asked.append(1) or robots)
+    for _ in range(400):
+        maker._draw(np.zeros((112, 160, 3), np.uint8), 0, rng)
+    assert len(asked) / 400 == pytest.approx(1.5, abs=0.15)
+
+
+def test_a_patch_takes_every_place_that_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    examples = boxed()
+    examples.robots[1, 1, 6:10] = 20, 20, 135, 100  # with its margin 152 x 108 of 160 x 112
+    found = Patches(Augmenter(examples, Augmentation(), seed=0), monkeypatch)
+    assert {rect[0] for rect in found.rects} == set(range(9))
+    assert {rect[1] for rect in found.rects} == set(range(5))
+    assert {(rect[2] - rect[0], rect[3] - rect[1]) for rect in found.rects} == {(152, 108)}

@@ -1,0 +1,81 @@
+"""A training that was stopped: it goes on to the same bytes, or is refused in one line."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import ModelError, SettingError
+from dmrl.learn.batches import Examples
+from dmrl.learn.checkpoint import has_checkpoint
+from dmrl.learn.fit import Training, new_network
+from dmrl.learn.settings import FitSettings
+
+from .fitting import EVERYTHING, SETTINGS, dots, trained
+
+
+def stopped(
+    examples: Examples, folder: Path, epochs: int, steps: int, settings: FitSettings = SETTINGS
+) -> None:
+    """A training that dies some steps into an epoch."""
+    folder.mkdir()
+    network = new_network(settings, examples)
+    training = Training(network, examples, settings, folder, identity="dots")
+    walk = training.steps()
+    for _ in range(epochs * -(-len(examples) // settings.batch_size) + steps):
+        next(walk)
+    walk.close()  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module", params=[SETTINGS, EVERYTHING], ids=["published", "everything"])
+def whole(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[FitSettings, Path]:
+    """A training that nothing stopped: its settings and its folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    trained(dots(9), folder, request.param)
+    return request.param, folder
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_resumed_training_ends_with_the_same_bytes(
+    tmp_path: Path, steps: int, whole: tuple[FitSettings, Path]
+) -> None:
+    settings, folder = whole
+    stopped(dots(9), tmp_path / "resumed", 2, steps, settings)
+    trained(dots(9), tmp_path / "resumed", settings, resume=True)
+    for name in ("model.safetensors", "model.json"):
+        assert (folder / name).read_bytes() == (tmp_path / "resumed" / name).read_bytes()
+
+
+def test_another_training_is_not_resumed(examples: Examples, tmp_path: Path) -> None:
+    stopped(examples, tmp_path / "run", 1, 1)
+    text = r"was trained with learning_rate 0\.001, not 0\.01\. Resume with the settings"
+    with pytest.raises(SettingError, match=text):
+        trained(examples, tmp_path / "run", replace(SETTINGS, learning_rate=0.01), resume=True)
+
+
+def test_without_a_checkpoint_there_is_nothing_to_resume(
+    examples: Examples, tmp_path: Path
+) -> None:
+    with pytest.raises(ModelError, match=r"no checkpoint in .* Train without --resume"):
+        trained(examples, tmp_path / "run", resume=True)
+
+
+def test_a_damaged_checkpoint_is_one_line(examples: Examples, tmp_path: Path) -> None:
+    stopped(examples, tmp_path / "run", 1, 1)
+    (tensors,) = (tmp_path / "run").glob("checkpoint-*.safetensors")
+    tensors.write_bytes(tensors.read_bytes()[:-9])
+    with pytest.raises(ModelError, match=r"checkpoint\.json is damaged"):
+        trained(examples, tmp_path / "run", resume=True)
+
+
+def test_one_checkpoint_is_kept_and_none_after_the_end(examples: Examples, tmp_path: Path) -> None:
+    stopped(examples, tmp_path / "run", 3, 1)
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"checkpoint.json", "checkpoint-0003.safetensors", "tensorboard"}
+    assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["epochs_done"] == 3
+    trained(examples, tmp_path / "run", resume=True)
+    assert not has_checkpoint(tmp_path / "run")

@@ -1,0 +1,164 @@
+"""The steps of a training: which images they take, at which rate, and what is shown of them."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dmrl.learn import fit
+from dmrl.learn.batches import Batch, Examples, gathered
+from dmrl.learn.fit import Training, learning_rate_at, new_network
+from dmrl.learn.network import Network, build
+from dmrl.learn.step import LOSSES, train_step
+
+from .fitting import PUBLISHED, SETTINGS, dots
+
+
+def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
+    rates = [learning_rate_at(step, 100, PUBLISHED) for step in range(1, 1501)]
+    assert rates[0] == pytest.approx(1e-3 / 200)
+    assert rates[99] == pytest.approx(0.5e-3)
+    assert max(rates) == rates[199] == pytest.approx(1e-3)
+    assert rates[849] == pytest.approx((1e-3 + 1e-6) / 2)
+    assert rates[-1] == pytest.approx(1e-6)
+
+
+def test_gradients_of_one_step_are_gone_before_the_next(examples: Examples) -> None:
+    network = build("locanet").train()
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.0)
+    batch = gathered(examples, [0, 1])
+    sizes = []
+    for _ in range(2):
+        train_step(network, optimizer, batch, SETTINGS, 0.0)
+        sizes.append([float(p.grad.norm()) for p in network.parameters() if p.grad is not None])
+    assert sizes[1] == pytest.approx(sizes[0], rel=1e-3)
+
+
+def test_every_epoch_has_an_order_of_its_own(examples: Examples, tmp_path: Path) -> None:
+    training = Training(new_network(SETTINGS, examples), examples, SETTINGS, tmp_path)
+    seen = [torch.cat([b.images for b in training._batches(epoch, None)]) for epoch in (0, 0, 1)]
+    assert torch.equal(seen[0], seen[1])
+    assert not torch.equal(seen[0], seen[2])
+
+
+def test_an_epoch_of_so_many_images_takes_as_many_steps_of_few(
+    examples: Examples, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, epochs=2, epoch_images=3 * SETTINGS.batch_size + 1)
+    few = examples.select(np.arange(len(examples)) < 5)
+    training = Training(new_network(settings, few), few, settings, tmp_path)
+    assert training.steps_left == 8
+    sizes = [len(batch.images) for batch in training._batches(0, None)]
+    assert sizes == [settings.batch_size] * 3 + [1]
+    assert [step.epoch for step in training.steps()] == [1] * 4 + [2] * 4
+    assert all(np.isfinite(epoch["loss"]) for epoch in training.history)
+
+
+def test_the_loss_that_is_shown_is_the_mean_over_the_images_since_the_last(
+    examples: Examples, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, epochs=2)
+    training = Training(new_network(settings, examples), examples, settings, tmp_path)
+    shown = [step.loss for step in training.steps()]
+    # Seven batches of an epoch, the last of two images: looked at once, at its end.
+    assert [shown[6], shown[13]] == pytest.approx([epoch["loss"] for epoch in training.history])
+
+
+def test_curves_stand_at_the_steps_of_what_they_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows: list[tuple[str, float, int]] = []
+
+    @contextmanager
+    def opened(_: Path, first_step: int) -> Iterator[Callable[..., None]]:
+        rows.append(("first", 0.0, first_step))
+        yield lambda *row: rows.append(row)
+
+    monkeypatch.setattr(fit.boards, "opened", opened)
+    settings, images = replace(SETTINGS, epochs=2), dots(7)  # three steps, the last of one image
+    network = new_network(settings, images)
+    training = Training(network, images, settings, tmp_path, validation=dots(3))
+    assert training.steps_left == 6
+    assert [step.epoch for step in training.steps()] == [1, 1, 1, 2, 2, 2]
+    assert training.steps_left == 0
+    found = {name: [row[1:] for row in rows if row[0] == name] for name, *_ in rows}
+    assert found.pop("first") == [(0.0, 1)]
+    assert [step for _, step in found["loss/train"]] == [3, 6]
+    for name, curve in found.items():
+        if name == "learning_rate":
+            assert curve == [(learning_rate_at(step, 3, settings), step) for step in (3, 6)]
+        else:
+            key = "loss" if name == "loss/train" else name.replace("/", "_", 1)
+            wanted = [
+                (pytest.approx(training.history[k][key], rel=1e-5), 3 * k + 3) for k in (0, 1)
+            ]
+            assert curve == wanted
+    shown = {name.replace("/", "_", 1) for name in found} - {"loss_train", "learning_rate"}
+    assert (
+        shown == {name for name in training.history[0] if name.startswith("validation_")} != set()
+    )
+
+
+def test_every_step_is_asked_for_as_the_recipe_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is computed here: what each step of three epochs would be given."""
+    images, asked = dots(8), []
+    settings = replace(SETTINGS, epochs=3, frozen_norm_epochs=1, ema_steps=5, hard_share=0.25)
+    teacher = build("dmrl-nano").train()
+
+    def step(network: Network, _: object, batch: Batch, *rest: object) -> torch.Tensor:
+        norms = {m.training for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)}
+        asked.append((batch.robots[:, 0, :2].tolist(), network.training, norms, rest))
+        return torch.full((len(LOSSES),), float(len(asked)))
+
+    updated, hard = [], []
+    monkeypatch.setattr(fit, "train_step", step)
+    monkeypatch.setattr(fit, "save_checkpoint", lambda *_: None)
+    monkeypatch.setattr(fit.boards, "opened", lambda *_: nullcontext(lambda *_: None))
+    monkeypatch.setattr(fit, "mined", lambda *given: hard.append(given))
+    monkeypatch.setattr(fit.Average, "update", lambda _, at: updated.append(at))
+    shares = np.ones(8)
+    training = Training(
+        new_network(settings, images), images, settings, tmp_path, teacher=teacher, shares=shares
+    )
+    shown = [(step.epoch, step.loss) for step in training.steps()]
+    assert updated == list(range(1, 10))
+    assert [epoch for epoch, _ in shown] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
+    every = sorted(images.robots[:, 0, :2].tolist())
+    for epoch in range(3):
+        mine = asked[3 * epoch : 3 * epoch + 3]
+        assert [len(at) for at, *_ in mine] == [3, 3, 2]
+        assert sorted(at for rows, *_ in mine for at in rows) == every
+        assert {training for _, training, *_ in mine} == {True}
+        assert [norms for _, _, norms, _ in mine] == [{epoch < 2}] * 3
+        ends = np.array([3 * epoch + k for k in (1, 2, 3)])
+        means = float((ends * [3, 3, 2]).sum() / 8)
+        assert training.history[epoch] == pytest.approx(
+            {"loss": len(LOSSES) * means, **dict.fromkeys(LOSSES, means)}
+        )
+        assert shown[3 * epoch + 2][1] == pytest.approx(len(LOSSES) * means)
+    for number, (*_, (given, rate, group, share, taught)) in enumerate(asked, start=1):
+        assert (given, rate) == (settings, learning_rate_at(number, 3, settings))
+        assert (group.size, share) == (1, 1.0)  # type: ignore[attr-defined]
+        assert taught is teacher and not teacher.training
+    assert len(hard) == 3
+    for network, examples, before, share in hard:
+        assert network is training.network and examples is images
+        assert before is shares and share == 0.25
+
+
+@pytest.mark.parametrize("warmup", [0, 1, 2])
+def test_learning_rates_are_a_line_and_half_a_cosine(warmup: int) -> None:
+    settings = replace(
+        SETTINGS, epochs=4, warmup_epochs=warmup, learning_rate=0.5, final_learning_rate=0.1
+    )
+    rates = [learning_rate_at(step, 5, settings) for step in range(1, 21)]
+    up, rest = 5 * warmup, 20 - 5 * warmup
+    wanted = [0.5 * step / up for step in range(1, up)]
+    wanted += [0.1 + 0.2 * (1 + np.cos(np.pi * k / rest)) for k in range(rest + 1)]
+    assert rates == pytest.approx(wanted[-20:])

@@ -1,0 +1,199 @@
+"""A folder whose surroundings are watched, and hostile things to put into it."""
+
+import hashlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from dmrl import boundary
+from dmrl.cli import app
+from dmrl.images.codec import encode_png
+from dmrl.messages import message
+from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter
+from dmrl.recording.provenance import Input
+from dmrl.recording.writer import channel_for
+
+ROBOTS = ("cf1", "..", "a\\b", "$(touch victim)", "$x^{$y$", "`*/", "<img src=x>", "a.b")
+CONTROLS = ("cf1", "x\x1b[2J", "n\nm", "\u202ecf2", "-rf")
+PEERS = ("../../victim/keep", "/tmp/victim", "cf2", "|[x](y)|\n# z")
+ELSEWHERE = ("../../victim/keep", "..", "a/b", "{victim}/keep", "data", "x\ny", "", "-rf")
+HOSTILE_TEXT = (
+    '*/\n#include "/etc/passwd"\nint main(void){return 7;}/*\\\n??/\n$(shell touch victim)'
+)
+WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
+
+
+CHANGES += ("os.chmod", "os.system", "os.posix_spawn", "os.exec")
+
+
+class Box(NamedTuple):
+    """The folders of a test: where OUT goes, what is around it."""
+
+    root: Path
+
+    def __getattr__(self, name: str) -> Path:
+        return self.root / name
+
+
+_watched: list[tuple[str, str]] | None = None
+
+
+def _hook(event: str, args: tuple[Any, ...]) -> None:
+    if _watched is None:
+        return
+    if event == "open" and isinstance(args[2], int) and args[2] & WRITES:
+        _watched.append((event, os.fsdecode(args[0]) if not isinstance(args[0], int) else ""))
+    elif event == "os.mkdir" and Path(os.fsdecode(args[0])).exists():
+        pass  # asked for in case it is not there
+    elif event in CHANGES and not (event in ("os.remove", "os.rmdir") and args[1] >= 0):
+        # Names within an open folder, as of a folder that is removed, the tree tells of.
+        _watched.extend((event, os.fsdecode(a)) for a in args[:2] if isinstance(a, str | bytes))
+
+
+sys.addaudithook(_hook)
+
+
+def _tree(root: Path) -> dict[str, str]:
+    """Every file and folder outside OUT and the temporary folder, with its content."""
+    found = {}
+    for folder, folders, files in os.walk(root):
+        at = Path(folder)
+        folders[:] = [f for f in folders if at / f not in (root / "out", root / "temp")]
+        for name in [*folders, *files]:
+            path = at / name
+            content = path.read_bytes() if path.is_file() else b""
+            found[str(path.relative_to(root))] = hashlib.sha256(content).hexdigest()
+    return found
+
+
+@contextmanager
+def untouched(box: Box) -> Iterator[None]:
+    """Nothing is written outside OUT and the temporary folder while the block lasts."""
+    global _watched
+    before = _tree(box.root)
+    _watched = []
+    try:
+        yield
+    finally:
+        seen, _watched = _watched, None
+    assert _tree(box.root) == before
+    free = (box.out, box.temp, Path("/dev"), Path(sys.prefix), Path("/proc"))
+    strange = [
+        (event, path)
+        for event, path in seen
+        if path
+        and not any((Path.cwd() / path).is_relative_to(one) for one in free)
+        and "__pycache__" not in path
+    ]
+    assert strange == []
+
+
+def run_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
+    """Exit status of a command that touches nothing; it is 0, or 1 with one line."""
+    with untouched(box):
+        status = boundary.status_of(lambda: app([str(word) for word in words]))
+    said = capsys.readouterr()
+    assert "internal error" not in said.err, said.err
+    assert "\x1b" not in said.out + said.err
+    assert status in (0, 1), said.err
+    last = said.err.strip().splitlines()[-1:]
+    told = words[0] == "check" and not last  # what it found, on standard output
+    assert status == 0 or told or last[0].startswith("dmrl: "), said.err
+    return status
+
+
+def hostile(
+    path: Path, split: dict[str, str] | None = None, robots: tuple[str, ...] = ROBOTS
+) -> Path:
+    """A recording of robots, peers, sources, metadata and inputs with hostile names."""
+    made = Provenance(
+        "predict\n# x",
+        {"recipe": "../../victim/keep", "x": "`*/"},
+        inputs=(Input("../../victim/keep", "0" * 64), Input("a|b`c\n<b>", "x|y")),
+        libraries={"numpy\n*/": "<script>"},
+    )
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, made) as sink:
+        if split is not None:
+            sink.add_metadata("dmrl.split", split)
+        sink.add_metadata("../../victim/keep", {"../x": "y"})
+        sink.add_attachment("../../victim/keep", "text/plain", b"overwritten")
+        for k in range(4):
+            for robot in robots:
+                rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
+                picture = message("CompressedImage")(data=encode_png(rgb), format="../../x")
+                peer = {"peer": PEERS[k], "u_px": 20, "v_px": 20, "depth_m": 1.0}
+                peers = [{**peer, "source": source} for source in ("truth", "../../victim/keep")]
+                found = [{"u_px": 20, "v_px": 20, "depth_m": 1.0, "confidence": 0.9}]
+                for topic, one in (
+                    ("camera/image", picture),
+                    ("labels", message("PeerLabels")(peers=peers)),
+                    ("detections", message("Detections")(detections=found)),
+                    ("height", message("Height")(height_m=1.0)),
+                    ("attitude", message("Attitude")()),
+                    ("velocity", message("Velocity")()),
+                    (f"range/{robot}", message("UwbRange")(range_m=1.0 + k)),
+                ):
+                    channel = channel_for(f"/{robot}/{topic}", one.DESCRIPTOR)
+                    time_ns = k * 100_000_000
+                    sink.write_raw(RawMessage(time_ns, time_ns, channel, one.SerializeToString()))
+        height = message("Height")(height_m=2.0)
+        for topic in (
+            "/../../victim/keep",
+            "/cf1.height",
+            "../victim",
+            "/",
+            "",
+            "/..",
+            "cf1/height",
+        ):
+            like = channel_for("/cf1/height", height.DESCRIPTOR)
+            channel = Channel(topic, like.schema_name, like.schema_data)
+            sink.write_raw(RawMessage(0, 0, channel, height.SerializeToString()))
+    return path
+
+
+EACH = """kind = "pipeline"
+[each]
+name = ["../../victim/x", "/tmp/victim", "..", "a\\u001b[2J", "recipe.toml", "x"]
+[[step]]
+stage = "sketch"
+out = "{name}"
+images = 1
+"""
+COLUMNS = """[time]
+name = "t"
+unit = "s"
+[range."../../victim/keep"]
+name = "r"
+unit = "m"
+"""
+
+
+def with_junk(path: Path, junk: str, calibration: dict[str, Any]) -> Path:
+    """A recording in which the messages of one topic are not what their schema says."""
+    made = message("CameraCalibration")(width=64, height=48, **calibration)
+    picture = encode_png(np.full((48, 64, 3), 99, np.uint8))
+    peers = [{"peer": "cf2", "u_px": 20, "v_px": 20, "depth_m": 1.0, "source": "truth"}]
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(6):
+            for name, one in {
+                "camera/calibration": made,
+                "camera/image": message("CompressedImage")(data=picture, format="png"),
+                "labels": message("PeerLabels")(peers=peers),
+                "attitude": message("Attitude")(),
+                "height": message("Height")(height_m=1.0),
+                "velocity": message("Velocity")(),
+                "detections": message("Detections")(),
+            }.items():
+                data = b"\xff\xff\xff\xff" if name == junk else one.SerializeToString()
+                channel = channel_for(f"/cf1/{name}", one.DESCRIPTOR)
+                sink.write_raw(RawMessage(k * 10**8, k * 10**8, channel, data))
+    return path

@@ -1,0 +1,59 @@
+"""A folder whose surroundings are watched, and everything that a stranger can give."""
+
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import boundary
+from dmrl.cli import app
+from dmrl.deploy.store import INTEGER_NAME, save
+from dmrl.images.codec import encode_png
+
+from ..deploy.networks import random_network
+from .box import COLUMNS, CONTROLS, EACH, HOSTILE_TEXT, ROBOTS, Box, hostile
+
+
+@pytest.fixture
+def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Box:
+    """A folder to work in, a victim beside it, and OUT."""
+    root = tmp_path.resolve()
+    for name in ("cwd", "in", "out", "temp", "victim"):
+        (root / name).mkdir()
+    (root / "victim" / "keep").write_text("precious")
+    monkeypatch.chdir(root / "cwd")
+    monkeypatch.setattr(tempfile, "tempdir", str(root / "temp"))
+    for name in ("TMPDIR", "HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR", "XDG_CONFIG_HOME"):
+        monkeypatch.setenv(name, str(root / "temp"))
+    monkeypatch.delenv("DMRL_DEBUG", raising=False)
+    return Box(root)
+
+
+@pytest.fixture(scope="module", params=[ROBOTS, CONTROLS], ids=["names", "controls"])
+def inputs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of everything a stranger can give, and a dataset made of it."""
+    root = tmp_path_factory.mktemp("hostile")
+    bad = hostile(root / "bad.mcap", robots=request.param)
+    hostile(root / "other.mcap", {"x": "[[0, 1]]"}, request.param)
+    (root / "each.toml").write_text(EACH)
+    (root / "columns.toml").write_text(COLUMNS)
+    for name in ("logs", "pictures", "folder", "model"):
+        (root / name).mkdir()
+    shutil.copy(bad, root / "folder" / "x\x1b[2J.mcap")
+    for robot in ("..cf1", "$(touch victim)", "a\nb", "\x1b[2J", "<img src=x>"):
+        log = "time_s,range_../../victim/keep_m\n0,1\n1,2\n"
+        (root / "logs" / f"{robot}.csv").write_text(log)
+        picture = encode_png(np.zeros((48, 64, 3), np.uint8))
+        (root / "pictures" / f"{robot}.png").write_bytes(picture)
+    layers = tuple(replace(layer, name=HOSTILE_TEXT) for layer in random_network(0).layers)
+    save(
+        replace(random_network(0), name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers),
+        root / "model" / INTEGER_NAME,
+    )
+    named = bad if request.param is ROBOTS else hostile(root / "named.mcap")
+    made = ["dataset", str(named), str(root / "cards"), "--split", "recordings"]
+    assert boundary.status_of(lambda: app(made)) == 0
+    return root

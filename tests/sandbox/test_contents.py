@@ -1,0 +1,159 @@
+"""What datasets and models say of themselves: their names and numbers lead nowhere else."""
+
+import json
+import shutil
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.deploy.c import write_c
+from dmrl.deploy.store import INTEGER_NAME, save
+from dmrl.images.codec import encode_png
+
+from ..deploy.networks import random_network
+from .box import ELSEWHERE, HOSTILE_TEXT, Box, hostile, run_in
+
+
+@pytest.mark.heavy
+@pytest.mark.usefixtures("empty_figures")
+@pytest.mark.parametrize("split", ELSEWHERE)
+def test_a_split_of_a_recording_stays_in_the_dataset(
+    split: str, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = split.replace("{victim}", str(box.victim))
+    bad = hostile(box.root / "in" / "bad.mcap", {name: "[[0, 900000000]]"})
+    for extra in ((), ("--parquet",)):
+        for mode in ("auto", "recordings"):
+            run_in(
+                box,
+                capsys,
+                "dataset",
+                bad,
+                box.out / f"{mode}{len(extra)}",
+                "--split",
+                mode,
+                *extra,
+            )
+    assert not any("keep" in path.name for path in box.out.rglob("*"))
+
+
+@pytest.mark.usefixtures("empty_figures")
+@pytest.mark.parametrize("split", ELSEWHERE)
+def test_a_split_of_a_label_table_stays_in_the_dataset(
+    split: str, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = split.replace("{victim}", str(box.victim))
+    folder = box.root / "in" / "pictures"
+    folder.mkdir()
+    (folder / "000000000000.png").write_bytes(encode_png(np.zeros((48, 64, 3), np.uint8)))
+    rows = f'file,peer,u_px,v_px,depth_m,split\n000000000000.png,cf2,3,4,1,"{name}"\n'
+    (folder / "labels.csv").write_text(rows)
+    out = box.out / "x.mcap"
+    if run_in(box, capsys, "convert", folder, out, "--from", "images") == 0:
+        run_in(box, capsys, "dataset", out, box.out / "set", "--split", "auto")
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_hostile_dataset_is_read_and_carded_where_it_is(
+    box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = hostile(box.root / "in" / "bad.mcap")
+    good = box.out / "set"
+    assert run_in(box, capsys, "dataset", bad, good, "--split", "recordings") == 0
+    card = (good / "README.md").read_text()
+    assert "<img" not in card.replace("`", "")
+    assert "\n# x" not in card
+    for edit in (
+        lambda d: (
+            (d / "manifest.json").unlink(),
+            (d / "dataset_dict.json").write_text('{"splits": ["../../victim"]}'),
+        ),
+        lambda d: (
+            (d / "manifest.json").unlink(),
+            (d / "dataset_dict.json").write_text('{"splits": [3, null]}'),
+        ),
+        lambda d: (d / "manifest.json").write_text(
+            (d / "manifest.json").read_text().replace("data-", "../../../victim/data-")
+        ),
+        lambda d: (d / "manifest.json").write_text(
+            (d / "manifest.json").read_text().replace('"train"', '"../../victim"')
+        ),
+        lambda d: (
+            (d / "manifest.json").unlink(),
+            (d / "train/state.json").write_text(
+                json.dumps({"_data_files": [{"filename": "../../../victim/keep"}]})
+            ),
+        ),
+        lambda d: (shutil.rmtree(d / "figures"), (d / "figures").symlink_to(box.victim)),
+        lambda d: ((d / "README.md").unlink(), (d / "README.md").symlink_to(box.victim / "keep")),
+        lambda d: (d / "provenance.json").write_text('{"stage": "*/", "inputs": [' * 2000),
+        lambda d: (d / "provenance.json").write_text("[" * 100_000),
+        lambda d: (d / "provenance.json").write_text('{"inputs": [], "settings": "x"}'),
+    ):
+        hurt = box.out / "hurt"
+        shutil.copytree(good, hurt)
+        (hurt / "figures").mkdir(exist_ok=True)
+        edit(hurt)
+        run_in(box, capsys, "card", hurt)
+        run_in(box, capsys, "train", hurt, box.out / "run", "--epochs", "1", "--batch-size", "0")
+        shutil.rmtree(hurt)
+
+
+def test_a_model_s_names_do_not_become_code(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
+    network = random_network(0)
+    layers = tuple(replace(layer, name=HOSTILE_TEXT) for layer in network.layers)
+    bad = replace(network, name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers)
+    folder = box.root / "in" / "model"
+    folder.mkdir()
+    save(bad, folder / INTEGER_NAME)
+    for words in (
+        ("export", folder, box.out / "exported"),
+        ("verify", folder),
+        ("predict", folder, folder, box.out / "x.mcap"),
+        ("quantize", folder, folder, box.out / "q"),
+    ):
+        run_in(box, capsys, *words)
+    written = box.out / "c"
+    written.mkdir()
+    for name in write_c(bad, written, []):
+        text = (written / name).read_text()
+        assert "/etc/passwd" not in text
+        assert "$(shell touch" not in text
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("width_px",), "1); system(0"),
+        (("name",), 3),
+        (("threshold",), float("nan")),
+        (("threshold",), "0.5"),
+        (("layers", 0, "stride"), "1 */"),
+        (("layers", 0, "stride"), 0),
+        (("layers", 0, "source"), 10**30),
+        (("layers", 0, "scale"), float("inf")),
+        (("heads", "confidence", "tensor"), 99),
+        (("heads", "confidence", "channel"), "0"),
+        (("layers",), 7),
+        (("layers", 0), None),
+        (("heads",), []),
+    ],
+)
+def test_a_model_s_numbers_are_numbers(
+    path: tuple[Any, ...], value: Any, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = box.root / "in" / "model"
+    folder.mkdir()
+    save(random_network(0), folder / INTEGER_NAME)
+    with np.load(folder / INTEGER_NAME) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    said = json.loads(arrays.pop("description").tobytes())
+    place = said
+    for step in path[:-1]:
+        place = place[step]
+    place[path[-1]] = value
+    text = np.frombuffer(json.dumps(said).encode(), np.uint8)
+    np.savez(folder / INTEGER_NAME, description=text, **arrays)
+    assert run_in(box, capsys, "export", folder, box.out / "x") == 1

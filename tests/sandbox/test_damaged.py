@@ -1,0 +1,150 @@
+"""Damaged inputs to every command: an error of one line, and nothing half-written."""
+
+import os
+from typing import Any
+
+import pytest
+
+from dmrl import boundary
+from dmrl.cli import COMMANDS, app
+
+from .box import Box, run_in, with_junk
+
+
+# doctor reads none; index writes into the folder, and what cannot be read is a row of its own
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("doctor", "index")])
+def test_every_command_takes_damaged_inputs_as_errors(
+    name: str, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    deep = {
+        "deep.json": "[" * 50_000,
+        "deep.toml": f"kind = {'[' * 50_000}",
+        "text.mcap": "not a recording",
+        "table.toml": 'kind = "pipeline"\n[[step]]\nstage = "fly"\nout = "x"\nsettings = 3\n',
+    }
+    for file, text in deep.items():
+        (box.root / "in" / file).write_text(text)
+    pattern = {
+        "run": ("run", "IN", "--out", "OUT"),
+        "render": ("render", "IN", "OUT"),
+        "fly": ("fly", "IN", "OUT"),
+        "sketch": ("sketch", "IN", "--images", "1"),
+        "demo": ("demo", "--out", "IN"),
+        "convert": ("convert", "IN", "OUT", "--from", "images", "--camera", "IN"),
+        "calibrate": ("calibrate", "IN", "OUT.toml"),
+        "record": ("record", "OUT.mcap", "--robot", "../../x=udp://127.0.0.1:1"),
+        "fake-drone": ("fake-drone", "--flight", "IN", "--uri", "udp://127.0.0.1:0x"),
+        "train": ("train", "IN", "OUT"),
+        "predict": ("predict", "IN", "IN", "OUT.mcap"),
+        "quantize": ("quantize", "IN", "IN", "OUT"),
+        "view": ("view", "IN", "--save", "OUT.rrd"),
+        "report": ("report", "IN", "OUT.html"),
+        "evaluate": ("evaluate", "IN"),
+        "info": ("info", "IN"),
+        "check": ("check", "IN"),
+        "card": ("card", "IN"),
+        "find": ("find", "true", "IN"),
+        "verify": ("verify", "IN"),
+    }.get(name, (name, "IN", "OUT.mcap"))
+    for file in [*deep, "."]:
+        given = str(box.root / "in" / file)
+        words = [w.replace("IN", given).replace("OUT", str(box.out / "x")) for w in pattern]
+        assert run_in(box, capsys, *words) == 1
+    assert list(box.out.iterdir()) == []
+
+
+@pytest.mark.heavy
+@pytest.mark.usefixtures("empty_figures")
+@pytest.mark.parametrize(
+    ("junk", "calibration"),
+    [
+        ("camera/image", {}),
+        ("labels", {}),
+        ("attitude", {}),
+        ("detections", {}),
+        ("camera/calibration", {}),
+        ("", {"K": [1.0, 2.0]}),
+        ("", {"K": [float("nan")] * 9, "D": [float("inf")]}),
+        ("", {"K": [0.0] * 9}),
+    ],
+)
+def test_messages_that_cannot_be_read_are_one_line(
+    junk: str, calibration: dict[str, Any], box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, out = with_junk(box.root / "in" / "bad.mcap", junk, calibration), box.out
+    for words in (
+        ("info", bad),
+        ("check", bad),
+        ("predict", "dmrl-nano", bad, out / "predicted.mcap"),
+        ("track", bad, out / "track.mcap"),
+        ("label", bad, out / "label.mcap"),
+        ("align", bad, out / "align.mcap"),
+        ("dataset", bad, out / "set"),
+        ("convert", bad, out / "csv", "--to", "csv"),
+        ("convert", bad, out / "ros", "--to", "ros2"),
+        ("calibrate", bad, out / "camera.toml"),
+        ("evaluate", bad),
+        ("view", bad, "--save", out / "view.rrd"),
+    ):
+        run_in(box, capsys, *words)
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_an_input_that_is_changed_meanwhile_is_one_line(
+    box: Box, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = with_junk(box.root / "in" / "flight.mcap", "", {})
+    other = with_junk(box.root / "temp" / "other.mcap", "labels", {})
+
+    def replace_it(*_: object) -> None:
+        other.replace(path)
+
+    monkeypatch.setattr("dmrl.datasets.parts.refuse_twins", replace_it)
+    assert boundary.status_of(lambda: app(["dataset", str(path), str(box.out / "set")])) == 1
+    said = capsys.readouterr().err
+    assert "flight.mcap was changed while it was read. Run it again" in said
+    assert list(box.out.iterdir()) == []
+
+
+def test_a_name_that_is_no_text_is_one_line(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = with_junk(box.root / "in" / os.fsdecode(b"\xff.mcap"), "", {})
+    for words in (
+        ("info", flight),
+        ("check", flight),
+        ("trim", flight, box.out / "trim.mcap"),
+        ("merge", flight, box.out / "merge.mcap"),
+        ("recover", flight, box.out / "recover.mcap"),
+        ("label", flight, box.out / "label.mcap"),
+        ("convert", flight, box.out / "csv", "--to", "csv"),
+        ("convert", flight, box.out / "ros", "--to", "ros2"),
+        ("evaluate", flight),
+        ("view", flight, "--save", box.out / "view.rrd"),
+        ("report", box.root / "in", box.out / "page.html"),
+        ("dataset", flight, box.out / "set"),
+    ):
+        run_in(box, capsys, *words)
+
+
+def test_a_pipe_in_place_of_a_file_is_one_line(
+    box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Opening it would wait for somebody who writes."""
+    pipe, folder = box.root / "in" / "x.mcap", box.root / "in"
+    for name in ("x.mcap", "x.h5", "model.json", "x.csv", "x.png", "labels.csv"):
+        os.mkfifo(folder / name)
+    for words in (
+        ("info", pipe),
+        ("recover", pipe, box.out / "recovered.mcap"),
+        ("convert", pipe, box.out / "x.mcap"),
+        ("convert", folder, box.out / "x.mcap"),
+        ("convert", folder / "x.csv", box.out / "x.mcap"),
+        ("convert", folder, box.out / "x.mcap", "--from", "images"),
+        ("convert", folder, box.out / "x.mcap", "--from", "csv"),
+        ("convert", folder, box.out / "x.mcap", "--from", "cfclient"),
+        ("predict", folder / "x.h5", pipe, box.out / "x.mcap"),
+        ("predict", folder, pipe, box.out / "x.mcap"),
+        ("train", folder, box.out / "run"),
+        ("report", folder, box.out / "page.html"),
+    ):
+        assert run_in(box, capsys, *words) == 1

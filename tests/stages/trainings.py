@@ -1,0 +1,5 @@
+"""The shortest training that there is."""
+
+from dmrl.stages.train import Settings
+
+SETTINGS = Settings(epochs=2, batch_size=4, device="cpu", validation_share=0.0)
