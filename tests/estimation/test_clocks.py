@@ -210,6 +210,19 @@ def test_single_outliers_are_not_heard_and_holes_are_known() -> None:
     assert len(unknown) == pytest.approx(2.1 / STEP_S, abs=3)
 
 
+@pytest.mark.parametrize(("gap_s", "unknown"), [(0.95, False), (1.05, True)])
+def test_a_second_without_samples_is_not_known(gap_s: float, unknown: bool) -> None:
+    time_s = np.concatenate([np.arange(0, 30, 0.1), 29.9 + gap_s + np.arange(0, 30, 0.1)])
+    found = _Series.of(time_s, np.sin(time_s / 3))
+    assert found is not None
+    assert (~found.known).any() == unknown
+
+
+def test_clocks_that_are_told_are_exact() -> None:
+    both = Clock(0.5).after(Clock(0.25))
+    assert (both.offset_s, both.sigma_s, both.sigma_drift) == (0.75, 0.0, 0.0)
+
+
 @pytest.mark.parametrize(("lasts_s", "enough"), [(OVERLAP_S - 0.5, False), (OVERLAP_S + 0.5, True)])
 def test_a_series_lasts_twenty_seconds_at_least(lasts_s: float, enough: bool) -> None:
     time_s = np.arange(0, lasts_s, 0.1)

@@ -1,16 +1,19 @@
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Literal
 
 import numpy as np
 import pytest
 
 from dmrl import messages
+from dmrl.estimation import estimate as entrance
 from dmrl.estimation import gate as room
+from dmrl.estimation.batch import Solution
 from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
 from dmrl.estimation.estimated import Estimate, from_peer, swapped
 from dmrl.estimation.pair import Pair, Track
-from dmrl.estimation.problem import Noise
+from dmrl.estimation.problem import GLOBALS, Noise
 from dmrl.flight import Trajectory
 
 from .flights import flown, pair_of, truth_at
@@ -33,6 +36,22 @@ def rmse(estimate: Estimate, seed: int, noise: str = "calibrated", own: str = "c
     error = estimate.state[:, :2] - truth_at(flight, estimate.time_s, own, peer)
     settled = estimate.time_s - estimate.time_s[0] > 20
     return float(np.sqrt((error[settled] ** 2).sum(axis=1).mean()))
+
+
+def test_spreads_grow_with_scales_and_with_what_else_may_be(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Scales sixteen times as wrong: variances eight times as large. Two solutions, 1 m apart."""
+    ends = [Solution(np.zeros((3, 6)), np.zeros(len(GLOBALS)), 0.0) for _ in range(2)]
+    ends[1].state[:, 0] = 1.0
+    noise = replace(Noise(), scale_std=16 * Noise().scale_std)
+    known = np.tile(np.eye(6), (3, 1, 1))
+    for name, given in (("solutions", ends), ("_weighed", ends), ("covariance", (known, None))):
+        monkeypatch.setattr(entrance, name, lambda *_, given=given: given)
+    flight = SimpleNamespace(key_s=np.arange(3.0))
+    found = entrance._from_batch(flight, noise, np.zeros(1), np.zeros((1, 3, 5)), [])  # type: ignore[arg-type]
+    wanted = 8 * entrance.INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
+    assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
 
 
 def test_the_statuses_are_those_of_the_schema() -> None:
@@ -169,7 +188,7 @@ def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() 
         np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]]),
         np.stack([np.eye(3), 3 * np.eye(3)]),
         none,
-        np.zeros(11),
+        np.zeros(len(GLOBALS)),
         Noise(),
     )
     xy, covariance, status = estimate.at(np.array([0.5, 2.0]))

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from dmrl.estimation import grading
+from dmrl.estimation.batch import Solution
 from dmrl.estimation.estimate import estimate_pairs
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK
-from dmrl.estimation.grading import FADING_S, ONE, excess
+from dmrl.estimation.grading import FADING_S, GRADES, ONE, TAKEN, excess
 from dmrl.estimation.pair import Pair
-from dmrl.estimation.problem import Noise
+from dmrl.estimation.problem import GLOBALS, Noise, Problem
 
 from .flights import flown, pair_of, truth_at
 
@@ -25,6 +26,27 @@ def reflected(pair: Pair, std_m: float, fades_s: float, seed: int) -> Pair:
     for keep, step in zip(kept, steps[1:], strict=True):
         error.append(keep * error[-1] + step)
     return replace(pair, range_m=np.maximum(pair.range_m + np.array(error), 0.05))
+
+
+@pytest.mark.parametrize("likeliest", [0.6, 1.2, 2.0])
+def test_a_grade_between_those_tried_is_where_the_evidence_peaks(
+    likeliest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Evidence is a parabola of the grade's logarithm: its top is found exactly."""
+
+    def likely(_: Problem, noise: Noise, __: Solution) -> float:
+        grade = noise.velocity_std_mps / Noise().velocity_std_mps
+        return float(-((np.log(grade) - np.log(likeliest)) ** 2))
+
+    some = Solution(np.zeros((1, 6)), np.zeros(len(GLOBALS)), 0.0)
+    monkeypatch.setattr(grading, "solve_batch", lambda *_, **__: some)
+    monkeypatch.setattr(grading, "evidence", likely)
+    found, nearest, _, _ = grading._graded(SimpleNamespace(), Noise(), some)  # type: ignore[arg-type]
+    assert GRADES[nearest] == min(GRADES, key=lambda grade: abs(np.log(grade / likeliest)))
+    velocity, scales, offset_m = (np.interp(likeliest, TAKEN[0], taken) for taken in TAKEN[1:])
+    assert found.velocity_std_mps == pytest.approx(velocity * Noise().velocity_std_mps)
+    assert found.velocity_scale_std == pytest.approx(scales * Noise().velocity_scale_std)
+    assert found.bias_std_m == pytest.approx(offset_m)
 
 
 @pytest.mark.heavy

@@ -52,6 +52,18 @@ def test_between_two_close_passes_the_peer_is_put_on_the_other_side() -> None:
     assert np.hypot(*copy[:, :2].T) == pytest.approx(np.hypot(*state[:, :2].T))
 
 
+def test_the_shortest_ways_between_passes_are_mirrored_first() -> None:
+    """A mirrored way that is long adds up more that odometry denies."""
+    at_s = np.array([5.0, 15.0, 21.0, 29.0, 32.0, 40.0, 50.0])
+    bends_s = np.sort([0.0, *at_s, *(at_s[1:] + at_s[:-1]) / 2, 55.0])
+    time_s = np.arange(0, 55, 0.1)
+    state = np.zeros((len(time_s), 6))
+    state[:, 0] = np.interp(time_s, bends_s, np.resize([1.0, 0.0, -1.0, 0.0], len(bends_s)))
+    state[:, 1] = 0.1
+    changed = [time_s[(copy != state).any(axis=1)].min() for copy in mirrored(state, 10.0)]
+    assert changed == pytest.approx([29.0, 15.0, 21.0, 32.0], abs=1.0)
+
+
 def test_without_close_passes_nothing_is_mirrored() -> None:
     far = np.tile([2.0, 0.0, 0.0, 0.0, 0.0], (200, 1))
     assert mirrored(far, 10.0) == []

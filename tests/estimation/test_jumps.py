@@ -81,6 +81,13 @@ def test_what_climbs_does_not_jump_and_a_jump_on_the_way_is_no_larger() -> None:
     assert levels(over, 0.1, 0.45, 3)[120] == pytest.approx(0.8, abs=1e-6)
 
 
+def test_how_fast_a_signal_climbs_is_no_noise() -> None:
+    over = 1.5 * np.arange(400) * 0.1
+    climb = over.copy()
+    over[100:150] += 0.8
+    assert levels(over, 0.1, 0.45, 3) == pytest.approx(over - climb, abs=1e-6)
+
+
 def test_few_samples_are_left_as_they_are() -> None:
     for count, seen in ((11, False), (12, True)):
         values = np.zeros(count)

@@ -96,6 +96,14 @@ def test_silence_of_any_sensor_marks_its_keyframes() -> None:
     assert silence(pair(unheard), np.array([9.0, 10.2, 11.0])).tolist() == [False, True, False]
 
 
+def test_a_time_beside_a_silent_sample_is_silent() -> None:
+    flight = pair(np.arange(3.0, 23.0, 0.1))
+    alone = np.arange(len(TIME_S)) == 1000
+    flight = replace(flight, peer=replace(flight.peer, gap=alone))
+    beside = TIME_S[1000] + np.array([-0.015, -0.005, 0.005, 0.015])
+    assert silence(flight, beside).tolist() == [False, True, True, False]
+
+
 def test_a_shadow_is_guessed_by_its_jumps_and_small_ones_are_left_alone() -> None:
     dense = np.arange(3.0, 23.0, 0.02)
     shadow = (dense > 9) & (dense < 11)

@@ -113,6 +113,15 @@ def test_errors_of_a_path_show_where_the_moved_path_would_be_seen() -> None:
             assert path.level[:, k] == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
 
 
+def test_between_knots_an_error_goes_along_a_line() -> None:
+    for path in _paths(VIEWS, TRUE, MATCHED, VALUES):
+        since_s = MATCHED.time_s[path.rows] - MATCHED.time_s[path.rows[0]]
+        fading = path.errors[:, 4:]
+        knots_s = KNOT_S * (np.arange(fading.shape[1]) - 1)
+        along, even = fading @ knots_s, fading.sum(axis=1)
+        assert along == pytest.approx(np.asarray(even).ravel() * np.repeat(since_s, 2))
+
+
 @pytest.mark.parametrize("held", [False, True])
 def test_a_step_is_that_of_the_dense_equations(held: bool) -> None:
     rng = np.random.default_rng(4)
@@ -175,6 +184,16 @@ def test_a_mount_is_found_its_delay_held_or_not_and_what_was_missed_costs() -> N
     one = 0.5 * CAUCHY**2 * np.log1p((MATCHED.radius_px / 3.0 / CAUCHY) ** 2)
     assert missed.cost - found.cost == pytest.approx(5 * one)
     assert found.cost > 0
+
+
+def test_what_a_mount_costs_is_the_loss_of_what_is_left_in_sigmas(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mount, "ROUNDS", 0)
+    every = replace(MATCHED, expected=len(MATCHED.time_s))
+    found = solve(VIEWS, TRUE, every, VALUES, NOISE, 5.0)
+    square = (residual(VIEWS, TRUE, every, VALUES) ** 2).sum(axis=1) / 5.0**2
+    assert found.cost == pytest.approx(_charge(square))
 
 
 def test_a_mount_that_nobody_would_build_is_at_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
