@@ -14,7 +14,7 @@ import numpy as np
 from dmrl.geometry.frames import Array, Camera
 from dmrl.images.codec import Rgb, decode, encode_jpeg
 from dmrl.rendering.backdrops import Photos
-from dmrl.rendering.likeness import FIGURES, of_one
+from dmrl.rendering.likeness import FIGURES, mean_of, of_one
 from dmrl.rendering.randomise import random_sensor
 from dmrl.rendering.sensor import blur, expose
 from dmrl.rendering.settings import LIMITS, Settings
@@ -35,7 +35,8 @@ class Knob:
     key, figure
         Their names.
     by
-        What a step is in: "factor" of both, "square" of both, or "lost", which the figure falls by.
+        What a step is in: "factor" of both, "square" of both, or "lost", of which the figure
+        is what is left.
     gain
         Of a step, over what the figure lacks.
     """
@@ -143,20 +144,21 @@ def _quality(settings: Settings, wanted: Array, have: Array) -> tuple[int, int]:
 
 def _moved(knob: Knob, limits: tuple[float, float], want: Array, got: Array) -> tuple[float, float]:
     """A range a step on: shifted by what the figure lacks, widened by how far it spreads."""
-    low, high = (max(value, LEAST.get(knob.key, 0.02)) for value in limits)
-    ends = np.array([low, high])
+    least, most = LIMITS[knob.key]
+    least = max(least, LEAST.get(knob.key, 0.0))
+    ends = np.clip(limits, max(least, LEAST.get(knob.key, 0.02)), most)
+    wanted, found = (max(mean_of(knob.figure, rows), 1e-3) for rows in (want, got))
+    if knob.by == "factor":
+        ends *= (wanted / found) ** knob.gain
+    elif knob.by == "lost":
+        ends = 1 - (1 - ends) * (wanted / found) ** knob.gain
+    else:
+        ends = np.sqrt(np.maximum(ends**2 + knob.gain * (wanted**2 - found**2), 0.0))
     if knob.by == "factor":
         want, got = np.log(np.maximum(want, 1e-3)), np.log(np.maximum(got, 1e-3))
-        ends *= np.exp(knob.gain * float(want.mean() - got.mean()))
-    elif knob.by == "lost":
-        ends += knob.gain * float(got.mean() - want.mean())
-    else:
-        step = knob.gain * float(want.mean() ** 2 - got.mean() ** 2)
-        ends = np.sqrt(np.maximum(ends**2 + step, 0.0))
     spread = float(want.std() / max(got.std(), 1e-3))
     middle, half = ends.mean(), np.ptp(ends) / 2 * np.clip(spread, 0.8, 1.15)
-    least, most = LIMITS[knob.key]
-    low, high = np.clip([middle - half, middle + half], max(least, LEAST.get(knob.key, 0.0)), most)
+    low, high = np.clip([middle - half, middle + half], least, most)
     return float(low), float(high)
 
 
@@ -168,4 +170,4 @@ def _column(rows: Array, figure: str) -> Array:
 
 
 def _middle(rows: Array, figure: str) -> float:
-    return float(_column(rows, figure).mean())
+    return mean_of(figure, _column(rows, figure))

@@ -76,11 +76,19 @@ def likeness(pictures: Sequence[Rgb]) -> Likeness:
         (H, W, 3) uint8 each, of any size over 16 px.
     """
     rows = np.array([of_one(picture) for picture in pictures])
-    return Likeness(*(_mean(name, column) for name, column in zip(FIGURES, rows.T, strict=True)))
+    return Likeness(*(mean_of(name, column) for name, column in zip(FIGURES, rows.T, strict=True)))
 
 
-def _mean(figure: str, values: Array) -> float:
-    """Of the values that could be measured, geometric for ratios; 0 without any."""
+def mean_of(figure: str, values: Array) -> float:
+    """Mean of the values that could be measured, geometric for ratios; 0 without any.
+
+    Parameters
+    ----------
+    figure
+        One of `FIGURES`.
+    values
+        (N,) of as many pictures; NaN where it could not be measured.
+    """
     found = values[np.isfinite(values)]
     if not len(found):
         return 0.0
