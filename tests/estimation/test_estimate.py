@@ -54,6 +54,16 @@ def test_spreads_grow_with_scales_and_with_what_else_may_be(
     assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
 
 
+def test_a_smoother_s_spread_is_its_own_and_that_between_its_tracks() -> None:
+    tracks = np.zeros((3, 2, 5))
+    tracks[:, 1, 0] = 1.0
+    known = np.tile(np.eye(5), (3, 2, 1, 1))
+    flight = SimpleNamespace(key_s=np.arange(3.0))
+    found = entrance._from_smoother(flight, Noise(), np.zeros(2), tracks, known)  # type: ignore[arg-type]
+    wanted = entrance.SMOOTHER_INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
+    assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
+
+
 def test_the_statuses_are_those_of_the_schema() -> None:
     assert (room.OK, room.UNCONVERGED, room.AMBIGUOUS) == (
         messages.STATUS_OK,

@@ -104,6 +104,12 @@ def test_starts_fill_the_circle_of_the_first_range() -> None:
     assert np.hypot(*starts(1.0, 1.5)[0, :2]) == pytest.approx(0.05)
 
 
+def test_states_are_alike_by_what_lies_between_them() -> None:
+    far = np.array([5.0, -4.0, 2.0])
+    assert alike(far, far + np.array([0.3, 0.2, 0.4]))
+    assert not alike(far, -far)
+
+
 def test_starts_that_differ_are_kept_best_first() -> None:
     near, turned, far = [0.3, 0.2, 0.4], [0.0, 0.0, 0.6], [0.41, 0.0, 0.0]
     states = np.array([[0.0, 0.0, 0.0], near, turned, far, [0.0, 0.0, 2 * np.pi - 0.1]])

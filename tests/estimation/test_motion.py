@@ -193,6 +193,18 @@ def test_a_calm_flight_is_the_same_but_for_what_may_be_noise() -> None:
     assert (found.range_m == task.range_m).all()
 
 
+def test_velocities_are_averaged_over_the_calm_time() -> None:
+    """A sample alone becomes a plateau; without noise nothing is shrunk."""
+    lone = np.zeros((200, 2))
+    lone[100] = 1.0
+    found = shrunk(lone, 0.0, 0.1)
+    count = round(CALM_S / 0.1)
+    assert found[:, 0] == pytest.approx(found[:, 1])
+    within = np.flatnonzero(found[:, 0] > 1e-9)
+    assert len(within) == count and within.mean() == pytest.approx(100, abs=0.5)
+    assert found[100] == pytest.approx([1 / count, 1 / count])
+
+
 def test_a_calm_path_turns_with_the_robots_that_fly_it() -> None:
     """Of motion far above its noise, the poses that follow from it are those that were."""
     task = problem(pair(np.arange(3.0, 23.0, 0.1)))

@@ -37,8 +37,10 @@ def test_a_pair_takes_only_what_is_finite_and_forward() -> None:
             uneven = np.where(np.arange(200) == 10, at, GRID)
             Pair(uneven, STILL, STILL, np.array([0.5]), np.array([1.0]))
     broken = Track(np.full(200, np.nan), *np.zeros((3, 200)), np.zeros(200, bool))
-    with pytest.raises(ValueError, match="peer signals are not 200 finite numbers"):
-        Pair(GRID, STILL, broken, np.array([0.5]), np.array([1.0]))
+    short = Track(*np.zeros((4, 199)), np.zeros(199, bool))
+    for odd in (broken, short):
+        with pytest.raises(ValueError, match="peer signals are not 200 finite numbers"):
+            Pair(GRID, STILL, odd, np.array([0.5]), np.array([1.0]))
 
 
 def test_a_pair_seen_from_the_peer_has_the_same_ranges() -> None:
