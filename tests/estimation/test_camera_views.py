@@ -74,8 +74,9 @@ def test_the_nearest_detection_within_reach_is_the_peers() -> None:
 
 def test_a_peer_is_expected_where_its_path_is_known_at_the_exposure() -> None:
     """The path lasts from 0 to 9.9 s, and images are stamped a quarter of a second late."""
-    nobody = replace(flight([], np.zeros((0, 2))), image_s=np.array([0.1, 0.2, 5.0, 10.0]))
-    assert match([(nobody, PATH)], CAMERA, 30.0, Noise()).expected == 2
+    one = flight([2], np.array([[178.0, 91.0]]))
+    late = replace(one, image_s=np.array([0.1, 0.2, 5.0, 10.0]))
+    assert match([(late, PATH)], CAMERA, 30.0, Noise()).expected == 2
 
 
 def test_whitened_errors_have_the_variance_of_one() -> None:
