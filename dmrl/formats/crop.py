@@ -9,7 +9,7 @@ from dmrl.images import codec
 
 @dataclass(frozen=True, slots=True)
 class Crop:
-    """The largest centred part of a picture with another aspect ratio, scaled; or a part cut out.
+    """The largest centred part of a picture with another aspect ratio, scaled.
 
     Parameters
     ----------
@@ -17,15 +17,15 @@ class Crop:
         Size of the picture.
     width_px, height_px
         Size wanted.
-    cut_px
-        Left and top of a part of that size, which is cut out as it is. None: centred and scaled.
+    margin_px
+        Left and top of what counts as the picture, which lies in its middle.
     """
 
     from_width_px: int
     from_height_px: int
     width_px: int
     height_px: int
-    cut_px: tuple[int, int] | None = None
+    margin_px: tuple[int, int] = (0, 0)
 
     @property
     def changes(self) -> bool:
@@ -35,15 +35,13 @@ class Crop:
     @property
     def scale(self) -> float:
         """Wanted pixels per pixel of the picture, the same both ways."""
-        if self.cut_px is not None:
-            return 1.0
-        return max(self.width_px / self.from_width_px, self.height_px / self.from_height_px)
+        width_px = self.from_width_px - 2 * self.margin_px[0]
+        height_px = self.from_height_px - 2 * self.margin_px[1]
+        return max(self.width_px / width_px, self.height_px / height_px)
 
     @property
     def corner_px(self) -> tuple[float, float]:
         """Left and top of the part that is kept."""
-        if self.cut_px is not None:
-            return self.cut_px
         left = (self.from_width_px - self.width_px / self.scale) / 2
         top = (self.from_height_px - self.height_px / self.scale) / 2
         return max(left, 0.0), max(top, 0.0)

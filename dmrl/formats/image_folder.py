@@ -16,7 +16,8 @@ a line: see ``aideck``. Labels of it need a camera. Maps of a chip: see ``chip_m
 
 Pixels are those of the stored picture, pixel-edge coordinates. ``calibration.toml`` in the
 folder is the camera that took the pictures as they are stored (keys: see ``Camera``). Pictures of
-the AI-deck's whole sensor, 324x244, with a camera of 320x224 are cut to what that is of.
+the AI-deck's whole sensor, 324x244, with a camera of 320x224 are cut to what that is of, unless
+324x244 is asked for.
 """
 
 from collections.abc import Collection, Iterator
@@ -202,10 +203,9 @@ def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
     camera, size = options.camera, (width_px, height_px)
     if camera is None or size == _size(camera):
         return Crop(*size, *(options.size_px or size))
-    if size == AIDECK_SENSOR_PX and _size(camera) == _size(AIDECK) == (
-        options.size_px or _size(AIDECK)
-    ):
-        return Crop(*size, *_size(AIDECK), cut_px=AIDECK_CORNER_PX)
+    if size == AIDECK_SENSOR_PX and _size(camera) == _size(AIDECK):
+        wanted = options.size_px or _size(AIDECK)
+        return Crop(*size, *wanted, (0, 0) if wanted == size else AIDECK_CORNER_PX)
     raise SettingError(
         f"{path} is {width_px}x{height_px} px, its camera {camera.width_px}x"
         f"{camera.height_px}. Give the calibration of the pictures as they are stored"
@@ -217,8 +217,14 @@ def _size(camera: Camera) -> tuple[int, int]:
 
 
 def _camera_after(crop: Crop, camera: Camera) -> Camera:
-    """The camera of the pictures as they are written: of what is cut out it is told already."""
-    return camera if crop.cut_px is not None else crop.camera(camera)
+    """The camera of the pictures as they are written, from one of them as they are stored.
+
+    A camera that is of less than is stored is of what lies in the middle.
+    """
+    left = (crop.from_width_px - camera.width_px) / 2
+    top = (crop.from_height_px - camera.height_px) / 2
+    stored = replace(camera, cx_px=camera.cx_px + left, cy_px=camera.cy_px + top)
+    return crop.camera(stored)
 
 
 FORMAT = Format("images", "a folder of pictures", recognises, content)

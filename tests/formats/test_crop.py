@@ -60,7 +60,7 @@ def test_pixels_are_those_of_the_part(crop: Crop) -> None:
 
 
 def test_a_part_that_is_cut_out_is_not_scaled() -> None:
-    crop = Crop(324, 244, 320, 224, cut_px=(2, 10))
+    crop = Crop(324, 244, 320, 224, margin_px=(2, 10))
     assert (crop.scale, crop.corner_px) == (1.0, (2, 10))
     row = crop.label(LabelRow("a.png", "cf2", 52.0, 30.0, sigmas=(1.0, 2.0, 3.0)))
     assert (row.u_px, row.v_px, row.sigmas) == (50.0, 20.0, (1.0, 2.0, 3.0))

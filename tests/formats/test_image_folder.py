@@ -258,8 +258,32 @@ def test_pictures_of_the_whole_sensor_are_cut_to_what_the_camera_is_of(tmp_path:
         assert camera.fields["K"][2] == AIDECK.cx_px
         (label,) = samples(tmp_path, "PeerLabels", options)
         assert (label.fields["peers"][0]["u_px"], label.fields["peers"][0]["v_px"]) == (100, 100)
-    with pytest.raises(SettingError, match="as they are stored"):
-        samples(tmp_path, "CompressedImage", Options(camera=AIDECK, size_px=(160, 112)))
+
+
+@pytest.mark.parametrize(
+    ("size_px", "wanted", "label_px"),
+    [
+        ((160, 112), (AIDECK.fx_px / 2, AIDECK.cx_px / 2, AIDECK.cy_px / 2), (50, 50)),
+        ((324, 244), (AIDECK.fx_px, AIDECK.cx_px + 2, AIDECK.cy_px + 10), (102, 110)),
+    ],
+)
+def test_pictures_of_the_whole_sensor_in_other_sizes_keep_a_true_camera(
+    tmp_path: Path,
+    size_px: tuple[int, int],
+    wanted: tuple[float, float, float],
+    label_px: tuple[int, int],
+) -> None:
+    whole = np.random.default_rng(0).integers(0, 256, (244, 324, 3), np.uint8)
+    (tmp_path / "a.png").write_bytes(encode_png(whole))
+    (tmp_path / "labels.csv").write_text("file,peer,u_px,v_px,depth_m\na.png,cf2,102,110,1\n")
+    options = Options(camera=AIDECK, size_px=size_px)
+    (picture,) = samples(tmp_path, "CompressedImage", options)
+    assert decode(picture.fields["data"]).shape == (size_px[1], size_px[0], 3)
+    (camera,) = samples(tmp_path, "CameraCalibration", options)
+    assert [camera.fields["K"][k] for k in (0, 2, 5)] == pytest.approx(wanted)
+    assert (camera.fields["width"], camera.fields["height"]) == size_px
+    (label,) = samples(tmp_path, "PeerLabels", options)
+    assert (label.fields["peers"][0]["u_px"], label.fields["peers"][0]["v_px"]) == label_px
 
 
 def test_how_much_there_will_be_is_told_before(folder: Path) -> None:
