@@ -90,11 +90,14 @@ def made_of(folder: Path, manifest: Manifest) -> Provenance:
     DatasetError
         If a part does not say.
     """
-    parts = [provenance_of(part_folder(folder, k)) for k in range(manifest.parts)]
-    if None in parts:
-        lost = part_folder(folder, parts.index(None))
-        raise DatasetError(f"{lost} has no provenance.json. Make the dataset again")
-    return joined(part for part in parts if part is not None)
+    parts = []
+    for k in range(manifest.parts):  # a damaged manifest can name any number: stop at the first gap
+        part = provenance_of(part_folder(folder, k))
+        if part is None:
+            lost = part_folder(folder, k)
+            raise DatasetError(f"{lost} has no provenance.json. Make the dataset again")
+        parts.append(part)
+    return joined(parts)
 
 
 def joined(parts: Iterable[Provenance]) -> Provenance:

@@ -188,6 +188,7 @@ def test_what_cannot_grow_is_one_line(record: Record, tmp_path: Path) -> None:
         ("manifest.json", b"[]"),
         ("manifest.json", held["manifest.json"].replace(b'"rows": 4', b'"rows": -4')),
         ("manifest.json", held["manifest.json"].replace(b'"parts": 1', b'"parts": 9')),
+        ("manifest.json", held["manifest.json"].replace(b'"parts": 1', b'"parts": %d' % 10**17)),
         ("parts/00000/seen.bin", b"nothing"),
         ("parts/00000/seen.bin", held["parts/00000/seen.bin"][:-5]),
         ("parts/00000/seen.bin", held["parts/00000/seen.bin"][:-25]),
