@@ -131,9 +131,8 @@ def judged(data: Dataset, form: Form, settings: FitSettings, most: int) -> Judge
     found = figures_of(len(test), labels, _scaled(points, form.shrink), THRESHOLD)
     names = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
     figures = {name: float(found[name] or 0) for name in names}
-    return Judged(
-        form.name, small.macs / 1e6, ram_bytes(small), rates(small, None)[0][0], **figures
-    )
+    state = ram_bytes(small)
+    return Judged(form.name, small.macs / 1e6, state, rates(small, None, state)[0][0], **figures)
 
 
 def _scaled(points: Points, factor: int) -> Points:
