@@ -155,6 +155,11 @@ class Conv:
             raise unsound(self, f"has weights {self.weight.shape} for {channels} channels")
         if self.groups not in (1, channels) or (self.depthwise and outs != channels):
             raise unsound(self, f"has {self.groups} groups of {channels} channels")
+        own = (self.bias, self.multiplier, *([self.gain] if len(inputs) > 1 else []))
+        if any(one.shape != (outs,) for one in own):
+            raise unsound(
+                self, f"has not one bias, multiplier and gain for each of {outs} channels"
+            )
         # The worst input has the largest value of its type wherever the weight has its sign.
         largest_input = 128 if signed[0] else 255
         largest = largest_input * np.abs(self.weight.astype(np.int64)).sum(axis=(1, 2, 3))

@@ -157,3 +157,17 @@ def test_a_model_s_numbers_are_numbers(
     text = np.frombuffer(json.dumps(said).encode(), np.uint8)
     np.savez(folder / INTEGER_NAME, description=text, **arrays)
     assert run_in(box, capsys, "export", folder, box.out / "x") == 1
+
+
+@pytest.mark.parametrize("name", ["layer0.bias", "layer0.multiplier"])
+@pytest.mark.parametrize("size", [0, 1])
+def test_a_model_has_a_number_for_each_channel(
+    name: str, size: int, box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = box.root / "in" / "model"
+    folder.mkdir()
+    save(random_network(0), folder / INTEGER_NAME)
+    with np.load(folder / INTEGER_NAME) as archive:
+        arrays = {known: archive[known] for known in archive.files}
+    np.savez(folder / INTEGER_NAME, **arrays | {name: arrays[name][:size]})
+    assert run_in(box, capsys, "export", folder, box.out / "x") == 1
