@@ -10,10 +10,12 @@ shift rounds down (so half goes up), then comes a clamp to the range of the outp
 of an unsigned tensor at 0 is the ReLU.
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
+from dmrl.border.names import shortened
 from dmrl.deploy.integer_layers import (
     PIXEL_ZERO,
     Add,
@@ -172,3 +174,6 @@ def require_sound(network: IntegerNetwork) -> None:
         on_grid = shapes[head.tensor][1:] == network.grid_shape
         if not signed[head.tensor] or head.tensor in read or not on_grid:
             raise ModelError(f"head {name} is no signed tensor of the grid. Quantise again")
+    named = Counter(layer.name for layer in network.layers)
+    if twice := [name for name, count in named.items() if count > 1]:
+        raise ModelError(f"two layers are called {shortened(twice[0])!r}. Quantise the model again")

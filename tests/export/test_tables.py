@@ -6,11 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dmrl.errors import OutputError
+from dmrl.errors import OutputError, UnsafeName
+from dmrl.export import tables
 from dmrl.export.tables import write_tables
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.recording import RecordingWriter, provenance
+from dmrl.recording import Channel, RawMessage, RecordingWriter, provenance
+from dmrl.recording.writer import channel_for
 
 PNG = encode_png(np.full((4, 4, 3), 7, np.uint8))
 
@@ -61,6 +63,31 @@ def test_tables_hold_what_the_recording_holds(recording: Path, tmp_path: Path, k
     assert (out / name).read_bytes() == PNG
     data = table("cf1.detections.grid")["data"][0]
     assert (base64.b64decode(data) if kind == "csv" else data) == b"\0\1"
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_topics_that_look_alike_have_tables_of_their_own(tmp_path: Path, kind: str) -> None:
+    path, out = tmp_path / "in.mcap", tmp_path / "out"
+    like = channel_for("/cf1/height", message("Height").DESCRIPTOR)
+    rows = {"/cf1/height": 2, "/cf1.height": 3, "cf1/height": 4}
+    with RecordingWriter(path, provenance("test")) as sink:
+        for topic, count in rows.items():
+            channel = Channel(topic, like.schema_name, like.schema_data)
+            for k in range(count):
+                sink.write_raw(RawMessage(k, k, channel, message("Height")().SerializeToString()))
+    assert write_tables(path, out, kind) == rows  # type: ignore[arg-type]
+    read = pd.read_csv if kind == "csv" else pd.read_parquet
+    assert sorted(len(read(file)) for file in out.iterdir()) == [2, 3, 4]
+
+
+def test_topics_that_one_disk_would_put_into_one_table_are_refused(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where A and a are one name of a file."""
+    monkeypatch.setattr(tables, "file_of_topic", lambda topic: topic[:4].strip("/"))
+    with pytest.raises(UnsafeName, match=r"/cf1/.* and another topic would both become"):
+        write_tables(recording, tmp_path / "out", "csv")
+    assert list(tmp_path.iterdir()) == [recording]
 
 
 def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +14,11 @@ import pytest
 
 from dmrl import boundary
 from dmrl.cli import app
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.samples import save_samples
+from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.images.codec import encode_png
+from dmrl.learn.pretrained import resolved
 from dmrl.messages import message
 from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter
 from dmrl.recording.provenance import Input
@@ -158,6 +163,14 @@ def hostile(
             channel = Channel(topic, like.schema_name, like.schema_data)
             sink.write_raw(RawMessage(0, 0, channel, height.SerializeToString()))
     return path
+
+
+def quantised(folder: Path, network: IntegerNetwork) -> Path:
+    """A folder as ``dmrl quantize`` writes it, with this int8 network beside honest weights."""
+    shutil.copytree(resolved(Path("dmrl-nano")), folder)
+    save(network, folder / INTEGER_NAME)
+    save_samples(np.zeros((1, network.height_px, network.width_px, 3), np.uint8), folder)
+    return folder
 
 
 EACH = """kind = "pipeline"

@@ -10,11 +10,10 @@ import pytest
 
 from dmrl import boundary
 from dmrl.cli import app
-from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.images.codec import encode_png
 
 from ..deploy.networks import random_network
-from .box import COLUMNS, CONTROLS, EACH, HOSTILE_TEXT, ROBOTS, Box, hostile
+from .box import COLUMNS, CONTROLS, EACH, HOSTILE_TEXT, ROBOTS, Box, hostile, quantised
 
 
 @pytest.fixture
@@ -40,7 +39,7 @@ def inputs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     hostile(root / "other.mcap", {"x": "[[0, 1]]"}, request.param)
     (root / "each.toml").write_text(EACH)
     (root / "columns.toml").write_text(COLUMNS)
-    for name in ("logs", "pictures", "folder", "model"):
+    for name in ("logs", "pictures", "folder"):
         (root / name).mkdir()
     shutil.copy(bad, root / "folder" / "x\x1b[2J.mcap")
     for robot in ("..cf1", "$(touch victim)", "a\nb", "\x1b[2J", "<img src=x>"):
@@ -48,12 +47,13 @@ def inputs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         (root / "logs" / f"{robot}.csv").write_text(log)
         picture = encode_png(np.zeros((48, 64, 3), np.uint8))
         (root / "pictures" / f"{robot}.png").write_bytes(picture)
-    layers = tuple(replace(layer, name=HOSTILE_TEXT) for layer in random_network(0).layers)
-    save(
-        replace(random_network(0), name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers),
-        root / "model" / INTEGER_NAME,
+    layers = tuple(
+        replace(layer, name=f"{HOSTILE_TEXT}{k}")
+        for k, layer in enumerate(random_network(0).layers)
     )
-    named = bad if request.param is ROBOTS else hostile(root / "named.mcap")
-    made = ["dataset", str(named), str(root / "cards"), "--split", "recordings"]
+    named = replace(random_network(0), name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers)
+    quantised(root / "model", named)
+    source = bad if request.param is ROBOTS else hostile(root / "named.mcap")
+    made = ["dataset", str(source), str(root / "cards"), "--split", "recordings"]
     assert boundary.status_of(lambda: app(made)) == 0
     return root

@@ -153,7 +153,9 @@ def test_a_recipe_s_step_writes_in_the_pipeline_s_folder(
 ) -> None:
     out = name.replace("{victim}", str(box.victim))
     recipe = box.root / "in" / "recipe.toml"
-    step = f'[[step]]\nstage = "sketch"\nout = "{out}"\n[step.settings]\nimages = 1\n'
-    recipe.write_text(f'kind = "pipeline"\n{step}')
+    step = '[[step]]\nstage = "sketch"\nimages = 1\nout = '
+    recipe.write_text(f'kind = "pipeline"\n{step}"{out}"\n')
     assert run_in(box, capsys, "run", recipe, "--out", box.out / "a") == 1
     assert list(box.out.iterdir()) == []
+    recipe.write_text(f'kind = "pipeline"\n{step}"honest"\n')
+    assert run_in(box, capsys, "run", recipe, "--out", box.out / "a") == 0  # so it is the name
