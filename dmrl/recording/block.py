@@ -12,6 +12,8 @@ Ints = NDArray[np.int64]
 HEAD_BYTES = 31
 """Of a message's record: opcode, length, channel, sequence, log and publish time."""
 ROWS = 10_000  # that become Python objects at a time
+EVER_NS = int(np.iinfo(np.int64).max)
+"""After every log time: a span up to here holds all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,11 @@ class Block:
             self.start[rows],
             self.end[rows],
         )
+
+    @property
+    def possible(self) -> NDArray[np.bool_]:
+        """(N,) whose times 64 bits with a sign can tell, those of the log before `EVER_NS`."""
+        return np.asarray((self.time_ns >= 0) & (self.publish_ns >= 0) & (self.time_ns < EVER_NS))
 
     def numbers(self) -> list[int]:
         """Channels that there are messages of."""

@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 from mcap.summary import Summary as McapSummary
 
-from dmrl.recording.block import EMPTY, HEAD_BYTES, Block, concatenate, joined
+from dmrl.recording.block import EMPTY, EVER_NS, HEAD_BYTES, Block, concatenate, joined
 from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import (
     RECORD_HEADER,
@@ -61,7 +61,7 @@ def blocks(
         If the file is not a complete recording, or a chunk's CRC does not match.
     """
     low = 0 if start_ns is None else start_ns
-    high = np.iinfo(np.int64).max if end_ns is None else end_ns
+    high = EVER_NS if end_ns is None else end_ns
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
         if summary is None:

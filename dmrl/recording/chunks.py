@@ -182,7 +182,7 @@ def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) 
     present = set(block.numbers())
     if unknown := present - set(known):
         raise McapError(f"messages of channel {min(unknown)}, which is not defined")
-    if len(block) and min(int(block.time_ns.min()), int(block.publish_ns.min())) < 0:
+    if not block.possible.all():
         raise McapError("a message has a time beyond the year 2262")
     return block if present <= set(numbers) else block.of(numbers)
 

@@ -15,16 +15,13 @@ from mcap.records import Chunk, ChunkIndex
 from mcap.summary import Summary as McapSummary
 from numpy.typing import NDArray
 
-from dmrl.recording.block import Block
+from dmrl.recording.block import EVER_NS, Block
 from dmrl.recording.blocks import chunks_between, compare, place_of, tally, whole_chunk
 from dmrl.recording.channel import Channel
 from dmrl.recording.index import mcap_summary
 from dmrl.recording.opening import opened
 from dmrl.recording.walk import channel_of, walked
 from dmrl.recording.writer import RecordingWriter
-
-EVER_NS = int(np.iinfo(np.int64).max)
-"""After every log time."""
 
 
 @dataclass(frozen=True, slots=True)

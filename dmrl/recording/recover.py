@@ -191,7 +191,7 @@ def _unpacked(stream: Bounded, walk: _Walk, chunk: Chunk, at: int) -> Block | No
 def _named(walk: _Walk, block: Block, chunk: Chunk | None) -> Iterator[Piece]:
     """The messages of a block whose topic is known, and whose time can be; none, or a piece."""
     named = np.isin(block.channel, list(walk.channels))
-    timed = (block.time_ns >= 0) & (block.publish_ns >= 0)
+    timed = block.possible
     walk.recovery.nameless += int((~named).sum())
     walk.recovery.timeless += int((named & ~timed).sum())
     good = named & timed

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dmrl.recording.block import ROWS, Ints
+from dmrl.recording.block import EVER_NS, ROWS, Ints
 from dmrl.recording.channel import RawMessage
-from dmrl.recording.copying import EVER_NS, Wanted, adopt, copy, pieces, put
+from dmrl.recording.copying import Wanted, adopt, copy, pieces, put
 from dmrl.recording.encode import Value
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import summary

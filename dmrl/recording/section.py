@@ -26,6 +26,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.border import limits
+from dmrl.recording.block import EVER_NS
 from dmrl.recording.opening import DEFINITIONS, MAGIC, RECORD, Bounded, damaged, too_large
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC
@@ -91,6 +92,7 @@ def section(path: Path, stream: Bounded) -> Section | None:
         return None
     _within_budget(path, stream, found)
     _counted(path, found)
+    _before_the_end_of_time(path, found)
     if not _placed(path, stream, found, start):
         return None
     return found
@@ -203,6 +205,14 @@ def _counted(path: Path, found: McapSummary) -> None:
     ):
         if indexes and len(indexes) != number:
             raise damaged(path, f"its summary lists {len(indexes)} of {number} {what}")
+
+
+def _before_the_end_of_time(path: Path, found: McapSummary) -> None:
+    latest = [chunk.message_end_time for chunk in found.chunk_indexes]
+    if found.statistics is not None:
+        latest += [found.statistics.message_start_time, found.statistics.message_end_time]
+    if max(latest, default=0) >= EVER_NS:
+        raise damaged(path, "a message has a time beyond the year 2262")
 
 
 def _placed(path: Path, stream: Bounded, found: Section, end: int) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording import sums
-from dmrl.recording.block import Ints
+from dmrl.recording.block import EVER_NS, Ints
 from dmrl.recording.blocks import blocks
 from dmrl.recording.index import mcap_summary, metadata_of, summary
 from dmrl.recording.kinds import require_types
@@ -46,7 +46,7 @@ def log_times(
     names = frozenset(topic for topic in topics if topic in present)
     require_types(path, present, names)
     low = 0 if start_ns is None else start_ns
-    high = np.iinfo(np.int64).max if end_ns is None else end_ns
+    high = EVER_NS if end_ns is None else end_ns
     found = {topic: np.sort(times) for topic, times in indexed_times(path, names).items()}
     return {topic: t[(t >= low) & (t < high)] for topic, t in found.items()}
 
@@ -93,9 +93,10 @@ def _times_in_indexes(
         raw = stream.read(chunk.message_index_length)
         crc = zlib.crc32(raw, crc)
         for number, at in chunk.message_index_offsets.items():
-            yield (
-                summary.channels[number].topic,
-                as_pairs(index_entries(path, raw, at - first, number))[:, 0],
-            )
+            times = as_pairs(index_entries(path, raw, at - first, number))[:, 0]
+            low, high = chunk.message_start_time, chunk.message_end_time
+            if len(times) and not low <= int(times.min()) <= int(times.max()) <= high:
+                raise damaged(path, f"message index of channel {number} has times of another chunk")
+            yield summary.channels[number].topic, times
     if said and said[-1].get("indexes") != sums.text(crc):
         raise damaged(path, "its message indexes fail their CRC")

@@ -72,9 +72,13 @@ def test_only_the_channels_that_are_asked_for() -> None:
         of_channels(block(), {7}, {7})
 
 
-@pytest.mark.parametrize("late", [(1, 2**63, 0, b""), (1, 0, 2**63, b"")])
+LATE = [(1, 2**63, 0, b""), (1, 0, 2**63, b""), (1, 2**63 - 1, 0, b"")]
+
+
+@pytest.mark.parametrize("late", LATE)
 def test_times_that_64_bits_with_a_sign_cannot_hold(late: tuple[int, int, int, bytes]) -> None:
-    last = (1, 2**63 - 1, 2**63 - 1, b"")
+    """Of the log not the last of them either: no span could end after it."""
+    last = (1, 2**63 - 2, 2**63 - 1, b"")
     assert len(of_channels(block([last]), {1}, {1})) == 1
     with pytest.raises(McapError, match="beyond the year 2262"):
         of_channels(block([last, late]), {1}, {1})

@@ -10,7 +10,7 @@ from mcap.writer import IndexType, Writer
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
-from dmrl.recording import Provenance, RecordingWriter, read_raw, summary
+from dmrl.recording import Provenance, RecordingWriter, check, merge, read_raw, summary, trim
 from dmrl.recording.blocks import blocks, in_file_order, tally
 from dmrl.recording.container import INDEX
 from dmrl.recording.extras import copy_extras, splits
@@ -128,6 +128,31 @@ def test_a_time_that_no_signed_number_holds_is_said(
         writer.finish()
     with pytest.raises(RecordingError, match="beyond the year 2262"):
         list(read_raw(path))
+
+
+@pytest.mark.parametrize("log_ns", [2**64 - 1, 2**63, 2**63 - 1])
+def test_a_time_after_every_other_is_said_by_all_that_read(log_ns: int, tmp_path: Path) -> None:
+    """check called it sound, convert damaged; view ended in an internal error."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        writer.add_message(
+            writer.register_channel("/cf1/height", "protobuf", schema), log_ns, b"", 5
+        )
+        writer.finish()
+    out = tmp_path / "out.mcap"
+    for read in (
+        summary,
+        check,
+        lambda p: list(read_raw(p)),
+        lambda p: log_times(p, ["/cf1/height"]),
+        lambda p: trim(p, out),
+        lambda p: merge([p], out),
+    ):
+        with pytest.raises(RecordingError, match=r"beyond the year 2262.*dmrl recover"):
+            read(path)
 
 
 def test_log_times_are_half_open(tmp_path: Path) -> None:

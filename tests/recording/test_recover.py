@@ -79,11 +79,12 @@ def test_messages_beyond_2262_are_left_out_and_counted(tmp_path: Path) -> None:
         writer.start()
         schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
-        for log_ns, publish_ns in ((1, 2), (2**63, 3), (4, 2**63), (2**63 - 2, 2**63 - 2)):
+        late = ((2**63, 3), (4, 2**63), (2**63 - 1, 5), (2**63 - 2, 2**63 - 2))
+        for log_ns, publish_ns in ((1, 2), *late):
             writer.add_message(channel, log_ns, b"", publish_ns)
         writer.finish()
     found = recover(path, tmp_path / "b.mcap")
-    assert (found.messages, found.timeless, found.whole) == (2, 2, False)
+    assert (found.messages, found.timeless, found.whole) == (2, 3, False)
     assert [raw.time_ns for raw in read_raw(tmp_path / "b.mcap")] == [1, 2**63 - 2]
 
 
