@@ -1,10 +1,12 @@
 """What recordings carry beside messages: splits, licences, counts, times of an index."""
 
+import struct
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import IndexType, Writer
 
@@ -18,6 +20,8 @@ from dmrl.recording.index import channel_on
 from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
 from dmrl.recording.message_index import as_pairs, index_entries
 from dmrl.recording.times import log_times
+
+from .records import records
 
 MADE = Provenance("test")
 
@@ -214,3 +218,24 @@ def test_statistics_say_what_is_there(times: list[int], tmp_path: Path) -> None:
     assert said.attachment_count == len(found.attachment_indexes) == 2  # and the recipe
     assert said.metadata_count == len(found.metadata_indexes) >= 1
     assert list(said.channel_message_counts.values()) == [len(times)] * bool(times)
+
+
+@pytest.mark.parametrize("time_ns", [2**64 - 1, 2**63, 99])
+def test_times_of_a_message_index_are_those_of_its_chunk(time_ns: int, tmp_path: Path) -> None:
+    """No sum tells in another program's file: a time that was -1 was left out without a word."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        channel = writer.register_channel("/cf1/height", "protobuf", schema)
+        for log_ns in (5, 6, 7):
+            writer.add_message(channel, log_ns, b"", log_ns)
+        writer.finish()
+    assert log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == [5, 6, 7]
+    data = bytearray(path.read_bytes())
+    (at,) = (start for opcode, start, _ in records(data) if opcode == Opcode.MESSAGE_INDEX)
+    struct.pack_into("<Q", data, at + INDEX.size, time_ns)
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="has times of another chunk"):
+        log_times(path, ["/cf1/height"])
