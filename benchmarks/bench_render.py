@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from render_exactness import _grey, grain, reprojection
+from render_exactness import grain, grey, reprojection
 
 from dmrl.rendering.environment import ensure
 from dmrl.rendering.randomise import World, draw_scene
@@ -64,7 +64,7 @@ def published_way(model: Path, backgrounds: Path, images: int, samples: int) -> 
         camera_of(settings),
         0.1,
         ("none",),
-        _grey,
+        grey,
         None,
     )
     photos = sorted(backgrounds.glob("*.jpg"))

@@ -62,7 +62,7 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
         world = World(
             settings, camera, renderer.radius_m, tuple(renderer.lights), renderer.panorama, None
         )
-        world = replace(world, panorama=_grey)
+        world = replace(world, panorama=grey)
         scenes = [draw_scene(world, k) for k in range(images)]
         shots = renderer.shots((camera, scene.robots, scene.look) for scene in scenes)
         for scene, shot in zip(scenes, shots, strict=True):
@@ -111,9 +111,7 @@ def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
     for samples in (MANY_SAMPLES, 4, 8, 16):
         model = Model(None, settings.scale)
         with Renderer(ensure(say), model, workers=1, samples=samples) as renderer:
-            world = World(
-                settings, camera, renderer.radius_m, tuple(renderer.lights), _grey, photos
-            )
+            world = World(settings, camera, renderer.radius_m, tuple(renderer.lights), grey, photos)
             drawn = [draw_scene(world, k) for k in range(images)]
             calm = [replace(d.look, sensor=_noiseless(d.look.sensor)) for d in drawn]
             scenes = [(camera, d.robots, look) for d, look in zip(drawn, calm, strict=True)]
@@ -125,7 +123,7 @@ def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
     return {name: _difference(found, exact) for name, found in shots.items()}
 
 
-def _grey(name: str) -> Picture:
+def grey(name: str) -> Picture:
     """(8, 16, 3) a panorama of nothing."""
     return np.full((8, 16, 3), 0.3, np.float32)
 

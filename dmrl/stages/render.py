@@ -333,16 +333,17 @@ def command(
         model=model,
         scale=scale,
     )
-    result: Mapping[str, Any]
     if preview:
         if on is not None or resume:
             raise SettingError("--preview is one picture, made here. Leave out --on and --resume")
-        result = look_at(out, settings)
-    elif on is None:
-        result = asdict(run(out, settings, resume=resume))
-    else:
-        result = done_on(on, "render", out, {}, settings) or {}
+        return _print("picture", out, look_at(out, settings), as_json)
+    if on is not None:
+        return _print("recording", out, done_on(on, "render", out, {}, settings) or {}, as_json)
+    return _print("recording", out, asdict(run(out, settings, resume=resume)), as_json)
+
+
+def _print(kind: str, out: Path, result: Mapping[str, object], as_json: bool) -> None:
     rows = {name.replace("_", " "): value for name, value in result.items()}
     if as_json:
-        return print_json({"picture" if preview else "recording": str(out), **rows})
-    return print_table(str(out), ("what", "value" if preview else "count"), list(rows.items()))
+        return print_json({kind: str(out), **rows})
+    return print_table(str(out), ("what", "value"), list(rows.items()))
