@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Iterator
 from typing import Any
+from urllib import request
 
 import pytest
 
@@ -23,6 +24,7 @@ def server() -> Iterator[str]:
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
         patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
         _forget()
+        request.urlopen(f"http://{host}:{port}/moto-api/reset", data=b"").close()  # of others
         yield f"http://{host}:{port}"
     _forget()
     running.stop()
