@@ -9,6 +9,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 import numpy as np
+import pytest
 
 from dmrl.cli import app
 from dmrl.images.codec import encode_png
@@ -217,14 +218,15 @@ def cli(*words: object) -> None:
     SystemExit
         With its exit status, unless that is 0.
     """
-    for place, name, other in STAND_INS.get(str(words[0]), ()):
-        stand_in = getattr(import_module(".stand_ins", __package__), other)
-        setattr(resolve_name(place), name, stand_in)
-    try:
-        app([str(word) for word in words])
-    except SystemExit as e:
-        if e.code:
-            raise
+    with pytest.MonkeyPatch.context() as patch:
+        for place, name, other in STAND_INS.get(str(words[0]), ()):
+            stand_in = getattr(import_module(".stand_ins", __package__), other)
+            patch.setattr(resolve_name(place), name, stand_in)
+        try:
+            app([str(word) for word in words])
+        except SystemExit as e:
+            if e.code:
+                raise
 
 
 def _dots(path: Path, seed: int = 0) -> None:
