@@ -63,7 +63,7 @@ class Broken:
             self.before = contents(self.out) if self.out.exists() else {}
             self.found = [self.read()]
             self.sound = self.run()
-        assert self.sound.status == 0, self.sound.said or self.wrong
+        assert self.sound.status == 0, self.wrong or self.sound.said
         self.whole = contents(self.out)
         self.found.append(self.read())
         self._inputs = (inputs, contents(inputs))

@@ -48,6 +48,15 @@ def test_what_a_library_writes_in_c_comes_to_the_disk(disk: Disk, folder: Path) 
     raise AssertionError(failed)
 
 
+@pytest.mark.heavy
+@pytest.mark.parametrize("work", [pytest.param(work, id=work.name) for work in WORKS])
+def test_every_work_comes_to_its_end_where_nothing_fails(
+    work: Work, disk: Disk, folder: Path
+) -> None:
+    """What the slow ones begin with: a work that its command has outgrown is seen early."""
+    assert Broken(work, disk, folder, disk.inputs).whole
+
+
 def broken_everywhere(broken: Broken, disk: Disk, count: Count, *, quick: bool) -> None:
     """Every operation fails once with each error; ``quick``: with the next of them in turn.
 

@@ -109,9 +109,9 @@ def _card(i: Inputs, out: Path) -> None:
 
 def _verify(i: Inputs, out: Path) -> None:
     """As a step of a pipeline, once gcc has had its say: the command writes nothing."""
-    verify, tried = import_module("dmrl.stages.verify"), pickle.loads(i.proof.read_bytes())
+    verify, result = import_module("dmrl.stages.verify"), pickle.loads(i.proof.read_bytes())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verify, "tried", lambda *_: tried)
+        patch.setattr(verify, "_tried", lambda *_: result)
         verify.run(i.c, verify.Settings(), out)
 
 
