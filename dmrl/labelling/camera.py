@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
+from dmrl.geometry.calibration import no_camera
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
 from dmrl.images.codec import size
@@ -21,7 +20,7 @@ def camera_of(held: Contents, robot: str) -> Camera | None:
     Raises
     ------
     RecordingError
-        If its lens is of a model that dmrl does not know.
+        If its lens is of a model that dmrl does not know, or its numbers are those of no camera.
     """
     topic = topics.calibration(robot)
     first = next(held.messages(topic), None) if topic in held.topics else None
@@ -34,11 +33,10 @@ def camera_of(held: Contents, robot: str) -> Camera | None:
             f"{len(found.D)} coefficients, dmrl knows plumb_bob with 5. Give another calibration: "
             "dmrl calibrate --board, then --camera"
         )
-    numbers = [*found.K, *found.D]
-    if len(found.K) != 9 or not np.isfinite(numbers).all() or min(found.K[0], found.K[4]) <= 0:
+    if why := no_camera(found.width, found.height, found.K, found.D):
         raise RecordingError(
-            f"{held.path}: {topic} has no camera matrix of 9 numbers. Give another calibration: "
-            "dmrl calibrate --board, then --camera"
+            f"{held.path}: {topic} {why}. Give another calibration: dmrl calibrate --board, then "
+            "--camera"
         )
     fx, _, cx, _, fy, cy, *_ = found.K
     return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D[:5]))

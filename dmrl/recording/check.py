@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import RecordingError
+from dmrl.geometry.calibration import no_camera
 from dmrl.recording.block import Ints
 from dmrl.recording.check_clocks import clocks
 from dmrl.recording.check_labels import labels
@@ -19,7 +20,7 @@ from dmrl.recording.check_units import periods
 from dmrl.recording.contents import Contents
 from dmrl.recording.finding import Finding
 from dmrl.terminal.progress import say
-from dmrl.topics import CAMERA_IMAGE, calibration, names, row_of
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, calibration, names, row_of
 
 GAP_PERIODS = 10  # a hole this many times the usual period is a gap
 GAP_MIN_S = 0.5
@@ -45,7 +46,7 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
     rules: tuple[Callable[[Seen], Iterator[Finding]], ...] = (_times, _clocks, _units, labels)
     seen = glimpse(Contents(path, *HELD)) if quick else look(path)
     if not quick:
-        rules = _types, _times, _clocks, _units, _images, labels
+        rules = _types, _times, _clocks, _units, _images, _calibrations, labels
     findings = [finding for rule in rules for finding in rule(seen)]
     if not seen.contents.summary.count:
         findings.append(Finding("error", "", "has no messages"))
@@ -163,3 +164,17 @@ def _sizes(seen: Seen, topic: str, calibrated: str, sizes: Counter[Size]) -> Ite
         yield Finding(
             "error", topic, f"images of {listed}, but the calibration is for {width}x{height}"
         )
+
+
+def _calibrations(seen: Seen) -> Iterator[Finding]:
+    """Calibrations that no camera can have, and cameras that are not calibrated."""
+    for topic, info in seen.contents.topics.items():
+        mine = names(CALIBRATION, topic) is not None and carries(topic, info.schema)
+        if not mine or topic in seen.broken:
+            continue
+        table = seen.contents.table(topic, ["width", "height", "K", "D"])
+        columns = [table[name].to_pylist() for name in ("width", "height", "K", "D")]
+        for width_px, height_px, k, d in zip(*columns, strict=True):
+            if why := no_camera(width_px, height_px, k, d):
+                yield Finding("error" if any(k) else "warning", topic, why)
+                break

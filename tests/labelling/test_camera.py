@@ -45,6 +45,15 @@ def test_a_lens_that_dmrl_does_not_know_is_refused(tmp_path: Path, lens: dict[st
         camera_of(Contents(path), "cf1")
 
 
+@pytest.mark.parametrize("lens", [{"K": []}, {"K": [1, 2]}, {"D": [float("inf")]}, {"width": 0}])
+def test_numbers_of_no_camera_are_refused(tmp_path: Path, lens: dict[str, Any]) -> None:
+    path = flight(tmp_path / "a.mcap", **lens)
+    with pytest.raises(
+        RecordingError, match=r"a.mcap: /cf1/camera/calibration (has|is) .*dmrl cali"
+    ):
+        camera_of(Contents(path), "cf1")
+
+
 def test_images_have_their_log_times(tmp_path: Path) -> None:
     path = flight(tmp_path / "a.mcap")
     assert Contents(path).times("/cf1/camera/image").tolist() == [5, 9]

@@ -22,6 +22,11 @@ def record(path: Path, fill: Callable[[Write], None]) -> list[str]:
     return [f"{f.level} {f.topic} {f.text}" for f in check(path)]
 
 
+def calibrated(width: int = 320, height: int = 224, **other: Any) -> Any:
+    numbers = {"K": [180, 0, width / 2, 0, 180, height / 2, 0, 0, 1]} | other
+    return message("CameraCalibration")(width=width, height=height, **numbers)
+
+
 def image(data: bytes = PNG) -> Any:
     return message("CompressedImage")(data=data, format="png")
 
@@ -39,7 +44,7 @@ def label(u_px: float, v_px: float, *, source: str = "truth", box: bool = True) 
 
 def labelled(write: Write, shift_v_px: float = 0.0) -> None:
     """Forty images with a true label each, and one whose source shifts it."""
-    write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+    write(0, "/cf1/camera/calibration", calibrated())
     rng = np.random.default_rng(0)
     for k in range(40):
         u_px, v_px = rng.uniform(50, 170, 2)
@@ -119,7 +124,7 @@ def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path)
     ]
 
     def fill(write: Write) -> None:
-        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=324, height=244))
+        write(0, "/cf1/camera/calibration", calibrated(324, 244))
         write(0, "/cf1/camera/image", image())
         write(1, "/cf1/camera/image", image(b"no image"))
 
@@ -144,7 +149,7 @@ def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path)
 )
 def test_impossible_labels_are_found(tmp_path: Path, bad: Any, complaint: str) -> None:
     def fill(write: Write) -> None:
-        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        write(0, "/cf1/camera/calibration", calibrated())
         write(0, "/cf1/camera/image", image())
         write(0, "/cf1/labels", message("PeerLabels")(peers=[bad]))
 
@@ -153,7 +158,7 @@ def test_impossible_labels_are_found(tmp_path: Path, bad: Any, complaint: str) -
 
 def test_labels_without_their_image_are_found(tmp_path: Path) -> None:
     def fill(write: Write) -> None:
-        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        write(0, "/cf1/camera/calibration", calibrated())
         write(0, "/cf1/camera/image", image())
         write(5, "/cf1/labels", message("PeerLabels")())
 
@@ -218,7 +223,7 @@ def test_ten_steps_make_a_rhythm(tmp_path: Path) -> None:
 
 def off_by(write: Write, off_px: list[tuple[float, float]]) -> None:
     """Labels beside the middle of their boxes."""
-    write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+    write(0, "/cf1/camera/calibration", calibrated())
     for k, (u_px, v_px) in enumerate(off_px):
         peer = label(100.0, 100.0)
         peer.u_px += u_px
@@ -280,7 +285,7 @@ def test_what_cannot_be_judged_in_what_was_just_written_is_no_error(
 
 def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> None:
     def fill(write: Write, left_px: float, right_px: float) -> None:
-        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        write(0, "/cf1/camera/calibration", calibrated())
         for k in range(40):
             box = [left_px, 50, right_px, 70]
             peer = message("PeerLabel")(u_px=100, v_px=60, depth_m=1, source="hand", box_px=box)
@@ -316,7 +321,7 @@ def test_images_are_of_one_size_and_of_the_calibrated(
     tmp_path: Path, sizes: list[tuple[int, int]], said: list[str]
 ) -> None:
     def fill(write: Write) -> None:
-        write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320, height=224))
+        write(0, "/cf1/camera/calibration", calibrated())
         for k, (width, height) in enumerate(sizes):
             data = encode_png(np.zeros((height, width, 3), np.uint8))
             write(k, "/cf1/camera/image", image(data))
@@ -341,3 +346,34 @@ def test_a_stamp_of_zero_counts_only_where_one_is_given_and_the_time_is_another(
     assert record(tmp_path / "a.mcap", fill) == [
         "warning /cf1/pose 1 messages have a time stamp of 0"
     ]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "finding"),
+    [
+        ({"K": []}, "warning /cf1/camera/calibration is not calibrated: K is zero or missing"),
+        ({"K": [0] * 9}, "warning /cf1/camera/calibration is not calibrated: K is zero or missing"),
+        ({"K": [1, 2]}, "error /cf1/camera/calibration has 2 numbers in K, not 9"),
+        (
+            {"D": [float("nan")]},
+            "error /cf1/camera/calibration has numbers in K or D that are not finite or too large",
+        ),
+        (
+            {"K": [180, 0, 1e300, 0, 180, 112, 0, 0, 1]},
+            "error /cf1/camera/calibration has numbers in K or D that are not finite or too large",
+        ),
+        (
+            {"K": [180, 0, 160, 0, -180, 112, 0, 0, 1]},
+            "error /cf1/camera/calibration has a focal length that is not above 0",
+        ),
+        ({"height": 0}, "error /cf1/camera/calibration is of images of 320 x 0 px"),
+    ],
+)
+def test_a_calibration_that_no_camera_has_is_found(
+    tmp_path: Path, numbers: dict[str, Any], finding: str
+) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", calibrated())
+        write(1, "/cf1/camera/calibration", calibrated(**numbers))
+
+    assert record(tmp_path / "a.mcap", fill) == [finding]

@@ -73,3 +73,21 @@ def test_a_provenance_that_nests_without_end_is_refused() -> None:
     deep = '{"inputs": [{"name": "a", "sha256": "b", "provenance": ' * 20_000
     with pytest.raises(ValueError, match="nests deeper"):
         Provenance.from_metadata({"stage": "a", "inputs": f"[{deep}"})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"settings": "x"},
+        {"settings": 3},
+        {"libraries": ["numpy"]},
+        {"stage": 1},
+        {"dmrl_version": None},
+        {"seed": "x"},
+        {"inputs": [3]},
+    ],
+)
+def test_what_is_no_provenance_is_refused(wrong: dict[str, object]) -> None:
+    document = Provenance("trim", {"to_s": 1.0}).to_json()
+    with pytest.raises((TypeError, ValueError, KeyError)):
+        Provenance.from_json(document | wrong)

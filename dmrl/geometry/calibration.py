@@ -1,0 +1,34 @@
+"""Whether the numbers of a calibration message are those of a camera."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+LARGEST = 1e6
+"""Pixels of a focal length or a principal point, and a coefficient, at most."""
+
+
+def no_camera(width_px: int, height_px: int, k: Sequence[float], d: Sequence[float]) -> str:
+    """Why no camera has this calibration; empty if one can.
+
+    Parameters
+    ----------
+    width_px, height_px
+        Size of its images, pixels.
+    k
+        K of ``foxglove.CameraCalibration``: 9 numbers, row by row, pixels. All zero, or none:
+        the camera is not calibrated.
+    d
+        D: coefficients of the lens.
+    """
+    if not any(k):
+        return "is not calibrated: K is zero or missing"
+    if len(k) != 9:
+        return f"has {len(k)} numbers in K, not 9"
+    if not np.isfinite([*k, *d]).all() or np.abs([*k, *d]).max() > LARGEST:
+        return "has numbers in K or D that are not finite or too large"
+    if min(k[0], k[4]) <= 0:
+        return "has a focal length that is not above 0"
+    if min(width_px, height_px) <= 0:
+        return f"is of images of {width_px} x {height_px} px"
+    return ""
