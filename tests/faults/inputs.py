@@ -17,6 +17,7 @@ from dmrl.messages import message
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 from dmrl.topics import attitude, camera_image, labels, uwb_range
 
+from ..pipeline.chain import CHAIN
 from ..stages.detector import with_detections
 
 STEP_NS = 100_000_000
@@ -51,22 +52,6 @@ robots_max = 2
 empty_share = 0.0
 workers = 1
 seed = 3
-"""
-PIPELINE = """
-kind = "pipeline"
-[[step]]
-stage = "sketch"
-out = "pictures"
-images = 2
-[[step]]
-stage = "convert"
-source = "pictures"
-out = "pictures.mcap"
-[[step]]
-stage = "trim"
-recording = "pictures.mcap"
-to_s = 0.5
-out = "short.mcap"
 """
 
 
@@ -144,7 +129,7 @@ class Inputs:
     @property
     def chain(self) -> Path:
         """A pipeline."""
-        return self.made("chain.toml", lambda path: path.write_text(PIPELINE))
+        return self.made("chain.toml", lambda path: path.write_text(CHAIN))
 
     @property
     def short(self) -> Path:

@@ -15,10 +15,20 @@ from dmrl.formats.format import Options
 from dmrl.formats.known import FORMATS
 from dmrl.messages import message
 
+from ..faults.mutate import mutated
 from . import foreign
 
 HANG_S = 20
 MEMORY_BYTES = 500_000_000
+ALONE = """
+import sys, types
+from pathlib import Path
+tests = types.ModuleType("tests")
+tests.__path__ = [sys.argv[1]]
+sys.modules["tests"] = tests
+from tests.formats.test_fuzz import run
+run(sys.argv[2], int(sys.argv[3]), Path(sys.argv[4]))
+"""
 
 
 def _usd(version: int) -> Callable[[Path], tuple[Path, Path]]:
@@ -96,33 +106,6 @@ SOURCES = {
 }
 
 
-def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """The same with one kind of damage: flipped, overwritten, cut, doubled, inserted bytes."""
-    out = bytearray(data)
-    # Headers are small: half of the damage is near the front.
-    reach = len(out) if rng.random() < 0.5 else min(len(out), 400)
-    at = int(rng.integers(reach))
-    size = int(rng.integers(1, 64))
-    kind = int(rng.integers(7))
-    if kind == 0:
-        for place in rng.integers(reach, size=int(rng.integers(1, 9))):
-            out[int(place)] ^= 1 << int(rng.integers(8))
-    elif kind == 1:
-        out[at : at + size] = rng.integers(0, 256, size, np.uint8).tobytes()
-    elif kind == 2:
-        del out[at:]
-    elif kind == 3:
-        del out[at : at + size]
-    elif kind == 4:
-        out[at:at] = out[at : at + size]
-    elif kind == 5:
-        out[at:at] = rng.integers(0, 256, size, np.uint8).tobytes()
-    else:
-        extremes = (b"\0" * 4, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0")
-        out[at : at + 4] = extremes[int(rng.integers(len(extremes)))]
-    return bytes(out)
-
-
 def convert(name: str, source: Path) -> int:
     """Messages of a source. DmrlError is the one error that may come."""
     count = 0
@@ -161,13 +144,9 @@ def run(which: str, count: int, folder: Path) -> None:
 
 
 def _in_a_process(which: str, count: int, folder: Path) -> str:
-    code = (
-        "import runpy, sys; sys.path.insert(0, sys.argv[4]); from pathlib import Path; "
-        "from formats.test_fuzz import run; run(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))"
-    )
     tests = str(Path(__file__).parents[1])
     done = subprocess.run(
-        [sys.executable, "-c", code, which, str(count), str(folder), tests],
+        [sys.executable, "-c", ALONE, tests, which, str(count), str(folder)],
         capture_output=True,
         text=True,
     )

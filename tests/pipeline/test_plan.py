@@ -18,18 +18,9 @@ from dmrl.pipeline.interface import interface_of
 from dmrl.pipeline.plan import Step
 from dmrl.stages.run import command as run_command
 
-HEAD = 'kind = "pipeline"\n'
-SMALL = f"""{HEAD}
-[[step]]
-stage = "sketch"
-out = "pictures"
-images = 2
+from .chain import HEAD, PICTURES
 
-[[step]]
-stage = "convert"
-source = "pictures"
-out = "pictures.mcap"
-
+SMALL = f"""{PICTURES}
 [[step]]
 stage = "merge"
 recordings = ["pictures.mcap", "{{data}}/other.mcap"]

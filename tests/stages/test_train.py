@@ -137,11 +137,25 @@ run(
 """
 
 
+def check_that_it_goes_on(dataset: Path, out: Path, settings: Settings) -> None:
+    """Without --resume it is refused; with it, it ends as if nobody had stopped it."""
+    partial, whole = out.with_name(f"{out.name}.partial"), out.with_name("whole")
+    assert partial.is_dir()
+    assert not out.exists()
+    with pytest.raises(OutputError, match=r"holds an interrupted training\. Go on with --resume"):
+        run(dataset, out, settings)
+    run(dataset, out, settings, resume=True)
+    run(dataset, whole, settings)
+    assert not partial.exists()
+    weights = [(folder / "model.safetensors").read_bytes() for folder in (out, whole)]
+    assert weights[0] == weights[1]
+
+
 @pytest.mark.heavy
 def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
     dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, partial = tmp_path / "run", tmp_path / "run.partial"
+    out = tmp_path / "run"
     steps, step = count(), fit.train_step
 
     def interrupted(*args: Any) -> Any:
@@ -152,15 +166,7 @@ def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(fit, "train_step", interrupted)
         run(dots_dataset, out, SETTINGS)
-    assert partial.is_dir()
-    assert not out.exists()
-    with pytest.raises(OutputError, match=r"holds an interrupted training\. Go on with --resume"):
-        run(dots_dataset, out, SETTINGS)
-    run(dots_dataset, out, SETTINGS, resume=True)
-    run(dots_dataset, tmp_path / "whole", SETTINGS)
-    assert not partial.exists()
-    weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "whole")]
-    assert weights[0] == weights[1]
+    check_that_it_goes_on(dots_dataset, out, SETTINGS)
 
 
 @pytest.mark.slow
@@ -175,15 +181,7 @@ def test_a_killed_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    assert partial.is_dir()
-    assert not out.exists()
-    with pytest.raises(OutputError, match=r"holds an interrupted training\. Go on with --resume"):
-        run(dots_dataset, out, settings)
-    run(dots_dataset, out, settings, resume=True)
-    run(dots_dataset, tmp_path / "whole", settings)
-    assert not partial.exists()
-    weights = [(tmp_path / n / "model.safetensors").read_bytes() for n in ("run", "whole")]
-    assert weights[0] == weights[1]
+    check_that_it_goes_on(dots_dataset, out, settings)
 
 
 @pytest.mark.heavy

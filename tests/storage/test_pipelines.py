@@ -9,22 +9,7 @@ from dmrl import recipe as recipes
 from dmrl.pipeline import run as pipeline
 from dmrl.storage import path_of
 
-CHAIN = """
-kind = "pipeline"
-[[step]]
-stage = "sketch"
-out = "pictures"
-images = 2
-[[step]]
-stage = "convert"
-source = "pictures"
-out = "pictures.mcap"
-[[step]]
-stage = "trim"
-recording = "pictures.mcap"
-to_s = 5.0
-out = "short.mcap"
-"""
+from ..pipeline.chain import CHAIN
 
 
 @pytest.mark.heavy

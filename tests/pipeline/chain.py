@@ -1,0 +1,22 @@
+"""A small pipeline: pictures, a recording of them, and something made of that."""
+
+HEAD = 'kind = "pipeline"\n'
+PICTURES = f"""{HEAD}
+[[step]]
+stage = "sketch"
+out = "pictures"
+images = 2
+
+[[step]]
+stage = "convert"
+source = "pictures"
+out = "pictures.mcap"
+"""
+"""What others begin with."""
+CHAIN = f"""{PICTURES}
+[[step]]
+stage = "trim"
+recording = "pictures.mcap"
+to_s = 0.5
+out = "short.mcap"
+"""
