@@ -49,6 +49,15 @@ def test_the_same_boards_give_the_same_digits_each_time() -> None:
     assert len({one.camera for one in made}) == 1
 
 
+def test_exact_corners_give_the_exact_camera() -> None:
+    rng = np.random.default_rng(3)
+    seen = [(corners_of(*pose(rng)),) * 2 for _ in range(8)]
+    made = calibrated(AIDECK, seen)
+    for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
+        assert getattr(made.camera, name) == pytest.approx(getattr(AIDECK, name), abs=0.02)
+    assert made.rms_px < 1e-3
+
+
 @pytest.mark.heavy
 def test_a_drawn_board_gives_the_camera_that_drew_it() -> None:
     pairs = shown(AIDECK, np.random.default_rng(0), 10)

@@ -128,6 +128,14 @@ def test_attitude_that_jumps_loses_its_noise_and_keeps_its_jumps() -> None:
         assert np.abs(left[beside].mean(axis=0)).max() < 0.005
 
 
+def test_of_white_noise_the_window_leaves_what_a_bell_of_two_samples_leaves() -> None:
+    """A mean under weights w of independent values has the variance sum w^2 / (sum w)^2."""
+    noise = np.random.default_rng(2).normal(0, 0.01, (5000, 2))
+    here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(5e3), attitude_rad=noise)
+    bell = 1 / np.sqrt(2 * np.sqrt(np.pi) * 2.0)
+    assert here.smoothed().attitude_rad.std() == pytest.approx(0.01 * bell, rel=0.06)
+
+
 def test_attitude_of_two_samples_stays_as_it_is() -> None:
     two = np.array([[0.1, 0.2], [0.3, 0.4]])
     here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(2.0), attitude_rad=two)

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from dmrl.estimation import exchanges
+from dmrl.estimation.clocks import Clock
 from dmrl.estimation.exchanges import (
     POLLED_S,
     SAME_M,
@@ -54,3 +56,15 @@ def test_a_clock_s_deviations_are_of_its_offset_and_of_its_drift() -> None:
     assert clock.drift == pytest.approx(-2e-5, abs=4 * clock.sigma_drift)
     middle = clock.at_s + clock.offset_s
     assert middle + 0.04 + 2e-5 * middle - 0.005 == pytest.approx(clock.at_s, abs=1e-3)
+
+
+def test_what_a_rough_clock_is_off_by_single_exchanges_put_right(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A guess that is 50 ms late and 100 ppm slow, of a clock that is right."""
+    time_s = np.arange(0, 100, 0.05)
+    range_m = 3 + np.sin(time_s / 3) + 0.01 * np.arange(len(time_s)) % 0.5
+    monkeypatch.setattr(exchanges, "estimate_clock", lambda *_: Clock(0.05, -1e-4, at_s=40.0))
+    clock = estimate_from_exchanges(time_s, range_m, time_s, range_m)
+    assert clock is not None
+    assert clock.corrected(time_s) == pytest.approx(time_s, abs=1e-6)

@@ -81,6 +81,26 @@ def test_a_pass_is_tried_on_the_other_side_and_the_rest_of_the_flight_stays() ->
     assert np.abs(np.diff(copy[:, 1])).max() < 0.1  # a way that can be flown
 
 
+@pytest.mark.parametrize("at_s", [0.1, 0.0, 19.8, 19.9])
+def test_a_pass_where_a_flight_begins_or_ends_is_tried_too(at_s: float) -> None:
+    time_s = np.arange(0, 20, 0.1)
+    state = np.zeros((len(time_s), 6))
+    state[:, 0], state[:, 1] = 0.5 * (time_s - at_s), 0.2
+    (copy,) = passed_by(state, 10.0)
+    nearest = int(np.argmin(np.abs(time_s - at_s)))
+    assert copy[nearest, :2] == pytest.approx([0.0, -0.2], abs=1e-9)
+    assert copy[:, 0] == pytest.approx(state[:, 0])  # aside of a way that is straight
+
+
+def test_a_pass_half_a_second_before_the_end_is_mirrored() -> None:
+    time_s = np.arange(0, 15.4, 0.1)
+    state = np.zeros((len(time_s), 6))
+    state[:, 0], state[:, 1] = np.cos(np.pi * time_s / 10), 0.1  # passes at 5 and 15 s
+    (copy,) = mirrored(state, 10.0)
+    between = (time_s > 5.5) & (time_s < 14.5)
+    assert copy[between, :2] == pytest.approx(state[between, :2] * [1.0, -1.0], abs=0.02)
+
+
 def test_the_nearest_pass_is_tried_first_and_a_far_one_not_at_all() -> None:
     time_s = np.arange(0, 30, 0.1)
     state = np.zeros((len(time_s), 6))

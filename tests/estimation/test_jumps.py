@@ -53,7 +53,7 @@ def test_a_jump_is_larger_than_the_least(jump: float, seen: bool) -> None:
         assert found[100:150] == pytest.approx(np.full(50, jump))
 
 
-@pytest.mark.parametrize(("lasts", "level"), [(299, True), (301, False)])
+@pytest.mark.parametrize(("lasts", "level"), [(299, True), (300, False), (301, False)])
 def test_a_level_lasts_30_s_at_most(lasts: int, level: bool) -> None:
     values = np.zeros(800)
     values[100 : 100 + lasts] = 1.0

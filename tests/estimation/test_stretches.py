@@ -230,6 +230,18 @@ def test_joined_stretches_of_two_that_circle_are_the_way_they_flew() -> None:
         assert state[:, 5] == pytest.approx(wanted)
 
 
+def test_in_a_stretch_its_solution_counts_whatever_the_logs_say() -> None:
+    """A peer that comes closer, while both logs say that nobody moves."""
+    time_s = np.arange(3001) / 100
+    still = Track(*np.zeros((4, 3001)), np.zeros(3001, bool))
+    flight = problem(Pair(time_s, still, still, np.array([1.0]), np.array([1.0])))
+    inner = (flight.key_s > 9.99) & (flight.key_s < 20.01)
+    part = standing(flight.key_s[inner], 0.0)
+    part.state[:, 0] = np.linspace(5.0, 1.0, inner.sum())
+    wanted = np.interp(flight.key_s, part.time_s, part.state[:, 0])  # beyond it, nobody moves
+    assert joined(flight, [part])[:, 0] == pytest.approx(wanted)
+
+
 @pytest.mark.parametrize("doubted", ["here", "there", "neither"])
 def test_a_surer_stretch_counts_whichever_robot_it_contradicts(doubted: str) -> None:
     time_s = np.arange(0.0, 20.0, 0.1)
