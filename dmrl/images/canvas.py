@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 from dmrl.geometry.frames import Array
 
 Picture = NDArray[np.float32]
+Levels = NDArray[np.uint8]
 Colour = Array
 """(3,) red, green, blue."""
 Outline = tuple[list[float], tuple[int, ...]]
@@ -92,8 +93,8 @@ class Canvas:
         levels = [min(max(round(value * scale), 0), LEVELS) for value in colour.tolist()]
         self.draw((corners, (*levels, round(opacity * LEVELS))))
 
-    def outlines(self, corners_px: Array, colours: Array, opacity: float) -> list[Outline]:
-        """Polygons of one opacity as `draw` takes them.
+    def outlines(self, corners_px: Array, colours: Array, opacity: float | Array) -> list[Outline]:
+        """Polygons of as many corners each, as `draw` takes them.
 
         Parameters
         ----------
@@ -102,12 +103,14 @@ class Canvas:
         colours
             (F, 3) of each.
         opacity
-            Of all of them.
+            Of all of them, or (F,) of each.
         """
         fine = (corners_px - (self.left_px, self.top_px)) * self._fineness
         levels = np.clip(np.rint(colours * (LEVELS / self._brightest)), 0, LEVELS).astype(int)
-        inks = np.insert(levels, 3, round(opacity * LEVELS), axis=1).tolist()
-        return list(zip(fine.reshape(len(fine), -1).tolist(), map(tuple, inks), strict=True))
+        inks = np.insert(levels, 3, np.rint(np.multiply(opacity, LEVELS)), axis=1).tolist()
+        return list(
+            zip(fine.reshape(len(fine), 2 * fine.shape[1]).tolist(), map(tuple, inks), strict=True)
+        )
 
     def draw(self, outline: Outline) -> None:
         """Draw one of `outlines` over what is there."""
@@ -129,10 +132,13 @@ class Canvas:
             slice(self.left_px, self.left_px + self.width_px),
         )
 
+    def levels(self) -> Levels:
+        """(H, W, 3) colours, 255 the brightest; without a ground multiplied by their opacity."""
+        return np.asarray(self._rgb.reduce(self._fineness))
+
     def rgb(self) -> Picture:
-        """(H, W, 3) colours; without a ground multiplied by their opacity."""
-        levels = np.asarray(self._rgb.reduce(self._fineness), np.float32)
-        return np.asarray(levels * np.float32(self._brightest / LEVELS), np.float32)
+        """(H, W, 3) `levels` as colours."""
+        return self.levels() * np.float32(self._brightest / LEVELS)
 
     def opacity(self) -> Picture:
         """(H, W, 1) how much of what is below is hidden, 0 to 1.

@@ -1,22 +1,35 @@
-"""Backgrounds made by code: rooms, gradients, textures and clutter of every size."""
+"""Backgrounds made by code: rooms, gradients, textures and clutter of every size.
 
-from collections.abc import Sequence
+Pictures are rows of (W * 3) numbers here, as NumPy is slow at arrays that end in a side of 3.
+"""
+
 from functools import cache
 
 import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array
-from dmrl.images.canvas import Canvas, Colour, Picture, bands
+from dmrl.images.canvas import Canvas, Colour, Levels, Outline, Picture, bands
 
 KNOTS = (3, 6, 12, 24, 48, 96)
-"""Of noise, from top to bottom, by the size of its detail."""
-SPREADS = (0.02, 0.05, 0.16)
+"""Of noise, from top to bottom of a picture, by the size of its detail."""
+SMOOTH, MIDDLE, ROUGH = 0.4, 0.6, 0.8
+"""How strong each finer detail of a noise is beside the one before."""
+DEVIATION = 0.4
+SPREADS = np.array([0.02, 0.05, 0.16])
 """How far a colour is from grey."""
 
+BOX, BALL, CABLE, CROSS, WINDOW, SHARD = range(6)
+THICKNESS = np.array([[0.2, 1.5], [0.3, 1.0], [0.01, 0.05], [0.02, 0.1], [0.75, 0.92], [0, 0]])
+"""Of a box, ball, cable, cross, the inside of a window: least and most, by its size."""
+THINNEST_PX = 0.7
+BAR = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+ROUND = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+DISC = np.column_stack([np.cos(ROUND), np.sin(ROUND)]) / 2
 
-def background(rng: Generator, width_px: int, height_px: int) -> Picture:
-    """A random background, (height_px, width_px, 3), 0 to 1.
+
+def background(rng: Generator, width_px: int, height_px: int) -> Levels:
+    """A random background, (height_px, width_px, 3), uint8.
 
     Parameters
     ----------
@@ -25,159 +38,159 @@ def background(rng: Generator, width_px: int, height_px: int) -> Picture:
     width_px, height_px
         Size.
     """
-    canvas = (_gradient, _clouds, _room)[rng.integers(3)](rng, width_px, height_px)
-    for _ in range(int(rng.integers(4, 30))):
-        _thing(rng, canvas)
-    picture = canvas.rgb()
-    grain = _noise(rng, width_px, height_px, rough=0.85)
+    ground = (_gradient, _clouds, _room)[rng.integers(3)]
+    canvas = ground(rng, width_px, height_px)
+    for outline in _things(rng, canvas):
+        canvas.draw(outline)
+    levels = canvas.levels().reshape(height_px, -1)
+    grain = _noise(rng, width_px, height_px, ROUGH)
     strength = np.float32(rng.uniform(0.02, 0.35))
+    out = np.empty_like(levels)
     for rows in bands(height_px):
-        picture[rows] *= (1 + strength * grain[rows].repeat(3, axis=1)).reshape(-1, width_px, 3)
-        np.clip(picture[rows], 0, 1, out=picture[rows])
-    return picture
+        band = grain[rows] * strength
+        band += 1
+        band *= levels[rows]
+        out[rows] = np.clip(band, 0, 255, out=band)
+    return out.reshape(height_px, width_px, 3)
 
 
-def _colour(rng: Generator) -> Colour:
-    """A colour, mostly greyish as rooms are; now and then vivid."""
-    grey = rng.uniform(0.03, 0.9)
-    return np.clip(grey + rng.normal(0, SPREADS[rng.integers(len(SPREADS))], 3), 0, 1)
+def window(rng: Generator, table: Picture, width_px: int, height_px: int) -> Picture:
+    """(height_px, width_px * 3) a random part of a larger picture of rows, not a copy."""
+    top = int(rng.integers(len(table) - height_px + 1))
+    left = 3 * int(rng.integers(table.shape[1] // 3 - width_px + 1))
+    return table[top : top + height_px, left : left + 3 * width_px]
+
+
+def _colours(rng: Generator, count: int) -> Array:
+    """(count, 3) colours, mostly greyish as rooms are; now and then vivid."""
+    grey = rng.uniform(0.03, 0.9, (count, 1))
+    spread = SPREADS[rng.integers(len(SPREADS), size=(count, 1))]
+    return np.clip(grey + spread * rng.standard_normal((count, 3)), 0, 1)
 
 
 def _on(ground: Picture) -> Canvas:
-    height_px, width_px, _ = ground.shape
+    height_px, width_px = len(ground), ground.shape[1] // 3
+    ground = ground.reshape(height_px, width_px, 3)
     return Canvas(0, 0, width_px, height_px, fineness=2, ground=ground)
 
 
+def _row(colour: Colour, width_px: int) -> Picture:
+    return np.tile(colour.astype(np.float32), width_px)
+
+
 def _gradient(rng: Generator, width_px: int, height_px: int) -> Canvas:
+    """From one colour to another, in any direction."""
     angle = rng.uniform(0, 2 * np.pi)
-    u = np.linspace(-0.5, 0.5, width_px, dtype=np.float32) * np.float32(np.cos(angle) / 1.42)
-    v = np.linspace(-0.5, 0.5, height_px, dtype=np.float32) * np.float32(np.sin(angle) / 1.42)
-    return _on(_between(rng, 0.5 + v[:, None] + u))
-
-
-def _between(rng: Generator, share: Picture) -> Picture:
-    """A mixture of two colours, (H, W, 3)."""
-    one, other = _colour(rng), _colour(rng)
-    return _tinted(share, one - other, other)
-
-
-def _tinted(share: Picture, step: Colour, base: Colour) -> Picture:
-    """``base + share * step``: (H, W, 3) of (H, W)."""
-    # As rows of numbers: NumPy is slow at arrays that end in a side of 3.
-    steps, bases = (np.tile(part, share.shape[1]).astype(np.float32) for part in (step, base))
-    return np.asarray(share.repeat(3, axis=1) * steps + bases).reshape(*share.shape, 3)
+    one, other = _colours(rng, 2)
+    across = np.linspace(-0.5, 0.5, width_px)[:, None] * np.cos(angle) / 1.42
+    down = np.linspace(-0.5, 0.5, height_px) * np.sin(angle) / 1.42
+    row = (other + (0.5 + across) * (one - other)).astype(np.float32).ravel()
+    sides = np.column_stack([down, np.ones(height_px)]).astype(np.float32)
+    return _on(sides @ np.stack([_row(one - other, width_px), row]))
 
 
 def _clouds(rng: Generator, width_px: int, height_px: int) -> Canvas:
-    share = 0.5 + 0.5 * _noise(rng, width_px, height_px, rough=rng.uniform(0.4, 0.8))
-    picture = _between(rng, share)
-    for channel in range(3):
-        picture[..., channel] += _noise(
-            rng, width_px, height_px, rough=0.5, deviation=0.024, knots=KNOTS[:4]
-        )
-    return _on(picture)
+    """Two colours, and a little of every other, in clouds."""
+    one, other = _colours(rng, 2)
+    share = _noise(rng, width_px, height_px, (SMOOTH, MIDDLE, ROUGH)[rng.integers(3)])
+    ground = share * _row((one - other) / 2, width_px)
+    ground += _row((one + other) / 2, width_px)
+    ground += window(rng, _tints(width_px, height_px), width_px, height_px)
+    return _on(ground)
 
 
 def _room(rng: Generator, width_px: int, height_px: int) -> Canvas:
     """A wall and a floor with boards that meet far away."""
     horizon = height_px * rng.uniform(0.2, 0.8)
-    floor, wall = _colour(rng), _colour(rng)
-    light = np.float32(0.12) * _noise(rng, width_px, height_px, rough=0.4)
-    canvas = _on(_tinted(light, np.ones(3), wall))
+    floor, wall, *boards = _colours(rng, 11)
+    light = np.float32(0.12) * _noise(rng, width_px, height_px, SMOOTH)
+    light += _row(wall, width_px)
+    canvas = _on(light)
     lean = rng.uniform(-0.15, 0.15) * width_px
     edge = np.array([[0, horizon - lean], [width_px, horizon + lean]])
     below = np.array([[width_px, 3 * height_px], [0, 3 * height_px]])
     canvas.fill(np.concatenate([edge, below]), floor)
     far = np.array([rng.uniform(0, width_px), horizon])
-    for u in np.arange(-4, 5) * rng.uniform(0.25, 0.6) * width_px + far[0]:
+    near = np.arange(-4, 5) * rng.uniform(0.25, 0.6) * width_px + far[0]
+    for u, colour in zip(near.tolist(), boards, strict=True):
         board = np.array([far, [u, 2 * height_px], [u + 0.04 * width_px, 2 * height_px]])
-        canvas.fill(board, _colour(rng), 0.4)
+        canvas.fill(board, colour, 0.4)
     return canvas
 
 
-def _thing(rng: Generator, canvas: Canvas) -> None:
-    """Draw something that is not a quadrotor: box, ball, cable, cross, window or shard."""
-    at = rng.uniform((0, 0), (canvas.width_px, canvas.height_px))
-    size = np.exp(rng.uniform(np.log(4), np.log(110)))
-    turn = rng.uniform(0, np.pi) if rng.random() < 0.5 else rng.normal(0, 0.06)
-    opacity = rng.uniform(0.3, 1.0) if rng.integers(3) == 0 else 1.0
-    shape = SHAPES[rng.integers(len(SHAPES))]
-    for outline in shape(rng, size):
-        canvas.fill(outline @ _turn(turn).T + at, _colour(rng), opacity)
+def _things(rng: Generator, canvas: Canvas) -> list[Outline]:
+    """Things that are no quadrotor, in the order in which they hide each other."""
+    count = int(rng.integers(4, 30))
+    kind = rng.integers(len(THICKNESS), size=count)
+    size = np.exp(rng.uniform(np.log(4), np.log(110), count))
+    thick = size * rng.uniform(*THICKNESS[kind].T)
+    cable, cross, pane = kind == CABLE, kind == CROSS, kind == WINDOW
+    thick[cable] = np.maximum(thick[cable], THINNEST_PX)
+    along = np.where(cable, 4 * size, size)
+    first = np.column_stack([along, np.where(pane, size, thick)])[:, None]
+    second = np.column_stack([thick, np.where(cross, size, thick)])[:, None]
+    shards = rng.normal(0, 0.5, (count, 3, 2)) * size[:, None, None]
+    place = _places(rng, canvas, count)
+    colours = _colours(rng, 2 * count)
+    opacity = np.where(rng.random(count) < 1 / 3, rng.uniform(0.3, 1.0, count), 1.0)
+    drawn: list[tuple[int, Outline]] = []
+    for which, corners, inks in (
+        ((kind != BALL) & (kind != SHARD), first * BAR, colours[:count]),
+        (kind == BALL, first * DISC, colours[:count]),
+        (kind == SHARD, shards, colours[:count]),
+        (cross | pane, second * BAR, colours[count:]),
+    ):
+        at_px = corners[which] @ place[which, :2] + place[which, 2:]
+        outlines = canvas.outlines(at_px, inks[which], opacity[which])
+        drawn += zip(np.flatnonzero(which).tolist(), outlines, strict=True)
+    return [outline for _, outline in sorted(drawn, key=lambda one: one[0])]
 
 
-def _turn(angle_rad: float) -> Array:
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[c, -s], [s, c]])
+def _places(rng: Generator, canvas: Canvas, count: int) -> Array:
+    """(count, 3, 2) a turn of corners, as rows, and a place in the picture under it."""
+    upright = rng.random(count) < 0.5
+    turn = np.where(upright, rng.normal(0, 0.06, count), rng.uniform(0, np.pi, count))
+    c, s = np.cos(turn), np.sin(turn)
+    at = rng.random((2, count)) * [[canvas.width_px], [canvas.height_px]]
+    return np.array([[c, s], [-s, c], at]).transpose(2, 0, 1)
 
 
-def _bar(width_px: float, height_px: float) -> Array:
-    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width_px / 2, height_px / 2)
-
-
-def _ellipse(half_width_px: float, half_height_px: float) -> Array:
-    turn = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-    return np.stack([np.cos(turn) * half_width_px, np.sin(turn) * half_height_px], axis=1)
-
-
-def _box(rng: Generator, size_px: float) -> list[Array]:
-    return [_bar(size_px, size_px * rng.uniform(0.2, 1.5))]
-
-
-def _ball(rng: Generator, size_px: float) -> list[Array]:
-    return [_ellipse(size_px / 2, size_px / 2 * rng.uniform(0.3, 1))]
-
-
-def _cable(rng: Generator, size_px: float) -> list[Array]:
-    return [_bar(size_px * 4, max(size_px * rng.uniform(0.01, 0.05), 0.7))]
-
-
-def _cross(rng: Generator, size_px: float) -> list[Array]:
-    thin_px = size_px * rng.uniform(0.02, 0.1)
-    return [_bar(size_px, thin_px), _bar(thin_px, size_px)]
-
-
-def _window(rng: Generator, size_px: float) -> list[Array]:
-    inner_px = size_px * rng.uniform(0.75, 0.92)
-    return [_bar(size_px, size_px), _bar(inner_px, inner_px)]
-
-
-def _shard(rng: Generator, size_px: float) -> list[Array]:
-    return [rng.normal(0, size_px / 2, (3, 2))]
-
-
-SHAPES = (_box, _ball, _cable, _cross, _window, _shard)
+def _noise(rng: Generator, width_px: int, height_px: int, rough: float) -> Picture:
+    """(H, W * 3) grey noise with detail of every size: a window of a table."""
+    table = _table(width_px, height_px, rough)
+    return window(rng, table, width_px, height_px)
 
 
 @cache
+def _table(width_px: int, height_px: int, rough: float) -> Picture:
+    """Noise of twice the width and height, the same in every process."""
+    rng = np.random.default_rng(round(100 * rough))
+    return _detail(rng, width_px, height_px, rough, KNOTS).repeat(3, axis=1)
+
+
+@cache
+def _tints(width_px: int, height_px: int) -> Picture:
+    """As `_table`, weak, of another noise in each channel, without fine detail."""
+    rng = np.random.default_rng(1)
+    parts = [0.06 * _detail(rng, width_px, height_px, 0.5, KNOTS[:4]) for _ in range(3)]
+    return np.stack(parts, axis=2, dtype=np.float32).reshape(len(parts[0]), -1)
+
+
+def _detail(
+    rng: Generator, width_px: int, height_px: int, rough: float, knots: tuple[int, ...]
+) -> Picture:
+    """(2 H, 2 W) noise, each size of detail linear between its knots."""
+    weights = rough ** np.arange(len(knots))
+    weights *= 1.5 * DEVIATION / np.sqrt((weights**2).sum())
+    total = np.zeros((2 * height_px, 2 * width_px), np.float32)
+    for weight, rows in zip(weights, knots, strict=True):
+        columns = max(rows * width_px // height_px, 2)
+        grid = np.float32(weight) * rng.standard_normal((2 * rows, 2 * columns), np.float32)
+        total += _stretch(2 * height_px, 2 * rows) @ grid @ _stretch(2 * width_px, 2 * columns).T
+    return total
+
+
 def _stretch(size: int, knots: int) -> Picture:
     """(size, knots) matrix that interpolates knots linearly to pixels."""
     place = np.linspace(0, knots - 1, size)
     return np.asarray(np.maximum(0, 1 - abs(place[:, None] - np.arange(knots))), np.float32)
-
-
-def _noise(
-    rng: Generator,
-    width_px: int,
-    height_px: int,
-    *,
-    rough: float,
-    deviation: float = 0.4,
-    knots: Sequence[int] = KNOTS,
-) -> Picture:
-    """(H, W) noise with detail of every size, or of some."""
-    across = [rows * width_px // height_px for rows in knots]
-    weights = rough ** np.arange(len(knots))
-    weights *= 1.5 * deviation / np.sqrt((weights**2).sum())
-    detail = [
-        np.float32(weight)
-        * (_stretch(height_px, rows) @ rng.standard_normal((rows, columns), np.float32))
-        for weight, rows, columns in zip(weights, knots, across, strict=True)
-    ]
-    # All sizes of detail in one product.
-    return np.asarray(np.concatenate(detail, axis=1) @ _stretches(width_px, tuple(across)))
-
-
-@cache
-def _stretches(size: int, knots: tuple[int, ...]) -> Picture:
-    return np.concatenate([_stretch(size, one) for one in knots], axis=1).T.copy()

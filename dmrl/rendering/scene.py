@@ -1,10 +1,13 @@
 """Random poses and looks for sketches."""
 
+from functools import cache
+
 import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.rendering.background import background
+from dmrl.images.canvas import Picture
+from dmrl.rendering.background import background, window
 from dmrl.rendering.quadrotor import RADIUS_M
 from dmrl.rendering.sketch import Look, Pose
 
@@ -72,11 +75,11 @@ def random_look(rng: Generator, camera: Camera) -> Look:
     camera
         Gives the size of the picture.
     """
+    size = camera.width_px, camera.height_px
     towards = rng.normal((0.0, 0.0, 1.5), 1.0)
-    shape = (camera.height_px, camera.width_px, 1)
-    noise = rng.standard_normal(shape, np.float32) * np.float32(rng.uniform(0.003, 0.04))
+    noise = window(rng, _static(*size), *size)
     return Look(
-        background=background(rng, camera.width_px, camera.height_px),
+        background=background(rng, *size),
         light_camera=towards / np.linalg.norm(towards),
         ambient=rng.uniform(0.3, 0.7),
         shine=rng.uniform(0.6, 1.6) * rng.normal(1, 0.06, 3),
@@ -86,5 +89,13 @@ def random_look(rng: Generator, camera: Camera) -> Look:
         vignette=rng.uniform(0, 0.5),
         gain=np.exp(rng.normal(0.1, 0.2)) * rng.normal(1, 0.05, 3),
         gamma=float(np.exp(rng.normal(0, 0.2))),
-        noise=noise,
+        noise_deviation=rng.uniform(0.003, 0.04),
+        noise=noise.reshape(camera.height_px, camera.width_px, 3),
     )
+
+
+@cache
+def _static(width_px: int, height_px: int) -> Picture:
+    """(2 H, 2 W * 3) grey white noise; every picture shows a window of it."""
+    rng = np.random.default_rng(0)
+    return rng.standard_normal((2 * height_px, 2 * width_px), np.float32).repeat(3, axis=1)

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.images.canvas import Canvas, Picture, bands
+from dmrl.images.canvas import Canvas, Levels, Picture, bands
 from dmrl.rendering import quadrotor
 
 SEEN = 1 / 255
 """Opacity from which a pixel counts as covered by a robot."""
 BRIGHTEST = 2.0
 """Of a robot in strong light."""
-GAMMA_STEPS = 4095
+CURVE_STEPS = 255 * 16 + 1
 """Of the light that a sensor tells apart: fine enough for 255 levels at any gamma."""
 SMALLEST_FACE_PX2 = 0.1
 """Faces that cover less of a pixel are not drawn: far robots have many."""
@@ -47,7 +47,7 @@ class Look:
     Parameters
     ----------
     background
-        (H, W, 3) what is behind the robots, 0 to 1.
+        (H, W, 3) uint8, what is behind the robots.
     light_camera
         (3,) unit vector to the light, camera frame.
     ambient
@@ -66,11 +66,13 @@ class Look:
         (3,) exposure and white balance.
     gamma
         Over 1 darkens the middle tones.
+    noise_deviation
+        How strong the noise is, by the brightest level.
     noise
-        (H, W, 1) or (H, W, 3), added last.
+        (H, W, 3) of deviation 1, added last.
     """
 
-    background: Picture
+    background: Levels
     light_camera: Array
     ambient: float
     shine: Array
@@ -80,6 +82,7 @@ class Look:
     vignette: float
     gain: Array
     gamma: float
+    noise_deviation: float
     noise: Picture
 
 
@@ -129,7 +132,7 @@ def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
         raise ValueError("sketches are drawn without distortion; give a camera without")
     xyz = np.array([pose.xyz_camera for pose in poses]).reshape(-1, 3)
     uv_px, depth_m = project(xyz, camera.image_from_optical)
-    picture = look.background.copy()
+    levels = look.background.copy()
     clear = np.ones((camera.height_px, camera.width_px), np.float32)
     box_px, share = np.full((len(poses), 4), np.nan), np.zeros(len(poses))
     drawn = []
@@ -140,9 +143,9 @@ def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
             clear[canvas.part] *= 1 - opacity[..., 0]
             drawn.append((canvas, opacity))
     for canvas, opacity in reversed(drawn):
-        picture[canvas.part] *= 1 - opacity
-        picture[canvas.part] += canvas.rgb()
-    return Sketch(_sensor(picture, look), uv_px, depth_m, box_px, share)
+        light = levels[canvas.part] * (1 - opacity) + 255 * canvas.rgb()
+        levels[canvas.part] = np.minimum(light + np.float32(0.5), 255)
+    return Sketch(_sensor(levels, look), uv_px, depth_m, box_px, share)
 
 
 def _visible(canvas: Canvas, opacity: Picture, clear: Picture) -> tuple[Array, float]:
@@ -213,35 +216,45 @@ def _body(camera: Camera, pose: Pose, look: Look) -> _Outlines:
     return _Outlines(faces.uv_px[seen], faces.distance_m[seen], colours[seen], 1.0)
 
 
-def _sensor(picture: Picture, look: Look) -> NDArray[np.uint8]:
+def _sensor(levels: Levels, look: Look) -> Levels:
     """What a small camera makes of the light that reaches it, (H, W, 3) uint8."""
-    height, width, _ = picture.shape
-    # Rows of numbers, not of pixels: NumPy is slow at arrays that end in a side of 3.
-    v = np.linspace(-1, 1, height, dtype=np.float32)[:, None] ** 2
-    u = np.linspace(-1, 1, width, dtype=np.float32).repeat(3) ** 2
-    dim = np.float32(look.vignette / 2)
-    gain = np.tile(GAMMA_STEPS * look.gain, width).astype(np.float32)
+    height, width, _ = levels.shape
+    # Gain and vignette come before the curve of gamma: each is a power of its own after it.
+    v = np.linspace(-1, 1, height)[:, None] ** 2
+    u = np.linspace(-1, 1, width)[:, None] ** 2
+    dim_v = ((1 - look.vignette / 2 * v) ** look.gamma).astype(np.float32)
+    dim_u = (look.gain * (1 - look.vignette / 2 * u)) ** look.gamma
+    gain = (255 * dim_u).astype(np.float32).ravel()
+    curve = np.linspace(0, 1, CURVE_STEPS, dtype=np.float32) ** np.float32(look.gamma)
     noise = look.noise.reshape(height, -1)
-    curve = np.linspace(0, 1, GAMMA_STEPS + 1, dtype=np.float32) ** np.float32(look.gamma)
-    curve = 255 * curve + np.float32(0.5)
+    deviation = np.float32(255 * look.noise_deviation)
     out = np.empty((height, 3 * width), np.uint8)
     for rows in bands(height):
-        band = picture[rows].reshape(-1, 3 * width)
-        if look.blur > 0:
-            mean = _mean_of_9(picture, rows).reshape(band.shape)
-            band = band + np.float32(look.blur) * (mean - band)
-        band = band * gain * (1 - dim * (u + v[rows]))
-        np.clip(band, 0, GAMMA_STEPS, out=band)
-        band = curve[band.astype(np.uint16)]
-        band += np.float32(255) * noise[rows].repeat(3 * width // noise.shape[1], axis=1)
+        band = curve.take(_blurred(levels, rows, look.blur)).reshape(-1, 3 * width)
+        band *= gain
+        band *= dim_v[rows]
+        band += deviation * noise[rows]
+        band += np.float32(0.5)
         out[rows] = np.clip(band, 0, 255, out=band)
-    return out.reshape(picture.shape)
+    return out.reshape(levels.shape)
 
 
-def _mean_of_9(picture: Picture, rows: slice) -> Picture:
-    """Every pixel of some rows the mean of the 3 x 3 around it; the border is repeated beyond."""
-    near = np.clip(np.arange(rows.start - 1, rows.stop + 1), 0, len(picture) - 1)
-    band = picture.take(near, axis=0)
-    band = band[:-2] + band[1:-1] + band[2:]
-    band = np.concatenate([band[:, :1], band, band[:, -1:]], axis=1)
-    return np.asarray((band[:, :-2] + band[:, 1:-1] + band[:, 2:]) * np.float32(1 / 9))
+def _blurred(levels: Levels, rows: slice, blur: float) -> NDArray[np.uint16]:
+    """Some rows in steps of the curve, of 16 each level, mixed with the mean of 3 x 3 pixels.
+
+    Beyond the border the border is repeated.
+    """
+    near = np.clip(np.arange(rows.start - 1, rows.stop + 1), 0, len(levels) - 1)
+    band = levels.take(near, axis=0).astype(np.uint16)
+    around = round(blur * 256 / 9)
+    middle = band[1:-1] * np.uint16(256 - 9 * around)
+    if around:
+        band = band[:-2] + band[1:-1] + band[2:]
+        band *= np.uint16(around)
+        middle += band
+        middle[:, 1:] += band[:, :-1]
+        middle[:, :-1] += band[:, 1:]
+        middle[:, 0] += band[:, 0]
+        middle[:, -1] += band[:, -1]
+    middle >>= 4
+    return middle

@@ -19,7 +19,7 @@ def plain() -> Look:
     """White background, even light, a sharp and noiseless sensor."""
     shape = (CAMERA.height_px, CAMERA.width_px, 3)
     return Look(
-        background=np.ones(shape, np.float32),
+        background=np.full(shape, 255, np.uint8),
         light_camera=np.array([0.0, 0.0, 1.0]),
         ambient=1.0,
         shine=np.ones(3),
@@ -29,6 +29,7 @@ def plain() -> Look:
         vignette=0.0,
         gain=np.ones(3),
         gamma=1.0,
+        noise_deviation=0.0,
         noise=np.zeros(shape, np.float32),
     )
 
