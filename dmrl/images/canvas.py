@@ -19,7 +19,7 @@ Colour = Array
 Outline = tuple[list[float], tuple[int, ...]]
 """Corners in fine pixels, u and v by turns; red, green, blue and opacity, 0 to 255."""
 LEVELS = 255
-BAND_ROWS = 32
+BAND_ROWS = 56
 
 
 def bands(rows: int) -> Iterator[slice]:
@@ -45,7 +45,8 @@ class Canvas:
     brightest
         The highest value of a colour that is told from others.
     ground
-        (H, W, 3) what is drawn upon. None: nothing; `opacity` says then how much still shows.
+        (H, W, 3) what is drawn upon, 255 the brightest. None: nothing; `opacity` says then how
+        much still shows.
     """
 
     def __init__(
@@ -57,24 +58,20 @@ class Canvas:
         *,
         fineness: int = 4,
         brightest: float = 1.0,
-        ground: Picture | None = None,
+        ground: Levels | None = None,
     ) -> None:
         self.left_px, self.top_px = left_px, top_px
         self.width_px, self.height_px = width_px, height_px
         self._fineness, self._brightest = fineness, brightest
         size = (width_px * fineness, height_px * fineness)
-        self._rgb = Image.new("RGB", size) if ground is None else self._image(ground, size)
+        if ground is None:
+            self._rgb = Image.new("RGB", size)
+        else:
+            self._rgb = Image.fromarray(ground).resize(size, Image.Resampling.NEAREST)
         self._cover = Image.new("RGB", size) if ground is None else None
         # Drawing in RGBA on an image that has no alpha blends, which takes longer than to replace.
         images = [self._rgb] if self._cover is None else [self._rgb, self._cover]
         self._over = [(ImageDraw.Draw(one), ImageDraw.Draw(one, "RGBA")) for one in images]
-
-    def _image(self, ground: Picture, size: tuple[int, int]) -> Image.Image:
-        levels = np.empty(ground.shape, np.uint8)
-        for rows in bands(len(ground)):
-            band = ground[rows] * np.float32(LEVELS / self._brightest) + np.float32(0.5)
-            levels[rows] = np.clip(band, 0, LEVELS, out=band)
-        return Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
 
     def fill(self, corners_px: Array, colour: Colour, opacity: float = 1.0) -> None:
         """Draw a polygon over what is there.
@@ -106,11 +103,12 @@ class Canvas:
             Of all of them, or (F,) of each.
         """
         fine = (corners_px - (self.left_px, self.top_px)) * self._fineness
-        levels = np.clip(np.rint(colours * (LEVELS / self._brightest)), 0, LEVELS).astype(int)
-        inks = np.insert(levels, 3, np.rint(np.multiply(opacity, LEVELS)), axis=1).tolist()
-        return list(
-            zip(fine.reshape(len(fine), 2 * fine.shape[1]).tolist(), map(tuple, inks), strict=True)
-        )
+        inks = np.empty((len(fine), 4))
+        inks[:, :3] = colours * (LEVELS / self._brightest)
+        inks[:, 3] = np.multiply(opacity, LEVELS)
+        whole = np.clip(np.rint(inks), 0, LEVELS).astype(int).tolist()
+        corners = fine.reshape(len(fine), 2 * fine.shape[1]).tolist()
+        return list(zip(corners, map(tuple, whole), strict=True))
 
     def draw(self, outline: Outline) -> None:
         """Draw one of `outlines` over what is there."""

@@ -3,13 +3,14 @@
 Pictures are rows of (W * 3) numbers here, as NumPy is slow at arrays that end in a side of 3.
 """
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array
-from dmrl.images.canvas import Canvas, Colour, Levels, Outline, Picture, bands
+from dmrl.images.canvas import LEVELS, Canvas, Colour, Levels, Outline, Picture, bands
 
 KNOTS = (3, 6, 12, 24, 48, 96)
 """Of noise, from top to bottom of a picture, by the size of its detail."""
@@ -68,10 +69,16 @@ def _colours(rng: Generator, count: int) -> Array:
     return np.clip(grey + spread * rng.standard_normal((count, 3)), 0, 1)
 
 
-def _on(ground: Picture) -> Canvas:
-    height_px, width_px = len(ground), ground.shape[1] // 3
-    ground = ground.reshape(height_px, width_px, 3)
-    return Canvas(0, 0, width_px, height_px, fineness=2, ground=ground)
+def _on(ground: Callable[[slice], Picture], width_px: int, height_px: int) -> Canvas:
+    """A canvas on the rows that ``ground`` gives, 0 to 1."""
+    levels = np.empty((height_px, 3 * width_px), np.uint8)
+    for rows in bands(height_px):
+        band = ground(rows)
+        band *= np.float32(LEVELS)
+        band += np.float32(0.5)
+        levels[rows] = np.clip(band, 0, LEVELS, out=band)
+    ground_levels = levels.reshape(height_px, width_px, 3)
+    return Canvas(0, 0, width_px, height_px, fineness=2, ground=ground_levels)
 
 
 def _row(colour: Colour, width_px: int) -> Picture:
@@ -86,26 +93,32 @@ def _gradient(rng: Generator, width_px: int, height_px: int) -> Canvas:
     down = np.linspace(-0.5, 0.5, height_px) * np.sin(angle) / 1.42
     row = (other + (0.5 + across) * (one - other)).astype(np.float32).ravel()
     sides = np.column_stack([down, np.ones(height_px)]).astype(np.float32)
-    return _on(sides @ np.stack([_row(one - other, width_px), row]))
+    mixed = np.stack([_row(one - other, width_px), row])
+    return _on(lambda rows: sides[rows] @ mixed, width_px, height_px)
 
 
 def _clouds(rng: Generator, width_px: int, height_px: int) -> Canvas:
     """Two colours, and a little of every other, in clouds."""
     one, other = _colours(rng, 2)
     share = _noise(rng, width_px, height_px, (SMOOTH, MIDDLE, ROUGH)[rng.integers(3)])
-    ground = share * _row((one - other) / 2, width_px)
-    ground += _row((one + other) / 2, width_px)
-    ground += window(rng, _tints(width_px, height_px), width_px, height_px)
-    return _on(ground)
+    tints = window(rng, _tints(width_px, height_px), width_px, height_px)
+    half, middle = _row((one - other) / 2, width_px), _row((one + other) / 2, width_px)
+
+    def ground(rows: slice) -> Picture:
+        band = share[rows] * half
+        band += middle
+        band += tints[rows]
+        return band
+
+    return _on(ground, width_px, height_px)
 
 
 def _room(rng: Generator, width_px: int, height_px: int) -> Canvas:
     """A wall and a floor with boards that meet far away."""
     horizon = height_px * rng.uniform(0.2, 0.8)
     floor, wall, *boards = _colours(rng, 11)
-    light = np.float32(0.12) * _noise(rng, width_px, height_px, SMOOTH)
-    light += _row(wall, width_px)
-    canvas = _on(light)
+    light, row = _noise(rng, width_px, height_px, SMOOTH), _row(wall, width_px)
+    canvas = _on(lambda rows: np.float32(0.12) * light[rows] + row, width_px, height_px)
     lean = rng.uniform(-0.15, 0.15) * width_px
     edge = np.array([[0, horizon - lean], [width_px, horizon + lean]])
     below = np.array([[width_px, 3 * height_px], [0, 3 * height_px]])

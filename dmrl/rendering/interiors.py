@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array
-from dmrl.images.canvas import Canvas, Colour, Picture
+from dmrl.images.canvas import LEVELS, Canvas, Colour, Picture
 from dmrl.images.codec import Rgb
 from dmrl.rendering.backdrops import Photos
 
@@ -80,7 +80,8 @@ def interior(rng: Generator, width_px: int, height_px: int) -> Picture:
     wall = _grey(rng, 0.45, 0.95)
     angle = rng.normal(0, 0.12)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    ground = np.tile(wall.astype(np.float32), (height_px, width_px, 1))
+    paint = wall.astype(np.float32) * LEVELS + np.float32(0.5)
+    ground = np.tile(paint.astype(np.uint8), (height_px, width_px, 1))
     canvas = Canvas(0, 0, width_px, height_px, fineness=2, ground=ground)
     unit_px = height_px * float(np.exp(rng.uniform(np.log(0.5), np.log(2.2))))
     room = _Room(canvas, rng, width_px, height_px, turn, unit_px, wall)

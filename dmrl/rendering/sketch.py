@@ -228,33 +228,37 @@ def _sensor(levels: Levels, look: Look) -> Levels:
     curve = np.linspace(0, 1, CURVE_STEPS, dtype=np.float32) ** np.float32(look.gamma)
     noise = look.noise.reshape(height, -1)
     deviation = np.float32(255 * look.noise_deviation)
+    flat = levels.reshape(height, -1)
+    flat = np.concatenate([flat[:1], flat, flat[-1:]])  # beyond the border it is repeated
     out = np.empty((height, 3 * width), np.uint8)
     for rows in bands(height):
-        band = curve.take(_blurred(levels, rows, look.blur)).reshape(-1, 3 * width)
+        near = flat[rows.start : rows.stop + 2]
+        band = curve.take(_blurred(near, look.blur), mode="clip")  # that looks at no index twice
         band *= gain
         band *= dim_v[rows]
-        band += deviation * noise[rows]
-        band += np.float32(0.5)
+        grains = noise[rows] * deviation
+        grains += np.float32(0.5)
+        band += grains
         out[rows] = np.clip(band, 0, 255, out=band)
     return out.reshape(levels.shape)
 
 
-def _blurred(levels: Levels, rows: slice, blur: float) -> NDArray[np.uint16]:
-    """Some rows in steps of the curve, of 16 each level, mixed with the mean of 3 x 3 pixels.
+def _blurred(near: Levels, blur: float) -> NDArray[np.intp]:
+    """Rows in steps of the curve, of 16 each level, mixed with the mean of 3 x 3 pixels.
 
-    Beyond the border the border is repeated.
+    ``near`` has the rows above and below as well. Beyond the sides the border is repeated.
     """
-    near = np.clip(np.arange(rows.start - 1, rows.stop + 1), 0, len(levels) - 1)
-    band = levels.take(near, axis=0).astype(np.uint16)
     around = round(blur * 256 / 9)
-    middle = band[1:-1] * np.uint16(256 - 9 * around)
-    if around:
-        band = band[:-2] + band[1:-1] + band[2:]
-        band *= np.uint16(around)
-        middle += band
-        middle[:, 1:] += band[:, :-1]
-        middle[:, :-1] += band[:, 1:]
-        middle[:, 0] += band[:, 0]
-        middle[:, -1] += band[:, -1]
+    middle = near[1:-1].astype(np.uint16)
+    column = np.add(near[:-2], near[2:], dtype=np.uint16)
+    column += middle
+    box = column.copy()
+    box[:, 3:] += column[:, :-3]
+    box[:, :-3] += column[:, 3:]
+    box[:, :3] += column[:, :3]
+    box[:, -3:] += column[:, -3:]
+    box *= np.uint16(around)
+    middle *= np.uint16(256 - 9 * around)
+    middle += box
     middle >>= 4
-    return middle
+    return middle.astype(np.intp)

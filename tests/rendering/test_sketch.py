@@ -155,7 +155,7 @@ def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
 
 
 def test_what_is_drawn_on_a_ground_hides_it(plain: Look) -> None:
-    ground = np.full((8, 8, 3), 0.25, np.float32)
+    ground = np.full((8, 8, 3), 64, np.uint8)
     canvas = Canvas(0, 0, 8, 8, ground=ground)
     canvas.fill(np.array([[0, 0], [4, 0], [4, 8], [0, 8]]), np.ones(3), 0.5)
     row = canvas.rgb()[3, :, 0]
