@@ -10,11 +10,12 @@ from mcap.records import Chunk
 
 from dmrl.errors import RecordingError
 from dmrl.output import as_output_error
-from dmrl.recording.block import HEAD_BYTES, Block, Bytes, Ints
+from dmrl.recording.block import Block, Bytes, Ints
 from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import set_heads
 from dmrl.recording.container import Container, Packed
 from dmrl.recording.defined import Defined
+from dmrl.recording.message_index import MessageIndex, index_of
 from dmrl.recording.open_chunk import CHUNK_BYTES, OpenChunk
 
 OLDEST = 16
@@ -99,7 +100,13 @@ class Assembly:
             if chunk.full:
                 self._close(chunk)
 
-    def append_chunk(self, chunk: Chunk, block: Block, channels: Mapping[int, Channel]) -> bool:
+    def append_chunk(
+        self,
+        chunk: Chunk,
+        block: Block,
+        channels: Mapping[int, Channel],
+        index: MessageIndex | None = None,
+    ) -> bool:
         """Append a chunk as it is, still compressed, if it can stand in this recording.
 
         Parameters
@@ -110,6 +117,8 @@ class Assembly:
             All of its messages, in the order of the chunk.
         channels
             By their numbers in it.
+        index
+            Its message indexes, if they are known to be right.
 
         Returns
         -------
@@ -122,17 +131,18 @@ class Assembly:
         RecordingError
             If a time is negative.
         """
-        pictured = {channels[number].pictured for number in block.numbers()}
-        small = chunk.uncompressed_size < CHUNK_BYTES // 4
-        if len(pictured) != 1 or small or not self._defined.begin_in(block, channels):
+        if chunk.uncompressed_size < CHUNK_BYTES // 4:
+            return False
+        index = index_of(block) if index is None else index
+        pictured = {channels[number].pictured for number in index.counts}
+        if len(pictured) != 1 or not self._defined.begin_in(block, channels):
             return False
         self._refuse_negative(block, channels)
         before = self._pictures if pictured.pop() else self._numbers
         self._close(before)  # what came before it stands before it
         crc = chunk.uncompressed_crc or zlib.crc32(block.data.data)
-        places = block.channel, block.time_ns, block.start - HEAD_BYTES
-        packed = Packed(chunk.compression, chunk.data, chunk.uncompressed_size, crc, *places)
-        self._put(packed, before)
+        size = chunk.uncompressed_size
+        self._put(Packed(chunk.compression, chunk.data, size, crc, *block.span, index), before)
         return True
 
     def _refuse_negative(self, block: Block, channels: Mapping[int, Channel]) -> None:

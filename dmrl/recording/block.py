@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,37 @@ HEAD_BYTES = 31
 ROWS = 10_000  # that become Python objects at a time
 EVER_NS = int(np.iinfo(np.int64).max)
 """After every log time: a span up to here holds all."""
+
+
+def taken(data: Bytes | bytes, dtype: np.dtype[Any] | str, at: Ints) -> NDArray[Any]:
+    """The values that stand at some bytes, aligned or not.
+
+    Parameters
+    ----------
+    data
+        Bytes.
+    dtype
+        Of a value; several numbers side by side are taken in one go.
+    at
+        (N,) where each starts, each at least its size before the end.
+    """
+    kind = np.dtype(dtype)
+    return _every(data, kind)[at].view(kind)
+
+
+def put_at(data: Bytes, at: Ints, values: NDArray[Any]) -> None:
+    """Write (N,) values where `taken` would find them."""
+    _every(data, values.dtype)[at] = values.view(_plain(values.dtype))
+
+
+def _every(data: Bytes | bytes, kind: np.dtype[Any]) -> NDArray[Any]:
+    """What stands at every byte of some data: a view with a stride of one byte."""
+    return np.ndarray((max(len(data) - kind.itemsize + 1, 0),), _plain(kind), data, 0, (1,))
+
+
+def _plain(kind: np.dtype[Any]) -> np.dtype[Any]:
+    """As many bytes without meaning: NumPy moves fields one by one otherwise."""
+    return np.dtype(f"V{kind.itemsize}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +82,11 @@ class Block:
             self.start[rows],
             self.end[rows],
         )
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last log time of some messages, one at least."""
+        return int(self.time_ns.min()), int(self.time_ns.max())
 
     @property
     def possible(self) -> NDArray[np.bool_]:

@@ -7,27 +7,18 @@ in it, its times and where its payload starts and ends. Decoders work on whole b
 
 from collections import Counter
 from collections.abc import Iterator, Set
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Chunk, ChunkIndex
+from mcap.records import ChunkIndex
 from mcap.summary import Summary as McapSummary
 
-from dmrl.recording.block import EMPTY, EVER_NS, HEAD_BYTES, Block, concatenate, joined
+from dmrl.recording.block import EMPTY, EVER_NS, Block, concatenate, joined
 from dmrl.recording.channel import Channel
-from dmrl.recording.chunks import (
-    RECORD_HEADER,
-    messages_at,
-    of_channels,
-    scanned,
-    unpacked,
-)
+from dmrl.recording.chunks import of_channels
 from dmrl.recording.index import mcap_summary
-from dmrl.recording.message_index import as_pairs, index_entries
-from dmrl.recording.opening import RECORD, Bounded, damaged, opened
+from dmrl.recording.listed import in_chunk, place_of
+from dmrl.recording.opening import Bounded, damaged, opened
 from dmrl.recording.section import Section
 from dmrl.recording.walk import channel_of, walked
 
@@ -181,100 +172,6 @@ def chunks_between(
         filter(wanted, summary.chunk_indexes),
         key=lambda c: (c.message_start_time, c.chunk_start_offset),
     )
-
-
-def place_of(chunk: ChunkIndex) -> tuple[int, int]:
-    """Where a chunk and its message indexes start, and how long they are together, bytes."""
-    return chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length
-
-
-def in_chunk(
-    path: Path,
-    stream: Bounded,
-    said: ChunkIndex,
-    channels: dict[int, Channel],
-    summary: Section,
-) -> Block:
-    """The messages of a chunk that are of some channels, in the order of the chunk.
-
-    Parameters
-    ----------
-    path, stream
-        The recording.
-    said
-        What its summary says of the chunk.
-    channels
-        Those that are wanted.
-    summary
-        Of the recording.
-
-    Raises
-    ------
-    RecordingError
-        If the chunk is not what its summary and its message indexes say.
-    """
-    return whole_chunk(path, stream, said, channels, summary)[1]
-
-
-def whole_chunk(
-    path: Path,
-    stream: Bounded,
-    said: ChunkIndex,
-    channels: dict[int, Channel],
-    summary: Section,
-) -> tuple[Chunk, Block]:
-    """The same, with the chunk that they stand in, still compressed."""
-    at, size = place_of(said)
-    stream.seek(at)
-    raw = stream.read(size)
-    record = _chunk_record(path, raw, said)
-    data = unpacked(path, record, at)
-    if summary.must_confirm(said):
-        summary.confirm(path, scanned(data).definitions())
-    if not said.message_index_offsets:
-        block = of_channels(scanned(data).block, channels, summary.channels)
-        return record, _within(path, said, block)
-    places = {n: place - at for n, place in said.message_index_offsets.items() if n in channels}
-    entries = as_pairs(b"".join(index_entries(path, raw, at, n) for n, at in places.items()))
-    entries = entries[np.argsort(entries[:, 1])]
-    # Indexes carry no CRC of their own, so they are held against the records they point at.
-    if entries.size and not 0 <= entries[0, 1] <= entries[-1, 1] <= len(data) - HEAD_BYTES:
-        raise damaged(path, f"index beyond the chunk at byte {at}")
-    block = messages_at(data, entries[:, 1])
-    if not (
-        (data[entries[:, 1]] == Opcode.MESSAGE).all()
-        and np.array_equal(block.time_ns, entries[:, 0])
-        and (block.end <= len(data)).all()
-        and set(block.numbers()) <= channels.keys()
-    ):
-        raise damaged(path, f"index of the chunk at byte {at} is wrong")
-    return record, _within(path, said, of_channels(block, channels, summary.channels))
-
-
-def _within(path: Path, chunk: ChunkIndex, block: Block) -> Block:
-    """The block, if its messages are of the time that the chunk is said to be of."""
-    low, high = chunk.message_start_time, chunk.message_end_time
-    if len(block) and not low <= int(block.time_ns.min()) <= int(block.time_ns.max()) <= high:
-        raise damaged(
-            path,
-            f"messages in the chunk at byte {chunk.chunk_start_offset} are of "
-            "other times than it says",
-        )
-    return block
-
-
-def _chunk_record(path: Path, raw: bytes, said: ChunkIndex) -> Chunk:
-    """The chunk at the start of some bytes, if it is the one that the summary says is there."""
-    at = said.chunk_start_offset
-    if len(raw) < RECORD_HEADER or raw[0] != Opcode.CHUNK:
-        raise damaged(path, f"no chunk at byte {at}")
-    chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(raw[RECORD_HEADER : said.chunk_length])))
-    if RECORD.unpack_from(raw)[1] != said.chunk_length - RECORD_HEADER or any(
-        getattr(chunk, name) != getattr(said, name)
-        for name in ("message_start_time", "message_end_time", "uncompressed_size", "compression")
-    ):
-        raise damaged(path, f"the chunk at byte {at} is not the one that its summary lists")
-    return chunk
 
 
 def _unindexed(

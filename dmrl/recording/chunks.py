@@ -15,13 +15,24 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
 
 from dmrl.border import limits
-from dmrl.recording.block import HEAD_BYTES, Block, Bytes, Ints
+from dmrl.recording.block import HEAD_BYTES, Block, Bytes, Ints, put_at, taken
 from dmrl.recording.container import laid_out
 from dmrl.recording.opening import DEFINITIONS, RECORD, damaged, too_large
 
 RECORD_HEADER = 1 + 8  # opcode, length
 MESSAGE = int(Opcode.MESSAGE)
 MESSAGE_HEADER = HEAD_BYTES - RECORD_HEADER  # channel id, sequence, log time, publish time
+HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("time", "<u8"),
+        ("publish", "<u8"),
+    ]
+)
+"""Of a message's record."""
 
 
 def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
@@ -64,21 +75,14 @@ def _decompressed(compression: str, data: bytes, size: int) -> bytes:
 
 def messages_at(data: Bytes, at_record: Ints) -> Block:
     """The messages whose records start at these offsets, each at least a header before the end."""
-
-    def field(offset: int, dtype: str) -> Ints:
-        # A view with a stride of one byte reads unaligned integers in one gather.
-        size = np.dtype(dtype).itemsize
-        view = np.ndarray((max(len(data) - size + 1, 0),), dtype, data, 0, (1,))
-        return view[at_record + offset].astype(np.int64)
-
-    start = at_record + HEAD_BYTES
+    heads = taken(data, HEAD, at_record)
     return Block(
         data,
-        field(RECORD_HEADER, "<u2"),
-        field(RECORD_HEADER + 6, "<u8"),
-        field(RECORD_HEADER + 14, "<u8"),
-        start,
-        at_record + RECORD_HEADER + field(1, "<u8"),
+        heads["channel"].astype(np.int64),
+        heads["time"].astype(np.int64),
+        heads["publish"].astype(np.int64),
+        at_record + HEAD_BYTES,
+        at_record + RECORD_HEADER + heads["length"].astype(np.int64),
     )
 
 
@@ -99,19 +103,11 @@ def set_heads(
         Nothing stands there yet: write the rest of the head as well.
     """
     at, size = at[:-1], np.diff(at)
-
-    def put(offset: int, dtype: str, values: Ints | int) -> None:
-        # A view with a stride of one byte writes unaligned integers in one go.
-        size = np.dtype(dtype).itemsize
-        view = np.ndarray((max(len(records) - size + 1, 0),), dtype, records.data, 0, (1,))
-        view[at + offset] = values
-
-    put(RECORD_HEADER, "<u2", number)
-    put(RECORD_HEADER + 6, "<u8", time_ns)
-    put(RECORD_HEADER + 14, "<u8", publish_ns)
+    heads = np.zeros(len(at), HEAD) if fresh else taken(records, HEAD, at)
+    heads["channel"], heads["time"], heads["publish"] = number, time_ns, publish_ns
     if fresh:
-        put(0, "<u1", MESSAGE)
-        put(1, "<u8", size - RECORD_HEADER)
+        heads["opcode"], heads["length"] = MESSAGE, size - RECORD_HEADER
+    put_at(records, at, heads)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +166,25 @@ def scanned(data: Bytes) -> Scan:
     return scan
 
 
+def beside(block: Block) -> Scan | None:
+    """The records of a chunk that are none of a block's messages, all of which it should hold.
+
+    None if there are other messages, or they overlap.
+    """
+    first = np.append(block.start - HEAD_BYTES, len(block.data))
+    last = np.concatenate([[0], block.end])
+    if (first < last).any():
+        return None
+    found = Scan(block.data, [], [])
+    for gap in np.flatnonzero(first != last).tolist():
+        before = int(last[gap])
+        scan = scanned(block.data[before : first[gap]])
+        if scan.messages:
+            return None
+        found.others.extend((opcode, before + at, before + end) for opcode, at, end in scan.others)
+    return found
+
+
 def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) -> Block:
     """The messages of some channels.
 
@@ -182,9 +197,21 @@ def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) 
     present = set(block.numbers())
     if unknown := present - set(known):
         raise McapError(f"messages of channel {min(unknown)}, which is not defined")
+    block = possible(block)
+    return block if present <= set(numbers) else block.of(numbers)
+
+
+def possible(block: Block) -> Block:
+    """The block.
+
+    Raises
+    ------
+    McapError
+        If a time is beyond the year 2262, where 64 bits with a sign end.
+    """
     if not block.possible.all():
         raise McapError("a message has a time beyond the year 2262")
-    return block if present <= set(numbers) else block.of(numbers)
+    return block
 
 
 def loose(messages: list[Message]) -> Block:

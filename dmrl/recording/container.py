@@ -8,18 +8,15 @@ import io
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
-    Channel,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -27,18 +24,15 @@ from mcap.records import (
     McapRecord,
     Metadata,
     MetadataIndex,
-    Schema,
     Statistics,
     SummaryOffset,
 )
 
 from dmrl.recording import sums
-from dmrl.recording.block import Ints
+from dmrl.recording.message_index import MessageIndex
 from dmrl.recording.opening import MAGIC, RECORD
 
 CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of a name
-INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
-ENTRY_BYTES = 16  # of a message index: log time, offset
 FOOTER = struct.Struct("<BQQQ")  # opcode, length, summary start, summary offset start
 
 
@@ -52,7 +46,7 @@ def laid_out(*records: McapRecord) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """A chunk, compressed, and where its messages are.
+    """A chunk, compressed, and its message indexes.
 
     Parameters
     ----------
@@ -60,17 +54,19 @@ class Packed:
         How its records are compressed, and to what.
     size, crc
         Length of its records, and their CRC-32.
-    channel, time_ns, at
-        (N,) channel number and log time of each message, and where its record starts.
+    first_ns, last_ns
+        Of its log times.
+    index
+        Where its messages are.
     """
 
     compression: str
     data: bytes
     size: int
     crc: int
-    channel: Ints
-    time_ns: Ints
-    at: Ints
+    first_ns: int
+    last_ns: int
+    index: MessageIndex
 
 
 class Container:
@@ -127,50 +123,45 @@ class Container:
 
     def add_chunk(self, chunk: Packed) -> None:
         """Append a chunk with its message indexes."""
-        first, last = int(chunk.time_ns.min()), int(chunk.time_ns.max())
+        first, last, index = chunk.first_ns, chunk.last_ns, chunk.index
         name = chunk.compression.encode()
         length = CHUNK.size - RECORD.size + len(name) + 8 + len(chunk.data)
         head = CHUNK.pack(Opcode.CHUNK, length, first, last, chunk.size, chunk.crc, len(name))
         head += name + struct.pack("<Q", len(chunk.data))
-        places, indexes = _indexes(chunk, self._at + RECORD.size + length)
-        self._sums.add_indexes(indexes)
+        after = self._at + RECORD.size + length
+        self._sums.add_indexes(index.records)
         self._chunks.append(
             ChunkIndex(
                 chunk_length=RECORD.size + length,
-                chunk_start_offset=self._put(head + chunk.data + indexes),
+                chunk_start_offset=self._put(b"".join((head, chunk.data, index.records))),
                 compression=chunk.compression,
                 compressed_size=len(chunk.data),
                 message_end_time=last,
-                message_index_length=len(indexes),
-                message_index_offsets=places,
+                message_index_length=len(index.records),
+                message_index_offsets={n: after + at for n, at in index.places.items()},
                 message_start_time=first,
                 uncompressed_size=chunk.size,
             )
         )
-        self._count(chunk, first, last)
-
-    def _count(self, chunk: Packed, first: int, last: int) -> None:
         said = self._said
         earlier = said.message_count > 0
         said.message_start_time = min(said.message_start_time, first) if earlier else first
         said.message_end_time = max(said.message_end_time, last)
-        said.message_count += len(chunk.channel)
-        for number, count in enumerate(np.bincount(chunk.channel).tolist()):
-            if count:
-                self._counts[number] += count
+        said.message_count += sum(index.counts.values())
+        self._counts.update(index.counts)
 
-    def finish(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
-        """Write the sums and the summary, with what defines every message."""
+    def finish(self, schemas: Sequence[bytes], channels: Sequence[bytes]) -> None:
+        """Write the sums and the summary, with the records that define every message."""
         self.add_metadata(sums.METADATA_NAME, self._sums.to_metadata(self._at))
         self._put(laid_out(DataEnd(self._crc)))
-        said, schemas, channels = self._said, list(schemas), list(channels)
+        said = self._said
         said.schema_count, said.channel_count = len(schemas), len(channels)
         said.chunk_count, said.metadata_count = len(self._chunks), len(self._metadata)
         said.attachment_count = len(self._attachments)
         said.channel_message_counts = dict(sorted(self._counts.items()))
         start, body, offsets = self._at, b"", b""
         chunks = b"".join(_chunk_index(chunk) for chunk in self._chunks)
-        before = laid_out(*schemas), laid_out(*channels), laid_out(said)
+        before = b"".join(schemas), b"".join(channels), laid_out(said)
         for records in (*before, chunks, laid_out(*self._attachments), laid_out(*self._metadata)):
             if records:
                 at = start + len(body)
@@ -188,22 +179,6 @@ class Container:
     def close(self) -> None:
         """Close the file, whole or not."""
         self._stream.close()
-
-
-def _indexes(chunk: Packed, at: int) -> tuple[dict[int, int], bytes]:
-    """Where the message index of each channel stands, and all of them one after another."""
-    order = np.argsort(chunk.channel, kind="stable")
-    numbers, first = np.unique(chunk.channel[order], return_index=True)
-    entries = np.column_stack([chunk.time_ns, chunk.at])[order].astype("<i8").tobytes()
-    places: dict[int, int] = {}
-    parts: list[bytes] = []
-    bounds = [*(ENTRY_BYTES * first).tolist(), len(entries)]
-    for number, (start, end) in zip(numbers.tolist(), pairwise(bounds), strict=True):
-        places[number] = at
-        parts.append(INDEX.pack(Opcode.MESSAGE_INDEX, end - start + 6, number, end - start))
-        parts.append(entries[start:end])
-        at += INDEX.size + end - start
-    return places, b"".join(parts)
 
 
 def _chunk_index(chunk: ChunkIndex) -> bytes:

@@ -16,9 +16,11 @@ from mcap.summary import Summary as McapSummary
 from numpy.typing import NDArray
 
 from dmrl.recording.block import EVER_NS, Block
-from dmrl.recording.blocks import chunks_between, compare, place_of, tally, whole_chunk
+from dmrl.recording.blocks import chunks_between, compare, tally
 from dmrl.recording.channel import Channel
 from dmrl.recording.index import mcap_summary
+from dmrl.recording.listed import place_of, whole_chunk
+from dmrl.recording.message_index import MessageIndex
 from dmrl.recording.opening import opened
 from dmrl.recording.walk import channel_of, walked
 from dmrl.recording.writer import RecordingWriter
@@ -36,11 +38,14 @@ class Piece:
         By number, those of the recording at least.
     chunk
         What the block is all of; None: it stands outside.
+    index
+        Message indexes of the chunk, if they are known to be right.
     """
 
     block: Block
     channels: Mapping[int, Channel]
     chunk: Chunk | None = None
+    index: MessageIndex | None = None
 
     @property
     def start_ns(self) -> int:
@@ -108,7 +113,8 @@ def put(piece: Piece, wanted: Wanted | None, sink: RecordingWriter) -> int:
         count = int(rows.sum())
         if not rows.all():
             block, piece = block.take(rows), replace(piece, chunk=None)
-    if piece.chunk is not None and sink.chunks.append_chunk(piece.chunk, block, piece.channels):
+    whole, channels = piece.chunk, piece.channels
+    if whole is not None and sink.chunks.append_chunk(whole, block, channels, piece.index):
         return count
     if len(block):
         sink.chunks.append(block, piece.channels)
@@ -134,9 +140,9 @@ def pieces(path: Path, wanted: Wanted) -> Iterator[Piece]:
         chunks = _chunks(summary, channels, wanted)
         stream.expect([place_of(index) for index in chunks])
         for index in chunks:
-            chunk, block = whole_chunk(path, stream, index, channels, summary)
+            chunk, block, messages = whole_chunk(path, stream, index, channels, summary)
             tally(found, block)
-            yield Piece(block, channels, chunk)
+            yield Piece(block, channels, chunk, messages)
         if (wanted.low_ns, wanted.high_ns) == (0, EVER_NS):
             kept = {n: channel for n, channel in channels.items() if channel.topic in wanted.topics}
             compare(path, summary, kept, found)

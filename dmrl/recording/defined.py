@@ -1,15 +1,14 @@
 """Numbers of the channels and schemas of a recording that is written, and their records."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel as McapChannel
 from mcap.records import Schema
 
-from dmrl.recording.block import HEAD_BYTES, Block
+from dmrl.recording.block import Block
 from dmrl.recording.channel import Channel
-from dmrl.recording.chunks import RECORD_HEADER, scanned
+from dmrl.recording.chunks import RECORD_HEADER, beside
 from dmrl.recording.container import laid_out
 
 
@@ -22,9 +21,11 @@ class Defined:
     def __init__(self) -> None:
         self.begun: set[int] = set()
         self._channels: dict[int, McapChannel] = {}
-        self._schemas: dict[int, Schema] = {}
+        self._records: dict[tuple[int, int], bytes] = {}  # by opcode and number
         self._begun_schemas: set[int] = {0}
         self._numbers: dict[Channel, int] = {}
+        # By identity, as to hash a channel takes longer than to copy its messages. Each is kept.
+        self._seen: dict[int, tuple[Channel, int]] = {}
         self._alike: dict[int, Channel] = {}  # seen to have the same number elsewhere
         self._schema_numbers: dict[tuple[str, str, bytes], int] = {}
 
@@ -44,8 +45,12 @@ class Defined:
 
     def number(self, channel: Channel) -> int:
         """Number of a channel."""
-        found = self._numbers.get(channel)
-        return self._define(channel, _free(self._channels), None) if found is None else found
+        known = self._seen.get(id(channel))
+        if known is None:
+            found = self._numbers.get(channel)
+            number = self._define(channel, _free(self._channels), None) if found is None else found
+            known = self._seen[id(channel)] = channel, number
+        return known[1]
 
     def topic(self, number: int) -> str:
         """Topic of a channel."""
@@ -56,11 +61,11 @@ class Defined:
         if number in self.begun:
             return b""
         self.begun.add(number)
-        channel = self._channels[number]
-        if channel.schema_id in self._begun_schemas:
-            return laid_out(channel)
-        self._begun_schemas.add(channel.schema_id)
-        return laid_out(self._schemas[channel.schema_id], channel)
+        schema_id, record = self._channels[number].schema_id, self._records[Opcode.CHANNEL, number]
+        if schema_id in self._begun_schemas:
+            return record
+        self._begun_schemas.add(schema_id)
+        return self._records[Opcode.SCHEMA, schema_id] + record
 
     def begin_in(self, block: Block, channels: Mapping[int, Channel]) -> bool:
         """Whether the chunk that a block is all of can stand here as it is; it counts as begun.
@@ -68,21 +73,21 @@ class Defined:
         Every message's channel has the same number here, and is defined before it, in the same
         words; nothing else is in the chunk.
         """
-        numbers = set(block.numbers())
-        if not all(self._same(number, channels[number]) for number in numbers):
+        numbers, alike = block.numbers(), self._alike
+        fresh = [number for number in numbers if alike.get(number) is not channels[number]]
+        if not all(self._same(number, channels[number]) for number in fresh):
             return False
         begun = set[int](), set[int]()
-        if (beside := _beside(block)) is None:
+        if (found := beside(block)) is None:
             return False
-        for opcode, number, record in beside:
-            known = self._schemas if opcode == Opcode.SCHEMA else self._channels
-            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL) or number not in known:
-                return False
-            if laid_out(known[number]) != record:
+        for opcode, at, end in found.others:
+            record = found.data[at:end].tobytes()
+            number = int.from_bytes(record[RECORD_HEADER : RECORD_HEADER + 2], "little")
+            if self._records.get((opcode, number)) != record:
                 return False
             begun[opcode == Opcode.CHANNEL].add(number)
         schemas = begun[0] | self._begun_schemas
-        if not numbers <= begun[1] | self.begun:
+        if not (begun[1] | self.begun).issuperset(numbers):
             return False
         if any(self._channels[number].schema_id not in schemas for number in begun[1]):
             return False
@@ -92,23 +97,21 @@ class Defined:
 
     def _same(self, number: int, channel: Channel) -> bool:
         """Whether a channel of another recording has its number here, too."""
-        if self._alike.get(number) is not channel:
-            if self._numbers.get(channel) != number:
-                return False
-            self._alike[number] = channel
+        if self._numbers.get(channel) != number:
+            return False
+        self._alike[number] = channel
         return True
 
-    def all_begun(self) -> tuple[list[Schema], list[McapChannel]]:
-        """Schemas and channels whose definition is in a chunk, by number."""
-        schemas = sorted(self._begun_schemas - {0})
-        return [self._schemas[n] for n in schemas], [self._channels[n] for n in sorted(self.begun)]
+    def all_begun(self) -> tuple[list[bytes], list[bytes]]:
+        """Records of schemas and channels whose definition is in a chunk, by number."""
+        schemas = [self._records[Opcode.SCHEMA, n] for n in sorted(self._begun_schemas - {0})]
+        return schemas, [self._records[Opcode.CHANNEL, n] for n in sorted(self.begun)]
 
     def _define(self, channel: Channel, number: int, schema_number: int | None) -> int:
         schema_id = self._schema_of(channel, schema_number)
         metadata = dict(channel.metadata)
-        self._channels[number] = McapChannel(
-            number, channel.topic, channel.encoding, metadata, schema_id
-        )
+        made = McapChannel(number, channel.topic, channel.encoding, metadata, schema_id)
+        self._channels[number], self._records[Opcode.CHANNEL, number] = made, laid_out(made)
         self._numbers[channel] = number
         return number
 
@@ -117,35 +120,15 @@ class Defined:
         if not any(key):
             return 0
         if key not in self._schema_numbers:
-            if not number or number in self._schemas:
-                number = _free(self._schemas)
-            self._schemas[number] = Schema(number, channel.schema_data, key[1], key[0])
-            self._schema_numbers[key] = number
+            taken = set(self._schema_numbers.values())
+            if not number or number in taken:
+                number = _free(taken)
+            made = Schema(number, channel.schema_data, key[1], key[0])
+            self._schema_numbers[key], self._records[Opcode.SCHEMA, number] = number, laid_out(made)
         return self._schema_numbers[key]
 
 
-def _beside(block: Block) -> list[tuple[int, int, bytes]] | None:
-    """Opcode, number and bytes of the records of a chunk that are none of the block's messages.
-
-    None if there are other messages, or they overlap.
-    """
-    first = np.append(block.start - HEAD_BYTES, len(block.data))
-    last = np.concatenate([[0], block.end])
-    if (first < last).any():
-        return None
-    found = []
-    for gap in np.flatnonzero(first != last).tolist():
-        scan = scanned(block.data[last[gap] : first[gap]])
-        if scan.messages:
-            return None
-        for opcode, at, end in scan.others:
-            record = scan.data[at:end].tobytes()
-            number = int.from_bytes(record[RECORD_HEADER : RECORD_HEADER + 2], "little")
-            found.append((opcode, number, record))
-    return found
-
-
-def _free(taken: Mapping[int, object]) -> int:
+def _free(taken: Collection[int]) -> int:
     """The number after the greatest, or the least that is free."""
     after = max(taken, default=0) + 1
     return after if after < 1 << 16 else next(k for k in range(1, 1 << 16) if k not in taken)

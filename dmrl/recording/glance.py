@@ -9,11 +9,12 @@ from mcap.records import ChunkIndex
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.block import Block, joined
-from dmrl.recording.blocks import blocks, chunks_between, in_chunk
+from dmrl.recording.blocks import blocks, chunks_between
 from dmrl.recording.channel import Channel
 from dmrl.recording.decoded import by_topic
 from dmrl.recording.index import mcap_summary, summary
 from dmrl.recording.kinds import require_types
+from dmrl.recording.listed import in_chunk
 from dmrl.recording.opening import opened
 from dmrl.recording.walk import channel_of
 

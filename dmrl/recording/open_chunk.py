@@ -10,6 +10,7 @@ import zstandard
 from dmrl.recording.block import HEAD_BYTES, Bytes, Ints
 from dmrl.recording.chunks import MESSAGE, RECORD_HEADER, messages_at
 from dmrl.recording.container import Packed
+from dmrl.recording.message_index import index_of
 
 CHUNK_BYTES = 256 * 1024
 """Costs no size against 1 MiB, and bounds what a crash can lose."""
@@ -69,5 +70,4 @@ class OpenChunk:
         squeezed = zstandard.ZstdCompressor(level=LEVEL).compress(data.data)
         crc = zlib.crc32(data.data)
         self.data, self.starts, self.age = bytearray(), array("q"), 0
-        at = block.start - HEAD_BYTES
-        return Packed("zstd", squeezed, len(data), crc, block.channel, block.time_ns, at)
+        return Packed("zstd", squeezed, len(data), crc, *block.span, index_of(block))

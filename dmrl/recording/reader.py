@@ -52,8 +52,10 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
     topics = summary(path).topics
     found: set[str] = set()
     for want in wanted:
-        pattern = re.compile(re.escape(want).replace(r"\*", "[^/]+"))
-        hits = {t for t in topics if pattern.fullmatch(t)}
+        hits = {want} & topics.keys()
+        if "*" in want:
+            pattern = re.compile(re.escape(want).replace(r"\*", "[^/]+"))
+            hits = {t for t in topics if pattern.fullmatch(t)}
         if not hits:
             raise MissingTopic(want, topics, path)
         found |= hits

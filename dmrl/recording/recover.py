@@ -33,11 +33,11 @@ from dmrl.recording.block import Block
 from dmrl.recording.blocks import tally
 from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import loose, scanned, unpacked
-from dmrl.recording.container import ENTRY_BYTES
 from dmrl.recording.copying import Piece, put
 from dmrl.recording.extras import copy_extras
 from dmrl.recording.index import Summary
 from dmrl.recording.inputs import sha256_of_file
+from dmrl.recording.message_index import ENTRY_BYTES
 from dmrl.recording.opening import DAMAGE, MAGIC, RECORD, Bounded, too_large
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.recovery import Recovery

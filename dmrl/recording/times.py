@@ -2,6 +2,7 @@
 
 import zlib
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from dmrl.recording.block import EVER_NS, Ints
 from dmrl.recording.blocks import blocks
 from dmrl.recording.index import mcap_summary, metadata_of, summary
 from dmrl.recording.kinds import require_types
-from dmrl.recording.message_index import as_pairs, index_entries
+from dmrl.recording.message_index import index_entries
 from dmrl.recording.opening import Bounded, damaged, opened
 
 _NO_TIMES: Ints = np.empty(0, np.int64)
@@ -92,11 +93,13 @@ def _times_in_indexes(
         stream.seek(first)
         raw = stream.read(chunk.message_index_length)
         crc = zlib.crc32(raw, crc)
-        for number, at in chunk.message_index_offsets.items():
-            times = as_pairs(index_entries(path, raw, at - first, number))[:, 0]
-            low, high = chunk.message_start_time, chunk.message_end_time
-            if len(times) and not low <= int(times.min()) <= int(times.max()) <= high:
-                raise damaged(path, f"message index of channel {number} has times of another chunk")
-            yield summary.channels[number].topic, times
+        places = {n: at - first for n, at in chunk.message_index_offsets.items()}
+        _, times, _, counts = index_entries(path, raw, places)
+        low, high = chunk.message_start_time, chunk.message_end_time
+        if len(times) and not low <= int(times.min()) <= int(times.max()) <= high:
+            raise damaged(path, f"a message index at byte {first} has times of another chunk")
+        bounds = pairwise([0, *np.cumsum(counts).tolist()])
+        for number, (begin, end) in zip(places, bounds, strict=True):
+            yield summary.channels[number].topic, times[begin:end]
     if said and said[-1].get("indexes") != sums.text(crc):
         raise damaged(path, "its message indexes fail their CRC")

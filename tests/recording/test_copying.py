@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
-from mcap.writer import CompressionType, Writer
+from mcap.records import ChunkIndex, MessageIndex
+from mcap.writer import ChunkBuilder, CompressionType, Writer
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
@@ -16,7 +16,7 @@ from dmrl.recording import (
     Provenance,
     RecordingWriter,
     Timed,
-    blocks,
+    listed,
     merge,
     read_raw,
     recover,
@@ -78,9 +78,9 @@ def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[int] = []
-    unpacked = blocks.unpacked
+    unpacked = listed.unpacked
     monkeypatch.setattr(
-        blocks, "unpacked", lambda p, c, at: opened.append(at) or unpacked(p, c, at)
+        listed, "unpacked", lambda p, c, at: opened.append(at) or unpacked(p, c, at)
     )
     fresh = [Timed(k * 100, "/cf1/labels", message("PeerLabels")()) for k in range(20)]
     out = tmp_path / "out.mcap"
@@ -134,6 +134,91 @@ def test_parts_are_merged_to_what_they_were(flight: Path, tmp_path: Path) -> Non
     again = tmp_path / "again.mcap"
     merge(parts, again)
     assert again.read_bytes() == out.read_bytes()
+
+
+def test_message_indexes_of_whole_chunks_go_along_as_they_are(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    rewrite(flight, out, MADE, without=())
+    before, after = (indexes(path) for path in (flight, out))
+    assert len(set(before) & set(after)) >= len(chunks(flight)) - 2
+    assert len(after) == len(chunks(out))
+
+
+def indexes(path: Path) -> list[bytes]:
+    """The message indexes of all chunks."""
+    data, found = path.read_bytes(), chunks(path)
+    ends = [(c.chunk_start_offset + c.chunk_length, c.message_index_length) for c in found]
+    return [data[at : at + size] for at, size in ends]
+
+
+@pytest.mark.parametrize("start_ns", [0, 2000, 2001, 5900])
+def test_a_trim_cuts_the_chunks_at_both_its_ends(
+    flight: Path, tmp_path: Path, start_ns: int
+) -> None:
+    """Where it begins, and one short of the end of a chunk."""
+    end_ns = next(c.message_end_time for c in chunks(flight) if c.message_end_time > start_ns)
+    out = tmp_path / "out.mcap"
+    trim(flight, out, start_ns=start_ns, end_ns=end_ns, topics=["/cf1/attitude", "/cf2/height"])
+    ours = read_raw(flight, "/cf1/attitude", "/cf2/height", start_ns=start_ns, end_ns=end_ns)
+    assert list(read_raw(out)) == list(ours)
+    assert len(list(read_raw(out))) == 2 * (end_ns - start_ns)
+
+
+def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Path) -> None:
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    rng = np.random.default_rng(0)
+    for path, robot in zip(paths, ("cf1", "cf2"), strict=True):
+        with RecordingWriter(path, MADE) as sink:
+            for k in range(12_000):
+                sink.write(k, f"/{robot}/height", message("Height")(height_m=rng.normal()))
+    assert {*_channels(paths[0])} == {*_channels(paths[1])}
+    out = tmp_path / "out.mcap"
+    assert merge(paths, out) == 24_000
+    for path, topic in zip(paths, ("/cf1/height", "/cf2/height"), strict=True):
+        unchanged(path, out, [topic])
+    assert len(_channels(out)) == 2
+
+
+def test_an_index_that_gives_a_message_to_another_channel_is_damage(
+    flight: Path, tmp_path: Path
+) -> None:
+    bad, data = tmp_path / "bad.mcap", bytearray(flight.read_bytes())
+    chunk = chunks(flight)[1]
+    first, second = sorted(chunk.message_index_offsets.values())[:2]
+    for at in range(15, 15 + 16):  # their first entries change places
+        data[first + at], data[second + at] = data[second + at], data[first + at]
+    bad.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"index of the chunk at byte \d+ is wrong"):
+        rewrite(bad, tmp_path / "out.mcap", MADE, without=())
+
+
+def test_an_empty_index_of_another_writer_does_not_go_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some list every channel with every chunk, with messages there or without."""
+    end = ChunkBuilder.end
+
+    def listing_all(chunk: ChunkBuilder) -> bytes:
+        for number in (1, 2):
+            chunk.message_indices.setdefault(number, MessageIndex(number, []))
+        return end(chunk)
+
+    monkeypatch.setattr(ChunkBuilder, "end", listing_all)
+
+    def fill(writer: Writer, schema: int) -> None:
+        for topic in ("/cf1/height", "/cf2/height"):
+            writer.register_channel(topic, "protobuf", schema)
+        for k in range(20_000):
+            data = message("Height")(height_m=k).SerializeToString()
+            writer.add_message(1 + (k < 10_000), k, data, k)
+
+    path = foreign(tmp_path / "a.mcap", fill, chunk_size=100_000)
+    out = tmp_path / "out.mcap"
+    rewrite(path, out, MADE, without=())
+    unchanged(path, out, ["/cf1/height", "/cf2/height"])
+    assert {*chunks(path)[0].message_index_offsets} == {1, 2}
+    assert {*chunks(out)[0].message_index_offsets} == {2}
+    assert packed(out)[0] == packed(path)[0]
 
 
 def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path) -> None:

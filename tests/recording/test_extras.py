@@ -14,11 +14,10 @@ from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
 from dmrl.recording import Provenance, RecordingWriter, check, merge, read_raw, summary, trim
 from dmrl.recording.blocks import blocks, in_file_order, tally
-from dmrl.recording.container import INDEX
 from dmrl.recording.extras import copy_extras, splits
 from dmrl.recording.index import channel_on
 from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
-from dmrl.recording.message_index import as_pairs, index_entries
+from dmrl.recording.message_index import INDEX, index_entries
 from dmrl.recording.times import log_times
 
 from .records import records
@@ -185,16 +184,19 @@ def test_messages_of_a_stretch_come_in_blocks_of_it(tmp_path: Path) -> None:
 def test_an_index_is_of_its_channel_and_whole() -> None:
     pairs = np.array([[5, 0], [7, 40]], "<i8").tobytes()
     raw = b"xy" + INDEX.pack(7, 6 + len(pairs), 3, len(pairs)) + pairs
-    assert as_pairs(index_entries(Path("a"), raw, 2, 3)).tolist() == [[5, 0], [7, 40]]
+    found = index_entries(Path("a"), raw, {3: 2})
+    assert [column.tolist() for column in found] == [[3, 3], [5, 7], [0, 40], [2]]
     for wrong, at, number in (
         (raw, 2, 4),
+        (raw, 3, 3),
+        (raw, -len(raw) + 2, 3),
         (raw[:-1], 2, 3),
         (b"xy" + INDEX.pack(8, 6 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
         (b"xy" + INDEX.pack(7, 7 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
         (b"xy" + INDEX.pack(7, 6 + 15, 3, 15) + pairs, 2, 3),
     ):
-        with pytest.raises(RecordingError, match=f"message index of channel {number}"):
-            index_entries(Path("a"), wrong, at, number)
+        with pytest.raises(RecordingError, match="message index"):
+            index_entries(Path("a"), wrong, {number: at})
 
 
 @pytest.mark.parametrize("times", [[], [0], [5, 3, 9]])

@@ -1,5 +1,6 @@
 """Chunks that are filled: one message at a time, or many, they hold the same."""
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import scanned
 from dmrl.recording.container import laid_out
 from dmrl.recording.defined import Defined, _free
+from dmrl.recording.message_index import index_entries
 from dmrl.recording.open_chunk import OpenChunk
 
 Row = tuple[int, int, int, bytes]
@@ -78,9 +80,12 @@ def test_a_packed_chunk_says_where_its_messages_are_and_is_empty_then() -> None:
     chunk.age = 3
     packed = chunk.packed()
     assert zstandard.ZstdDecompressor().decompress(packed.data) == data
-    assert (packed.size, packed.at.tolist()) == (len(data), starts)
-    assert packed.channel.tolist() == [row[0] for row in ROWS]
-    assert packed.time_ns.tolist() == [row[1] for row in ROWS]
+    times = [row[1] for row in ROWS]
+    assert (packed.size, packed.first_ns, packed.last_ns) == (len(data), min(times), max(times))
+    found = index_entries(Path("a"), packed.index.records, packed.index.places)
+    told = zip(found.at.tolist(), found.channel.tolist(), found.time_ns.tolist(), strict=True)
+    assert sorted(told) == [(k, row[0], row[1]) for k, row in zip(starts, ROWS, strict=True)]
+    assert packed.index.counts == Counter(row[0] for row in ROWS)
     assert (len(chunk.data), len(chunk.starts), chunk.age) == (0, 0, 0)
 
 
@@ -133,6 +138,13 @@ def definitions(defined: Defined, one: Channel) -> list[McapChannel | Schema]:
     return list(scanned(np.frombuffer(begun, np.uint8)).definitions())
 
 
+def summarised(defined: Defined) -> tuple[list[int], list[int]]:
+    """Numbers of the schemas and channels that the summary repeats."""
+    records = [np.frombuffer(b"".join(kind), np.uint8) for kind in defined.all_begun()]
+    schemas, channels = ([one.id for one in scanned(r).definitions()] for r in records)
+    return schemas, channels
+
+
 def test_channels_are_numbered_once_and_defined_once() -> None:
     defined = Defined()
     assert [defined.number(channel(t)) for t in ("/a", "/b", "/a")] == [1, 2, 1]
@@ -149,8 +161,7 @@ def test_channels_are_numbered_once_and_defined_once() -> None:
     assert [(type(one), one.schema_id) for one in nameless if isinstance(one, McapChannel)] == [
         (McapChannel, 0)
     ]
-    schemas, channels = defined.all_begun()
-    assert ([s.id for s in schemas], [c.id for c in channels]) == ([1], [1, 2, 3])
+    assert summarised(defined) == ([1], [1, 2, 3])
 
 
 def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> None:
@@ -175,7 +186,7 @@ def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> N
 
     defined, stands = begun(schema, records[4], 4, records[6], 6, 4)
     assert stands and defined.begun == {4, 6}
-    assert [[one.id for one in kind] for kind in defined.all_begun()] == [[9], [4, 6]]
+    assert summarised(defined) == ([9], [4, 6])
     assert defined.begin(4) == defined.begin(6) == b""
     assert defined.begin_in(chunk(6, 4), mine)  # known by now
     for parts in (

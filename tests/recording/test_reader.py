@@ -12,9 +12,9 @@ from dmrl.messages import message, schema_bytes
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
-    blocks,
     columns,
     glance,
+    listed,
     log_times,
     open_chunk,
     read,
@@ -289,9 +289,9 @@ def test_a_glance_sees_every_topic_all_over_the_recording_in_a_few_chunks(
             sink.write_raw(raw)
         # One message, in the middle of the file though not of the time.
         sink.write(39_000_000_000, "/cf2/height", HEIGHT(height_m=2.0))
-    unpacked, chunks = blocks.unpacked, set()
+    unpacked, chunks = listed.unpacked, set()
     monkeypatch.setattr(
-        blocks, "unpacked", lambda path, chunk, at: chunks.add(at) or unpacked(path, chunk, at)
+        listed, "unpacked", lambda path, chunk, at: chunks.add(at) or unpacked(path, chunk, at)
     )
     wanted = {"/cf1/attitude": ("roll_rad",), "/cf1/range/cf2": None, "/cf2/height": None}
     seen = glance(path, {**wanted, "/cf9/height": None}, start_ns=0, end_ns=10**12)

@@ -16,7 +16,7 @@ from dmrl.messages import message
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
-    blocks,
+    listed,
     read,
     read_raw,
     read_table,
@@ -171,9 +171,9 @@ def test_pictures_stand_apart_and_numbers_are_read_without_them(
 ) -> None:
     path = filmed(tmp_path / "a.mcap")
     read_bytes: list[int] = []
-    unpacked = blocks.unpacked
+    unpacked = listed.unpacked
     monkeypatch.setattr(
-        blocks,
+        listed,
         "unpacked",
         lambda *a: read_bytes.append(len(found := unpacked(*a))) or found,
     )

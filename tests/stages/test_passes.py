@@ -12,8 +12,8 @@ from dmrl import card, topics
 from dmrl.messages import message
 from dmrl.recording import (
     RecordingWriter,
-    blocks,
     check,
+    listed,
     merge,
     open_chunk,
     provenance,
@@ -64,13 +64,13 @@ def _chunks(path: Path) -> int:
 def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
     """How often a recording was gone over since the last call."""
     opened: Counter[str] = Counter()
-    unpacked = blocks.unpacked
+    unpacked = listed.unpacked
 
     def counted(path: Path, *rest: object) -> object:
         opened[path.name] += 1
         return unpacked(path, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(blocks, "unpacked", counted)
+    monkeypatch.setattr(listed, "unpacked", counted)
     monkeypatch.setattr(card, "plots", None)
 
     def count(path: Path) -> float:

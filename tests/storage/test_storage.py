@@ -17,8 +17,8 @@ from dmrl.messages import message
 from dmrl.output import partial_file, partial_folder, rewritten_file
 from dmrl.pipeline.folders import recordings_in, tasks_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
-from dmrl.recording.blocks import place_of
 from dmrl.recording.inputs import input_of, sha256_of_file
+from dmrl.recording.listed import place_of
 from dmrl.recording.opening import opened
 from dmrl.recording.section import section
 from dmrl.storage import Remote, path_of

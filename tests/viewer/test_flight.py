@@ -10,7 +10,7 @@ import pytest
 
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
-from dmrl.recording import blocks, glance, open_chunk, reader
+from dmrl.recording import glance, listed, open_chunk, reader
 from dmrl.viewer import Settings, save, scene
 from dmrl.viewer.session import prepare
 
@@ -222,9 +222,9 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
     monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
     monkeypatch.setattr(sys.modules[glance.__module__], "CHUNKS", 2)
     opened: list[int] = []
-    unpacked = blocks.unpacked
+    unpacked = listed.unpacked
     monkeypatch.setattr(
-        blocks, "unpacked", lambda path, chunk, at: opened.append(at) or unpacked(path, chunk, at)
+        listed, "unpacked", lambda path, chunk, at: opened.append(at) or unpacked(path, chunk, at)
     )
     show = prepare([fly()], Settings())
     paths, before = [], None
