@@ -3,10 +3,14 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+
 from dmrl.messages import message
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
+    read_raw,
 )
 
 TOPICS = ("/cf1/height", "/cf1/range/cf2")
@@ -33,3 +37,37 @@ def records(data: bytes) -> Iterator[tuple[int, int, int]]:
         end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
         yield data[at], at, end
         at = end
+
+
+def chunks(path: Path) -> list[ChunkIndex]:
+    """What the summary says of each chunk."""
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    return found.chunk_indexes
+
+
+def packed(path: Path) -> list[bytes]:
+    """The records of all chunks, without their message indexes."""
+    data = path.read_bytes()
+    found = sorted(chunks(path), key=lambda c: c.chunk_start_offset)
+    return [data[c.chunk_start_offset : c.chunk_start_offset + c.chunk_length] for c in found]
+
+
+def unchanged(before: Path, after: Path, topics: list[str]) -> None:
+    """Messages of these topics are the same, by dmrl's reader and by mcap's."""
+    for topic in topics:
+        assert list(read_raw(after, topic)) == list(read_raw(before, topic))
+    with after.open("rb") as stream:
+        theirs = make_reader(stream, validate_crcs=True).iter_messages(topics)
+        got = [(c.topic, m.log_time, m.publish_time, m.data) for _, c, m in theirs]
+    ours = [(r.topic, r.time_ns, r.publish_ns, r.data) for r in read_raw(before, *topics)]
+    assert sorted(got) == sorted(ours)
+
+
+def channels(path: Path) -> dict[int, str]:
+    """Topic of each channel number that the summary lists."""
+    with path.open("rb") as stream:
+        found = make_reader(stream).get_summary()
+    assert found is not None
+    return {number: channel.topic for number, channel in found.channels.items()}

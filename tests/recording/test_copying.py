@@ -1,17 +1,12 @@
 """Copies by the chunk: what goes over as it is, what as slices, and what is refused."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.records import ChunkIndex, MessageIndex
-from mcap.writer import ChunkBuilder, CompressionType, Writer
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
@@ -24,6 +19,8 @@ from dmrl.recording import (
     summary,
     trim,
 )
+
+from .records import channels, chunks, packed, unchanged
 
 MADE = Provenance("test")
 MOMENTS = 6000
@@ -46,31 +43,6 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 sink.write(k, "/cf1/camera/image", picture)
         sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
     return path
-
-
-def chunks(path: Path) -> list[ChunkIndex]:
-    with path.open("rb") as stream:
-        found = make_reader(stream).get_summary()
-    assert found is not None
-    return found.chunk_indexes
-
-
-def packed(path: Path) -> list[bytes]:
-    """The records of all chunks, without their message indexes."""
-    data = path.read_bytes()
-    found = sorted(chunks(path), key=lambda c: c.chunk_start_offset)
-    return [data[c.chunk_start_offset : c.chunk_start_offset + c.chunk_length] for c in found]
-
-
-def unchanged(before: Path, after: Path, topics: list[str]) -> None:
-    """Messages of these topics are the same, by dmrl's reader and by mcap's."""
-    for topic in topics:
-        assert list(read_raw(after, topic)) == list(read_raw(before, topic))
-    with after.open("rb") as stream:
-        theirs = make_reader(stream, validate_crcs=True).iter_messages(topics)
-        got = [(c.topic, m.log_time, m.publish_time, m.data) for _, c, m in theirs]
-    ours = [(r.topic, r.time_ns, r.publish_ns, r.data) for r in read_raw(before, *topics)]
-    assert sorted(got) == sorted(ours)
 
 
 @pytest.mark.heavy
@@ -171,12 +143,12 @@ def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Pa
         with RecordingWriter(path, MADE) as sink:
             for k in range(12_000):
                 sink.write(k, f"/{robot}/height", message("Height")(height_m=rng.normal()))
-    assert {*_channels(paths[0])} == {*_channels(paths[1])}
+    assert {*channels(paths[0])} == {*channels(paths[1])}
     out = tmp_path / "out.mcap"
     assert merge(paths, out) == 24_000
     for path, topic in zip(paths, ("/cf1/height", "/cf2/height"), strict=True):
         unchanged(path, out, [topic])
-    assert len(_channels(out)) == 2
+    assert len(channels(out)) == 2
 
 
 def test_an_index_that_gives_a_message_to_another_channel_is_damage(
@@ -192,35 +164,6 @@ def test_an_index_that_gives_a_message_to_another_channel_is_damage(
         rewrite(bad, tmp_path / "out.mcap", MADE, without=())
 
 
-def test_an_empty_index_of_another_writer_does_not_go_along(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Some list every channel with every chunk, with messages there or without."""
-    end = ChunkBuilder.end
-
-    def listing_all(chunk: ChunkBuilder) -> bytes:
-        for number in (1, 2):
-            chunk.message_indices.setdefault(number, MessageIndex(number, []))
-        return end(chunk)
-
-    monkeypatch.setattr(ChunkBuilder, "end", listing_all)
-
-    def fill(writer: Writer, schema: int) -> None:
-        for topic in ("/cf1/height", "/cf2/height"):
-            writer.register_channel(topic, "protobuf", schema)
-        for k in range(20_000):
-            data = message("Height")(height_m=k).SerializeToString()
-            writer.add_message(1 + (k < 10_000), k, data, k)
-
-    path = foreign(tmp_path / "a.mcap", fill, chunk_size=100_000)
-    out = tmp_path / "out.mcap"
-    rewrite(path, out, MADE, without=())
-    unchanged(path, out, ["/cf1/height", "/cf2/height"])
-    assert {*chunks(path)[0].message_index_offsets} == {1, 2}
-    assert {*chunks(out)[0].message_index_offsets} == {2}
-    assert packed(out)[0] == packed(path)[0]
-
-
 def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path) -> None:
     cut, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
     last = max(c.chunk_start_offset for c in chunks(flight))
@@ -228,71 +171,6 @@ def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path)
     result = recover(cut, out)
     assert result.messages == summary(out).count > MOMENTS
     assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 3
-
-
-def foreign(path: Path, fill: Callable[[Writer, int], None], **options: Any) -> Path:
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)
-        writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
-        fill(writer, schema)
-        writer.finish()
-    return path
-
-
-@pytest.mark.heavy
-@pytest.mark.parametrize("compression", list(CompressionType))
-def test_chunks_of_other_writers_are_copied_in_their_compression(
-    tmp_path: Path, compression: CompressionType
-) -> None:
-    rng = np.random.default_rng(0)
-
-    def fill(writer: Writer, schema: int) -> None:
-        image = schema_bytes("CompressedImage")
-        pictures = writer.register_channel(
-            "/cam",
-            "protobuf",
-            writer.register_schema("foxglove.CompressedImage", "protobuf", image),
-        )
-        heights = writer.register_channel("/cf1/height", "protobuf", schema)
-        for k in range(16_000):
-            writer.add_message(heights, k, message("Height")(height_m=k).SerializeToString(), k)
-        for k in range(40):  # a chunk of both, then of pictures alone
-            data = message("CompressedImage")(data=rng.bytes(20_000)).SerializeToString()
-            writer.add_message(pictures, k, data, k)
-
-    path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=200_000)
-    out = tmp_path / "out.mcap"
-    rewrite(path, out, MADE, without=(), fresh=())
-    unchanged(path, out, ["/cf1/height", "/cam"])
-    assert len(set(packed(path)) & set(packed(out))) >= 6
-    numbers = {n for n, c in _channels(out).items() if c != "/cam"}
-    assert all(len({n in numbers for n in c.message_index_offsets}) == 1 for c in chunks(out))
-
-
-def _channels(path: Path) -> dict[int, str]:
-    with path.open("rb") as stream:
-        found = make_reader(stream).get_summary()
-    assert found is not None
-    return {number: channel.topic for number, channel in found.channels.items()}
-
-
-def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) -> None:
-    def fill(writer: Writer, schema: int) -> None:
-        channel = writer.register_channel("/cf1/height", "protobuf", schema)
-        for k in range(5_000):
-            writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
-
-    path = foreign(tmp_path / "a.mcap", fill, compression=CompressionType.NONE)
-    data = bytearray(path.read_bytes())
-    at = data.index(b"/cf1/height")
-    data[at : at + 11] = b"/cf9/height"  # the summary, which has a CRC and counts, says otherwise
-    crc = chunks(path)[0].chunk_start_offset + 9 + 24
-    data[crc : crc + 4] = bytes(4)
-    path.write_bytes(data)
-    with pytest.raises(RecordingError, match="/cf9/height is not what its summary repeats of it"):
-        rewrite(path, tmp_path / "out.mcap", MADE, without=(), fresh=())
-    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_what_is_copied_is_checked(flight: Path, tmp_path: Path) -> None:
@@ -319,40 +197,3 @@ def test_small_chunks_of_a_live_recording_are_put_together(tmp_path: Path) -> No
     rewrite(path, out, MADE, without=(), fresh=())
     assert len(chunks(out)) == 1
     unchanged(path, out, ["/cf1/height"])
-
-
-def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
-    def fill(writer: Writer, schema: int) -> None:
-        channel = writer.register_channel("/cf1/height", "protobuf", schema)
-        for k in range(300):
-            writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
-
-    path = foreign(tmp_path / "a.mcap", fill, use_chunking=False)
-    out = tmp_path / "out.mcap"
-    rewrite(path, out, MADE, without=(), fresh=())
-    assert list(read_raw(out)) == list(read_raw(path))
-
-
-def test_a_calibration_at_time_0_in_a_chunk_of_its_own_goes_along(tmp_path: Path) -> None:
-    def fill(writer: Writer, schema: int) -> None:
-        told = message("CameraCalibration")(width=320, distortion_model="x" * 500)
-        camera = writer.register_channel(
-            "/cf1/camera/calibration",
-            "protobuf",
-            writer.register_schema(
-                "foxglove.CameraCalibration", "protobuf", schema_bytes("CameraCalibration")
-            ),
-        )
-        writer.add_message(camera, 0, told.SerializeToString(), 0)
-        height = writer.register_channel("/cf1/height", "protobuf", schema)
-        for k in range(60):
-            writer.add_message(height, k, message("Height")(height_m=k).SerializeToString(), k)
-
-    path = foreign(tmp_path / "a.mcap", fill, chunk_size=400)
-    assert chunks(path)[0].message_end_time == 0
-    out = tmp_path / "out.mcap"
-    assert trim(path, out, start_ns=50, end_ns=55) == 5  # beside the calibration
-    assert [(r.topic, r.time_ns) for r in read_raw(out)] == [
-        ("/cf1/camera/calibration", 50),
-        *(("/cf1/height", k) for k in range(50, 55)),
-    ]
