@@ -2,7 +2,8 @@
 
 Run as ``python benchmarks/bench_commands.py [--rounds 3] [--json FILE]``. CPU seconds of a process
 for ``dmrl --help`` and the help of every command, beside Python that imports cyclopts alone; then
-CPU milliseconds of a sketch of three robots, 320 x 224, without its PNG. Medians over rounds.
+CPU milliseconds of a sketch, 320 x 224: of three robots, and of one at most with its JPEG, as
+``dmrl fly --camera`` makes them. Medians over rounds.
 """
 
 import argparse
@@ -23,8 +24,10 @@ import numpy as np
 
 from dmrl.cli import COMMANDS
 from dmrl.geometry.frames import AIDECK
+from dmrl.images.codec import encode_jpeg
 from dmrl.rendering.scene import random_look, random_poses
 from dmrl.rendering.sketch import draw
+from dmrl.stages import sketch
 
 SKETCHES = 40
 
@@ -47,6 +50,15 @@ def sketch_ms(seed: int) -> float:
     return (time.process_time() - begun) / SKETCHES * 1e3
 
 
+def with_jpeg_ms(seed: int) -> float:
+    """CPU milliseconds of a sketch of one robot or none, and its JPEG."""
+    settings = sketch.Settings(seed=seed, robots_max=1)
+    begun = time.process_time()
+    for k in range(SKETCHES):
+        encode_jpeg(sketch.sketch(settings, k).rgb)
+    return (time.process_time() - begun) / SKETCHES * 1e3
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -63,7 +75,9 @@ def main() -> None:
         cpu_s(words)
     rounds = range(arguments.rounds)
     found = {name: median(cpu_s(words) for _ in rounds) for name, words in work.items()}
+    sketch_ms(0), with_jpeg_ms(0)  # tables are made
     found["sketch, ms"] = median(sketch_ms(seed) for seed in rounds)
+    found["sketch of one and JPEG, ms"] = median(with_jpeg_ms(seed) for seed in rounds)
     print(f"{platform.platform()}, Python {platform.python_version()}")
     for name, value in found.items():
         print(f"{name:28} {value:8.3f}")

@@ -5,8 +5,9 @@ Every figure is a function of a weight per image, so that one piece of code give
 95 % percentile intervals over images. Definitions of the figures: ``DEFINITIONS``.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from dmrl.learn.matching import Array, Errors, Index, Points, errors, hits
 
 BANDS_M = ((0.0, np.inf), (0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 2.0), (2.0, np.inf))
 """Ranges of the label's depth, metres, lower end included; the first is all of them."""
+
+Band = tuple[float, float]
+Across = Callable[[Callable[[Band], "BandFigures"], Sequence[Band]], Iterable["BandFigures"]]
 
 SCORE_RADIUS_PX = 16.0
 
@@ -108,7 +112,7 @@ def score(images: int, labels: Points, detections: Points) -> Scored:
 
 
 def by_band(
-    scored: Scored, *, threshold: float, draws: int = 1000, seed: int = 0
+    scored: Scored, *, threshold: float, draws: int = 1000, seed: int = 0, across: Across = map
 ) -> list[BandFigures]:
     """Figures over all distances, then for each band of ``BANDS_M``.
 
@@ -122,13 +126,14 @@ def by_band(
         Bootstrap samples.
     seed
         Of the bootstrap.
+    across
+        What does a thing for every band, in their order: processes, perhaps.
     """
-    return [_band(scored, band, threshold, draws, seed) for band in BANDS_M]
+    one = partial(_band, scored=scored, threshold=threshold, draws=draws, seed=seed)
+    return list(across(one, BANDS_M))
 
 
-def _band(
-    scored: Scored, band: tuple[float, float], threshold: float, draws: int, seed: int
-) -> BandFigures:
+def _band(band: Band, scored: Scored, threshold: float, draws: int, seed: int) -> BandFigures:
     inside = _in_band(scored.labels.depth_m, band)
     value = figures(scored, band, threshold, np.ones((1, scored.images)))
     blocks = [
@@ -218,9 +223,7 @@ def resamples(scored: Scored, draws: int, seed: int) -> Iterator[Array]:
         yield counts.reshape(rows, scored.images).astype(np.float64)
 
 
-def figures(
-    scored: Scored, band: tuple[float, float], threshold: float, weights: Array
-) -> dict[str, Array]:
+def figures(scored: Scored, band: Band, threshold: float, weights: Array) -> dict[str, Array]:
     """Every figure for (b, images) weights: name to (b,) values."""
     inside = _in_band(scored.labels.depth_m, band)
     out = _error_figures(scored, inside, weights[:, scored.labels.image[inside]])
@@ -319,7 +322,7 @@ def average_precision(
 
 
 def _judged(
-    scored: Scored, taken: Index, band: tuple[float, float], inside: NDArray[np.bool_]
+    scored: Scored, taken: Index, band: Band, inside: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(D,) right and (D,) wrong detections of a band; the others are another band's."""
     free = taken < 0
@@ -328,5 +331,5 @@ def _judged(
     return right, free & _in_band(scored.detections.depth_m, band)
 
 
-def _in_band(depth_m: Array, band: tuple[float, float]) -> NDArray[np.bool_]:
+def _in_band(depth_m: Array, band: Band) -> NDArray[np.bool_]:
     return (band[0] <= depth_m) & (depth_m < band[1])

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal
@@ -19,10 +20,12 @@ from dmrl.evaluation.tables import by_band_table
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, curves, score
 from dmrl.learn.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.output import partial_folder, refuse_existing
+from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import all_recordings
 from dmrl.pipeline.once import done_on
+from dmrl.pipeline.spread import spread
 from dmrl.recording import input_of, summary
-from dmrl.terminal.arguments import AsJson, Flat, On
+from dmrl.terminal.arguments import AsJson, Flat, On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -37,6 +40,8 @@ KINDS = {"positions": positions, "tracks": tracks}
 """What can be judged by true positions; both modules offer the same functions."""
 SETTLE_S, SHORT_S = 20.0, 30.0
 """Time to settle; of what is shorter than this, the first half is."""
+WORTH_DRAWING = 2_000_000
+"""Images times draws from which processes gain more than they take to begin."""
 FALLBACK_THRESHOLD = 0.33  # the published evaluation's, for detectors that name none
 Finite = Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))]
 
@@ -105,7 +110,9 @@ class Evaluation:
     threshold: float
 
 
-def run(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Evaluation | Document:
+def run(
+    recordings: Sequence[Path], out: Path | None, settings: Settings, *, workers: int = 1
+) -> Evaluation | Document:
     """Judge detections together, or one recording's positions or tracks: then as JSON values.
 
     Parameters
@@ -117,6 +124,8 @@ def run(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Eva
         None: nothing is written.
     settings
         See `Settings`.
+    workers
+        Processes that draw the intervals, at most; changes no byte.
 
     Raises
     ------
@@ -136,7 +145,7 @@ def run(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Eva
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
     what = settings.what if settings.what != "auto" else _what(recordings[0])
     if what == "detections":
-        return run_detections(recordings, out, settings)
+        return run_detections(recordings, out, settings, workers)
     if len(recordings) > 1:
         raise SettingError(
             f"{what} are judged one recording at a time. Name one, or give --what detections"
@@ -181,12 +190,22 @@ def _folder(out: Path, name: str, made: Document) -> Iterator[Path]:
         yield folder
 
 
-def run_detections(recordings: Sequence[Path], out: Path | None, settings: Settings) -> Evaluation:
+def run_detections(
+    recordings: Sequence[Path], out: Path | None, settings: Settings, workers: int = 1
+) -> Evaluation:
     """Judge the detections of all recordings, image by image; see `run`."""
     pairs = join(recordings, settings.against, settings.split, partial=settings.partial)
     scored = score(pairs.images, pairs.labels, pairs.detections)
     threshold = _threshold(scored, pairs, settings)
-    bands = by_band(scored, threshold=threshold, draws=settings.draws, seed=settings.seed)
+    if pairs.images * settings.draws < WORTH_DRAWING:
+        workers = 1
+    bands = by_band(
+        scored,
+        threshold=threshold,
+        draws=settings.draws,
+        seed=settings.seed,
+        across=partial(spread, workers=workers),
+    )
     evaluation = Evaluation(pairs, scored, bands, threshold)
     if out is not None:
         made = document(recordings, settings, evaluation)
@@ -317,6 +336,7 @@ def command(
     *,
     settings: Flat[Settings] = DEFAULTS,
     plots_to: Annotated[Path | None, Parameter(name="--plots")] = None,
+    workers: Workers = None,
     on: On = None,
     as_json: AsJson = False,
 ) -> None:
@@ -330,6 +350,9 @@ def command(
     plots_to
         Folder to write plots to, and evaluation.json, positions.json or tracks.json. Must not
         exist.
+    workers
+        Processes that draw the intervals, at most. Without it, as many as there are cores.
+        Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
@@ -338,7 +361,7 @@ def command(
         done_on(on, "evaluate", plots_to, {"recordings": recordings}, settings)
         print_line(f"{plots_to}: figures and their document")
         return
-    evaluation = run(recordings, plots_to, settings)
+    evaluation = run(recordings, plots_to, settings, workers=workers or cores())
     if isinstance(evaluation, dict):
         if as_json:
             print_json(evaluation)

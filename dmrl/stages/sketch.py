@@ -5,6 +5,8 @@ So a demonstration takes the same road as anyone's own pictures.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -19,12 +21,17 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 from dmrl.images.codec import encode_png
 from dmrl.output import partial_folder
+from dmrl.pipeline.crew import cores
+from dmrl.pipeline.spread import spread
 from dmrl.recording import provenance
 from dmrl.rendering.scene import random_look, random_poses
 from dmrl.rendering.sketch import Sketch, draw
-from dmrl.terminal.arguments import AsJson, Flat, Seed, Share
+from dmrl.terminal.arguments import AsJson, Flat, Seed, Share, Workers
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
+
+AT_ONCE = 100
+"""Pictures that are given to a process: it takes as long to begin as to draw them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +59,7 @@ class Settings:
     test_share: Share = 0.2
 
 
-def run(out: Path, settings: Settings) -> dict[str, int]:
+def run(out: Path, settings: Settings, *, workers: int = 1) -> dict[str, int]:
     """Counts of pictures and robots drawn into the folder ``out``.
 
     Parameters
@@ -61,6 +68,8 @@ def run(out: Path, settings: Settings) -> dict[str, int]:
         Folder to write. Must not exist.
     settings
         See `Settings`.
+    workers
+        Processes that draw, at most; changes no byte.
 
     Raises
     ------
@@ -71,19 +80,30 @@ def run(out: Path, settings: Settings) -> dict[str, int]:
     """
     _check(settings)
     rows: list[LabelRow] = []
-    with partial_folder(out) as partial:
-        for index in track(range(settings.images), "Drawing"):
-            name = f"{index:06d}.png"
-            picture = sketch(settings, index)
-            (partial / name).write_bytes(encode_png(picture.rgb))
-            rows += _rows(name, picture, _split(settings, index))
-        with (partial / LABELS).open("w", newline="", encoding="utf-8") as stream:
+    numbers = range(settings.images)
+    parts = [numbers[k : k + AT_ONCE] for k in range(0, len(numbers), AT_ONCE)]
+    drawn = chain.from_iterable(spread(partial(_drawn, settings=settings), parts, workers))
+    with partial_folder(out) as folder:
+        for name, png, labels in track(drawn, "Drawing", settings.images):
+            (folder / name).write_bytes(png)
+            rows += labels
+        with (folder / LABELS).open("w", newline="", encoding="utf-8") as stream:
             write_labels(stream, rows)
-        (partial / CALIBRATION).write_text(write_camera(AIDECK_PINHOLE), encoding="utf-8")
+        (folder / CALIBRATION).write_text(write_camera(AIDECK_PINHOLE), encoding="utf-8")
         made = provenance("sketch", settings, seed=settings.seed, libraries=("numpy", "pillow"))
-        made.write(partial)
+        made.write(folder)
     empty = sum(not row.peer for row in rows)
     return {"images": settings.images, "robots": len(rows) - empty, "empty images": empty}
+
+
+def _drawn(indices: range, settings: Settings) -> list[tuple[str, bytes, list[LabelRow]]]:
+    """Of each picture: the name of its file, its PNG, its labels."""
+    made = []
+    for index in indices:
+        name, picture = f"{index:06d}.png", sketch(settings, index)
+        labels = list(_rows(name, picture, _split(settings, index)))
+        made.append((name, encode_png(picture.rgb), labels))
+    return made
 
 
 def sketch(settings: Settings, index: int, camera: Camera = AIDECK_PINHOLE) -> Sketch:
@@ -148,6 +168,7 @@ def command(
     /,
     *,
     settings: Flat[Settings] = DEFAULTS,
+    workers: Workers = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw a folder of pictures of small drones, with exact labels.
@@ -156,10 +177,12 @@ def command(
     ----------
     out
         Folder to write. Must not exist.
+    workers
+        Processes that draw, at most. Without it, as many as there are cores. Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
-    counts = run(out, settings)
+    counts = run(out, settings, workers=workers or cores())
     if as_json:
         print_json({"folder": str(out), **counts})
         return

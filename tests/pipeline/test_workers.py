@@ -1,0 +1,82 @@
+"""Every command with --workers writes and says the same with any number of them."""
+
+import inspect
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from dmrl.cli import COMMANDS, app
+from dmrl.stages import evaluate, fly, predict
+
+FLIGHT = fly.Settings(2, 24.0, camera=True, cameras_max=1, camera_rate_hz=1.0)
+CALLS: Mapping[str, tuple[str, ...]] = {
+    "align": ("flights", "out"),
+    "check": ("flights",),
+    "convert": ("flights", "out", "--to", "csv"),
+    "dataset": ("flights/a.mcap", "flights/b.mcap", "out"),
+    "evaluate": ("found/a.mcap", "--plots", "out"),
+    "index": ("flights",),
+    "label": ("flights", "out", "--method", "smoother"),
+    "predict": ("dmrl-nano", "flights", "out"),
+    "recover": ("flights", "out"),
+    "sketch": ("out", "--images", "250", "--seed", "4"),  # parts of a hundred
+    "track": ("found", "out"),
+    "trim": ("flights", "out", "--from", "2"),
+}
+ELSEWHERE = {"run": "tests/pipeline/test_pipeline.py", "render": "tests/stages/test_render.py"}
+"""Which tests do the same for a recipe, and for Blender."""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two flights, and what a network found in them."""
+    folder = tmp_path_factory.mktemp("place")
+    (folder / "flights").mkdir()
+    (folder / "found").mkdir()
+    for seed, name in enumerate(("a.mcap", "b.mcap")):
+        flown = folder / "flights" / name
+        fly.run(flown, replace(FLIGHT, seed=seed))
+        predict.run(Path("dmrl-nano"), flown, folder / "found" / name, predict.Settings())
+    return folder
+
+
+@pytest.mark.heavy
+def test_every_command_with_workers_is_tried() -> None:
+    modules = {name: import_module(f"dmrl.stages.{name.replace('-', '_')}") for name in COMMANDS}
+    asking = {
+        name
+        for name, module in modules.items()
+        if "workers" in inspect.getfullargspec(module.command)[4]
+    }
+    assert asking == set(CALLS) | set(ELSEWHERE)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("command", CALLS)
+def test_any_number_of_workers_writes_the_same_bytes(
+    command: str,
+    place: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(evaluate, "WORTH_DRAWING", 0)  # even for so few images
+    found = []
+    numbers = ("1", "2")
+    for workers in numbers:  # links, all before the first run: `index` lists when a file changed
+        shutil.copytree(place, tmp_path / workers, copy_function=os.link)
+    for workers in numbers:
+        folder = tmp_path / workers
+        monkeypatch.chdir(folder)
+        words = [command, *CALLS[command], "--workers", workers]
+        app(words, exit_on_error=False, result_action="return_value")
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        made = {str(path.relative_to(folder)): path.read_bytes() for path in files}
+        found.append((made, capfd.readouterr().out))
+    assert len(found[0][0]) > 4 or command == "check"
+    assert found[0] == found[1]
