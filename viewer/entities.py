@@ -167,25 +167,26 @@ def grids(
     stride_px = batch["stride_px"][0].as_py() or STRIDE_PX
     # A topic's channels do not change from message to message.
     names = batch["channels"][0].as_py()
-    for index, channel in enumerate(names):
-        if channel in scales:
-            grids = batch["data"].to_pylist()
-            buffers = [_share(data, index, len(names)) for data in grids]
-            if channel == "depth_m" and "confidence" in names:
-                at = names.index("confidence")
-                beliefs = (_share(data, at, len(names)) for data in grids)
-                buffers = [_dimmed(*two) for two in zip(buffers, beliefs, strict=True)]
-            columns = rr.DepthImage.columns(buffer=buffers, format=formats)
-            yield map_entity(
-                channel_path(path, channel),
-                frame,
-                scales[channel],
-                columns,
-                stride_px=stride_px,
-                smooth=smooth,
-            )
-            if channel == "confidence":
-                yield _best_cells(f"{path}/best", frame, buffers, formats, stride_px)
+    data = batch["data"].to_pylist()
+
+    def buffers_of(channel: str) -> list[bytes]:
+        return [_share(one, names.index(channel), len(names)) for one in data]
+
+    for channel in filter(scales.__contains__, names):
+        buffers = buffers_of(channel)
+        if channel == "depth_m" and "confidence" in names:
+            beliefs = buffers_of("confidence")
+            buffers = [_dimmed(*two) for two in zip(buffers, beliefs, strict=True)]
+        yield map_entity(
+            channel_path(path, channel),
+            frame,
+            scales[channel],
+            rr.DepthImage.columns(buffer=buffers, format=formats),
+            stride_px=stride_px,
+            smooth=smooth,
+        )
+        if channel == "confidence":
+            yield _best_cells(f"{path}/best", frame, buffers, formats, stride_px)
 
 
 def map_entity(

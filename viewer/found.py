@@ -95,22 +95,31 @@ def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Fou
     RecordingError
         If a recording has no detections, or none of these images.
     """
-    parts, keys, where = [], [], []
+    sources = {source for source, _, _ in wanted}
+    parts: list[pa.RecordBatch] = []
+    where: list[tuple[Path, str, int]] = []  # of each row of the parts
+    at: dict[Key, int] = {}
     for path in recordings:
-        names, robots = _related(path, folder, {source for source, _, _ in wanted})
-        own = {topics.detections(robot): robot for robot in robots}
-        for stretch in stretches(path, dict.fromkeys(own)):
-            for topic, batch in stretch.items():
-                parts.append(batch)
-                times = batch["log_time"].to_pylist()
-                keys += [(names, own[topic], time_ns) for time_ns in times]
-                where += [(path, own[topic], time_ns) for time_ns in times]
-    at = {(name, robot, t): k for k, (names, robot, t) in enumerate(keys) for name in names}
+        names, robots = _related(path, folder, sources)
+        for robot, batch in _detected(path, robots):
+            for time_ns in batch["log_time"].to_pylist():
+                # A row of the dataset names the recording that it is from: this, or one before it.
+                at |= {(name, robot, time_ns): len(where) for name in names}
+                where.append((path, robot, time_ns))
+            parts.append(batch)
     place = np.array([at.get(key, -1) for key in wanted], np.int64)
     if not (place >= 0).any():
         raise RecordingError(f"no image of {folder} is in {recordings[0]}. Predict on its images")
     found = tuple(where[k] if k >= 0 else None for k in place.tolist())
     return Found(pa.Table.from_batches(parts), place, found)
+
+
+def _detected(path: Path, robots: Sequence[str]) -> Iterator[tuple[str, pa.RecordBatch]]:
+    """Robot and columns of what was detected, one stretch of time after another."""
+    own = {topics.detections(robot): robot for robot in robots}
+    for stretch in stretches(path, dict.fromkeys(own)):
+        for topic, batch in stretch.items():
+            yield own[topic], batch
 
 
 def _related(path: Path, folder: Path, sources: set[str]) -> tuple[set[str], list[str]]:

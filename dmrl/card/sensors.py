@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import islice
+from typing import Any
 
 from dmrl import topics
 from dmrl.recording import Contents
@@ -22,15 +23,20 @@ def cameras_of(held: Iterable[Contents]) -> dict[str, str]:
     found = {}
     for one in held:
         for topic in one.topics:
-            robot = topics.names(topics.CALIBRATION, topic)
-            if robot is not None:
-                for stamped in islice(one.messages(topic), 1):
-                    k, distortion = list(stamped.message.K), list(stamped.message.D)
-                    if len(k) != 9:
-                        continue
-                    size = f"{stamped.message.width} x {stamped.message.height} px"
-                    words = f"{size}, fx {k[0]:.2f}, fy {k[4]:.2f}, cx {k[2]:.2f}, cy {k[5]:.2f}"
-                    bent = ", ".join(f"{value:.4g}" for value in distortion)
-                    name = f"{one.path.name}: {robot['robot']}"
-                    found[name] = words + (f", distortion {bent}" if any(distortion) else "")
+            if (names := topics.names(topics.CALIBRATION, topic)) is None:
+                continue
+            for stamped in islice(one.messages(topic), 1):
+                if words := _camera(stamped.message):
+                    found[f"{one.path.name}: {names['robot']}"] = words
     return found
+
+
+def _camera(calibration: Any) -> str:
+    """Words for a CameraCalibration; empty where its K is no 3 x 3 matrix, row by row."""
+    if len(calibration.K) != 9:
+        return ""
+    fx, _, cx, _, fy, cy, *_ = calibration.K
+    size = f"{calibration.width} x {calibration.height} px"
+    words = f"{size}, fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f}, cy {cy:.2f}"
+    bent = ", ".join(f"{value:.4g}" for value in calibration.D)
+    return f"{words}, distortion {bent}" if any(calibration.D) else words

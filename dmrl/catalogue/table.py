@@ -190,6 +190,16 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
     return Catalogue(folder, table)
 
 
+def _lacks_inner(column: pa.Array) -> bool:
+    """Whether a list of the column lacks a value, or a field that each of its values has."""
+    if not pa.types.is_list(column.type):
+        return False
+    inner = column.flatten()
+    structs = pa.types.is_struct(inner.type)
+    fields = [f.name for f in inner.type if f.name not in PERHAPS] if structs else []
+    return bool(inner.null_count or any(inner.field(name).null_count for name in fields))
+
+
 def _refuse_odd(table: pa.Table) -> None:
     """Nothing, if what every row has is there, and names lead to files of the folder.
 
@@ -200,15 +210,9 @@ def _refuse_odd(table: pa.Table) -> None:
     """
     if not table.schema.equals(COLUMNS):
         return  # another version's
-    for name in (*ALWAYS, *table.column_names):
+    for name in table.column_names:
         column = table[name].combine_chunks()
-        parts = [column] if name in ALWAYS else []
-        if pa.types.is_list(column.type):
-            inner = column.flatten()
-            structs = pa.types.is_struct(inner.type)
-            fields = [f for f in inner.type if f.name not in PERHAPS] if structs else []
-            parts += [inner, *(inner.field(f.name) for f in fields)]
-        if any(part.null_count for part in parts):
+        if (name in ALWAYS and column.null_count) or _lacks_inner(column):
             raise ValueError(f"{name} lacks values")
     focal_px = table["cameras"].combine_chunks().flatten().field("focal_px")
     for name, numbers in (("duration_s", table["duration_s"]), ("focal_px", focal_px)):

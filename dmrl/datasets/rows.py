@@ -164,31 +164,25 @@ def rows_of(
         Images that are left out.
     """
     for image, labels, covered in labelled_images(held, masks=masks):
+        split = split_of(image.time_ns)
+        mine = [] if labels is None else [one for one in labels.peers if one.source == source]
         if flagged and (held.path.name, _robot(image), image.time_ns) in flagged:
             tally.flagged += 1
-            yield None
-            continue
-        if labels is None:
+        elif labels is None:
             tally.without_labels += 1
-            yield None
-            continue
-        split = split_of(image.time_ns)
-        mine = [label for label in labels.peers if label.source == source]
-        if split is None:
+        elif split is None:
             tally.in_no_split += 1
-            yield None
         elif source not in (looked_at(labels) or {source}):
             tally.of_other_sources += 1
-            yield None
         elif masks and covered is None and mine:
             tally.without_mask += 1
-            yield None
         elif not keep_all and any(label.status != STATUS_OK for label in mine):
             tally.not_ok += 1
-            yield None
         else:
             tally.kept += 1
             yield split, partial(_row, held.path, image, mine, covered, masks=masks)
+            continue
+        yield None
 
 
 def labelled_images(

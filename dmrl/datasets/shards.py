@@ -103,19 +103,27 @@ def _not_laid_out(table: pa.Table) -> str:
     rows, cols = grid.list_size, grid.value_type.list_size
     if not 0 < rows * cols <= limits.PIXELS // STRIDE_PX**2:
         return f"has grids of {cols} x {rows}"
-    size = (rows * STRIDE_PX, cols * STRIDE_PX)
-    for wanted in (
-        *layout.schema(*size, masks=layout.MASKS in names),
-        layout.schema(*size, png=True).field(layout.IMAGE),
-    ):
-        if wanted.name in names and table.schema.field(wanted.name).type != wanted.type:
-            return f"has a column {wanted.name} of another type"
-        if wanted.name in names and any(map(_has_nulls, table[wanted.name].chunks)):
-            return f"has a column {wanted.name} with values missing"
+    if wrong := _wrong_column(table, rows * STRIDE_PX, cols * STRIDE_PX):
+        return wrong
     if (pc.max(pc.utf8_length(table["source"])).as_py() or 0) > limits.NAME_CHARACTERS:
         return "has a source with a very long name"
     most = pc.max(pc.list_value_length(table["peers"])).as_py() or 0
     return f"has an image with {most} peers" if most > limits.PEERS else ""
+
+
+def _wrong_column(table: pa.Table, height_px: int, width_px: int) -> str:
+    """Which column is not as the layout has it for images of that size; empty: none."""
+    names = table.schema.names
+    known = layout.schema(height_px, width_px, masks=layout.MASKS in names)
+    packed = layout.schema(height_px, width_px, png=True).field(layout.IMAGE)
+    for wanted in (*known, packed):
+        if wanted.name not in names:
+            continue
+        if table.schema.field(wanted.name).type != wanted.type:
+            return f"has a column {wanted.name} of another type"
+        if any(map(_has_nulls, table[wanted.name].chunks)):
+            return f"has a column {wanted.name} with values missing"
+    return ""
 
 
 def _has_nulls(values: pa.Array) -> bool:

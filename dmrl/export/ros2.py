@@ -65,24 +65,22 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     found = summary(recording)
     types = _Types()
     counts = dict.fromkeys(found.topics, 0)
-    connections: dict[str, Any] = {}
+    connections: dict[str, Any] = {}  # by topic; a bag names a topic's type once, before its data
     with partial_folder(out) as folder:
         writer = Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
         with writer:
             for sample in track(read(recording), "Writing a bag", found.count):
                 kind, message = types.converted(sample)
-                if sample.topic not in connections:
-                    connections[sample.topic] = writer.add_connection(
-                        sample.topic, kind, typestore=types.store
-                    )
-                elif connections[sample.topic].msgtype != kind:
-                    raise RecordingError(
-                        f"{recording}: {sample.topic} mixes message types. Split it: dmrl trim "
-                        "--help"
-                    )
+                topic = sample.topic
+                if topic not in connections:
+                    opened = writer.add_connection(topic, kind, typestore=types.store)
+                    connections[topic] = opened
+                if connections[topic].msgtype != kind:
+                    mixed = f"{recording}: {topic} mixes message types"
+                    raise RecordingError(f"{mixed}. Split it: dmrl trim --help")
                 data = types.store.serialize_cdr(message, kind)
-                writer.write(connections[sample.topic], sample.time_ns, data)
-                counts[sample.topic] += 1
+                writer.write(connections[topic], sample.time_ns, data)
+                counts[topic] += 1
         for path in (folder / "bag").iterdir():
             path.rename(folder / path.name)
         (folder / "bag").rmdir()

@@ -234,22 +234,23 @@ def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sa
             yield line, bag_ns, reader.deserialize(data, connection.msgtype)
 
     for line, bag_ns, decoded in _guarded(source, messages):
-        where = Placed(
-            source,
-            line.robot,
-            line.peer,
-            bool(CAPTURE.search(line.topic)),
-            line.robot in moving,
-            fixed,
-        )
+        captured, odometry = bool(CAPTURE.search(line.topic)), line.robot in moving
+        where = Placed(source, line.robot, line.peer, captured, odometry, fixed)
+        # Where a header has no time, and where there is none, the bag's own is the best there is.
         time_ns = _stamp_ns(decoded)
         unstamped[line.topic] += time_ns == 0 < bag_ns
         for sample in _of(line, decoded, time_ns or max(bag_ns, 0), where):
-            if sample.message == "CameraCalibration":
-                if sample.topic in calibrated:
-                    continue
+            is_calibration = sample.message == "CameraCalibration"
+            # It comes with every image and is always the same: the first is enough.
+            if not (is_calibration and sample.topic in calibrated):
+                yield replace(sample, publish_ns=max(bag_ns, 0))
+            if is_calibration:
                 calibrated.add(sample.topic)
-            yield replace(sample, publish_ns=max(bag_ns, 0))
+    _say_what_is_odd(source, fixed, unstamped)
+
+
+def _say_what_is_odd(source: Path, fixed: set[str], unstamped: Mapping[str, int]) -> None:
+    """Lines on velocities that were left out, and on topics whose stamps are 0."""
     if fixed:
         say(
             f"{source}: left out: velocities of {', '.join(sorted(fixed))}, which are in a frame "

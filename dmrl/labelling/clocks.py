@@ -197,21 +197,14 @@ def _of_pose(time_s: Array, rows: Array) -> Signals:
 
 def _poses(held: Contents) -> dict[str, tuple[Array, Array]]:
     """Of each robot that motion capture sees: times, and (N, 7) poses."""
-    rows: dict[str, dict[int, list[float]]] = {}
-    true = {t: n["robot"] for t in held.topics if (n := topics.names(topics.TRUE_POSE, t))}
-    for topic, robot in true.items():
-        for stamped in held.messages(topic):
-            pose = stamped.message.pose
-            rows.setdefault(robot, {})[stamped.time_ns] = _row(pose.position, pose.orientation)
-    if topics.TRANSFORMS in held.topics:
-        for stamped in held.messages(topics.TRANSFORMS):
-            for frame in stamped.message.transforms:
-                robot, _, part = frame.child_frame_id.partition("/")
-                if part in ("", "horizontal") and robot not in true.values():
-                    row = _row(frame.translation, frame.rotation)
-                    rows.setdefault(robot, {})[stamped.time_ns] = row
+    true = {n["robot"]: t for t in held.topics if (n := topics.names(topics.TRUE_POSE, t))}
+    rows = {robot: _true_poses(held, topic) for robot, topic in true.items()}
+    # A topic of true poses counts before a frame, which may be another estimate.
+    rows |= {robot: by for robot, by in _frames(held).items() if robot not in true}
     found = {}
     for robot, by_time in rows.items():
+        if not by_time:
+            continue
         values = np.array(list(by_time.values()))
         good = np.isfinite(values).all(axis=1)
         if good.any():
@@ -219,6 +212,27 @@ def _poses(held: Contents) -> dict[str, tuple[Array, Array]]:
     return found
 
 
+def _true_poses(held: Contents, topic: str) -> dict[int, list[float]]:
+    """Rows of a topic of poses, by log time; of equal times the last counts."""
+    poses = ((stamped.time_ns, stamped.message.pose) for stamped in held.messages(topic))
+    return {time_ns: _row(pose.position, pose.orientation) for time_ns, pose in poses}
+
+
+def _frames(held: Contents) -> dict[str, dict[int, list[float]]]:
+    """The same of every robot on ``/tf``, whichever of its own frames is there."""
+    rows: dict[str, dict[int, list[float]]] = {}
+    if topics.TRANSFORMS not in held.topics:
+        return rows
+    for stamped in held.messages(topics.TRANSFORMS):
+        for frame in stamped.message.transforms:
+            robot, _, part = frame.child_frame_id.partition("/")
+            if part in ("", "horizontal"):
+                row = _row(frame.translation, frame.rotation)
+                rows.setdefault(robot, {})[stamped.time_ns] = row
+    return rows
+
+
 def _row(place: object, turn: object) -> list[float]:
+    """x, y, z, and the quaternion x, y, z, w."""
     names = [(place, n) for n in "xyz"] + [(turn, n) for n in "xyzw"]
     return [float(getattr(part, name)) for part, name in names]

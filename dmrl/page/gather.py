@@ -148,8 +148,9 @@ def _take(found: Found, path: Path) -> None:
         name = _name(found, path.parent)
         found.documents.setdefault(DOCUMENTS[path.name], {})[name] = _document(path)
         _remember(found, path.parent)
-    elif path.name in ("dataset_dict.json",) or path.suffix == ".parquet":
-        root = path.parent if path.suffix != ".parquet" else path.parent.parent
+    elif path.name == "dataset_dict.json" or path.suffix == ".parquet":
+        # DATASET/dataset_dict.json, DATASET/data/SPLIT-00000.parquet
+        root = path.parent.parent if path.suffix == ".parquet" else path.parent
         if is_dataset(root):
             found.datasets[_name(found, root)] = root
             _remember(found, root)

@@ -247,17 +247,18 @@ def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
         figure = Figure((2.6 * across, 2.1 * len(shown) + 1.1), layout="constrained")
         figure.get_layout_engine().set(h_pad=0.12)  # type: ignore[call-arg, union-attr]
         grid = figure.subplots(len(shown), across, squeeze=False)
-        for channel, (name, colours) in enumerate(zip(words, ("inferno", "turbo"), strict=True)):
-            columns = slice(1 + channel * len(names), 1 + (channel + 1) * len(names))
-            most = max(pair.maps[who][channel].max() for pair in shown for who in names)
-            for row, pair in zip(grid, shown, strict=True):
-                for axes, who in zip(row[columns], names, strict=True):
-                    drawn = axes.imshow(pair.maps[who][channel], vmin=0, vmax=most, cmap=colours)
-                    axes.set_title(who, fontsize=9)
-            figure.colorbar(drawn, ax=grid[:, columns], location="bottom", shrink=0.6, label=name)
         for row, pair in zip(grid, shown, strict=True):
             row[0].imshow(pair.rgb)
             row[0].set_title(pair.title, fontsize=9)
-            for axes in row:
-                axes.set(xticks=[], yticks=[])
+        # Column 0 has the images; then one block of columns for each channel.
+        for channel, (name, colours) in enumerate(zip(words, ("inferno", "turbo"), strict=True)):
+            block = grid[:, 1 + channel * len(names) : 1 + (channel + 1) * len(names)]
+            most = max(pair.maps[who][channel].max() for pair in shown for who in names)
+            for row, pair in zip(block, shown, strict=True):
+                for axes, who in zip(row, names, strict=True):
+                    drawn = axes.imshow(pair.maps[who][channel], vmin=0, vmax=most, cmap=colours)
+                    axes.set_title(who, fontsize=9)
+            figure.colorbar(drawn, ax=block, location="bottom", shrink=0.6, label=name)
+        for axes in grid.flat:
+            axes.set(xticks=[], yticks=[])
     save(figure, stem)

@@ -130,8 +130,22 @@ def _meshes(path):
 
     Importers turn y up into z up by the roots' rotation, so there it counts.
     """
+    kind, meshes = path.suffix.lower(), []
+    things = _imported(path, kind)
+    for thing in things:
+        if thing.type == "MESH":
+            place = thing.matrix_world
+            if kind == ".blend":
+                place = _root(thing).matrix_world.inverted() @ place
+            meshes.append((thing.data, place.copy()))
+    for thing in things:
+        bpy.data.objects.remove(thing)
+    return meshes
+
+
+def _imported(path, kind):
+    """Every object of a file, by the importer of its kind, with matrices that are up to date."""
     before = set(bpy.data.objects)
-    kind = path.suffix.lower()
     if kind == ".blend":
         with bpy.data.libraries.load(str(path)) as (source, wanted):
             wanted.objects = source.objects
@@ -141,18 +155,12 @@ def _meshes(path):
         bpy.ops.wm.obj_import(filepath=str(path))
     else:
         bpy.ops.wm.stl_import(filepath=str(path))
-    found = [thing for thing in bpy.data.objects if thing not in before]
     bpy.context.view_layer.update()
-    meshes = []
-    for thing in found:
-        if thing.type == "MESH":
-            place = thing.matrix_world
-            if kind == ".blend":
-                root = thing
-                while root.parent is not None:
-                    root = root.parent
-                place = root.matrix_world.inverted() @ place
-            meshes.append((thing.data, place.copy()))
-    for thing in found:
-        bpy.data.objects.remove(thing)
-    return meshes
+    return [thing for thing in bpy.data.objects if thing not in before]
+
+
+def _root(thing):
+    """What an object hangs from, at the top; itself, where it hangs from nothing."""
+    while thing.parent is not None:
+        thing = thing.parent
+    return thing
