@@ -48,6 +48,23 @@ def test_what_sticks_above_the_best_is_solved_afresh(monkeypatch: pytest.MonkeyP
     assert best.cost == 1.0
 
 
+def test_of_a_flight_in_stretches_their_join_and_the_two_likeliest_starts_are_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun: list[int] = []
+
+    def solved(_: Problem, __: Noise, state: Array, *___: object, **____: object) -> Solution:
+        begun.append(round(float(state[0, 0]) - 10.0))
+        return solution(begun[-1], 10.0 * begun[-1])
+
+    monkeypatch.setattr(search, "solve_batch", solved)
+    tracks = np.stack([solution(x, 0.0).state[:, :5] for x in (5.0, 6.0, 7.0)])
+    joined = [solution(1.0, 0.0).state]
+    found = search.solutions(flight(), Noise(), np.array([3.0, 1.0, 2.0]), tracks, joined)
+    assert begun == [1, 5, 7, 1]  # and the best again, afresh
+    assert (found[0].cost, round(float(found[0].state[0, 0]))) == (10.0, 11)
+
+
 def test_other_sides_are_tried_six_times_and_from_the_best_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
