@@ -31,6 +31,10 @@ WINDOW_S = 10.0
 """Over which motion is held against its noise."""
 NOISE_FACTOR = 1.8
 """Motion must exceed its noise's energy by this: 10 s of noise reach it in a few per cent."""
+CONSTANT = 1.5
+"""Sigmas that come from what is constant are this much larger: no average over a flight makes such
+an error smaller, so where it is outside its ellipse, all of the flight is. Real velocities have
+larger scales and biases than their priors say, and scales that differ by axis."""
 
 
 def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Array, Array]:
@@ -58,7 +62,8 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
 def _inverse(equations: Normal) -> tuple[Array, Array]:
     *_, response, constants = solve(equations)
     keyframes = block_inverse(equations.diagonal, equations.above)
-    return keyframes + response @ constants @ response.swapaxes(1, 2), constants
+    shared = response @ constants @ response.swapaxes(1, 2)
+    return keyframes + CONSTANT**2 * shared, constants
 
 
 def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array]:

@@ -30,7 +30,7 @@ from dmrl.estimation.stretches import joined, mended, stretches
 INFLATION = 1.03
 """Sigmas of the batch solve are multiplied by this, and where biases are larger than the
 default's by some more: the 95 % ellipse then holds 92 to 98 % in view."""
-GATE_SIGMA = 0.9
+GATE_SIGMA = 0.75
 """The gate goes by sigmas this much smaller: with the ellipse's it expects more bad positions
 than there are."""
 SMOOTHER_INFLATION = 1.5

@@ -69,7 +69,7 @@ class Noise:
     scale_std: float = 0.02
     gyro_std_radps: float = 0.003
     velocity_scale_std: float = 0.05
-    velocity_bias_std_mps: float = 0.012
+    velocity_bias_std_mps: float = 0.02
     clock_std_s: float = 0.02
     height_std_m: float = 0.04
     gap_speed_mps: float = 0.5
