@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 
 from dmrl.estimation.banded import Normal, block_inverse, solve
 from dmrl.estimation.batch import Solution, equations_of
-from dmrl.estimation.linear import linearise
+from dmrl.estimation.linear import BIAS, SCALE, linearise
 from dmrl.estimation.motion import Increments, rotation
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import Noise, Problem
@@ -31,10 +31,11 @@ WINDOW_S = 10.0
 """Over which motion is held against its noise."""
 NOISE_FACTOR = 1.8
 """Motion must exceed its noise's energy by this: 10 s of noise reach it in a few per cent."""
-CONSTANT = 1.5
-"""Sigmas that come from what is constant are this much larger: no average over a flight makes such
-an error smaller, so where it is outside its ellipse, all of the flight is. Real velocities have
-larger scales and biases than their priors say, and scales that differ by axis."""
+CONSTANT_RANGE, CONSTANT = 1.25, 1.7
+"""Sigmas that come from offset and scale of the ranges, and from what else is constant, are this
+much larger: no average over a flight makes such an error smaller, so where it is outside its
+ellipse, all of the flight is. Real velocities have larger scales and biases than their priors say,
+and scales that differ by axis."""
 
 
 def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Array, Array]:
@@ -62,8 +63,10 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
 def _inverse(equations: Normal) -> tuple[Array, Array]:
     *_, response, constants = solve(equations)
     keyframes = block_inverse(equations.diagonal, equations.above)
-    shared = response @ constants @ response.swapaxes(1, 2)
-    return keyframes + CONSTANT**2 * shared, constants
+    wider = np.full(len(constants), CONSTANT)
+    wider[[BIAS, SCALE]] = CONSTANT_RANGE
+    response = response * wider
+    return keyframes + response @ constants @ response.swapaxes(1, 2), constants
 
 
 def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array]:

@@ -28,11 +28,10 @@ from dmrl.estimation.search import KEY_HZ, distinct, solutions
 from dmrl.estimation.stretches import joined, mended, stretches
 
 INFLATION = 1.03
-"""Sigmas of the batch solve are multiplied by this, and where biases are larger than the
-default's by some more: the 95 % ellipse then holds 92 to 98 % in view."""
+"""Sigmas of the batch solve are multiplied by this: the 95 % ellipse in view holds 93 to 99 %."""
 GATE_SIGMA = 0.75
-"""The gate goes by sigmas this much smaller: with the ellipse's it expects more bad positions
-than there are."""
+"""The gate goes by sigmas this much smaller: those of the ellipse expect more bad positions than
+there are, as they make room for what is constant."""
 SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
@@ -221,8 +220,7 @@ def _from_batch(
     best = ends[0]
     if not noise:
         found, best = with_range_noise(flight, found, best)
-    worse = max(1.0, found.scale_std / Noise().scale_std) ** 0.75
-    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 * worse + apart
+    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 + apart
     none = np.zeros(len(tracks), np.int8)
     state, error_m = best.state[:, :3], best.state[:, RANGE_ERROR]
     return Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)

@@ -14,7 +14,9 @@ from dmrl.estimation.batch import (
     near,
     solve_batch,
 )
+from dmrl.estimation.confidence import CONSTANT, CONSTANT_RANGE, _inverse
 from dmrl.estimation.linear import (
+    BIAS,
     OWN_SCALE,
     PEER_SCALE,
     RANGE_ERROR,
@@ -109,6 +111,22 @@ def test_the_banded_solve_is_the_dense_one(flight: Problem, anywhere: tuple[Arra
     for k in (0, 50, len(blocks) - 1):
         here = slice(k * SIZE, (k + 1) * SIZE)
         assert np.allclose(blocks[k], inverse[here, here], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("constant", [BIAS, OWN_SCALE])
+def test_what_is_constant_counts_for_more_in_a_keyframe_s_spread(constant: int) -> None:
+    """Two keyframes are a constant, known to 0.5, with an error of 0.1 each."""
+    border = np.zeros((2, 1, len(GLOBALS)))
+    border[:, 0, constant] = -100.0
+    corner = np.eye(len(GLOBALS))
+    corner[constant, constant] = 200.0 + 0.5**-2
+    blocks = np.full((2, 1, 1), 100.0)
+    nothing = np.zeros((2, 1)), np.zeros(len(GLOBALS))
+    equations = banded.Normal(blocks, np.zeros((1, 1, 1)), border, corner, *nothing)
+    spread, constants = _inverse(equations)
+    wider = CONSTANT_RANGE if constant == BIAS else CONSTANT
+    assert spread == pytest.approx(np.full((2, 1, 1), 0.1**2 + (wider * 0.5) ** 2))
+    assert constants[constant, constant] == pytest.approx(0.5**2)
 
 
 def test_without_noise_the_solution_is_the_truth_and_the_constants_vanish() -> None:
