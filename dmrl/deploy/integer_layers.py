@@ -22,6 +22,9 @@ PIXEL_ZERO = 128
 Q_LEVELS = 256
 GAIN_SHIFT = 8
 """Bits of a shortcut's gain behind the point: a step of the sum may be coarse beside its own."""
+SIGNED_OFFSET = 128
+"""Levels that the sums of a signed convolution are above its output: none that
+has a level is negative, where a multiplier that is rounded up would give one too few."""
 
 
 class Layer(Protocol):
@@ -64,8 +67,9 @@ class Conv:
 
     ``acc = bias + sum(weight * x)``, with ``(gain * s) >> GAIN_SHIFT`` of a shortcut, fits in
     int32 for every input; then, per output channel, ``q = clamp((acc * multiplier) >> shift)``, the
-    product in int64. The half step that rounds is in the bias. With a shift of 32, which is nearly
-    always, q is the high word of the product.
+    product in int64, less `SIGNED_OFFSET` before the clamp where the output is signed. Half a step,
+    which rounds, is in the bias, and so is that offset. With a shift of 32, which is nearly always,
+    q is the high word of the product.
 
     Output row r reads the input rows ``r * stride - padding + dilation * k``, columns likewise;
     what lies outside reads as ``pad_value``. Rows: ``(h + 2 padding - dilation (k - 1) - 1) //
@@ -80,7 +84,8 @@ class Conv:
     weight
         (out, in / groups, k, k) int8, -127 to 127, k is 1 or 3.
     bias
-        (out,) int32. The zero point of the image and half a step of the output are folded in.
+        (out,) int32. The zero point of the image, half a step of the output and the offset of a
+        signed one are folded in.
     multiplier
         (out,) int32, 1 to 2^31 - 1. The real factor is ``multiplier / 2^shift``.
     shift
@@ -133,6 +138,13 @@ class Conv:
     def depthwise(self) -> bool:
         """Whether every channel is convolved alone."""
         return self.groups > 1
+
+    @property
+    def divisor(self) -> Array:
+        """(out,) what sums are divided by: whole, or one over a whole number."""
+        factor = self.multiplier / 2.0**self.shift
+        near: Array = np.rint(np.maximum(1 / factor, 1)) / np.rint(np.maximum(factor, 1))
+        return near
 
     def shape(self, inputs: tuple[Shape, ...]) -> Shape:
         """Channels, rows and columns of its output."""

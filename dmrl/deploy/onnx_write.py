@@ -5,14 +5,15 @@ one (N, rows, cols) float32 output per channel, see ``OUTPUT_OF``.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.graph import FloatAdd, FloatConv, Graph
 from dmrl.deploy.integer import PIXEL_ZERO, Add, Conv, Head, IntegerNetwork
-from dmrl.deploy.quantise import HALF_STEP, HEAD_OF, SHORTCUT_LOSES
+from dmrl.deploy.integer_layers import GAIN_SHIFT, SIGNED_OFFSET
+from dmrl.deploy.quantise import HEAD_OF
 from dmrl.errors import MissingExtra
 
 try:
@@ -38,6 +39,7 @@ class _Writer:
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.constants: dict[str, Any] = {}
+        self.made: set[str] = set()
 
     def constant(self, name: str, values: NDArray[Any]) -> str:
         """The name of a constant; one that is there already is not written again."""
@@ -48,6 +50,7 @@ class _Writer:
     def node(self, kind: str, inputs: Sequence[str], output: str, **settings: Any) -> str:
         """Append a node; the name of its output comes back."""
         self.nodes.append(helper.make_node(kind, list(inputs), [output], output, **settings))
+        self.made.add(output)
         return output
 
     def model(self, name: str, image: Sequence[int], outputs: dict[str, tuple[int, int]]) -> bytes:
@@ -69,6 +72,14 @@ class _Writer:
         onnx.checker.check_model(model, full_check=True)
         written: bytes = model.SerializeToString(deterministic=True)
         return written
+
+
+class _Levels(NamedTuple):
+    """The name of a uint8 tensor, what a step of it is and which level is zero."""
+
+    name: str
+    scale: float
+    zero_point: int
 
 
 def float_onnx(
@@ -147,107 +158,134 @@ def _max_pool(out: _Writer, source: str, name: str) -> str:
 def int8_onnx(network: IntegerNetwork) -> bytes:
     """An ONNX file of an int8 network, in pairs of QuantizeLinear and DequantizeLinear.
 
-    What runs it may fuse the pairs into integer operations, and may round otherwise than
-    ``reference`` by one level. A signed tensor is written as uint8 around 128, since
-    onnxruntime fuses a convolution only where its input and output are of one type. A convolution
-    with a shortcut is not rounded before the sum, as in ``reference``: it runs in float.
+    What runs it may fuse the pairs into integer operations. Sums of the quantiser's networks never
+    lie halfway between two levels: rounded to the nearest, they give those of ``reference``. A
+    signed tensor is written as uint8 around 128, since onnxruntime fuses a convolution only where
+    its input and output are of one type. With a shortcut the sum of products, whole numbers that
+    float32 holds, is left as it is until the shortcut is added. An `Add` is rounded from floats.
     """
     out = _Writer()
-    levels = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
-    tensors = [_dequantised(out, levels, "image", 1 / PIXEL_ZERO, PIXEL_ZERO)]
-    scales = [1 / PIXEL_ZERO]
+    planes = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
+    tensors = [_Levels(planes, 1 / PIXEL_ZERO, PIXEL_ZERO)]
     of_heads = {head.tensor for head in network.heads.values()}
     for index, layer in enumerate(network.layers):
         inputs = [tensors[k] for k in layer.sources]
+        zero = SIGNED_OFFSET if layer.signed else 0
         if index + 1 in of_heads:
-            assert isinstance(layer, Conv)
-            tensors.append("")  # read by heads alone, which are written one by one
+            tensors.append(inputs[0])  # read by heads alone, which are written one by one
+        elif isinstance(layer, Conv):
+            every = np.arange(len(layer.bias))
+            tensors.append(_convolved(out, layer, inputs, every, layer.scale, zero, layer.name))
         else:
-            if isinstance(layer, Conv):
-                every = np.arange(len(layer.bias))
-                value = _int8_conv(out, layer, inputs[0], scales[layer.source], every, layer.scale)
-                if inputs[1:]:
-                    value = out.node("Add", [value, inputs[1]], f"{layer.name}.both")
-            elif isinstance(layer, Add):
-                value = out.node("Add", inputs, f"{layer.name}.sum")
+            reals = [_real(out, each) for each in inputs]
+            if isinstance(layer, Add):
+                value = out.node("Add", reals, f"{layer.name}.sum")
             else:
-                value = _max_pool(out, inputs[0], f"{layer.name}.largest")
-            zero = 128 if layer.signed else 0
-            tensors.append(_requantised(out, value, layer.name, layer.scale, zero))
-        scales.append(layer.scale)
-    names = [
-        _int8_head(out, network, head, OUTPUT_OF[channel], tensors, scales)
-        for channel in HEAD_OF
-        if (head := network.heads.get(HEAD_OF[channel])) is not None
-    ]
+                value = _max_pool(out, reals[0], f"{layer.name}.largest")
+            tensors.append(_quantised(out, value, layer.name, layer.scale, zero))
+    names = {OUTPUT_OF[channel]: name for channel, name in HEAD_OF.items() if name in network.heads}
+    for output, name in names.items():
+        _head(out, network, network.heads[name], output, tensors)
     image = (network.height_px, network.width_px, network.channels)
     return out.model("int8", image, dict.fromkeys(names, network.grid_shape))
 
 
-def _int8_conv(
-    out: _Writer,
-    layer: Conv,
-    source: str,
-    source_scale: float,
-    chosen: NDArray[np.integer],
-    out_scale: float,
-    zero_point: int = 0,
-    suffix: str = "",
-) -> str:
-    """The convolution of the chosen output channels, on dequantised values."""
-    weight = layer.weight[chosen]
-    factor = layer.multiplier[chosen] / 2.0**layer.shift
-    bias = layer.bias[chosen].astype(np.int64)
-    if layer.source == 0:
-        bias += PIXEL_ZERO * weight.astype(np.int64).sum(axis=(1, 2, 3))
-    lost = SHORTCUT_LOSES * (len(layer.sources) - 1)
-    bias -= np.rint((zero_point + HALF_STEP) / factor + lost).astype(np.int64)
-    sum_scale = (factor * out_scale).astype(np.float32)
-    name = layer.name + suffix
-    levels = out.constant(f"{name}.weight.levels", weight)
-    scale = out.constant(f"{name}.weight.scale", (sum_scale / source_scale).astype(np.float32))
-    zeros = out.constant(f"{name}.weight.zero", np.zeros(len(chosen), np.int8))
-    real = out.node("DequantizeLinear", [levels, scale, zeros], f"{name}.weight", axis=0)
-    sums = out.constant(f"{name}.bias.levels", bias.astype(np.int32))
-    sum_name = out.constant(f"{name}.bias.scale", sum_scale)
-    zero = out.constant(f"{name}.bias.zero", np.zeros(len(chosen), np.int32))
-    summand = out.node("DequantizeLinear", [sums, sum_name, zero], f"{name}.bias", axis=0)
-    return out.node("Conv", [source, real, summand], f"{name}.sum", **_conv_settings(layer))
-
-
-def _int8_head(
-    out: _Writer,
-    network: IntegerNetwork,
-    head: Head,
-    name: str,
-    tensors: list[str],
-    scales: list[float],
-) -> str:
+def _head(
+    out: _Writer, network: IntegerNetwork, head: Head, name: str, tensors: list[_Levels]
+) -> None:
     layer = network.layers[head.tensor - 1]
     assert isinstance(layer, Conv)
-    value = _int8_conv(
-        out,
-        layer,
-        tensors[layer.source],
-        scales[layer.source],
-        np.array([head.channel]),
-        head.scale,
-        head.zero_point,
-        f".{name}",
-    )
-    real = _requantised(out, value, f"{layer.name}.{name}", head.scale, head.zero_point + 128)
+    inputs, chosen = [tensors[k] for k in layer.sources], np.array([head.channel])
+    zero = head.zero_point + SIGNED_OFFSET
+    levels = _convolved(out, layer, inputs, chosen, head.scale, zero, f"{layer.name}.{name}")
     axis = out.constant("channel_axis", np.array([1], np.int64))
-    return out.node("Squeeze", [real, axis], name)
+    out.node("Squeeze", [_real(out, levels), axis], name)
 
 
-def _requantised(out: _Writer, value: str, name: str, scale: float, zero_point: int) -> str:
+def _convolved(
+    out: _Writer,
+    layer: Conv,
+    inputs: list[_Levels],
+    chosen: NDArray[np.integer],
+    scale: float,
+    zero_point: int,
+    name: str,
+) -> _Levels:
+    """The chosen channels of a convolution, with the shortcut that it may have."""
+    weight, divisor = layer.weight[chosen], layer.divisor[chosen]
+    bias = layer.bias[chosen].astype(np.float64) - divisor // 2 - np.rint(zero_point * divisor)
+    if layer.source == 0:
+        bias += PIXEL_ZERO * weight.astype(np.int64).sum(axis=(1, 2, 3))
+    bias = np.clip(bias, -(2**31), 2**31 - 1)
+    source, *shortcut = inputs
+    if shortcut:
+        operands = [
+            _real(out, source._replace(scale=1.0)),
+            out.constant(f"{name}.weight", weight.astype(np.float32)),
+            out.constant(f"{name}.bias", bias.astype(np.float32)),
+        ]
+        products = out.node("Conv", operands, f"{name}.products", **_conv_settings(layer))
+        both = [products, _gained(out, layer, shortcut[0], chosen, name)]
+        value = out.node("Add", both, f"{name}.sum")
+        levels = _levels_of(out, value, f"{name}.sum", divisor, zero_point)
+        return _Levels(levels, scale, zero_point)
+    operands = [
+        _real(out, source),
+        _constant_levels(out, f"{name}.weight", weight, scale / divisor / source.scale),
+        _constant_levels(out, f"{name}.bias", bias.astype(np.int32), scale / divisor),
+    ]
+    value = out.node("Conv", operands, f"{name}.sum", **_conv_settings(layer))
+    return _quantised(out, value, name, scale, zero_point)
+
+
+def _gained(
+    out: _Writer, layer: Conv, shortcut: _Levels, chosen: NDArray[np.integer], name: str
+) -> str:
+    """What a shortcut adds to the sums of the chosen channels."""
+    levels = _real(out, shortcut._replace(scale=1.0))
+    if len(chosen) < len(layer.bias):
+        places = out.constant(f"{name}.places", chosen.astype(np.int64))
+        levels = out.node("Gather", [levels, places], f"{name}.chosen", axis=1)
+    gain = layer.gain[chosen].reshape(-1, 1, 1) / 2.0**GAIN_SHIFT
+    gains = out.constant(f"{name}.gain", gain.astype(np.float32))
+    return out.node(
+        "Floor", [out.node("Mul", [levels, gains], f"{name}.gained")], f"{name}.shortcut"
+    )
+
+
+def _constant_levels(
+    out: _Writer, name: str, levels: NDArray[Any], scale: NDArray[np.float64]
+) -> str:
+    """Real values of constants, with a scale for each of the first axis."""
+    inputs = [
+        out.constant(f"{name}.levels", levels),
+        out.constant(f"{name}.scale", scale.astype(np.float32)),
+        out.constant(f"{name}.zero", np.zeros(len(scale), levels.dtype)),
+    ]
+    return out.node("DequantizeLinear", inputs, name, axis=0)
+
+
+def _real(out: _Writer, tensor: _Levels) -> str:
+    """Real values of a tensor; those of one scale are computed once."""
+    name = f"{tensor.name}.by.{tensor.scale:.9g}"
+    if name not in out.made:
+        scale = out.constant(f"{name}.scale", np.array(tensor.scale, np.float32))
+        zero = out.constant(f"{name}.zero", np.array(tensor.zero_point, np.uint8))
+        out.node("DequantizeLinear", [tensor.name, scale, zero], name)
+    return name
+
+
+def _quantised(out: _Writer, value: str, name: str, scale: float, zero_point: int) -> _Levels:
     scale_name = out.constant(f"{name}.scale", np.array(scale, np.float32))
     zero_name = out.constant(f"{name}.zero", np.array(zero_point, np.uint8))
     levels = out.node("QuantizeLinear", [value, scale_name, zero_name], f"{name}.levels")
-    return out.node("DequantizeLinear", [levels, scale_name, zero_name], f"{name}.real")
+    return _Levels(levels, scale, zero_point)
 
 
-def _dequantised(out: _Writer, levels: str, name: str, scale: float, zero_point: int) -> str:
-    scale_name = out.constant(f"{name}.scale", np.array(scale, np.float32))
-    zero_name = out.constant(f"{name}.zero", np.array(zero_point, np.uint8))
-    return out.node("DequantizeLinear", [levels, scale_name, zero_name], f"{name}.real")
+def _levels_of(
+    out: _Writer, value: str, name: str, divisor: NDArray[np.float64], zero_point: int
+) -> str:
+    """The levels of sums, each channel with a divisor of its own."""
+    scale_name = out.constant(f"{name}.divisor", divisor.astype(np.float32))
+    zeros = out.constant(f"{name}.zero", np.full(len(divisor), zero_point, np.uint8))
+    return out.node("QuantizeLinear", [value, scale_name, zeros], f"{name}.levels", axis=1)

@@ -29,7 +29,7 @@ from dmrl.deploy.integer import (
     IntegerNetwork,
     MaxPool,
 )
-from dmrl.deploy.integer_layers import GAIN_SHIFT
+from dmrl.deploy.integer_layers import GAIN_SHIFT, SIGNED_OFFSET
 from dmrl.deploy.ranges import Ranges
 from dmrl.deploy.rounding import Moments, rounded
 from dmrl.errors import SettingError
@@ -46,10 +46,10 @@ HEAD_OF = {
 HEAD_ROOM = 0.05
 """Share of its range that a head keeps free at either end, for images not seen before."""
 LEVELS = np.arange(-128.0, 128.0)
-HALF_STEP = 0.5
-"""Of the output: a convolution's bias holds it, and rounding down then rounds to the nearest."""
 SHORTCUT_LOSES = 0.5
 """Steps of the sum that rounding down a shortcut takes on average; the bias makes that good."""
+GAIN_BITS = 16
+"""Of a shortcut's gain: its product with a value of 8 bits is then exact in float32, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,17 +188,17 @@ def _conv(
 ) -> Conv:
     outs = len(layer.bias)
     scale = 1.0 if heads else _activation_scale(ranges, tensor, signed=not layer.relu)
-    out_scale, zero_point = np.full(outs, scale), np.zeros(outs)
+    out_scale = np.full(outs, scale)
+    zero = np.full(outs, 0.0 if layer.relu else SIGNED_OFFSET)
     for head in heads:
-        out_scale[head.channel], zero_point[head.channel] = head.scale, head.zero_point
+        out_scale[head.channel] = head.scale
+        zero[head.channel] += head.zero_point
     in_scales = [scales[source] for source in layer.sources]
-    weight, bias, gain, factor = _integers(
-        layer, in_scales, out_scale, zero_point * out_scale, moments
-    )
+    weight, bias, gain, divisor = _integers(layer, in_scales, out_scale, zero, moments)
     # The image alone has a zero point: sum(w * (q - 128)) = sum(w * q) - 128 * sum(w).
     if layer.sources[0] == 0:
         bias -= PIXEL_ZERO * weight.sum(axis=(1, 2, 3))
-    multiplier, shift = _fixed_point(factor)
+    multiplier, shift = _fixed_point(divisor)
     return Conv(
         layer.name,
         layer.sources[0],
@@ -221,43 +221,63 @@ def _conv(
 def _integers(
     layer: FloatConv, in_scales: list[float], out_scale: Array, zero: Array, moments: Array | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
-    """Weights, bias, gain of a shortcut, and the real factor from sum to output, per channel.
+    """Weights, bias, gain of a shortcut, and what a sum is divided by, per channel.
 
-    The bias takes the zero point and the half step that rounds. The scale of a channel's weights
-    is set by its largest weight; by its bias and shortcut, where these would not fit beside the
-    sum; or by the smallest factor whose half step does.
+    The bias takes the level of zero and half of the divisor, which rounds. The scale of a channel's
+    weights is set by its largest weight; by its bias and shortcut, where these would not fit beside
+    the sum; or by the largest divisor. It is a little more then, for the divisor to be odd.
     """
     # What is left of an int32 for bias and shortcut beside the largest sum of weights times inputs.
     largest = np.abs(layer.weight).max(axis=(1, 2, 3))
     room = 2**31 - 1 - 128 * 255 * (layer.weight[0].size + 1)
     in_scale, *beside = in_scales
-    offset = zero + HALF_STEP * out_scale
-    bias = layer.bias + offset
-    more = np.abs(bias) + 2.0**GAIN_SHIFT * 255 * sum(beside)
+    more = np.abs(layer.bias) + (np.abs(zero) + 1) * out_scale
+    more += 2.0**GAIN_SHIFT * 255 * sum(beside)
     least = 2.0**-30 * out_scale / in_scale
     weight_scale = np.maximum.reduce([largest / 127, more / (in_scale * room), least])
+    divisor = _odd(out_scale / (in_scale * weight_scale))
+    sum_scale = out_scale / divisor
+    weight_scale = sum_scale / in_scale
     if moments is None:
         weight = np.rint(layer.weight / weight_scale[:, None, None, None]).astype(np.int64)
+        bias = layer.bias
     else:
-        weight, suited = rounded(layer, weight_scale, moments)
-        bias = suited + offset
-    sum_scale = in_scale * weight_scale
-    lost = SHORTCUT_LOSES * len(beside)
-    steps = np.clip(np.rint(bias / sum_scale + lost), -room, room).astype(np.int64)
-    gains = [np.rint(2.0**GAIN_SHIFT * scale / sum_scale) for scale in beside]
+        weight, bias = rounded(layer, weight_scale, moments)
+    steps = np.rint(bias / sum_scale + SHORTCUT_LOSES * len(beside))
+    steps += np.rint(zero * divisor) + divisor // 2
+    gains = [_shortened(2.0**GAIN_SHIFT * scale / sum_scale) for scale in beside]
     gain = np.array(gains).ravel().astype(np.int64)
-    return weight, steps, gain, sum_scale / out_scale
+    return weight, np.clip(steps, -room, room).astype(np.int64), gain, divisor
 
 
-def _fixed_point(factor: Array) -> tuple[Int32, int]:
+def _odd(divisor: Array) -> Array:
+    """The odd number at or below each; below 1 one over a whole number.
+
+    Then no sum lies halfway between two levels, so all that round to the nearest agree, in integers
+    or in floats, whatever they do with halves.
+    """
+    odd: Array = 2 * np.floor((np.maximum(divisor, 1) + 1) / 2) - 1
+    return odd / np.ceil(np.maximum(1 / divisor, 1))
+
+
+def _shortened(gain: Array) -> Array:
+    """Whole numbers of at most `GAIN_BITS` bits that are not zero."""
+    unit = np.maximum(2.0 ** (np.frexp(gain)[1] - GAIN_BITS), 1.0)
+    near: Array = np.rint(gain / unit) * unit
+    return near
+
+
+def _fixed_point(divisor: Array) -> tuple[Int32, int]:
     """Requantisation factors as integers, ``multiplier / 2^shift``, the largest in 30 bits.
 
     Integers, because they round the same on every machine, also on those without floats. The
-    shift is 32 unless a factor is 1/4 or more. A small factor has few bits, but so has what
-    comes of it: a sum of 24 bits is rounded by less than a tenth of a step.
+    shift is 32 unless a divisor is 4 or less. Multipliers are rounded up: with a shift of 32 and a
+    whole divisor to 4095 the product is the quotient, rounded down, of every sum that has a level.
+    A multiplier of few bits does for a greater one: a sum of 24 bits is off by less than a tenth of
+    a step.
     """
-    shift = min(32, 30 - int(np.frexp(factor.max())[1]))
-    return np.maximum(np.rint(factor * 2.0**shift), 1).astype(np.int32), shift
+    shift = min(32, 30 - int(np.frexp(1 / divisor.min())[1]))
+    return np.ceil(2.0**shift / divisor).astype(np.int32), shift
 
 
 def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> Add:

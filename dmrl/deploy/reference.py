@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.integer import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
-from dmrl.deploy.integer_layers import GAIN_SHIFT
+from dmrl.deploy.integer_layers import GAIN_SHIFT, SIGNED_OFFSET
 from dmrl.deploy.windows import largest_of_blocks, taps_of
 from dmrl.learn.decode import SAME_PX
 
@@ -57,9 +57,10 @@ def compute(layer: AnyLayer, *inputs: Quantised) -> Quantised:
 
 
 def convolve(layer: Conv, x: Quantised, *shortcut: Quantised) -> Quantised:
-    """Output of a convolution, requantised: ``clamp((acc * multiplier) >> shift)``."""
+    """Output of a convolution, requantised: ``clamp((acc * multiplier) >> shift)``, see `Conv`."""
     product = accumulate(layer, x, *shortcut) * layer.multiplier.astype(np.int64)[:, None, None]
-    return clamp(product >> layer.shift, signed=layer.signed)
+    offset = SIGNED_OFFSET if layer.signed else 0
+    return clamp((product >> layer.shift) - offset, signed=layer.signed)
 
 
 def accumulate(layer: Conv, x: Quantised, *shortcut: Quantised) -> NDArray[np.int64]:

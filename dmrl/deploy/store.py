@@ -18,7 +18,7 @@ from dmrl.errors import ModelError
 
 INTEGER_NAME = "integer.npz"
 """Name of the file in a quantised model and in an export folder."""
-FORMAT = 2
+FORMAT = 3
 KINDS: dict[str, type[AnyLayer]] = {kind.kind: kind for kind in (Conv, MaxPool, Add)}
 HEADS = ("confidence", "depth", "offset_u", "offset_v")
 PLAIN = ("name", "architecture", "channels", "height_px", "width_px", "stride_px", "threshold")

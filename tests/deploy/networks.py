@@ -15,6 +15,7 @@ from dmrl.deploy.integer import (
     MaxPool,
     Shape,
 )
+from dmrl.deploy.integer_layers import SIGNED_OFFSET
 from dmrl.deploy.reference import accumulate, compute
 
 Rng = np.random.Generator
@@ -68,7 +69,9 @@ class _Growing:
         shift = min(32, 30 - int(np.frexp(factor.max())[1])) - int(rng.choice([0, 0, 2]))
         multiplier = np.maximum(np.round(factor * 2.0**shift), 1).astype(np.int32)
         fields = {name: getattr(draft, name) for name in draft.__slots__}
-        fields |= {"multiplier": multiplier, "shift": shift}
+        offset = SIGNED_OFFSET * 2.0**shift / multiplier if signed else np.zeros(outs)
+        bias = (draft.bias + np.rint(offset)).astype(np.int32)
+        fields |= {"multiplier": multiplier, "shift": shift, "bias": bias}
         self.grow(Conv(**fields))
 
     def add(self, other: int, *, signed: bool) -> None:

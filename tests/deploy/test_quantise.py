@@ -13,7 +13,7 @@ from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import FloatConv, Graph, grey_of, outputs_of, tensors_of, to_input
 from dmrl.deploy.integer import Conv
 from dmrl.deploy.layers import layer_figures
-from dmrl.deploy.quantise import MEANINGS, About, _fixed_point, quantise
+from dmrl.deploy.quantise import MEANINGS, About, _fixed_point, _odd, _shortened, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.errors import ModelError, SettingError
 
@@ -155,27 +155,48 @@ def test_a_network_that_breaks_its_promises_is_refused() -> None:
         replace(network, layers=(late, *network.layers[1:]))
 
 
-@given(st.lists(st.floats(2.0**-32, 4.0), min_size=1, max_size=5))
-def test_factors_are_31_bits_and_one_shift_that_rounds_no_sum_by_a_tenth_of_a_step(
-    factors: list[float],
+@given(st.lists(st.floats(0.25, 2.0**32), min_size=1, max_size=5))
+def test_multipliers_are_31_bits_and_one_shift_that_rounds_no_sum_by_a_tenth_of_a_step(
+    divisors: list[float],
 ) -> None:
-    multipliers, shift = _fixed_point(np.array(factors))
+    multipliers, shift = _fixed_point(np.array(divisors))
     assert 1 <= shift <= 32
-    for factor, multiplier in zip(factors, multipliers.tolist(), strict=True):
+    for divisor, multiplier in zip(divisors, multipliers.tolist(), strict=True):
         assert 1 <= multiplier < 2**31
-        largest = min(2.0**24, 256 / factor)  # of 500 weights; beyond it the value is clamped
-        assert abs(multiplier / 2**shift - factor) * largest <= 0.1
+        largest = min(2.0**24, 256 * divisor)  # of 500 weights; beyond it the value is clamped
+        assert abs(multiplier / 2**shift - 1 / divisor) * largest <= 0.1
 
 
 @pytest.mark.parametrize(
-    ("factor", "wanted"),
-    [(2.0**-3, (2**29, 32)), (2.0**-2, (2**29, 31)), (1.0, (2**29, 29)), (2.0**-40, (1, 32))],
+    ("divisor", "wanted"),
+    [(8.0, (2**29, 32)), (4.0, (2**29, 31)), (1.0, (2**29, 29)), (2.0**40, (1, 32))],
 )
 def test_the_shift_is_32_where_the_high_word_will_do(
-    factor: float, wanted: tuple[int, int]
+    divisor: float, wanted: tuple[int, int]
 ) -> None:
-    (multiplier,), shift = _fixed_point(np.array([factor]))
+    (multiplier,), shift = _fixed_point(np.array([divisor]))
     assert (multiplier, shift) == wanted
+
+
+@given(st.integers(2, 2047).map(lambda half: 2 * half + 1), st.integers(0, 255), st.integers(-2, 2))
+def test_a_sum_by_its_multiplier_is_the_quotient_rounded_down(
+    divisor: int, level: int, beside: int
+) -> None:
+    (multiplier,), shift = _fixed_point(np.array([float(divisor)]))
+    total = max(level * divisor + beside, 0)
+    assert total * int(multiplier) >> shift == total // divisor
+    assert np.rint((total - divisor // 2) / divisor) == total // divisor
+
+
+def test_divisors_are_odd_and_gains_have_16_bits() -> None:
+    divisors = _odd(np.array([0.3, 1.0, 2.9, 3.0, 100.2, 101.0]))
+    assert divisors.tolist() == [0.25, 1.0, 1.0, 3.0, 99.0, 101.0]
+    gains = _shortened(np.array([0.2, 3.4, 65535.0, 131_071.0, 8_388_000.0]))
+    assert gains.tolist() == [0.0, 3.0, 65535.0, 131_072.0, 8_387_968.0]
+    for seed in range(10):
+        for layer in quantised_network(seed).layers:
+            if isinstance(layer, Conv):
+                assert ((layer.divisor % 2 == 1) | (1 / layer.divisor % 1 == 0)).all()
 
 
 @pytest.mark.parametrize("shortcut", [False, True])

@@ -29,7 +29,7 @@ def by_hand(layer: Conv, x: np.ndarray, *shortcut: np.ndarray) -> np.ndarray:
         for beside in shortcut:
             acc += int(layer.gain[o]) * int(beside[o, r, c]) >> 8
         assert -(2**31) <= acc < 2**31
-        scaled = (acc * int(layer.multiplier[o])) >> layer.shift
+        scaled = ((acc * int(layer.multiplier[o])) >> layer.shift) - (128 if layer.signed else 0)
         out[o, r, c] = min(max(scaled, low), high)
     return out
 

@@ -48,8 +48,7 @@ def test_every_backend_runs_a_quantised_model_and_an_export(
     np.testing.assert_array_equal(grids(exported, dots, tmp_path, "c"), reference)
     for model in (quantised, exported):
         fast = grids(model, dots, tmp_path, "onnx-int8")
-        # Residual blocks are added up in float there: some levels off in a hardly trained network.
-        assert np.abs(fast - reference)[:, 0].mean() < 0.02
+        np.testing.assert_allclose(fast, reference, rtol=1e-5)  # the same levels
 
 
 @pytest.mark.heavy

@@ -36,7 +36,7 @@ typedef char shifts_round_down[(-1 >> 1) == -1 ? 1 : -1];
 typedef char state_is_as_stated[sizeof(${prefix}_t) == ${PREFIX}_STATE_BYTES ? 1 : -1];
 
 /* How the sums of one output channel become its values: they begin at the bias, which holds the
- * half step that rounds. */
+ * half step that rounds and, where values are signed, the 128 levels that keep it above zero. */
 typedef struct {
     int32_t bias, multiplier;
 } scale_t;
@@ -63,10 +63,10 @@ INLINE int32_t gained(int32_t gain, int32_t value)
     return (gain * value) >> $gain_shift;
 }
 
-/* A value of a sum. `shift` is nearly always 32: a multiplication that keeps the high word. */
+/* A value of a sum, which is `low` above it. `shift` is nearly always 32: a multiplication that keeps the high word. */
 INLINE uint8_t scaled(int32_t sum, int32_t multiplier, int shift, int32_t low, int32_t high)
 {
-    const int64_t value = ((int64_t)sum * multiplier) >> shift;
+    const int64_t value = (((int64_t)sum * multiplier) >> shift) + low;
     if (shift < 32)
         return (uint8_t)(value < low ? low : value > high ? high : value);
     int32_t clamped = clamp((int32_t)value, low, high);

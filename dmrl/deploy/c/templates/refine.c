@@ -49,7 +49,7 @@ void ${prefix}_head_apply(const ${prefix}_head_t *head, ${prefix}_t *net)
                 int32_t sum = head->bias[h];
                 for (int c = 0; c < ${PREFIX}_FEATURES; c++)
                     sum += x[c] * ((head->weight[h][c] + 32768) >> 16);
-                const int64_t value = ((int64_t)sum * heads[h][1]) >> $shift;
+                const int64_t value = (((int64_t)sum * heads[h][1]) >> $shift) - 128;
                 set(net, h, row, col, (int8_t)(value < -128 ? -128 : value > 127 ? 127 : value));
             }
         }
