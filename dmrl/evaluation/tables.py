@@ -1,9 +1,11 @@
-"""Figures of detections as rows of a table, a column for each range of depth."""
+"""Figures of detections: rows of a table, a column for each range of depth; and JSON values."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
-from dmrl.learn.metrics import BandFigures, Figure
+from dmrl.learn.metrics import BandFigures, Figure, Scored, curves
 
 # Name of a figure, its words in the table, and its format.
 ROWS = (
@@ -51,3 +53,29 @@ def _cell(figure: Figure, form: str) -> str:
         return "-"
     low, high = format(figure.low, form), format(figure.high, form)
     return f"{figure.value:{form}} [{low.removesuffix('%')}, {high.removesuffix('%')}]"
+
+
+def band_values(band: BandFigures) -> dict[str, Any]:
+    """Figures of one range of depth, as JSON values."""
+    return {
+        "from_m": band.from_m,
+        "to_m": finite(band.to_m),
+        "labels": band.labels,
+        "images": band.images,
+        "unmatched_labels": band.unmatched,
+        **{
+            name: {key: finite(value) for key, value in asdict(figure).items()}
+            for name, figure in band.figures.items()
+        },
+    }
+
+
+def curve_values(scored: Scored) -> dict[str, list[float | None]]:
+    """Precision, recall and the like over the confidence, as JSON values."""
+    found = asdict(curves(scored))
+    return {name: [finite(value) for value in values.tolist()] for name, values in found.items()}
+
+
+def finite(value: float) -> float | None:
+    """The number, if it is one: JSON has neither NaN nor infinity."""
+    return value if math.isfinite(value) else None

@@ -1,7 +1,6 @@
 """``dmrl evaluate``: detections against labels; positions and tracks against the truth."""
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -16,8 +15,8 @@ from dmrl import topics
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
-from dmrl.evaluation.tables import by_band_table
-from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, curves, score
+from dmrl.evaluation.tables import band_values, by_band_table, curve_values, finite
+from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, score
 from dmrl.learn.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.pipeline.crew import cores
@@ -240,7 +239,7 @@ def document(
     One recording is ``recording``, several are ``recordings``.
     """
     sources = [{"name": s.name, "sha256": s.sha256} for s in map(input_of, recordings)]
-    overall, *bands = [_band(band) for band in evaluation.bands]
+    overall, *bands = [band_values(band) for band in evaluation.bands]
     return {
         **({"recordings": sources} if len(sources) > 1 else {"recording": sources[0]}),
         "against": settings.against,
@@ -253,38 +252,15 @@ def document(
         "images_without_detections": evaluation.pairs.unseen,
         "left_out": evaluation.pairs.left_out,
         **{
-            name: _finite(value)
+            name: finite(value)
             for name, value in asdict(alarms(evaluation.scored, evaluation.threshold)).items()
         },
         "bootstrap": {"draws": settings.draws, "seed": settings.seed},
         "overall": overall,
         "bands": bands,
-        "curves": _curves(evaluation.scored),
+        "curves": curve_values(evaluation.scored),
         "definitions": DEFINITIONS,
     }
-
-
-def _band(band: BandFigures) -> dict[str, Any]:
-    return {
-        "from_m": band.from_m,
-        "to_m": _finite(band.to_m),
-        "labels": band.labels,
-        "images": band.images,
-        "unmatched_labels": band.unmatched,
-        **{
-            name: {key: _finite(value) for key, value in asdict(figure).items()}
-            for name, figure in band.figures.items()
-        },
-    }
-
-
-def _curves(scored: Scored) -> dict[str, list[float | None]]:
-    found = asdict(curves(scored))
-    return {name: [_finite(value) for value in values.tolist()] for name, values in found.items()}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def print_evaluation(
