@@ -31,11 +31,9 @@ test-heavy: $(VENV)/.dev ## Run the tests that take a second of CPU or more.
 test-all: $(VENV)/.dev ## Run every test, those too that take minutes.
 	$(PYTEST) -m "slow or not slow" --timeout 3600 $(ARGS)
 
-bench: $(VENV)/.dev ## Time dmrl beside others, on flights it makes; JSON ends up in build/bench/.
+bench: $(VENV)/.dev ## Time dmrl beside others, on flights it makes: build/bench/. ARGS="--only predict".
 	$(BIN)/pip install --quiet --group bench
-	@mkdir -p build/bench
-	@set -e; for name in recording predict commands; do \
-	  $(BIN)/python benchmarks/bench_$$name.py --json build/bench/$$name.json; done
+	$(BIN)/python benchmarks/bench_all.py build/bench $(ARGS)
 
 mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. ARGS="geometry --seed 1".
 	$(BIN)/python tests/mutants.py $(ARGS)

@@ -1,0 +1,106 @@
+"""Every benchmark that wants no data of others: its table, its JSON, a picture, the machine.
+
+Run as ``python benchmarks/bench_all.py [OUT] [--only recording ...]``; ``make bench`` does. In OUT:
+a .txt of each, .json where it writes one, machine.json and ratios.png: what others take of CPU
+time for what dmrl does, of the same rounds. One that fails, for want of a package or of Blender,
+is told with its last line, the others go on, and the exit status is 1.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+WORK: Mapping[str, tuple[str, ...]] = {
+    "recording": ("bench_recording.py", "--json"),
+    "predict": ("bench_predict.py", "--json"),
+    "commands": ("bench_commands.py", "--json"),
+    "memory": ("bench_memory.py", "--json"),
+    "training": ("bench_training.py",),
+    "dataset": ("bench_dataset.py",),
+    "labels": ("bench_labels.py", "--costs-only"),
+}
+"""Scripts and what they are given; one that ends in ``--json`` is told where to."""
+ASKS = {
+    "render": "python benchmarks/bench_render.py speed --model crazyflie-published.blend "
+    "--backgrounds DIR: the authors' model, photos and Blender are not here",
+    "deploy": "python benchmarks/bench_deploy.py EXPORT: of a network of one's own",
+}
+"""What is left out, and why."""
+
+
+def machine() -> dict[str, Any]:
+    """Where figures are from."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return {
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "processor": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg(),
+    }
+
+
+def run(name: str, out: Path) -> str:
+    """One benchmark; nothing, or the last line of what went wrong."""
+    script, *words = WORK[name]
+    if words and words[-1] == "--json":
+        words.append(str(out / f"{name}.json"))
+    done = subprocess.run(
+        [sys.executable, str(HERE / script), *words], capture_output=True, text=True, check=False
+    )
+    (out / f"{name}.txt").write_text(done.stdout, encoding="utf-8")
+    print(f"== {name}\n{done.stdout}", flush=True)
+    return (done.stderr.strip().splitlines() or ["?"])[-1] if done.returncode else ""
+
+
+def draw(out: Path) -> None:
+    """What others take, times dmrl's, as bars: of what is there."""
+    bars: list[tuple[str, float]] = []
+    if (path := out / "recording.json").exists():
+        rows = json.loads(path.read_text())
+        bars += [(f"{r['what']}: {r['who']}", r["ratio"]) for r in rows]
+    if (path := out / "predict.json").exists():
+        rows = {row["who"]: row for row in json.loads(path.read_text())}
+        own = rows.pop("dmrl predict --backend onnx")["cpu_ms"]
+        bars += [(f"predict: {who}", row["cpu_ms"] / own) for who, row in rows.items()]
+    if not bars:
+        return
+    figure = Figure(figsize=(9, 0.3 * len(bars) + 1), layout="constrained")
+    axes = figure.subplots()
+    axes.barh([name for name, _ in bars], [ratio for _, ratio in bars], color="#4477aa")
+    axes.axvline(1, color="black", linewidth=1)
+    axes.set(xscale="log", xlabel="CPU time, times what dmrl takes")
+    axes.invert_yaxis()
+    figure.savefig(out / "ratios.png", dpi=120)
+
+
+def main() -> None:
+    """Run all, or those that are named."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, nargs="?", default=Path("build/bench"))
+    parser.add_argument("--only", nargs="+", choices=list(WORK), default=list(WORK))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "machine.json").write_text(json.dumps(machine(), indent=1) + "\n")
+    failed = {name: why for name in arguments.only if (why := run(name, arguments.out))}
+    draw(arguments.out)
+    for name, why in ASKS.items():
+        print(f"left out: {name}: {why}")
+    for name, why in failed.items():
+        print(f"failed: {name}: {why}", file=sys.stderr)
+    sys.exit(bool(failed))
+
+
+if __name__ == "__main__":
+    main()
