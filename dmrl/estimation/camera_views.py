@@ -104,6 +104,8 @@ def _smoothed(values: Array) -> Array:
     """
     if len(values) < 3:
         return values
+    # Of white noise the second difference has 1 + 4 + 1 times the variance; 1.4826 turns the median
+    # of absolute values into a standard deviation.
     bends = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0)
     noise = np.maximum(1.4826 * bends / np.sqrt(6.0), 1e-9)[:, None]
     side = np.ceil(3 * WIDTH).astype(int)
@@ -207,6 +209,7 @@ def _whitening(jacobian: Array, covariance: Array, noise: Noise) -> Array:
     joint = np.zeros((len(jacobian), 5, 5))
     joint[:, :3, :3] = covariance
     joint[:, [3, 4], [3, 4]] = noise.attitude_std_rad**2
+    # With the covariance C = L L^T of pixel errors e, L^-1 e has unit variance.
     spread = jacobian @ joint @ jacobian.swapaxes(1, 2) + noise.pixel_std_px**2 * np.eye(2)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(spread)))
 

@@ -92,6 +92,7 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
     out[:, :2] = _apply(rotation(-own_heading), path)
     out[:, 2] = state[:, 2]
     own_shift = _apply(rotation(-own_heading[:-1]), own_steps)
+    # The peer's own way is the observer's and the relative one, turned into the peer's frame.
     peer_heading = own_heading[:-1] + state[:-1, 2]
     peer_shift = _apply(rotation(-peer_heading), own_steps + relative_steps)
     return replace(
@@ -124,6 +125,7 @@ def shrunk(velocity: Array, energy: float, step_s: float) -> Array:
     slow = uniform_filter1d(velocity, max(1, round(CALM_S / step_s)), axis=0, mode="nearest")
     window = max(1, round(WINDOW_S / step_s))
     seen = uniform_filter1d((slow**2).sum(axis=1), window, mode="nearest")
+    # What was seen is motion and noise, whose energies add: motion's share is the rest.
     share = np.sqrt(np.maximum(1 - NOISE_FACTOR * energy / np.maximum(seen, 1e-12), 0.0))
     return np.asarray(slow * share[:, None])
 

@@ -80,12 +80,14 @@ def from_peer(state: Array) -> Array:
 def swapped(estimate: Estimate) -> Estimate:
     """The same flight seen from the peer. The status stays that of the observer."""
     state = from_peer(estimate.state)
+    # Seen from the peer p' = -R(-psi) p and psi' = -psi; the derivative of p' by psi is -Q p', with
+    # Q a quarter turn. First order: the covariance of the swapped state is J C J^T.
     by_state = np.zeros((len(state), 3, 3))
     by_state[:, :2, :2], by_state[:, 2, 2] = -rotation(-estimate.state[:, 2]), -1.0
     by_state[:, :2, 2] = -state[:, :2] @ QUARTER.T
     covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
     constants = estimate.constants[SWAPPED]
-    constants[CLOCK] *= -1
+    constants[CLOCK] *= -1  # an offset between two clocks has the other sign from the other side
     return replace(estimate, state=state, covariance=covariance, constants=constants)
 
 

@@ -39,6 +39,7 @@ def estimate_from_exchanges(
     index, apart_s = _same_exchange(reference_s, reference, start, values)
     if len(index) < SHARE * len(time_s):
         return rough
+    # Of each exchange: by how much the reference's log is later than the rough correction says.
     from_middle = time_s[index] - rough.at_s
     slope, middle, sigmas = _line(from_middle, apart_s)
     return Clock(

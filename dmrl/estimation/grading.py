@@ -96,6 +96,7 @@ def _graded(
             break
         middle = min(max(best, 1), last)
     around = range(middle - 1, middle + 2)
+    # The top of a parabola through the best and its neighbours; where it bends up there is none.
     bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
     peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
     velocity, scales, offset_m = (float(np.interp(peak, TAKEN[0], taken)) for taken in TAKEN[1:])

@@ -154,6 +154,7 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
         way = state[min(end + second // 2, len(state) - 1), :2] - state[end - second // 2, :2]
         aside = QUARTER @ way / max(float(np.hypot(*way)), 1e-6)
         copy = state.copy()
+        # p - 2 (n p) n, a mirror along the way: ranges stay as they are, odometry does not.
         copy[start:end, :2] -= 2 * np.outer(copy[start:end, :2] @ aside, aside)
         out.append(copy)
     return out
@@ -177,6 +178,7 @@ def passed_by(state: Array, rate_hz: float) -> list[Array]:
         end = int(farther[farther > at].min(initial=len(state)))
         way = state[min(at + 2, len(state) - 1), :2] - state[max(at - 2, 0), :2]
         aside = QUARTER @ way / max(float(np.hypot(*way)), 1e-6)
+        # Wholly mirrored where it is nearest, less and less from there on: a way without a jump.
         near = np.cos((distance[start:end] - distance[at]) / ROUND_M * np.pi / 2)
         copy = state.copy()
         copy[start:end, :2] -= np.outer(2 * near * (copy[start:end, :2] @ aside), aside)

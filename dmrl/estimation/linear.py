@@ -149,9 +149,12 @@ def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> Ar
 
 def _residual(moves: _Steps, state: Array) -> Array:
     error = state[:-1, 3:5]
+    # Relative motion in the observer's frame: p' = p + peer's way - own way + half_s (w + w'), the
+    # velocity's error by the trapezium rule. psi is the peer's heading less the observer's.
     shift = moves.ahead - state[:-1, :2] - moves.peer + moves.own
     shift = shift - moves.half_s * (error + moves.error_ahead)
     turn = state[1:, 2] - state[:-1, 2] - moves.peer_turn + moves.own_turn
+    # Gauss-Markov: what is left of an error after a step, and new noise, which is the residual.
     longer = state[1:, RANGE_ERROR:] - moves.range_kept * state[:-1, RANGE_ERROR:]
     return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error, longer])
 

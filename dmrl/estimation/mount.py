@@ -233,6 +233,7 @@ class _Half:
 
 
 def _normal(path: _Path, error: Array, left: Array, slopes: Array, spread_px: float) -> _Half:
+    # Cauchy's weight 1 / (1 + r^2 / c^2), as its root on either side of the normal equations.
     far = (left**2).sum(axis=1) / (CAUCHY * spread_px) ** 2
     root = np.repeat(1.0 / (spread_px * np.sqrt(1.0 + far)), 2)
     errors = csr_array(path.errors.multiply(root[:, None]))
@@ -305,6 +306,8 @@ def _axes(xyz_m: Array, spread: Array) -> tuple[Array, Array]:
 
 def _chain(count: int) -> csr_array:
     """(count, count) information of a Gauss-Markov process of unit variance, knot by knot."""
+    # x_k = keeps x_(k-1) + noise of variance 1 - keeps^2. A knot is tied to its two neighbours
+    # alone, so the inverse of the covariance is tridiagonal; the ends have one neighbour.
     keeps = np.exp(-KNOT_S / FADES_S)
     middle = np.full(count, 1 + keeps**2)
     middle[[0, -1]] = 1.0
@@ -315,6 +318,7 @@ def _chain(count: int) -> csr_array:
 
 def slopes_of(views: Sequence[View], camera: Camera, matched: Matched, values: Array) -> Array:
     """(N, 2, 4) derivatives of the expected pixel by roll, pitch, yaw and delay."""
+    # A residual is what was seen less what is expected: its slope is the expectation's, negated.
     sides = [
         residual(views, camera, matched, values - step)
         - residual(views, camera, matched, values + step)

@@ -45,6 +45,7 @@ def contradicts(whole: Estimate, sure: Estimate) -> bool:
         return False
     apart = (xy - sure.state[:, :2])[known]
     information = np.linalg.inv(sure.covariance[known, :2, :2])
+    # Squared Mahalanobis distances: chi-square with two degrees of freedom, if both are right.
     squared = np.einsum("ki,kij,kj->k", apart, information, apart)
     return bool((squared > chi2.ppf(INSIDE, 2)).mean() > CONTRADICTED)
 

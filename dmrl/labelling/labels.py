@@ -61,7 +61,7 @@ class Look:
     def exposures_ns(self, robot: str, images_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """When images of a robot were taken, from their log times."""
         delay_s = self.cameras[robot].delay_s if robot in self.cameras else 0.0
-        return images_ns - round(delay_s * 1e9)
+        return images_ns - round(delay_s * 1e9)  # a delay is how much later the log time is
 
 
 def image_labels(

@@ -79,6 +79,7 @@ class Sight:
         """Of the observer between images k - 1 and k."""
         if k == 0:
             return Motion(0.0, np.zeros(3), 0.0)
+        # R(-yaw) turns the way into the observer's frame at the image before.
         c, s = np.cos(self.yaw_rad[k - 1]), np.sin(self.yaw_rad[k - 1])
         x, y, z = self.path_m[k] - self.path_m[k - 1]
         shift_m = np.array([c * x + s * y, -s * x + c * y, z])
@@ -253,6 +254,7 @@ def _path(
         warnings.append(f"{topics.velocity(robot)}: not there; {robot} is taken to stand still")
     else:
         heading = np.interp(moving[0], at_ns, yaw_rad)
+        # Velocities are in the robot's own frame: each is turned by its heading before they add up.
         forward = np.exp(1j * heading) * (moving[1] @ [1, 1j])
         along = _summed(moving[0], np.column_stack([forward.real, forward.imag]))
         for axis in range(2):
