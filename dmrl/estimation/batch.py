@@ -16,6 +16,7 @@ from dmrl.estimation.linear import (
     linearise,
     step_variance,
 )
+from dmrl.estimation.looks import add
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
 from dmrl.estimation.robust import cost_of, weights_of
@@ -122,6 +123,8 @@ def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Arra
     """Normal equations with the losses' weights and the globals' prior."""
     weights = weights_of(linear, noise, constants)
     equations = normal(linear, problem.range_key, weights, WEAK)
+    if problem.looks is not None and linear.seen is not None and weights.seen is not None:
+        add(equations, problem.looks, linear.seen, weights.seen)
     held = weights.free.copy()
     held[0] += weights.first
     equations.diagonal[:, RANGE_ERROR, RANGE_ERROR] += held

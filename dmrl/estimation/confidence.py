@@ -18,6 +18,7 @@ from scipy.ndimage import uniform_filter1d
 from dmrl.estimation.banded import Normal, block_inverse, solve
 from dmrl.estimation.batch import Solution, equations_of
 from dmrl.estimation.linear import BIAS, SCALE, linearise
+from dmrl.estimation.looks import Looks, Seen, picked
 from dmrl.estimation.motion import Increments, rotation
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import Noise, Problem
@@ -48,16 +49,43 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
     constants : Array
         (G, G), in the order of ``GLOBALS``.
     """
+    if problem.looks is not None:
+        problem = replace(problem, looks=picked(problem.looks, solution.state))
     at_solution = linearise(problem, noise, solution.state, solution.constants)
     calm, state = calmed(problem, noise, solution.state)
     linear = linearise(calm, noise, state, solution.constants)
     # The calmed copy does not fit the ranges; their weights come from the solution.
     linear.ranges[:, -1] = at_solution.range
+    if linear.seen is not None and at_solution.seen is not None:
+        linear.seen.rows[..., -1] = at_solution.seen.rows[..., -1]
+        linear.seen.beyond[:] = at_solution.seen.beyond
     equations = equations_of(calm, noise, linear, solution.constants)
     weights = weights_of(linear, noise, solution.constants)
     held = curvature_of(noise, solution.constants) - weights.prior * noise.prior_std() ** -2
     equations.corner[...] += np.diag(held)
-    return _inverse(equations)
+    keyframes, constants = _inverse(equations)
+    if problem.looks is not None and linear.seen is not None and weights.seen is not None:
+        keyframes += _shared(equations, problem.looks, linear.seen, weights.seen)
+    return keyframes, constants
+
+
+def _shared(equations: Normal, looks: Looks, found: Seen, weight: Array) -> Array:
+    """(K, 6, 6) what an error adds that all images of a camera share: of a mount, or a network.
+
+    It is not solved for, but considered (Schmidt 1966): one as large as that of a single image in
+    azimuth, for either camera.
+    """
+    out = np.zeros_like(equations.diagonal)
+    for side in (1, -1):
+        mine = weight * (looks.side == side)
+        gradient = np.zeros_like(equations.gradient)
+        pulled, part = found.rows[:, 0, :3] * mine[:, None], looks.part[:, None]
+        np.add.at(gradient[:, :3], looks.key, (1 - part) * pulled)
+        np.add.at(gradient[:, :3], looks.key + 1, part * pulled)
+        nothing = np.zeros_like(equations.corner_gradient)
+        moved = solve(replace(equations, gradient=gradient, corner_gradient=nothing))[0]
+        out += moved[:, :, None] * moved[:, None, :]
+    return out
 
 
 def _inverse(equations: Normal) -> tuple[Array, Array]:

@@ -19,10 +19,12 @@ from dmrl.estimation.gate import (
     Statuses,
     statuses,
 )
+from dmrl.estimation.glances import glances_of, repeated
 from dmrl.estimation.grading import noise_of, with_range_noise
 from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, spread_of
 from dmrl.estimation.linear import RANGE_ERROR
-from dmrl.estimation.pair import Array, Mask, Pair
+from dmrl.estimation.looks import agreeing, trusted
+from dmrl.estimation.pair import LONGEST_GAP_S, Array, Mask, Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
 from dmrl.estimation.search import KEY_HZ, distinct, solutions
 from dmrl.estimation.stretches import joined, mended, stretches
@@ -36,6 +38,8 @@ SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
 flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
+LOOKED_S = 3.0
+"""A camera that saw the other for so long tells the bearing of a flight that has no motion."""
 STEADY, REACH_M = 10, 0.5
 """A position is held against the medians of so many ranges before and after, and may be this
 much farther."""
@@ -87,25 +91,36 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     estimate, far = within_reach(flight, estimate)
     back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
-    floor = (flight.silent | far) * np.int8(UNCONVERGED)
+    looks = trusted(flight.looks, estimate.state)
+    looked = [
+        agreeing(looks, estimate.state, side, flight.key_s, LONGEST_GAP_S) for side in (1, -1)
+    ]
+    # Where a camera sees the other, ranges may be silent.
+    silent = flight.silent | (flight.unheard & ~(looked[0] | looked[1]))
+    floor = (silent | far) * np.int8(UNCONVERGED)
     here = np.maximum(statuses(estimate.state, estimate.covariance * GATE_SIGMA**2, gate_m), floor)
     there = np.maximum(statuses(back.state, back.covariance * GATE_SIGMA**2, gate_m), floor)
-    for status, moved in ((here, own), (there, peer)):
-        if moved < STILL or relative < ALIKE:
+    # What does not move tells no bearing. A camera that sees the other tells it.
+    ways = (here, own, looked[0]), (there, peer, looked[1])
+    why: list[Refused | None] = []
+    for status, moved, at in ways:
+        unmoved: Refused | None = None
+        if at.sum() < LOOKED_S * KEY_HZ:
+            unmoved = "still" if moved < STILL else "alike" if relative < ALIKE else None
+        if unmoved:
             status[:] = AMBIGUOUS
-    silent = bool(flight.silent.mean() > MOST)
-    why = [_refused(s, moved, relative, silent) for s, moved in ((here, own), (there, peer))]
+        why.append(_refused(status, unmoved, bool(silent.mean() > MOST)))
     return (
         replace(estimate, status=here, refused=why[0]),
         replace(back, status=there, refused=why[1]),
     )
 
 
-def _refused(status: Statuses, moved: float, relative: float, silent: bool) -> Refused | None:
+def _refused(status: Statuses, unmoved: Refused | None, silent: bool) -> Refused | None:
     if (status == OK).any():
         return None
-    if moved < STILL or relative < ALIKE:
-        return "still" if moved < STILL else "alike"
+    if unmoved:
+        return unmoved
     if silent:
         return "silent"
     return "open" if (status == AMBIGUOUS).mean() > MOST else "imprecise"
@@ -187,9 +202,11 @@ def _starts(problems: list[Problem], noise: Noise | None) -> list[_Starts]:
 def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Array]:
     """Scores (P KEPT,), states and covariances (K, P KEPT, ...) of P flights of one length."""
     inputs = keyframe_filter.inputs_of(problems, noise)
-    start = candidates(inputs, KEY_HZ).reshape(-1, 3)
+    glances = glances_of([flight.looks for flight in problems])
+    start = candidates(inputs, KEY_HZ, glances).reshape(-1, 3)
     count = len(problems[0].key_s)
-    filtered = keyframe_filter.run(inputs.repeated(KEPT, count), start, START_STD)
+    given = inputs.repeated(KEPT, count), start, START_STD
+    filtered = keyframe_filter.run(*given, repeated(glances, KEPT))
     return filtered.log_likelihood, *keyframe_filter.smoothed(filtered)
 
 
@@ -214,6 +231,8 @@ def _from_batch(
 ) -> Estimate:
     first = noise or Noise()
     ends = solutions(flight, first, score, tracks.swapaxes(0, 1), pieced)
+    if flight.looks is not None:
+        flight = replace(flight, looks=trusted(flight.looks, ends[0].state))
     found, best = (noise, ends[0]) if noise else noise_of(flight, first, ends[0])
     ends = _weighed(flight, found, best, ends)
     apart = spread_of(np.array([s.cost for s in ends]), np.stack([s.state[:, :3] for s in ends]))

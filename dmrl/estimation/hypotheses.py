@@ -8,6 +8,7 @@ from scipy.ndimage import minimum_filter1d
 
 from dmrl.estimation import keyframe_filter
 from dmrl.estimation.batch import near
+from dmrl.estimation.glances import NOTHING, Glances, repeated
 from dmrl.estimation.keyframe_filter import QUARTER, Inputs
 from dmrl.estimation.pair import Array
 
@@ -52,7 +53,7 @@ def starts(range_m: float, height_m: float) -> Array:
     return np.column_stack([radius * np.cos(bearing), radius * np.sin(bearing), heading])
 
 
-def candidates(inputs: Inputs, rate_hz: float) -> Array:
+def candidates(inputs: Inputs, rate_hz: float, glances: Glances = NOTHING) -> Array:
     """(P, KEPT, 3) likely starts of P pairs, best first, distinct as far as there are such.
 
     Parameters
@@ -61,11 +62,14 @@ def candidates(inputs: Inputs, rate_hz: float) -> Array:
         Of P pairs.
     rate_hz
         Keyframes per second.
+    glances
+        What cameras saw, of each pair.
     """
     keyframes = min(len(inputs.range_m), int(FIRST_S * rate_hz))
     first = [_first(inputs, pair, keyframes) for pair in range(inputs.range_m.shape[1])]
     count = BEARINGS * HEADINGS
-    run = keyframe_filter.run(inputs.repeated(count, keyframes), np.concatenate(first), START_STD)
+    given = inputs.repeated(count, keyframes), np.concatenate(first), START_STD
+    run = keyframe_filter.run(*given, repeated(glances, count))
     end = run.state[-1, :, :3].reshape(-1, count, 3)
     score = run.log_likelihood.reshape(-1, count)
     begun = np.stack(first)

@@ -6,6 +6,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.estimation.glances import NOTHING, Glances, glanced
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import Noise, Problem
@@ -137,7 +138,7 @@ class Filtered:
     log_likelihood: Array
 
 
-def run(inputs: Inputs, start: Array, start_std: Array) -> Filtered:
+def run(inputs: Inputs, start: Array, start_std: Array, glances: Glances = NOTHING) -> Filtered:
     """Filter from B starts.
 
     Parameters
@@ -148,6 +149,8 @@ def run(inputs: Inputs, start: Array, start_std: Array) -> Filtered:
         (B, 3) x, y (m), psi (rad) at the first keyframe.
     start_std
         (5,) standard deviations of these and of the biases, rad/s.
+    glances
+        What cameras saw, by keyframe.
     """
     count, filters = inputs.range_m.shape
     states = (np.empty((count, filters, SIZE)) for _ in range(2))
@@ -159,6 +162,10 @@ def run(inputs: Inputs, start: Array, start_std: Array) -> Filtered:
     for k in range(count):
         out.prior[k], out.prior_covariance[k] = state, covariance
         _update(state, covariance, inputs, k, out.log_likelihood)
+        for glance in glances.get(k, ()):
+            mine = slice(glance.first, glance.first + glance.copies)
+            given = state[mine], covariance[mine], inputs.height_m[k, mine]
+            glanced(*given, glance, out.log_likelihood[mine])
         out.state[k], out.covariance[k] = state, covariance
         state, step = _moved(state, inputs, k)
         out.step[k] = step

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.estimation.keyframe_filter import QUARTER
+from dmrl.estimation.looks import Seen, seen
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
@@ -45,11 +46,14 @@ class Linear:
         (R, 4 + 2 + 1) by x, y, psi, b; by bias and scale of the ranges; the residual.
     error_m
         (K,) b, metres.
+    seen
+        What cameras saw; None: nothing.
     """
 
     steps: Array
     ranges: Array
     error_m: Array
+    seen: Seen | None = None
 
     @property
     def step(self) -> Array:
@@ -75,7 +79,9 @@ def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) ->
         (G,) as in ``GLOBALS``.
     """
     steps = _steps(problem, noise, state, constants)
-    return Linear(steps, _ranges(problem, noise, state, constants), state[:, RANGE_ERROR])
+    ranges = _ranges(problem, noise, state, constants)
+    looked = None if problem.looks is None else seen(problem.looks, state)
+    return Linear(steps, ranges, state[:, RANGE_ERROR], looked)
 
 
 @dataclass(frozen=True, slots=True)

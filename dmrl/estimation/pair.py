@@ -47,6 +47,26 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
+class Sightings:
+    """What a robot's camera showed that may be the other robot. I images, up to C candidates.
+
+    Parameters
+    ----------
+    time_s
+        (I,) when the images that show a candidate were taken, seconds, never going back.
+    polar
+        (I, C, 3) azimuth, elevation (rad) in the horizontal frame of the robot that saw, and the
+        logarithm of the distance in metres; NaN where an image has no more candidates.
+    std
+        (I, C, 3) standard deviations of these.
+    """
+
+    time_s: Array
+    polar: Array
+    std: Array
+
+
+@dataclass(frozen=True, slots=True)
 class Pair:
     """An observer, its peer, and the ranges between them.
 
@@ -60,6 +80,9 @@ class Pair:
         (R,) times of the ranges, seconds, inside the grid, never going back.
     range_m
         (R,) measured distances, metres.
+    own_sees, peer_sees
+        What the camera of either showed; None: nothing, or it has none. Images outside the grid
+        do not count.
 
     Raises
     ------
@@ -73,6 +96,8 @@ class Pair:
     peer: Track
     range_time_s: Array
     range_m: Array
+    own_sees: Sightings | None = None
+    peer_sees: Sightings | None = None
 
     def __post_init__(self) -> None:
         count = len(self.time_s)
@@ -101,7 +126,8 @@ class Pair:
 
     def swapped(self) -> "Pair":
         """The same ranges seen from the peer."""
-        return Pair(self.time_s, self.peer, self.own, self.range_time_s, self.range_m)
+        ranges = self.range_time_s, self.range_m
+        return Pair(self.time_s, self.peer, self.own, *ranges, self.peer_sees, self.own_sees)
 
 
 def usable_ranges(time_s: Array, range_m: Array) -> Mask:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.jumps import levels
+from dmrl.estimation.looks import Looks, looks_of
 from dmrl.estimation.motion import Increments, odometry
 from dmrl.estimation.pair import LONGEST_GAP_S, Array, Mask, Pair
 
@@ -133,7 +134,9 @@ class Problem:
     gap_s
         (K - 1,) share of the interval, in seconds, in which a robot's sensors were silent.
     silent
-        (K,) whether any sensor, ranges and heights too, was silent for over half a second.
+        (K,) whether any sensor of a robot, heights too, was silent for over half a second.
+    unheard
+        (K,) whether the ranges were.
     range_key
         (R,) keyframe at or before each range.
     range_m
@@ -144,6 +147,8 @@ class Problem:
         (R,) by how much ranges seem to have jumped, metres: a first guess.
     height_m
         (R,) peer's height less the observer's, metres.
+    looks
+        What cameras saw; None: nothing.
     """
 
     key_s: Array
@@ -152,12 +157,14 @@ class Problem:
     peer_by_clock: Array
     gap_s: Array
     silent: Mask
+    unheard: Mask
     range_key: NDArray[np.intp]
     range_m: Array
     own_to_range: Increments
     peer_to_range: Increments
     range_level_m: Array
     height_m: Array
+    looks: Looks | None = None
 
     @property
     def steps_s(self) -> Array:
@@ -194,17 +201,19 @@ def problem(pair: Pair, rate_hz: float = 10.0) -> Problem:
         peer_by_clock=(after.shift_m - before.shift_m) / (2 * SHIFT_S),
         gap_s=np.diff(gap, prepend=0.0),
         silent=silence(pair, key_s),
+        unheard=unheard(pair, key_s),
         range_key=range_key,
         range_m=pair.range_m,
         own_to_range=own.increments(key_s[range_key], pair.range_time_s),
         peer_to_range=peer.increments(key_s[range_key], pair.range_time_s),
         range_level_m=range_levels(pair),
         height_m=np.interp(pair.range_time_s, grid, height),
+        looks=looks_of(pair, key_s, Noise().height_std_m),
     )
 
 
 def silence(pair: Pair, time_s: Array) -> Mask:
-    """(K,) whether a sensor of either robot, or the ranges, were silent for over half a second.
+    """(K,) whether a sensor of either robot was silent for over half a second.
 
     Parameters
     ----------
@@ -218,9 +227,22 @@ def silence(pair: Pair, time_s: Array) -> Mask:
         if track.height_gap is not None:
             gap = gap | track.height_gap
     low = np.clip(np.searchsorted(pair.time_s, time_s, "right") - 1, 0, len(gap) - 2)
+    return np.asarray(gap[low] | gap[low + 1])
+
+
+def unheard(pair: Pair, time_s: Array) -> Mask:
+    """(K,) whether the ranges were silent for over half a second.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    time_s
+        (K,) times asked for, seconds.
+    """
     edges = np.concatenate([[-np.inf], pair.range_time_s, [np.inf]])
     after = np.clip(np.searchsorted(edges, time_s), 1, len(edges) - 1)
-    return np.asarray(gap[low] | gap[low + 1] | (edges[after] - edges[after - 1] > LONGEST_GAP_S))
+    return np.asarray(edges[after] - edges[after - 1] > LONGEST_GAP_S)
 
 
 def range_levels(pair: Pair) -> Array:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.estimation.linear import RANGE_ERROR, SIZE, Linear
+from dmrl.estimation.looks import LIMIT
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import Noise
 
@@ -37,6 +38,8 @@ class Weights:
         (K,) of every range error, likewise.
     prior
         (G,) of what is constant.
+    seen
+        (I,) of what was seen in each image; None: nothing.
     """
 
     step: Array
@@ -44,6 +47,7 @@ class Weights:
     first: float
     free: Array
     prior: Array
+    seen: Array | None = None
 
 
 def limits(noise: Noise) -> tuple[Array, float]:
@@ -61,18 +65,22 @@ def cost_of(linear: Linear, noise: Noise, constants: Array) -> float:
     total += noise.jump**2 * np.log1p(_first(linear, noise))
     total += noise.free_weight * np.log1p((linear.error_m / noise.free_m) ** 2).sum()
     total += (PRIOR * np.log1p((constants / noise.prior_std()) ** 2 / PRIOR)).sum()
+    if linear.seen is not None:
+        total += (linear.seen.share * LIMIT * np.log1p(linear.seen.squared / LIMIT)).sum()
     return float(total) / 2
 
 
 def weights_of(linear: Linear, noise: Noise, constants: Array) -> Weights:
     """Weights with which squares have the losses' slopes."""
     step, ranges = limits(noise)
+    looked = linear.seen
     return Weights(
         1 / (1 + linear.step**2 / step),
         1 / (1 + linear.range**2 / ranges),
         1 / (1 + _first(linear, noise)) / noise.range_error_std_m**2,
         noise.free_weight / (noise.free_m**2 + linear.error_m**2),
         1 / (1 + (constants / noise.prior_std()) ** 2 / PRIOR),
+        None if looked is None else looked.share / (1 + looked.squared / LIMIT),
     )
 
 

@@ -19,6 +19,7 @@ from dmrl.estimation.gate import OK
 from dmrl.estimation.motion import rotation
 from dmrl.estimation.pair import Array, Mask, Pair, Track
 from dmrl.estimation.problem import Problem
+from dmrl.estimation.sightings import within
 
 SILENCE_S = 3.0
 """Ranges or odometry that are silent for so long part a flight."""
@@ -155,6 +156,7 @@ def _cut(pair: Pair, start_s: float, end_s: float) -> Pair:
         _cut_track(pair.peer, at),
         pair.range_time_s[inside],
         pair.range_m[inside],
+        *(within(seen, time_s[0], time_s[-1]) for seen in (pair.own_sees, pair.peer_sees)),
     )
 
 

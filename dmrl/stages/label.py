@@ -23,17 +23,18 @@ from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
+    from dmrl.estimation.contested import told_apart
     from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
     from dmrl.estimation.estimated import Estimate
     from dmrl.estimation.gate import GATE_M
-    from dmrl.estimation.pair import Pair
+    from dmrl.estimation.pair import Pair, Sightings
     from dmrl.estimation.swarm import estimate_swarm
     from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import SENSED, Logs, read_logs
     from dmrl.labelling.report import PairReport, doubts, pair_report, refusal
     from dmrl.labelling.sight import SEEN, read_sight
-    from dmrl.labelling.sighted import sighted
+    from dmrl.labelling.sighted import levelled, sightings_of, with_sightings
     from dmrl.labelling.truth import TOLD
     from dmrl.labelling.write import label_messages, position_series
 except ModuleNotFoundError as e:
@@ -72,8 +73,8 @@ class Settings:
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
     detections
-        Correct bearings by the detections that are in the recording, of a network that learned
-        from such labels.
+        Solve with the detections that are in the recording as well, whosever they may be, wrong
+        ones among them. For the method "batch".
     pixel_std_px
         Error of such a detection in u and in v, pixels.
     range_offset_m
@@ -140,15 +141,22 @@ def side_by_side(recording: Path, out: Path, settings: Settings, workers: int) -
     logs = _logs(held, settings)
     cameras = {robot: camera_given(held, robot, path) for robot, path in settings.camera.items()}
     look = Look(settings.attitude_std_rad, not settings.undistorted, cameras)
-    estimates = _estimates(logs.pairs, settings, workers)
+    sees = _sightings(held, logs, look, settings) if settings.detections else {}
+    pairs = with_sightings(logs.pairs, sees)
+    estimates = _estimates(pairs, settings, workers)
+    if again := told_apart(pairs, estimates):
+        estimates = dict(sorted((estimates | _estimates(again, settings, workers)).items()))
     images = {robot: held.times(topics.camera_image(robot)) for robot in logs.robots}
     exposures = {robot: look.exposures_ns(robot, times) for robot, times in images.items()}
     positions = {
         pair: _positions(logs.start_ns, _oriented(logs.pairs, pair), estimate, exposures[pair[0]])
         for pair, estimate in estimates.items()
     }
-    if settings.detections:
-        _correct(held, positions, look, settings.pixel_std_px)
+    for (robot, peer), found in positions.items():
+        if robot in sees:
+            positions[robot, peer], used = levelled(found, logs.start_ns, sees[robot])
+            said = f"{used} detections in {len(sees[robot].time_s)} images counted"
+            say(f"{robot} -> {peer}: {said}")
     reports = [pair_report(held, pair, positions[pair], estimates[pair]) for pair in positions]
     filming = [robot for robot, times in images.items() if len(times)]
     made = {
@@ -210,21 +218,24 @@ def _count(made: Iterable[Iterable[Timed]]) -> int:
     return sum(peer.source == SOURCE for peer in peers)
 
 
-def _correct(held: Contents, positions: dict[Names, Positions], look: Look, std_px: float) -> None:
-    """Put into the positions what their observers' cameras detected."""
+def _sightings(held: Contents, logs: Logs, look: Look, settings: Settings) -> dict[str, Sightings]:
+    """What the cameras of robots in pairs detected, by robot."""
+    if settings.method != "batch":
+        raise SettingError(f"--detections goes with --method batch, not {settings.method}")
     robots = topics.robots(list(held.topics), topics.DETECTIONS)
     if not robots:
         raise MissingTopic(topics.detections("*"), held.topics, held.path)
-    for robot in robots:
+    out = {}
+    for robot in (robot for robot in robots if robot in logs.robots):
         camera = look.cameras.get(robot) or camera_of(held, robot)
         if camera is None:
             raise MissingTopic(topics.calibration(robot), held.topics, held.path)
         if not look.distorted:
             camera = replace(camera, distortion=())
         sight = read_sight(held, robot, camera, None)
-        for pair in (pair for pair in positions if pair[0] == robot):
-            positions[pair], used = sighted(sight, positions[pair], std_px)
-            say(f"{' -> '.join(pair)}: {used} detections in {len(sight.time_ns)} images counted")
+        stds = settings.pixel_std_px, settings.attitude_std_rad
+        out[robot] = sightings_of(sight, logs.start_ns, *stds)
+    return out
 
 
 def _oriented(pairs: Mapping[Names, Pair], pair: Names) -> Pair:

@@ -1,82 +1,107 @@
-"""Positions corrected by detections."""
+"""Detections as bearings and distances, and heights that they correct."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dmrl.geometry.frames import Array, Camera, pixels_from_horizontal
+from dmrl.estimation.pair import Array
+from dmrl.estimation.sightings import polar_of
+from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.sight import Sight
-from dmrl.labelling.sighted import sighted
+from dmrl.labelling.sighted import (
+    DISTANCE_RATIO,
+    LEAST_RATIO,
+    levelled,
+    sightings_of,
+    with_sightings,
+)
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 
+from ..estimation.sighted_flights import still_pair
+
 CAMERA = Camera(320, 224, 180.0, 180.0, 160.0, 112.0)
-COUNT, STEP_NS = 40, 100_000_000
-TIME_NS = np.arange(COUNT) * STEP_NS
-TRUE_M = np.column_stack([2 + 0 * TIME_NS, 0.3 * np.sin(TIME_NS / 1e9), 0.1 + 0 * TIME_NS])
-TILT = np.column_stack([0.1 * np.cos(TIME_NS / 1e9), 0.05 * np.sin(TIME_NS / 1e9)])
+COUNT, STEP_NS, START_NS = 40, 100_000_000, 7_000_000_000
+TIME_NS = START_NS + np.arange(COUNT) * STEP_NS
+SWAY = np.sin(np.arange(COUNT) / 10)
+TRUE_M = np.column_stack([2 + 0 * SWAY, 0.3 * SWAY, 0.1 + 0 * SWAY])
+TILT = np.column_stack([0.25 * np.cos(SWAY), -0.15 + 0.05 * SWAY])
 
 
 def known(off_m: Array, status: int = STATUS_OK) -> Positions:
-    covariance = np.tile(np.diag([0.09, 0.09, 0.01]), (COUNT, 1, 1))
+    covariance = np.tile(np.diag([0.01, 0.01, 0.04]), (COUNT, 1, 1))
     return Positions(TIME_NS, TRUE_M + off_m, covariance, np.full(COUNT, status, np.int8))
 
 
-def seen(every: int = 1, shift_ns: int = 0) -> Sight:
-    uv, depth_m, _ = pixels_from_horizontal(TRUE_M, *TILT.T, CAMERA)
-    kept = np.arange(0, COUNT, every)
-    detections = np.column_stack([uv, depth_m, np.zeros(COUNT)])[kept]
-    times_ns = TIME_NS[kept] + shift_ns
-    return Sight(
-        "cf1",
-        CAMERA,
-        times_ns,
-        times_ns,
-        detections,
-        np.arange(len(kept) + 1),
-        TILT[kept],
-        np.zeros((len(kept), 3)),
-        np.zeros(len(kept)),
-        {},
-        [],
-    )
+def seen(sigma_m: float = 0.0, every: int = 1) -> Sight:
+    """One candidate in each image, and none in the others."""
+    uv, depth_m, _ = pixels_from_horizontal(TRUE_M, TILT[:, 0], TILT[:, 1], CAMERA)
+    shown = np.arange(COUNT) % every == 0
+    rows = np.column_stack([uv, depth_m, np.full(COUNT, sigma_m)])[shown]
+    first = np.concatenate([[0], np.cumsum(shown)])
+    nothing = np.zeros((COUNT, 3))
+    return Sight("cf1", CAMERA, TIME_NS, TIME_NS, rows, first, TILT, nothing, nothing[:, 0], {}, [])
 
 
-def test_what_was_seen_moves_positions_to_where_it_was() -> None:
-    before = known(np.array([0.0, 0.25, 0.0]))
-    after, used = sighted(seen(every=2), before, 3.0)
+def test_detections_are_directions_in_the_horizontal_frame() -> None:
+    found = sightings_of(seen(every=2), START_NS, 3.6, 0.015)
+    assert found.time_s == pytest.approx(np.arange(0, COUNT, 2) * 0.1)
+    assert found.polar[:, 0] == pytest.approx(polar_of(TRUE_M[::2]))
+    wanted = [3.6 / 180, np.hypot(3.6 / 180, 0.015), DISTANCE_RATIO]
+    assert found.std == pytest.approx(np.tile(wanted, (COUNT // 2, 1, 1)))
+
+
+def test_a_network_that_says_how_sure_it_is_of_a_distance_is_believed_to_a_limit() -> None:
+    depth_m = seen().detections[:, 2]
+    assert sightings_of(seen(0.4), 0, 3.0, 0.01).std[:, 0, 2] == pytest.approx(0.4 / depth_m)
+    assert (sightings_of(seen(1e-3), 0, 3.0, 0.01).std[..., 2] == LEAST_RATIO).all()
+
+
+def test_images_have_as_many_candidates_as_they_show() -> None:
+    one = seen(every=4)
+    # The first image that shows something gets a second candidate.
+    rows = np.concatenate([one.detections[:1], one.detections])
+    first = one.first + (np.arange(COUNT + 1) > 0)
+    found = sightings_of(replace(one, detections=rows, first=first), START_NS, 3.0, 0.01)
+    assert np.isfinite(found.polar[..., 0]).sum(axis=1).tolist() == [2] + [1] * 9
+    assert found.polar[0, 0] == pytest.approx(found.polar[0, 1])
+    none = replace(one, detections=rows[:0], first=0 * first)
+    assert len(sightings_of(none, START_NS, 3.0, 0.01).time_s) == 0
+
+
+def test_both_robots_of_a_pair_get_what_their_cameras_showed() -> None:
+    pair, _ = still_pair()
+    sees = sightings_of(seen(), START_NS, 3.0, 0.01)
+    pairs = with_sightings({("a", "b"): pair, ("b", "c"): pair}, {"b": sees})
+    assert pairs["a", "b"].peer_sees is sees and pairs["a", "b"].own_sees is None
+    assert pairs["b", "c"].own_sees is sees and pairs["b", "c"].peer_sees is None
+    assert pairs["a", "b"].swapped().own_sees is sees
+
+
+def test_heights_go_to_where_the_peer_was_seen() -> None:
+    sees = sightings_of(seen(every=2), START_NS, 3.0, 0.005)
+    before = known(np.array([0.0, 0.02, 0.15]))
+    after, used = levelled(before, START_NS, sees)
     assert used == COUNT // 2
-    assert np.abs(after.xyz_m - TRUE_M)[:, 1].mean() < 0.08
-    assert (after.covariance[:, 1, 1] < 0.3 * before.covariance[:, 1, 1]).all()
-    assert (after.time_ns == before.time_ns).all()
+    assert (after.xyz_m[:, :2] == before.xyz_m[:, :2]).all()
+    assert np.abs(after.xyz_m - TRUE_M)[:, 2].max() < 0.03
+    assert (after.covariance[:, 2, 2] < 0.2 * before.covariance[:, 2, 2]).all()
     assert (after.status == before.status).all()
 
 
-def test_a_vaguer_detector_moves_them_less() -> None:
-    before = known(np.array([0.0, 0.25, 0.0]))
-    sharp, vague = (sighted(seen(every=8), before, std_px)[0] for std_px in (2.0, 60.0))
-    assert (sharp.covariance[:, 1, 1] < vague.covariance[:, 1, 1]).all()
-
-
-def test_positions_that_are_not_ok_and_images_without_one_are_left_alone() -> None:
-    open_ones = known(np.array([0.0, 0.25, 0.0]), STATUS_AMBIGUOUS)
-    assert sighted(seen(), open_ones, 3.0) == (open_ones, 0)
-    between = known(np.array([0.0, 0.25, 0.0]))
-    assert sighted(seen(shift_ns=STEP_NS // 2), between, 3.0) == (between, 0)
-    status = np.where(np.arange(COUNT) < 20, STATUS_AMBIGUOUS, STATUS_OK).astype(np.int8)
-    mixed = replace(between, status=status)
-    after, used = sighted(seen(), mixed, 3.0)
+def test_what_is_not_ok_or_was_not_seen_stays() -> None:
+    sees = sightings_of(seen(), START_NS, 3.0, 0.005)
+    open_ones = known(np.array([0.0, 0.0, 0.15]), STATUS_AMBIGUOUS)
+    assert levelled(open_ones, START_NS, sees) == (open_ones, 0)
+    elsewhere = known(np.array([0.0, 1.5, 0.15]))
+    after, used = levelled(elsewhere, START_NS, sees)
+    assert used == 0
+    assert after.xyz_m == pytest.approx(elsewhere.xyz_m)
+    assert after.covariance == pytest.approx(elsewhere.covariance)
+    half = np.where(np.arange(COUNT) < 20, STATUS_AMBIGUOUS, STATUS_OK).astype(np.int8)
+    mixed = replace(known(np.array([0.0, 0.0, 0.15])), status=half)
+    after, used = levelled(mixed, START_NS, sees)
     assert used == 20
     assert (after.xyz_m[:20] == mixed.xyz_m[:20]).all()
-    assert np.abs(after.xyz_m[25:] - TRUE_M[25:])[:, 1].max() == pytest.approx(0, abs=0.1)
-
-
-def test_detections_are_turned_by_the_attitude_of_their_image() -> None:
-    steep = np.tile([0.25, -0.15], (COUNT, 1))
-    uv, depth_m, _ = pixels_from_horizontal(TRUE_M, *steep.T, CAMERA)
-    detections = np.column_stack([uv, depth_m, np.zeros(COUNT)])
-    tilted = replace(seen(), detections=detections, attitude_rad=steep)
-    after, used = sighted(tilted, known(np.array([0.0, 0.1, 0.0])), 3.0)
-    assert used == COUNT
-    assert np.abs(after.xyz_m - TRUE_M).max() < 0.02
+    assert np.abs(after.xyz_m[20:] - TRUE_M[20:])[:, 2].max() < 0.03

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.errors import MissingTopic, OutputError
+from dmrl.errors import MissingTopic, OutputError, SettingError
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.pair import Pair, Track
 from dmrl.estimation.problem import Noise
@@ -132,6 +132,8 @@ def test_what_a_network_saw_makes_labels_better(
             sink.write(stamped.time_ns, topics.detections("cf1"), made)
     label.run(seen, tmp_path / "refined.mcap", replace(LENIENT, detections=True))
     assert off_px(tmp_path / "refined.mcap") < 0.6 * off_px(labelled)
+    with pytest.raises(SettingError, match="--detections goes with --method batch, not ekf"):
+        label.run(seen, tmp_path / "none.mcap", Settings(method="ekf", detections=True))
     with pytest.raises(MissingTopic, match="no topic /\\*/detections"):
         label.run(flight, tmp_path / "none.mcap", replace(LENIENT, detections=True))
     assert not (tmp_path / "none.mcap").exists()

@@ -1,0 +1,262 @@
+"""Labels with what cameras saw in the solve: what a network adds to ranges, and takes.
+
+Run as ``python benchmarks/bench_label_detections.py [--flights 6] [--first-seed 0] [--only CASE]``.
+Flights as `dmrl fly` makes them, and a detector like a small network: 10 images a second of every
+robot; what is in view is missed in 15 %, off by 1.5 px and 10 % of its distance, and 7 % of the
+images show something that is not there; nobody knows which robot was seen. Every pair is solved
+without and with the detections, through `dmrl label`'s gate.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from bench_label_faults import pair_of, times
+from fault_cases import CASES as FAULTS
+
+from dmrl.estimation.contested import told_apart
+from dmrl.estimation.estimate import estimate_pairs
+from dmrl.estimation.estimated import Estimate
+from dmrl.estimation.gate import OK
+from dmrl.estimation.pair import Pair
+from dmrl.estimation.score import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
+from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
+from dmrl.geometry.frames import AIDECK, Array, pixels_from_horizontal
+from dmrl.labelling.sight import Sight
+from dmrl.labelling.sighted import sightings_of, with_sightings
+
+IMAGES_HZ = 10.0
+PIXEL_STD_PX, DISTANCE_RATIO, MISSED, FARTHEST_M = 1.5, 0.1, 0.15, 5.0
+SAID_PX, ATTITUDE_STD_RAD = 3.0, 0.015
+"""What `dmrl label` is told of it with --pixel-std-px, and believes of attitudes."""
+SETTLE_S = 5.0
+Names = tuple[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is flown.
+
+    Parameters
+    ----------
+    trajectory, duration_s, robots
+        As in `dmrl fly`.
+    fault
+        A row of the faults' table.
+    wrong
+        Share of images with a detection of nothing.
+    """
+
+    trajectory: Trajectory
+    duration_s: float = 60.0
+    robots: int = 2
+    fault: str = "none"
+    wrong: float = 0.07
+
+
+CASES = {
+    "in view": Case("in_view"),
+    "in view, 50 % wrong": Case("in_view", wrong=0.5),
+    "in view, three robots": Case("in_view", robots=3),
+    "random": Case("random"),
+    "15 s": Case("in_view", 15.0),
+    "no ranges for 30 s": Case("in_view", 100.0, fault="no ranges for 30 s"),
+    "flow stuck for 10 s": Case("in_view", 100.0, fault="flow stuck for 10 s"),
+    "observer at rest": Case("observer_static"),
+    "both at rest": Case("both_static"),
+    "three at rest": Case("both_static", robots=3),
+    "both the same way": Case("parallel"),
+    "peer at rest": Case("peer_static"),
+}
+
+
+def sights(flight: Flight, wrong: float, seed: int) -> dict[str, Sight]:
+    """What every robot's camera shows to the detector."""
+    rng = np.random.default_rng(seed + 10_000)
+    return {robot: _sight(flight, robot, wrong, rng) for robot in flight.robots}
+
+
+def _sight(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -> Sight:
+    log, truth, clock = flight.robots[robot], flight.truth[robot], flight.clocks[robot]
+    time_s = np.arange(log.time_s[0] + 0.05, log.time_s[-1], 1 / IMAGES_HZ)
+    true_s = clock.true_time(time_s)
+    roll, pitch = (np.interp(true_s, truth.time_s, angle) for angle in (truth.roll, truth.pitch))
+    found: list[list[list[float]]] = [[] for _ in time_s]
+    size = np.array([AIDECK.width_px, AIDECK.height_px])
+    for peer in flight.robots:
+        if peer == robot:
+            continue
+        place = flight.peer_in_horizontal(robot, peer, true_s)
+        uv, depth_m, _ = pixels_from_horizontal(place, roll, pitch, AIDECK)
+        shown = (depth_m > 0.1) & (depth_m < FARTHEST_M) & ((uv > 0) & (uv < size)).all(axis=1)
+        uv = uv + PIXEL_STD_PX * rng.standard_normal(uv.shape)
+        depth_m = depth_m * np.exp(DISTANCE_RATIO * rng.standard_normal(len(depth_m)))
+        for k in np.flatnonzero(shown & (rng.random(len(uv)) >= MISSED)):
+            found[k].append([*uv[k], depth_m[k], DISTANCE_RATIO * depth_m[k]])
+    for k in np.flatnonzero(rng.random(len(time_s)) < wrong):
+        depth = float(np.exp(rng.uniform(np.log(0.5), np.log(4.0))))
+        found[k].append([*(rng.random(2) * size), depth, DISTANCE_RATIO * depth])
+    first = np.concatenate([[0], np.cumsum([len(here) for here in found])])
+    detections = np.reshape([row for here in found for row in here], (-1, 4))
+    time_ns = np.round(time_s * 1e9).astype(np.int64)
+    measured = [np.interp(time_s, log.time_s, angle) for angle in (log.roll_rad, log.pitch_rad)]
+    nothing = np.zeros((len(time_s), 3))
+    attitude = np.column_stack(measured)
+    return Sight(
+        robot, AIDECK, time_ns, time_ns, detections, first, attitude, nothing, nothing[:, 0], {}, []
+    )
+
+
+def ranges_alone(pairs: dict[Names, Pair], _: dict[str, Sight]) -> dict[Names, Estimate]:
+    """Every ordered pair, from ranges and odometry."""
+    return _both(pairs)
+
+
+def one_solve(pairs: dict[Names, Pair], seen: dict[str, Sight]) -> dict[Names, Estimate]:
+    """The same with detections in the solve."""
+    found = {
+        robot: sightings_of(sight, 0, SAID_PX, ATTITUDE_STD_RAD) for robot, sight in seen.items()
+    }
+    looking = with_sightings(pairs, found)
+    estimates = _both(looking)
+    again = told_apart(looking, estimates)
+    return estimates | _both(again) if again else estimates
+
+
+def _both(pairs: dict[Names, Pair]) -> dict[Names, Estimate]:
+    out: dict[Names, Estimate] = {}
+    for (one, other), (here, there) in zip(
+        pairs, estimate_pairs(list(pairs.values())), strict=True
+    ):
+        out |= {(one, other): here, (other, one): there}
+    return out
+
+
+WAYS: dict[str, Callable[[dict[Names, Pair], dict[str, Sight]], dict[Names, Estimate]]] = {
+    "without": ranges_alone,
+    "with": one_solve,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A case solved one way, the peers as cf1 sees them; shares of samples over all flights.
+
+    Parameters
+    ----------
+    case, way
+        What was flown, and how it was solved.
+    rmse_m, worst_m
+        Horizontal, after 5 s: median and worst of the flights and peers.
+    ellipse
+        Share inside the 95 % ellipse.
+    kept, bad, worst_bad
+        Share with status OK; of these over 0.3 m off, and in the worst flight.
+    cpu_s
+        CPU seconds of a flight.
+    """
+
+    case: str
+    way: str
+    rmse_m: float
+    worst_m: float
+    ellipse: float
+    kept: float
+    bad: float
+    worst_bad: float
+    cpu_s: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.case:<24}{self.way:<10}{self.rmse_m:6.3f}{self.worst_m:7.2f}{self.ellipse:9.1%}"
+            f"{self.kept:8.1%}{self.bad:8.2%}{self.worst_bad:8.1%}{self.cpu_s:7.2f}"
+        )
+
+
+def rows_of(name: str, noise: str, seeds: range) -> Iterator[Row]:
+    """A case, solved each way."""
+    case = CASES[name]
+    scenario = Scenario(case.robots, case.duration_s, case.trajectory)
+    flights = [simulate(scenario, NOISE[noise], seed, FAULTS[case.fault].faults) for seed in seeds]
+    pairs = [
+        {both: pair_of(flight, *both) for both in combinations(flight.robots, 2)}
+        for flight in flights
+    ]
+    seen = [sights(f, case.wrong, seed) for f, seed in zip(flights, seeds, strict=True)]
+    for way, solve in WAYS.items():
+        begun = time.process_time()
+        found = [solve(*given) for given in zip(pairs, seen, strict=True)]
+        spent_s = (time.process_time() - begun) / len(flights)
+        flown = [list(_judged(*one)) for one in zip(flights, pairs, found, strict=True)]
+        yield _row(name, way, flown, spent_s)
+
+
+def _judged(
+    flight: Flight, pairs: dict[Names, Pair], found: dict[Names, Estimate]
+) -> Iterator[Judged]:
+    for (robot, peer), pair in pairs.items():
+        if robot != "cf1":
+            continue
+        time_s = times(pair)
+        xy, spread, status = found[robot, peer].at(time_s)
+        true_s = flight.clocks[robot].true_time(time_s)
+        truth = flight.peer_in_horizontal(robot, peer, true_s)[:, :2]
+        away = np.linalg.norm(truth, axis=1)
+        yield Judged(time_s - time_s[0], xy - truth, spread, away, status == OK)
+
+
+def _row(case: str, way: str, flown: list[list[Judged]], cpu_s: float) -> Row:
+    every = [judged for here in flown for judged in here]
+    late = [judged.time_s >= SETTLE_S for judged in every]
+    rmse = [float(np.sqrt(np.mean(j.size_m[at] ** 2))) for j, at in zip(every, late, strict=True)]
+    inside = [squared_distances(j)[at] <= CHI2_95_OF_2 for j, at in zip(every, late, strict=True)]
+    bad = [np.concatenate([j.size_m[j.kept] > GOOD_M for j in here]) for here in flown]
+    total = np.concatenate(bad)
+    return Row(
+        case,
+        way,
+        float(np.median(rmse)),
+        max(rmse),
+        float(np.concatenate(inside).mean()),
+        len(total) / sum(len(j.time_s) for j in every),
+        _mean(total),
+        max(_mean(here) for here in bad),
+        cpu_s,
+    )
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if len(values) else 0.0
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--flights", type=int, default=6)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--noise", choices=[n for n in NOISE if n != "ideal"], default="calibrated")
+    parser.add_argument("--only", choices=list(CASES), action="append", help="may be repeated")
+    parser.add_argument("--json", type=Path, help="write the rows there too")
+    given = parser.parse_args()
+    seeds = range(given.first_seed, given.first_seed + given.flights)
+    print(f"{given.noise} noise, {given.flights} flights each, seeds from {seeds[0]}; cf1's peers")
+    print(
+        f"{'case':<24}{'way':<10}{'RMSE':>6}{'worst':>7}{'ellipse':>9}{'kept':>8}{'bad':>8}"
+        f"{'worst':>8}{'cpu-s':>7}"
+    )
+    rows = []
+    for name in given.only or CASES:
+        for row in rows_of(name, given.noise, seeds):
+            rows.append(row)
+            print(row, flush=True)
+    if given.json:
+        given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

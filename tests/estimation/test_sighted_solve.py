@@ -1,0 +1,90 @@
+"""Whole flights with what cameras saw in the solve: where ranges tell too little, and where not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.contested import told_apart
+from dmrl.estimation.estimate import estimate_pairs
+from dmrl.estimation.estimated import Estimate
+from dmrl.estimation.gate import AMBIGUOUS, OK
+from dmrl.estimation.pair import Pair
+from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
+
+from .flights import flown, pair_of, truth_at
+from .sighted_flights import rmse, sightings
+
+
+def looking(flight: Flight, wrong: float = 0.07) -> Pair:
+    """A pair whose cameras both see."""
+    mine, theirs = (
+        sightings(flight, own, (peer,), wrong=wrong)
+        for own, peer in (("cf1", "cf2"), ("cf2", "cf1"))
+    )
+    return replace(pair_of(flight), own_sees=mine, peer_sees=theirs)
+
+
+def off_m(found: Estimate, flight: Flight, own: str = "cf1", peer: str = "cf2") -> float:
+    return rmse(found.state[:, :2], truth_at(flight, found.time_s, own, peer))
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("trajectory", ["observer_static", "both_static", "parallel"])
+def test_a_camera_tells_the_bearing_of_flights_without_motion(trajectory: Trajectory) -> None:
+    flight = flown(trajectory, "calibrated", 3, 30.0)
+    ((blind, _),) = estimate_pairs([pair_of(flight)])
+    ((here, there),) = estimate_pairs([looking(flight)])
+    assert (blind.status == AMBIGUOUS).all()
+    assert off_m(here, flight) < 0.2 < off_m(blind, flight)
+    assert (here.status == OK).mean() > 0.5
+    if trajectory != "observer_static":
+        # Nobody sees how the observer stands before its peer, so that stays open.
+        assert (there.status == AMBIGUOUS).all()
+        assert there.refused in ("still", "alike")
+
+
+@pytest.mark.heavy
+def test_wrong_ones_take_nothing_from_a_flight_that_ranges_know() -> None:
+    flight = flown("in_view", "calibrated", 3, 60.0)
+    ((blind, _),) = estimate_pairs([pair_of(flight)])
+    for wrong in (0.07, 0.5):
+        ((here, _),) = estimate_pairs([looking(flight, wrong)])
+        assert off_m(here, flight) < 0.7 * off_m(blind, flight)
+    lost = sightings(flight, "cf1", (), wrong=0.5)
+    ((here, _),) = estimate_pairs([replace(pair_of(flight), own_sees=lost)])
+    assert off_m(here, flight) == pytest.approx(off_m(blind, flight), abs=0.02)
+
+
+@pytest.mark.heavy
+def test_a_robot_at_rest_whose_camera_shows_other_things_stays_ambiguous() -> None:
+    flight = flown("both_static", "calibrated", 3, 30.0)
+    lost = sightings(flight, "cf1", (), wrong=0.5)
+    ((here, there),) = estimate_pairs([replace(pair_of(flight), own_sees=lost)])
+    assert (here.status == AMBIGUOUS).all() and (there.status == AMBIGUOUS).all()
+    assert here.refused == "still"
+
+
+@pytest.mark.heavy
+def test_of_two_peers_at_rest_each_gets_its_own() -> None:
+    """One camera sees both, nobody says who is who; the ranges do."""
+    flight = simulate(Scenario(3, 30.0, "both_static"), NOISE["calibrated"], 5)
+    sees = sightings(flight, "cf1", ("cf2", "cf3"))
+    names = [("cf1", "cf2"), ("cf1", "cf3")]
+    pairs = {both: replace(pair_of(flight, *both), own_sees=sees) for both in names}
+    for _ in range(2):
+        found = dict(zip(names, estimate_pairs([pairs[n] for n in names]), strict=True))
+        ways = {k: v for n in names for k, v in ((n, found[n][0]), (n[::-1], found[n][1]))}
+        pairs |= told_apart(pairs, ways)
+    for one, other in names:
+        assert off_m(found[one, other][0], flight, one, other) < 0.25
+        assert (found[one, other][0].status == OK).mean() > 0.5
+
+
+@pytest.mark.heavy
+def test_the_same_pair_the_other_way_round_is_the_same_solution() -> None:
+    pair = looking(flown("in_view", "calibrated", 4, 20.0))
+    ((here, there),) = estimate_pairs([pair])
+    ((back, forth),) = estimate_pairs([pair.swapped()])
+    assert np.abs(here.state[:, :2] - forth.state[:, :2]).max() < 0.05
+    assert np.abs(there.state[:, :2] - back.state[:, :2]).max() < 0.05
