@@ -28,6 +28,9 @@ KNOWN = 9.0
 TRUSTED, LEAST = 0.25, 10
 """A camera counts where so large a share of its images, and so many, agree with the solution.
 Images of other things agree with a wrong one too, by chance: one in twenty was seen to."""
+FAR, OPEN_RAD = 25.0, 0.05
+"""Squared distance beyond which an image shows something else and pulls no more, with what a solve
+that goes on may be off by in azimuth besides."""
 LIMIT = 4.0
 """Squared distance of a candidate, in its sigmas, at which it counts half."""
 
@@ -199,6 +202,9 @@ def seen(looks: Looks, state: Array) -> Seen:
     rows[:, 1:, 3] *= within
     rows[:, 1:] *= np.sqrt(looks.lasting)[:, None, None]
     beyond = np.maximum(squared - KNOWN, 0.0).sum(axis=1)
+    most = FAR * (1 + (OPEN_RAD / looks.std[images, nearest, 0]) ** 2)
+    lost = (rows[..., 3] ** 2).sum(axis=1) + beyond > most
+    rows[lost], beyond[lost] = 0.0, most[lost]
     return Seen(rows, beyond, looks.share)
 
 
@@ -246,15 +252,17 @@ def add(equations: "Normal", looks: Looks, found: Seen, weight: Array) -> None:
     np.add.at(equations.above[:, :3, :3], looks.key, (1 - after) * after * products[..., :3])
 
 
-def _agree(looks: Looks, state: Array) -> Mask:
-    """(I,) images that show the other where a solution has it."""
+def _squared(looks: Looks, state: Array) -> Array:
+    """(I,) squared distance of each image's nearest candidate from a solution."""
     off = difference(looks.polar, expected(looks, state)[0][:, None]) / looks.std
     squared = (off**2).sum(axis=2)
-    return np.asarray(np.where(np.isnan(squared), np.inf, squared).min(axis=1) < AGREES)
+    return np.asarray(np.where(np.isnan(squared), np.inf, squared).min(axis=1))
 
 
 def trusted(looks: Looks | None, state: Array) -> Looks | None:
     """The images of those cameras of which enough agree with a solution; None where none do.
+
+    Images that are far off are left out: where ranges tell little, each would still pull.
 
     Parameters
     ----------
@@ -265,11 +273,12 @@ def trusted(looks: Looks | None, state: Array) -> Looks | None:
     """
     if looks is None:
         return None
-    agree, kept = _agree(looks, state), np.zeros(len(looks.side), bool)
+    squared, kept = _squared(looks, state), np.zeros(len(looks.side), bool)
+    agree = squared < AGREES
     for side in (1, -1):
         mine = looks.side == side
         if agree[mine].sum() >= max(LEAST, TRUSTED * mine.sum()):
-            kept |= mine
+            kept |= mine & (squared < FAR)
     if kept.all() or not kept.any():
         return looks if kept.any() else None
     return Looks(*(getattr(looks, field.name)[kept] for field in fields(looks)))
@@ -293,7 +302,7 @@ def agreeing(looks: Looks | None, state: Array, side: int, key_s: Array, within_
     """
     if looks is None:
         return np.zeros(len(key_s), bool)
-    good = _agree(looks, state) & (looks.side == side)
+    good = (_squared(looks, state) < AGREES) & (looks.side == side)
     at_s = np.concatenate([[-np.inf], looks.time_s[good], [np.inf]])
     after = np.searchsorted(at_s, key_s)
     return np.asarray(np.minimum(at_s[after] - key_s, key_s - at_s[after - 1]) <= within_s)

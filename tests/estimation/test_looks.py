@@ -134,6 +134,23 @@ def test_the_nearest_candidate_of_an_image_counts() -> None:
         assert rows[0, 0, 3] == pytest.approx(off)
 
 
+def test_what_is_far_off_pulls_no_more_and_costs_the_same_wherever_it_is() -> None:
+    pair, _ = still_pair()
+    found = looks(problem(replace(pair, own_sees=seen_at(0.0, np.array([4.0])))))
+    far, farther, near = (seen(found, straight(pair, angle)) for angle in (0.5, 1.5, 0.2))
+    assert not far.rows.any() and near.rows.any()
+    assert far.squared == pytest.approx(farther.squared)
+    assert near.squared < far.squared
+    task = problem(replace(pair, own_sees=seen_at(0.0, np.arange(1, 9, 0.2))))
+    kept = trusted(looks(task), straight(pair, 0.0))
+    assert kept is not None and len(kept.time_s) == 40
+    mixed = np.where(np.arange(40) % 2 == 0, 0.0, 1.0)
+    sees = seen_at(0.0, np.arange(1, 9, 0.2))
+    sees.polar[:, 0, 0] = mixed
+    kept = trusted(looks(problem(replace(pair, own_sees=sees))), straight(pair, 0.0))
+    assert kept is not None and (kept.polar[..., 0] == 0.0).all() and len(kept.time_s) == 20
+
+
 def test_azimuths_are_compared_the_short_way() -> None:
     pair, _ = still_pair()
     found = looks(problem(replace(pair, own_sees=seen_at(3.1, np.array([4.0])))))
