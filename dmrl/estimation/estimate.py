@@ -89,7 +89,6 @@ def estimate_pairs(
 def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:
     """Estimates seen from either robot, with their statuses."""
     estimate, far = within_reach(flight, estimate)
-    back = swapped(estimate)
     own, peer, relative = restlessness(flight, estimate.state)
     looks = trusted(flight.looks, estimate.state)
     looked = [
@@ -97,30 +96,71 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
     ]
     # Where a camera sees the other, ranges may be silent.
     silent = flight.silent | (flight.unheard & ~(looked[0] | looked[1]))
-    floor = (silent | far) * np.int8(UNCONVERGED)
-    here = np.maximum(statuses(estimate.state, estimate.covariance * GATE_SIGMA**2, gate_m), floor)
-    there = np.maximum(statuses(back.state, back.covariance * GATE_SIGMA**2, gate_m), floor)
     # What does not move tells no bearing. A camera that sees the other tells it.
-    ways = (here, own, looked[0]), (there, peer, looked[1])
-    why: list[Refused | None] = []
-    for status, moved, at in ways:
-        unmoved: Refused | None = None
-        if at.sum() < LOOKED_S * KEY_HZ:
-            unmoved = "still" if moved < STILL else "alike" if relative < ALIKE else None
-        if unmoved:
-            status[:] = AMBIGUOUS
-        why.append(_refused(status, unmoved, bool(silent.mean() > MOST)))
+    enough = [at.sum() >= LOOKED_S * KEY_HZ for at in looked]
+    why = [
+        None if seen else unmoved(moved, relative)
+        for seen, moved in zip(enough, (own, peer), strict=True)
+    ]
     return (
-        replace(estimate, status=here, refused=why[0]),
-        replace(back, status=there, refused=why[1]),
+        with_status(estimate, silent, why[0], gate_m, far=far, sigma=GATE_SIGMA),
+        with_status(swapped(estimate), silent, why[1], gate_m, far=far, sigma=GATE_SIGMA),
     )
 
 
-def _refused(status: Statuses, unmoved: Refused | None, silent: bool) -> Refused | None:
+def unmoved(moved: float, relative: float) -> Refused | None:
+    """Why a motion tells no bearing; None where it does.
+
+    Parameters
+    ----------
+    moved, relative
+        Mean squares of the observer's velocity and of the peer's against it, (m/s)^2.
+    """
+    if moved < STILL:
+        return "still"
+    return "alike" if relative < ALIKE else None
+
+
+def with_status(
+    estimate: Estimate,
+    silent: Mask,
+    why: Refused | None,
+    gate_m: float,
+    *,
+    far: Mask | None = None,
+    sigma: float = 1.0,
+) -> Estimate:
+    """An estimate with its statuses, and why nothing of it is OK where that is so.
+
+    Parameters
+    ----------
+    estimate
+        What was found.
+    silent
+        (K,) whether a sensor of either robot, or their ranges, were silent.
+    why
+        Why its motion tells no bearing; None where it does.
+    gate_m
+        A position that is off by more than this is a bad one, metres.
+    far
+        (K,) where the estimate was farther than ranges allow; None: nowhere.
+    sigma
+        The gate goes by sigmas so much as large.
+    """
+    status = statuses(estimate.state, estimate.covariance * sigma**2, gate_m)
+    floor = silent if far is None else silent | far
+    status = np.maximum(status, floor * np.int8(UNCONVERGED))
+    if why:
+        status[:] = AMBIGUOUS
+    refused = _refused(status, why, bool(silent.mean() > MOST))
+    return replace(estimate, status=status, refused=refused)
+
+
+def _refused(status: Statuses, why: Refused | None, silent: bool) -> Refused | None:
     if (status == OK).any():
         return None
-    if unmoved:
-        return unmoved
+    if why:
+        return why
     if silent:
         return "silent"
     return "open" if (status == AMBIGUOUS).mean() > MOST else "imprecise"

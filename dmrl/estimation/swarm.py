@@ -10,14 +10,14 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from dmrl.estimation.confidence import RESTLESS_S, noise_energy, shrunk
-from dmrl.estimation.estimate import STILL
+from dmrl.estimation.estimate import unmoved, with_status
 from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.gate import AMBIGUOUS, GATE_M, UNCONVERGED, statuses
+from dmrl.estimation.gate import GATE_M
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.estimation.motion import odometry, rotation
 from dmrl.estimation.pair import Array, Pair, Track
-from dmrl.estimation.problem import GLOBALS
+from dmrl.estimation.problem import GLOBALS, silence, unheard
 from dmrl.estimation.search import KEY_HZ
 from dmrl.estimation.stretches import contradicts
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Link, Swarm, inverse, solved
@@ -79,9 +79,14 @@ def _estimates(
     out = {}
     for one, other in estimates:
         state, covariance = _relative(found.state, spread, place[one], place[other])
-        status = np.maximum(statuses(state, covariance, gate_m), _floor(flight, place, one, other))
         constants = _constants(flight, found, place[one], place[other])
-        out[one, other] = Estimate(flight.key_s, state, covariance, status, constants, noise)
+        none = np.zeros(len(state), np.int8)
+        seen = Estimate(flight.key_s, state, covariance, none, constants, noise)
+        pair = pairs[one, other] if (one, other) in pairs else pairs[other, one]
+        # Two that fly alike are told apart by a third.
+        why = unmoved(_moved(flight, place[one]), np.inf)
+        silent = silence(pair, flight.key_s) | unheard(pair, flight.key_s)
+        out[one, other] = with_status(seen, silent, why, gate_m)
     return out
 
 
@@ -180,15 +185,12 @@ def _relative(state: Array, spread: Array, one: int, other: int) -> tuple[Array,
     return np.column_stack([xy, there[:, 2] - here[:, 2]]), covariance
 
 
-def _floor(flight: Flight, place: Mapping[str, int], one: str, other: str) -> Array:
-    """(K,) the least status: gaps of either log; an observer that stands still has no bearing."""
-    gap_s = flight.gap_s[place[one]] + flight.gap_s[place[other]]
-    silent = np.append(gap_s, 0.0) + np.append(0.0, gap_s) > 0
+def _moved(flight: Flight, robot: int) -> float:
+    """Mean square of a robot's averaged velocity, (m/s)^2."""
     step_s = float(np.median(np.diff(flight.key_s)))
-    velocity = np.diff(flight.paths[place[one]][1], axis=0) / step_s
+    velocity = np.diff(flight.paths[robot][1], axis=0) / step_s
     slow = uniform_filter1d(velocity, round(RESTLESS_S / step_s), axis=0, mode="nearest")
-    still = (slow**2).sum(axis=1).mean() < STILL
-    return np.full(len(silent), AMBIGUOUS) if still else silent * np.int8(UNCONVERGED)
+    return float((slow**2).sum(axis=1).mean())
 
 
 def _constants(flight: Flight, found: Swarm, one: int, other: int) -> Array:

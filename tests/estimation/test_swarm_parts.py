@@ -6,6 +6,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from dmrl.estimation import swarm
+from dmrl.estimation.estimate import unmoved, with_status
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import AMBIGUOUS, OK, UNCONVERGED
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
@@ -14,9 +16,10 @@ from dmrl.estimation.problem import GLOBALS, Noise
 from dmrl.estimation.swarm import (
     _calmed,
     _constants,
-    _floor,
+    _moved,
     _relative,
     _start,
+    estimate_swarm,
     flight_of,
 )
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Swarm
@@ -148,18 +151,54 @@ def test_a_place_in_another_s_frame_varies_as_both_do() -> None:
         assert covariance == pytest.approx(wanted, rel=1e-5, abs=1e-5)
 
 
-def test_who_is_silent_or_stands_still_is_not_ok() -> None:
-    place = {name: k for k, name in enumerate(NAMES)}
-    clear = _floor(FLIGHT, place, "a", "c")
-    assert (clear == OK).all()
-    floor = _floor(FLIGHT, place, "a", "b")
-    silent = FLIGHT.key_s[floor == UNCONVERGED]
-    assert silent[[0, -1]] == pytest.approx([20, 22], abs=0.15)
-    assert set(floor.tolist()) == {OK, UNCONVERGED}
-    heading, path = FLIGHT.paths[0]
-    still = replace(FLIGHT, paths=[(heading, 0.01 * path), *FLIGHT.paths[1:]])
-    assert (_floor(still, place, "a", "c") == AMBIGUOUS).all()
-    assert (_floor(still, place, "c", "a") == OK).all()
+def test_how_much_a_robot_moved_is_its_speed_s_square() -> None:
+    for number, name in enumerate(NAMES):
+        assert _moved(FLIGHT, number) == pytest.approx(abs(MOTION[name][0]) ** 2, rel=0.05)
+
+
+def test_who_is_silent_or_stands_still_is_not_ok_and_says_why() -> None:
+    time_s = FLIGHT.key_s
+    found, silent = seen("a", "b", time_s, 0.05), (time_s > 20) & (time_s < 22)
+    flown = with_status(found, silent, None, 0.3)
+    assert (flown.status == np.where(silent, UNCONVERGED, OK)).all()
+    assert flown.refused is None
+    still = with_status(found, silent, unmoved(0.01, np.inf), 0.3)
+    assert (still.status == AMBIGUOUS).all()
+    assert still.refused == "still"
+    assert with_status(found, silent, unmoved(0.1, 0.01), 0.3).refused == "alike"
+    assert with_status(found, time_s > 0, unmoved(0.1, np.inf), 0.3).refused == "silent"
+    vague = with_status(seen("a", "b", time_s, 0.4), silent, None, 0.3)
+    assert vague.refused in ("open", "imprecise")
+
+
+def test_silent_ranges_and_heights_are_in_all_robots_statuses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is checked is what a pair's log says; the solve itself stands in for the truth."""
+    measured, truth = pairs(), {}
+    for names in permutations(NAMES, 2):
+        truth[names] = seen(*names, FLIGHT.key_s)
+    ab = measured["a", "b"]
+    heard = (ab.range_time_s < 30) | (ab.range_time_s > 33)
+    measured["a", "b"] = replace(ab, range_time_s=ab.range_time_s[heard], range_m=ab.range_m[heard])
+    ac = measured["a", "c"]
+    over = (ac.time_s > 35) & (ac.time_s < 37)
+    measured["a", "c"] = replace(ac, peer=replace(ac.peer, height_gap=over))
+    state = np.zeros((len(FLIGHT.key_s), 3, OWN))
+    for k, name in enumerate(NAMES):
+        place, heading = at(name, FLIGHT.key_s)
+        state[:, k, 0], state[:, k, 1], state[:, k, 2] = place.real, place.imag, heading
+    sizes = 3 * ROBOT + 3 * SHARED
+    spread = np.tile(1e-4 * np.eye(3 * OWN), (len(state), 1, 1))
+    monkeypatch.setattr(swarm, "solved", lambda *_: Swarm(state, np.zeros(sizes), 0.0))
+    monkeypatch.setattr(swarm, "inverse", lambda *_: spread)
+    out = estimate_swarm(measured, truth)
+    for names, start_s, end_s in ((("b", "a"), 30, 33), (("c", "a"), 35, 37)):
+        silent = out[names].status != OK
+        wanted = (FLIGHT.key_s > start_s + 0.1) & (FLIGHT.key_s < end_s - 0.1)
+        assert silent[wanted].all()
+    away = (FLIGHT.key_s > 23) & (FLIGHT.key_s < 34.5)
+    assert (out["a", "c"].status[away] == OK).all()
 
 
 def test_constants_of_a_pair_are_its_own() -> None:
