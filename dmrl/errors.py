@@ -54,6 +54,8 @@ def words_of(error: Exception) -> str | None:
             where = "standard output, or a disk" if named is None else str(named)
             why = f"cannot read or write {where}: {error.strerror}"
             return f"{why}. Check its name, its rights, its space"
+        case RuntimeError() if str(error).startswith("Symlink loop"):  # Python before 3.13
+            return f"cannot read a link that leads to itself: {error}. Remove it"
     return None
 
 

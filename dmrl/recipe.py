@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create
 
 from dmrl.border import limits
 from dmrl.border.documents import parse_toml
+from dmrl.border.folders import refuse_pipe
 from dmrl.errors import RecipeError
 
 Settings = TypeVar("Settings")
@@ -51,6 +52,7 @@ def text(name: str | Path) -> str:
         If there is no such recipe.
     """
     path = Path(name)
+    refuse_pipe(path)
     source = path if path.suffix == ".toml" else _shipped() / f"{name}.toml"
     try:
         with source.open("rb") as stream:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from dmrl import boundary
+from dmrl.cli import app
 from dmrl.errors import OutputError
 
 DMRL = [sys.executable, "-m", "dmrl.cli"]
@@ -70,6 +71,13 @@ def test_what_the_system_refuses_is_one_line(
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
+
+
+def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (link := tmp_path / "a.mcap").symlink_to("a.mcap")
+    words = ["merge", str(link), str(link), str(tmp_path / "b.mcap")]
+    assert boundary.status_of(lambda: app(words)) == 1
+    assert re.fullmatch(r"dmrl: .*a\.mcap.*\n", capsys.readouterr().err)
 
 
 @pytest.mark.heavy

@@ -1,13 +1,31 @@
-"""What stands in a folder of a stranger."""
+"""What stands in a folder of a stranger, and under a name that somebody gives."""
 
 import os
+import stat
+from contextlib import suppress
 from pathlib import Path
 
 from dmrl.errors import UnsafeName
 
 
+def refuse_pipe(path: Path) -> None:
+    """Nothing, if a path is a file or a folder, or nothing is there.
+
+    Raises
+    ------
+    UnsafeName
+        If it is a pipe, a socket or a device, or no path at all.
+    """
+    if "\0" in str(path):
+        raise UnsafeName(f"no file can be called {str(path)[:80]!r}. Check the name")
+    with suppress(OSError):  # who opens it says so
+        mode = os.stat(str(path)).st_mode  # noqa: PTH116 - a bucket is not asked
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise UnsafeName(f"{path} is a pipe or a device, no file. Name a file")
+
+
 def refuse_pipes(folder: Path) -> None:
-    """Nothing, if a folder and its folders hold files and folders alone; or if it is no folder.
+    """Nothing, if a folder and its folders hold files and folders alone; or if it is a file.
 
     Archives can hold named pipes and devices. Who opens one waits for ever, or reads without end.
 
@@ -18,6 +36,7 @@ def refuse_pipes(folder: Path) -> None:
     OSError
         If a folder cannot be read.
     """
+    refuse_pipe(folder)
     to_do = [str(folder)] if os.path.isdir(str(folder)) else []  # noqa: PTH112 - a bucket's is none
     while to_do:
         with os.scandir(to_do.pop()) as entries:

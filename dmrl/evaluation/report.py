@@ -7,7 +7,7 @@ from typing import Any
 
 from dmrl.border.documents import parse_json
 from dmrl.evaluation import positions
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_line, print_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
     if rows:
         print_table("", ["evaluation", "against", "images", *headers], rows)
     for picture in pictures:
-        print(picture)
+        print_line(str(picture))
 
 
 def _documents(done: Sequence[Done], name: str) -> dict[str, dict[str, Any]]:

@@ -4,6 +4,7 @@ from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
 from dmrl.border.documents import parse_toml
+from dmrl.border.folders import refuse_pipe
 from dmrl.errors import SourceError
 from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 
@@ -53,6 +54,7 @@ def read_camera(path: Path) -> Camera:
     SourceError
         If the file is not TOML, or a key is unknown, missing or of the wrong kind.
     """
+    refuse_pipe(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

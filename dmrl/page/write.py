@@ -33,7 +33,7 @@ def write(folder: Path, out: Path | None = None) -> Path:
     """
     path = folder / NAME if out is None else out
     if path.suffix != ".html":
-        raise OutputError(f"{path}: a report is a page. Call it {path.with_suffix('.html').name}")
+        raise OutputError(f"{path}: a report is a page. Call it {path.stem or 'page'}.html")
     again = path.is_file() and not path.is_symlink()
     if again and not path.read_bytes()[:200].decode(errors="replace").count(MARK):
         raise OutputError(f"{path} exists and is no report of dmrl's. Choose another name")

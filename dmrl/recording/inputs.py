@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.border.documents import parse_json
+from dmrl.border.folders import refuse_pipe
 from dmrl.errors import RecordingError
 from dmrl.recording.index import summary
 from dmrl.recording.opening import expect_unchanged
@@ -87,9 +88,12 @@ def input_of(path: Path) -> Input:
     ------
     RecordingError
         If there is no such file or folder.
+    UnsafeName
+        If it is a pipe or a device, which has no end.
     """
     if not path.exists():
         raise RecordingError(f"no file or folder {path}. Check the name")
+    refuse_pipe(path)  # in a folder, a link may lead to a device
     if path.suffix == ".mcap" and path.is_file():
         expect_unchanged(path)
     digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)

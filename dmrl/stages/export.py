@@ -25,7 +25,7 @@ from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import provenance
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_line, print_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,5 +171,7 @@ def command(
     print_table(str(out), ("file", "bytes", "what it is"), rows)
     if (state := _state_bytes(out, written)) is not None:
         fit = "fits" if fits_l1(state) else "does not fit"
-        print(f"{state:,} bytes of RAM, which {fit} a GAP8's L1: {L1_FOR_STATE:,} beside stacks")
-        print(f"prove the C with: dmrl verify {out}")
+        print_line(
+            f"{state:,} bytes of RAM, which {fit} a GAP8's L1: {L1_FOR_STATE:,} beside stacks"
+        )
+        print_line(f"prove the C with: dmrl verify {out}")

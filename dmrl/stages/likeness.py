@@ -104,9 +104,9 @@ def run(real: Path, out: Path, settings: Settings) -> Result:
     OutputError
         If the recipe or the picture exists.
     """
+    if not out.name or out.suffix == ".png":
+        raise SettingError(f"{out} is no name of a recipe. Write one: OUT.toml")
     picture = out.with_suffix(".png")
-    if picture == out:
-        raise SettingError(f"{out} is the name of the picture. Write a recipe: OUT.toml")
     refuse_existing(out)
     if not partial_of(out).exists():  # else one that was killed may have left the picture
         refuse_existing(picture)

@@ -8,6 +8,7 @@ from cyclopts import Group, Parameter, validators
 
 from dmrl.errors import SettingError
 from dmrl.terminal.arguments import Flat
+from dmrl.terminal.tables import print_line
 from dmrl.viewer import Settings, Web, flag, save, screenshot, serve, view
 
 DEFAULTS = Settings()
@@ -79,14 +80,14 @@ def command(
             )
     if save_to is not None:
         count = save(recording, save_to, settings)
-        print(f"{save_to}: {count} images")
+        print_line(f"{save_to}: {count} images")
     elif screenshot_to is not None:
         shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
-        print(f"{screenshot_to}: {shown}")
+        print_line(f"{screenshot_to}: {shown}")
     elif flag_to is not None:
         if not any(path.is_dir() for path in recording):
             raise SettingError(f"{recording[0]} is no dataset. --flag needs one: dmrl dataset")
-        print(f"{flag_to}: {flag(recording, flag_to, settings)} rows. Open it in a browser")
+        print_line(f"{flag_to}: {flag(recording, flag_to, settings)} rows. Open it in a browser")
     elif serve_web:
         serve(recording, settings, web)
     else:

@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path, PosixPath
 from typing import Any
 
+from dmrl.border.folders import refuse_pipe
 from dmrl.border.names import inside
 from dmrl.errors import StorageError
 from dmrl.storage.ranges import STEP_BYTES, Ranged
@@ -225,9 +226,18 @@ class Remote(PosixPath):
 
 
 def path_of(name: str) -> Path:
-    """The path that a name stands for: of ``s3://bucket/key`` a `Remote`, else a plain one."""
+    """The path that a name stands for: of ``s3://bucket/key`` a `Remote`, else a plain one.
+
+    Raises
+    ------
+    UnsafeName
+        If it is that of a pipe or a device: who opens one waits for ever, or reads without end.
+    """
     scheme, mark, _ = name.partition("://")
-    return Remote(name) if mark and scheme in SCHEMES else Path(name)
+    if mark and scheme in SCHEMES:
+        return Remote(name)
+    refuse_pipe(Path(name))
+    return Path(name)
 
 
 @cache

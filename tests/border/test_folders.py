@@ -1,19 +1,23 @@
 """Folders of strangers: what would be read without end is refused before it is opened."""
 
 import os
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from dmrl.border.folders import refuse_pipes
+from dmrl import recipe
+from dmrl.border.folders import refuse_pipe, refuse_pipes
 from dmrl.datasets import open_dataset
 from dmrl.deploy import store
 from dmrl.deploy.detector import open_detector
 from dmrl.errors import UnsafeName
 from dmrl.formats.image_folder import list_pictures
+from dmrl.geometry.camera_file import read_camera
 from dmrl.learn.model import load_model
 from dmrl.page import gather
+from dmrl.recording.inputs import input_of
 from dmrl.rendering.backdrops import photos_in
 from dmrl.stages import calibrate, convert
 from dmrl.storage import path_of
@@ -27,6 +31,7 @@ OPENED: dict[str, Callable[[Path], object]] = {
     "backgrounds": photos_in,
     "outputs": gather,
     "logs": lambda path: convert.run(path, path.with_name("a.mcap"), convert.Settings()),
+    "an input": lambda path: input_of(path / "a.png"),
     "boards": lambda path: calibrate.run(
         [path], path.with_name("a.toml"), calibrate.Settings("7x5")
     ),
@@ -62,3 +67,36 @@ def test_what_is_no_folder_here_is_left_to_who_opens_it(folder: Path) -> None:
     refuse_pipes(folder / "a.txt")
     refuse_pipes(folder / "absent")
     refuse_pipes(path_of("s3://bucket/key"))
+
+
+@pytest.mark.parametrize(
+    "reads",
+    [
+        path_of,
+        recipe.text,
+        lambda name: read_camera(Path(name)),
+        lambda name: refuse_pipes(Path(name)),
+    ],
+    ids=["a command line", "a recipe", "a camera", "a folder"],
+)
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
+def test_what_is_no_file_is_refused_under_its_own_name_too(
+    reads: Callable[[str], object], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # the name of a socket is short
+    if kind == "pipe":
+        os.mkfifo("a.toml")
+    elif kind == "device":
+        Path("a.toml").symlink_to("/dev/zero")
+    else:
+        with socket.socket(socket.AF_UNIX) as one:
+            one.bind("a.toml")
+    with pytest.raises(UnsafeName, match=r"^a.toml is a pipe or a device, no file"):
+        reads("a.toml")
+
+
+def test_what_may_be_named_is_a_file_a_folder_or_nothing(tmp_path: Path) -> None:
+    for name in (tmp_path, tmp_path / "absent", Path("x" * 5000)):
+        refuse_pipe(name)
+    with pytest.raises(UnsafeName, match=r"no file can be called 'a\\x00b'"):
+        path_of("a\0b")

@@ -130,6 +130,8 @@ def test_a_report_is_written_again_but_no_other_file(outputs: Path) -> None:
         write(outputs, other)
     with pytest.raises(OutputError, match=r"Call it page\.html"):
         write(outputs, outputs / "page.pdf")
+    with pytest.raises(OutputError, match=r"Call it page\.html"):
+        write(outputs, Path())
     assert other.read_text() == "<p>mine</p>"
 
 

@@ -105,8 +105,9 @@ def test_what_cannot_be_measured_is_one_line(tmp_path: Path, dots: Path) -> None
         run(dots, tmp_path / "a.toml", Settings(preset="mine"))
     with pytest.raises(RecordingError):
         run(tmp_path / "none.mcap", tmp_path / "a.toml", Settings())
-    with pytest.raises(SettingError, match=r"OUT\.toml"):
-        run(dots, tmp_path / "a.png", Settings())
+    for out in (tmp_path / "a.png", Path()):
+        with pytest.raises(SettingError, match=r"OUT\.toml"):
+            run(dots, out, Settings())
     (tmp_path / "a.png").write_bytes(b"mine")
     with pytest.raises(OutputError):
         run(dots, tmp_path / "a.toml", Settings())
