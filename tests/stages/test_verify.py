@@ -10,6 +10,7 @@ import pytest
 from dmrl.cli import app
 from dmrl.deploy import targets
 from dmrl.deploy.c import write_c
+from dmrl.deploy.c.source import STACK_BYTES
 from dmrl.deploy.integer import Conv, IntegerNetwork
 from dmrl.deploy.samples import save_samples
 from dmrl.deploy.store import INTEGER_NAME, save
@@ -67,7 +68,7 @@ def test_every_target_computes_what_the_reference_does(everything: dict[str, Any
 @pytest.mark.slow
 def test_what_the_c_costs_is_measured(everything: dict[str, Any]) -> None:
     assert 500 < everything["code_bytes"] < 50_000
-    assert 0 < everything["stack_bytes"] <= 512
+    assert 0 < everything["stack_bytes"] <= STACK_BYTES
     # A multiplication and an addition at the least; small layers cost more around them.
     assert 2 < everything["instructions_per_mac"] < 60
     assert [e["images_per_s"] > 0 for e in everything["gap8_estimates"]] == [True, True]

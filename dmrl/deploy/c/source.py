@@ -18,7 +18,7 @@ from dmrl.deploy.integer import SUBPIXEL, Head, IntegerNetwork
 from dmrl.deploy.integer_layers import GAIN_SHIFT
 from dmrl.learn.decode import SAME_PX
 
-STACK_BYTES = 512
+STACK_BYTES = 640
 """Stack that the C may use on a 32-bit core, optimised; `dmrl verify` measures it."""
 
 
