@@ -173,17 +173,23 @@ KINDS = pytest.mark.parametrize("kind", ["partial_file", "partial_folder"])
 
 
 @KINDS
-def test_a_second_writer_gets_one_line_and_the_first_its_output(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_second_writer_gets_one_line_and_the_first_its_output(
+    kind: str, stopped: bool, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     with _writing(kind, out, "mine") as first:
         assert first.stdout is not None
         assert first.stdout.readline() == "begun\n"
+        if stopped:
+            first.send_signal(signal.SIGSTOP)
         words = f"out is being written by another dmrl, process {first.pid}"
         for writer in (partial_file, partial_folder):
             with pytest.raises(OutputError, match=words), writer(out):
                 pytest.fail("the block ran")
         with pytest.raises(OutputError, match=words):
             refuse_existing(out)
+        first.send_signal(signal.SIGCONT)
         first.communicate("", timeout=PATIENCE_S)
         assert first.returncode == 0
     inner = out / "a" if kind == "partial_folder" else out
