@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.errors import DmrlError, OutputError, SettingError, SourceError
+from dmrl.errors import DmrlError, OutputError, SettingError, SourceError, UnsafeName
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import decode, encode_png
 from dmrl.recording import SPLIT_METADATA, RecordingWriter, check, read, read_table, summary
@@ -179,7 +179,7 @@ def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
         run(tmp_path / "notes", tmp_path / "out.mcap", Settings())
     with pytest.raises(SourceError, match="no file or folder"):
         run(tmp_path / "none", tmp_path / "out.mcap", Settings())
-    with pytest.raises(SourceError, match="neither a file nor a folder"):
+    with pytest.raises(UnsafeName, match="is a pipe or a device, no file"):
         run(Path("/dev/null"), tmp_path / "out.mcap", Settings())
 
 
