@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
@@ -21,8 +21,10 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 
-def spread(function: Callable[[Item], Made], items: Sequence[Item], workers: int) -> Iterator[Made]:
-    """``function`` of every item, in their order.
+def spread(
+    function: Callable[[Item], Made], items: Sequence[Item], workers: int
+) -> Generator[Made]:
+    """``function`` of every item, in their order; closed early, it ends its processes.
 
     Parameters
     ----------

@@ -4,6 +4,7 @@ So a demonstration takes the same road as anyone's own pictures.
 """
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -82,9 +83,10 @@ def run(out: Path, settings: Settings, *, workers: int = 1) -> dict[str, int]:
     rows: list[LabelRow] = []
     numbers = range(settings.images)
     parts = [numbers[k : k + AT_ONCE] for k in range(0, len(numbers), AT_ONCE)]
-    drawn = chain.from_iterable(spread(partial(_drawn, settings=settings), parts, workers))
-    with partial_folder(out) as folder:
-        for name, png, labels in track(drawn, "Drawing", settings.images):
+    drawn = spread(partial(_drawn, settings=settings), parts, workers)
+    # A signal may come between two parts: closing ends the processes, which would work on.
+    with partial_folder(out) as folder, closing(drawn):
+        for name, png, labels in track(chain.from_iterable(drawn), "Drawing", settings.images):
             (folder / name).write_bytes(png)
             rows += labels
         with (folder / LABELS).open("w", newline="", encoding="utf-8") as stream:
