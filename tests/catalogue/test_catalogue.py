@@ -33,7 +33,8 @@ def record(path: Path, camera: str, images: int, statuses: tuple[int, ...]) -> P
     path.parent.mkdir(parents=True, exist_ok=True)
     made = Provenance("label", {"k": 1}, inputs=(Input("raw.mcap", "0" * 64),))
     with RecordingWriter(path, made) as sink:
-        calibration = message("CameraCalibration")(width=64, height=48, K=[90, 0, 32, 0, 90, 24, 0, 0, 1])
+        matrix = [90, 0, 32, 0, 90, 24, 0, 0, 1]
+        calibration = message("CameraCalibration")(width=64, height=48, K=matrix)
         sink.write(0, topics.calibration(camera), calibration)
         for k in range(images):
             data = encode_png(np.full((48, 64, 3), 10 * k, np.uint8))

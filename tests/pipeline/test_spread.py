@@ -1,5 +1,6 @@
 """Work spread over processes: order, errors, deaths, and nobody who stays behind."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -45,6 +46,10 @@ def die(value: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def much(value: int) -> bytes:
+    return bytes(50_000_000)
+
+
 def wait_there(folder: Path) -> None:
     (folder / str(os.getpid())).touch()
     time.sleep(60)
@@ -72,6 +77,16 @@ def test_an_error_is_the_callers_own_when_its_turn_comes() -> None:
 def test_a_process_that_was_killed_is_one_line() -> None:
     with pytest.raises(SettingError, match="Try fewer --workers"):
         list(spread(die, range(2), 2))
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.01, 0.05])
+def test_processes_that_are_amid_an_answer_end_too(after_s: float) -> None:
+    """Half of an answer in a pipe was waited for, for ever."""
+    results = spread(much, range(9), 2)
+    assert len(next(results)) == 50_000_000
+    time.sleep(after_s)
+    results.close()
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
