@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from dmrl.estimation.looks import Looks
+from dmrl.estimation.looks import Looks, toward
 from dmrl.estimation.pair import Array
 from dmrl.estimation.sightings import difference
 
@@ -93,23 +93,16 @@ def glanced(
 
     It moves a filter by its azimuth alone, and none that is far from it.
     """
-    x, y = (state[:, :2] * glance.side).T
-    level2, up = np.maximum(x * x + y * y, 1e-6), glance.side * height_m
-    square, level = level2 + up * up, np.sqrt(level2)
-    back = glance.side < 0
-    azimuth = np.arctan2(y, x) - back * state[:, 2]
-    polar = np.column_stack([azimuth, np.arctan2(up, level), np.log(square) / 2])
-    row = np.column_stack([-y / level2, x / level2]) * glance.side
-    row = np.column_stack([row, np.full(len(x), -float(back))])
-    farther = np.column_stack([x, y]) * (glance.side / square)[:, None]
+    polar, slope = toward(state[:, :3], np.full(len(state), glance.side), height_m)
+    row, farther = slope[:, 0], slope[:, 2, :2]
     cross = np.einsum("bij,bj->bi", covariance[..., :3], row)
-    spread = np.zeros((len(x), 1, 3))
+    spread = np.zeros((len(state), 1, 3))
     spread[:, 0, 0] = np.einsum("bi,bi->b", row, cross[:, :3])
     spread[:, 0, 2] = np.einsum("bi,bij,bj->b", farther, covariance[:, :2, :2], farther)
     spread = spread + glance.std**2
     off = difference(glance.polar, polar[:, None])
     squared = (off**2 / spread).sum(axis=2)
-    nearest, filters = squared.argmin(axis=1), np.arange(len(x))
+    nearest, filters = squared.argmin(axis=1), np.arange(len(state))
     least, variance = squared[filters, nearest], spread[filters, nearest, 0]
     log_likelihood -= 0.5 * np.log(variance) + np.log1p(0.5 * least)
     gain = np.where(least < LOOK_GATE, 1 / variance, 0.0)[:, None] * cross

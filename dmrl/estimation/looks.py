@@ -147,7 +147,7 @@ def _shares(time_s: Array) -> Array:
 
 
 def expected(looks: Looks, state: Array) -> tuple[Array, Array]:
-    """Where the robot that looks should see the other.
+    """Where the robot that looks should see the other, as `toward`, at the time of each image.
 
     Parameters
     ----------
@@ -155,28 +155,43 @@ def expected(looks: Looks, state: Array) -> tuple[Array, Array]:
         Of I images.
     state
         (K, 6) x, y (m), psi (rad), ...
+    """
+    part = looks.part[:, None]
+    at = (1 - part) * state[looks.key, :3] + part * state[looks.key + 1, :3]
+    return toward(at, looks.side, looks.height_m)
+
+
+def toward(at: Array, side: Array, height_m: Array) -> tuple[Array, Array]:
+    """Where one robot of a pair should see the other.
+
+    Parameters
+    ----------
+    at
+        (N, 3) x, y (m), psi (rad) of the peer in its observer's frame.
+    side
+        (N,) 1 where the observer looks, -1 where the peer does.
+    height_m
+        (N,) peer's height less the observer's, metres.
 
     Returns
     -------
     polar : Array
-        (I, 3) azimuth, elevation (rad), log distance.
+        (N, 3) azimuth, elevation (rad), log distance.
     slope : Array
-        (I, 3, 3) their derivatives by x, y, psi at the image.
+        (N, 3, 3) their derivatives by x, y, psi.
     """
-    part, sign = looks.part[:, None], looks.side
-    at = (1 - part) * state[looks.key, :3] + part * state[looks.key + 1, :3]
-    x, y = (at[:, :2] * sign[:, None]).T
+    x, y = (at[:, :2] * side[:, None]).T
     level2 = np.maximum(x * x + y * y, 1e-6)
-    up = sign * looks.height_m
+    up = side * height_m
     square, level = level2 + up * up, np.sqrt(level2)
-    heading = np.where(sign < 0, at[:, 2], 0.0)
+    heading = np.where(side < 0, at[:, 2], 0.0)
     polar = np.column_stack([np.arctan2(y, x) - heading, np.arctan2(up, level), np.log(square) / 2])
     slope = np.zeros((len(at), 3, 3))
     slope[:, 0, 0], slope[:, 0, 1] = -y / level2, x / level2
     slope[:, 1, 0], slope[:, 1, 1] = -x * up / (level * square), -y * up / (level * square)
     slope[:, 2, 0], slope[:, 2, 1] = x / square, y / square
-    slope[:, :, :2] *= sign[:, None, None]
-    slope[:, 0, 2] = -1.0 * (sign < 0)
+    slope[:, :, :2] *= side[:, None, None]
+    slope[:, 0, 2] = -1.0 * (side < 0)
     return polar, slope
 
 
@@ -191,8 +206,7 @@ def seen(looks: Looks, state: Array) -> Seen:
         (K, 6) x, y (m), psi (rad), ...
     """
     polar, slope = expected(looks, state)
-    off = difference(looks.polar, polar[:, None]) / looks.std
-    nearest = _nearest(off)
+    off, nearest, _ = _candidates(looks, polar)
     images = np.arange(len(nearest))
     rows = np.empty((len(nearest), 3, 4))
     rows[..., :3] = -slope / looks.std[images, nearest][..., None]
@@ -208,10 +222,12 @@ def seen(looks: Looks, state: Array) -> Seen:
     return Seen(rows, beyond, looks.share)
 
 
-def _nearest(off: Array) -> NDArray[np.intp]:
-    """(I,) number of the nearest candidate."""
+def _candidates(looks: Looks, polar: Array) -> tuple[Array, NDArray[np.intp], Array]:
+    """(I, C, 3) how far candidates are off, in sigmas; (I,) the nearest, (I,) its square."""
+    off = difference(looks.polar, polar[:, None]) / looks.std
     squared = (off**2).sum(axis=-1)
-    return np.asarray(np.where(np.isnan(squared), np.inf, squared).argmin(axis=1))
+    squared[np.isnan(squared)] = np.inf
+    return off, np.asarray(squared.argmin(axis=1)), np.asarray(squared.min(axis=1))
 
 
 def picked(looks: Looks, state: Array) -> Looks:
@@ -224,8 +240,7 @@ def picked(looks: Looks, state: Array) -> Looks:
     state
         (K, 6) the solution.
     """
-    off = difference(looks.polar, expected(looks, state)[0][:, None]) / looks.std
-    at = _nearest(off)[:, None, None]
+    at = _candidates(looks, expected(looks, state)[0])[1][:, None, None]
     polar, std = (np.take_along_axis(v, at, axis=1) for v in (looks.polar, looks.std))
     return replace(looks, polar=polar, std=std)
 
@@ -254,9 +269,7 @@ def add(equations: "Normal", looks: Looks, found: Seen, weight: Array) -> None:
 
 def _squared(looks: Looks, state: Array) -> Array:
     """(I,) squared distance of each image's nearest candidate from a solution."""
-    off = difference(looks.polar, expected(looks, state)[0][:, None]) / looks.std
-    squared = (off**2).sum(axis=2)
-    return np.asarray(np.where(np.isnan(squared), np.inf, squared).min(axis=1))
+    return _candidates(looks, expected(looks, state)[0])[2]
 
 
 def trusted(looks: Looks | None, state: Array) -> Looks | None:
