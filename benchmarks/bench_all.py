@@ -31,7 +31,7 @@ WORK: Mapping[str, tuple[str, ...]] = {
 """Scripts and what they are given; one that ends in ``--json`` is told where to."""
 ASKS = {
     "render": "python benchmarks/bench_render.py speed --model crazyflie-published.blend "
-    "--backgrounds DIR: the authors' model, photos and Blender are not here",
+    "--backgrounds DIR: of the authors' model and of photos",
     "deploy": "python benchmarks/bench_deploy.py EXPORT: of a network of one's own",
 }
 """What is left out, and why."""
