@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from dmrl.estimation.linear import RANGED, Linear
+from dmrl.estimation.looks import Looks, Seen
 from dmrl.estimation.pair import Array
 from dmrl.estimation.robust import Weights
 
@@ -74,6 +75,28 @@ def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior:
     rest[np.ix_(shared, shared)] += weighted[:, 4:].T @ ranges[:, 4:]
     above = products[:, :width, width : 2 * width]
     return Normal(diagonal, above, border, rest[:-1, :-1], gradient, rest[:-1, -1])
+
+
+def add_looks(equations: Normal, looks: Looks, found: Seen, weight: Array) -> None:
+    """Put what was seen into normal equations, in place.
+
+    Parameters
+    ----------
+    equations
+        Of a flight's ranges and motions.
+    looks
+        Of I images, each between two keyframes.
+    found
+        The images' rows.
+    weight
+        (I,) of their squares.
+    """
+    products = found.rows[..., :3].swapaxes(1, 2) @ (found.rows * weight[:, None, None])
+    after = looks.part[:, None, None]
+    for key, part in ((looks.key, 1 - after), (looks.key + 1, after)):
+        np.add.at(equations.diagonal[:, :3, :3], key, part**2 * products[..., :3])
+        np.add.at(equations.gradient[:, :3], key, part[..., 0] * products[..., 3])
+    np.add.at(equations.above[:, :3, :3], looks.key, (1 - after) * after * products[..., :3])
 
 
 def _summed(key: NDArray[np.intp], parts: Array) -> tuple[NDArray[np.intp], Array]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dmrl.estimation.banded import Normal, log_determinant, normal, solve
+from dmrl.estimation.banded import Normal, add_looks, log_determinant, normal, solve
 from dmrl.estimation.linear import (
     METRIC,
     OWN_SCALE,
@@ -16,7 +16,6 @@ from dmrl.estimation.linear import (
     linearise,
     step_variance,
 )
-from dmrl.estimation.looks import add
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
 from dmrl.estimation.robust import cost_of, weights_of
@@ -124,7 +123,7 @@ def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Arra
     weights = weights_of(linear, noise, constants)
     equations = normal(linear, problem.range_key, weights, WEAK)
     if problem.looks is not None and linear.seen is not None and weights.seen is not None:
-        add(equations, problem.looks, linear.seen, weights.seen)
+        add_looks(equations, problem.looks, linear.seen, weights.seen)
     held = weights.free.copy()
     held[0] += weights.first
     equations.diagonal[:, RANGE_ERROR, RANGE_ERROR] += held

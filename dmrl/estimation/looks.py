@@ -10,16 +10,13 @@ of a camera together tell of the place what one of them would.
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.pair import Array, Mask, Pair
 from dmrl.estimation.sightings import AGREES, difference, within
-
-if TYPE_CHECKING:
-    from dmrl.estimation.banded import Normal
 
 ALIKE_S = 0.3
 """Errors of a network last while it sees the same: images of this time count as one together."""
@@ -243,28 +240,6 @@ def picked(looks: Looks, state: Array) -> Looks:
     at = _candidates(looks, expected(looks, state)[0])[1][:, None, None]
     polar, std = (np.take_along_axis(v, at, axis=1) for v in (looks.polar, looks.std))
     return replace(looks, polar=polar, std=std)
-
-
-def add(equations: "Normal", looks: Looks, found: Seen, weight: Array) -> None:
-    """Put what was seen into normal equations, in place.
-
-    Parameters
-    ----------
-    equations
-        Of a flight's ranges and motions.
-    looks
-        Of I images, each between two keyframes.
-    found
-        The images' rows.
-    weight
-        (I,) of their squares.
-    """
-    products = found.rows[..., :3].swapaxes(1, 2) @ (found.rows * weight[:, None, None])
-    after = looks.part[:, None, None]
-    for key, part in ((looks.key, 1 - after), (looks.key + 1, after)):
-        np.add.at(equations.diagonal[:, :3, :3], key, part**2 * products[..., :3])
-        np.add.at(equations.gradient[:, :3], key, part[..., 0] * products[..., 3])
-    np.add.at(equations.above[:, :3, :3], looks.key, (1 - after) * after * products[..., :3])
 
 
 def _squared(looks: Looks, state: Array) -> Array:
