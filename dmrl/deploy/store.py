@@ -27,7 +27,8 @@ DAMAGES = (
     *(TypeError, ValueError, LookupError, ArithmeticError, AttributeError, RecursionError),
     *(OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error),
 )
-"""What reading a file of a stranger can raise."""
+"""What reading a file of a stranger can raise: of zipfile RuntimeError where it is encrypted, and
+NotImplementedError where it is packed in a way that Python does not know."""
 
 Arrays = dict[str, NDArray[Any]]
 Part = TypeVar("Part")
