@@ -23,11 +23,12 @@ import tempfile
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from types import FrameType
 
 from dmrl import output
 from dmrl.border.names import without_middle
-from dmrl.errors import DmrlError, one_line, words_of
+from dmrl.errors import DmrlError, SettingError, one_line, words_of
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -85,6 +86,7 @@ def status_of(work: Callable[[], object]) -> int:
 
 def _guarded(work: Callable[[], object]) -> int:
     try:
+        _refuse_removed_folder()
         work()
     except SystemExit as e:
         return e.code if isinstance(e.code, int) else int(e.code is not None)
@@ -99,6 +101,14 @@ def _guarded(work: Callable[[], object]) -> int:
             raise
         return _end(words_of(e) or _bug(e))
     return 0
+
+
+def _refuse_removed_folder() -> None:
+    """Nothing, if the process is in a folder that is there: libraries abort where it is not."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise SettingError("the folder you are in was removed. Go to another: cd") from None
 
 
 def _end(text: str, status: int = 1) -> int:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dmrl.border.disk import sync, sync_one
+from dmrl.border.folders import refuse_no_text
 from dmrl.border.locking import is_held, refuse_locked, take_file, take_folder
 from dmrl.errors import FullDisk, OutputError
 from dmrl.storage import Remote, added_files, uploaded_file, uploaded_folder
@@ -53,9 +54,9 @@ def refuse_existing(path: Path) -> None:
 
     Raises
     ------
-    OutputError
-        If something is there already, its folder is not, its name is too long, or another
-        process is writing it.
+    OutputError, UnsafeName
+        If something is there already, its folder is not, its name is too long or no text, or
+        another process is writing it.
     """
     _refuse_taken(path)
     if not isinstance(path, Remote):
@@ -63,6 +64,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def _refuse_taken(path: Path) -> None:
+    refuse_no_text(path)
     if len(os.fsencode(path.name)) > MOST_NAME_BYTES:
         raise _name_too_long(path)
     try:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dmrl import boundary
-from dmrl.cli import app
+from dmrl.cli import COMMANDS, app
 from dmrl.errors import OutputError
 
 DMRL = [sys.executable, "-m", "dmrl.cli"]
@@ -154,12 +154,21 @@ def test_no_file_is_opened_as_a_closed_standard_stream(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_nothing_of_the_process_is_needed(tmp_path: Path) -> None:
-    """No home, no temporary folder, no working folder, a name that is no text."""
-    out, gone = tmp_path / os.fsdecode(b"\xff.out"), tmp_path / "gone"
+    """No home, no temporary folder, no language."""
+    out = tmp_path / "out"
     environment = {"PATH": os.environ["PATH"], "TMPDIR": "/nonexistent"}
-    gone.mkdir()
-    shell = f'cd "{gone}" && rmdir "{gone}" && "$@"'
-    command = ["sh", "-c", shell, "sh", *DMRL, "sketch", str(out), "--images", "2"]
+    command = [*DMRL, "sketch", str(out), "--images", "2"]
     done = subprocess.run(command, env=environment, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     assert out.is_dir()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_working_folder_that_was_removed_is_said_before_a_library_aborts(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (gone := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert boundary.status_of(lambda: app([name])) == 1
+    assert capsys.readouterr().err == "dmrl: the folder you are in was removed. Go to another: cd\n"

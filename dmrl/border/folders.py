@@ -8,6 +8,28 @@ from pathlib import Path
 from dmrl.errors import UnsafeName
 
 
+def refuse_no_text(path: Path) -> None:
+    """Nothing, if every library can be given a path: it is text, and holds no NUL.
+
+    File systems take any bytes. What writes tables, figures and logs of a training takes text, and
+    some of it fails in the middle of the work.
+
+    Raises
+    ------
+    UnsafeName
+        If one cannot.
+    """
+    name = str(path)
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise UnsafeName(
+            f"{name[:80]} is no text, and not every program reads it. Rename it"
+        ) from None
+    if "\0" in name:
+        raise UnsafeName(f"no file can be called {name[:80]!r}. Check the name")
+
+
 def refuse_pipe(path: Path) -> None:
     """Nothing, if a path is a file or a folder, or nothing is there.
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dmrl.border import limits
 from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_pipes
+from dmrl.border.folders import refuse_no_text, refuse_pipes
 from dmrl.border.names import inside, split_name
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, read_manifest
@@ -246,8 +246,9 @@ def open_dataset(path: Path) -> Dataset:
     DatasetError
         If it is not a dataset.
     UnsafeName
-        If a split is called what could not be a folder's name.
+        If a split is called what could not be a folder's name, or the path is no text.
     """
+    refuse_no_text(path)
     refuse_pipes(path)
     manifest = read_manifest(path)
     if manifest is not None and manifest.splits:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_pipes
+from dmrl.border.folders import refuse_no_text, refuse_pipes
 from dmrl.deploy.backends import Backend, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
 from dmrl.deploy.compiled import Compiled
@@ -118,6 +118,7 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
             f"no model {model}. Give a run folder, a Keras .h5, an export folder, or the name of "
             f"one that ships with dmrl: {', '.join(pretrained.names())}"
         )
+    refuse_no_text(model)
     refuse_pipes(model)
     if backend not in OPENS:
         raise SettingError(f"no backend {backend}. There are: {', '.join(OPENS)}")

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dmrl.border import limits
 from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_pipes
+from dmrl.border.folders import refuse_no_text, refuse_pipes
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
@@ -230,6 +230,7 @@ def load_model(path: Path) -> Model:
         If the file is none of these (a pickle is refused unread), is damaged, or its tensors
         do not fit the architecture.
     """
+    refuse_no_text(path)
     refuse_pipes(path)
     if path.is_dir():
         return _load_safetensors(path / WEIGHTS_NAME, path / DESCRIPTION_NAME, path.name)

@@ -13,6 +13,7 @@ from glob import has_magic
 from pathlib import Path
 from typing import Any
 
+from dmrl.border.folders import refuse_no_text
 from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
 from dmrl.output import note
 from dmrl.pipeline.array import array_job
@@ -275,6 +276,7 @@ def _named(source: Path, out: Path) -> tuple[Mapping[Path, Path], Path]:
 
 def _make_folders(out: Path, tasks: Iterable[Task]) -> list[Path]:
     """Make the folders of all outputs; those that were not there, the deepest first."""
+    refuse_no_text(out)
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Many recordings go into a folder: name one")
     if isinstance(out, Remote):

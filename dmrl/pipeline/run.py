@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from dmrl.border.folders import refuse_no_text
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.report import Done
 from dmrl.output import as_output_error, partial_of, rewritten_file
@@ -109,6 +110,7 @@ def _owned(out: Path) -> Iterator[Path]:
         require_bucket(out)
         yield out
         return
+    refuse_no_text(out)
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Name a folder: --out DIR")
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dmrl import recipe
-from dmrl.border.folders import refuse_pipe, refuse_pipes
+from dmrl.border.folders import refuse_no_text, refuse_pipe, refuse_pipes
 from dmrl.datasets import open_dataset
 from dmrl.deploy import store
 from dmrl.deploy.detector import open_detector
@@ -100,3 +100,17 @@ def test_what_may_be_named_is_a_file_a_folder_or_nothing(tmp_path: Path) -> None
         refuse_pipe(name)
     with pytest.raises(UnsafeName, match=r"no file can be called 'a\\x00b'"):
         path_of("a\0b")
+
+
+@pytest.mark.parametrize("name", [os.fsdecode(b"\xff"), os.fsdecode(b"\xff/b"), "a\0b"])
+def test_a_name_that_is_no_text_is_said(name: str) -> None:
+    refuse_no_text(Path("\N{LATIN SMALL LETTER E WITH ACUTE} \n\x1b"))
+    with pytest.raises(UnsafeName, match=r"(Rename it|Check the name)$"):
+        refuse_no_text(Path(name))
+
+
+@pytest.mark.parametrize("what", ["a dataset", "a model", "a model for a backend"])
+def test_what_libraries_open_by_its_name_has_one_that_is_text(what: str, tmp_path: Path) -> None:
+    (given := tmp_path / os.fsdecode(b"\xff")).mkdir()
+    with pytest.raises(UnsafeName, match="is no text"):
+        OPENED[what](given)

@@ -108,7 +108,8 @@ def test_an_input_that_is_changed_meanwhile_is_one_line(
 
 
 def test_a_name_that_is_no_text_is_one_line(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
-    flight = with_junk(box.root / "in" / os.fsdecode(b"\xff.mcap"), "", {})
+    made = with_junk(box.root / "in" / "a.mcap", "", {})
+    flight = made.rename(made.with_name(os.fsdecode(b"\xff.mcap")))
     for words in (
         ("info", flight),
         ("check", flight),
