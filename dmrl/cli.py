@@ -43,7 +43,7 @@ COMMANDS = {
     "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
     "record": "Record the logs and cameras of Crazyflies in flight, until Ctrl-C.",
     "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
-    "calibrate": "Calibrate a camera: intrinsics from a chessboard, mount and delay from a flight.",
+    "calibrate": "Calibrate cameras by boards or flights, other sensors by what flights agree on.",
     "align": "Set clocks by each other: from ranges of pairs, images, or motion capture.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",

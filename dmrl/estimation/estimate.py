@@ -269,7 +269,8 @@ def _from_smoother(
 def _from_batch(
     flight: Problem, noise: Noise | None, score: Array, tracks: Array, pieced: Sequence[Array]
 ) -> Estimate:
-    first = noise or Noise()
+    known = () if flight.known_std is None else tuple(flight.known_std.tolist())
+    first = noise or Noise(known_std=known)
     ends = solutions(flight, first, score, tracks.swapaxes(0, 1), pieced)
     if flight.looks is not None:
         flight = replace(flight, looks=trusted(flight.looks, ends[0].state))
@@ -279,10 +280,12 @@ def _from_batch(
     best = ends[0]
     if not noise:
         found, best = with_range_noise(flight, found, best)
-    spread = covariance(flight, found, best)[0][:, :3, :3] * INFLATION**2 + apart
+    keyframes, constants = covariance(flight, found, best)
+    spread = keyframes[:, :3, :3] * INFLATION**2 + apart
     none = np.zeros(len(tracks), np.int8)
     state, error_m = best.state[:, :3], best.state[:, RANGE_ERROR]
-    return Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)
+    made = Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)
+    return replace(made, constants_covariance=constants)
 
 
 def _weighed(

@@ -9,14 +9,12 @@ from dmrl.estimation.gate import UNCONVERGED, Statuses
 from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import CLOCK
 from dmrl.estimation.motion import rotation
-from dmrl.estimation.pair import Array
+from dmrl.estimation.pair import SWAPPED, Array
 from dmrl.estimation.problem import Noise
 
 Refused = Literal["still", "alike", "silent", "open", "imprecise"]
 """Why nothing is OK: the observer hardly moves; one moves as the other; sensors were silent for
 most of it; the motion leaves the bearing open, or other solutions fit; nothing is exact enough."""
-SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
-"""Order of the globals seen from the peer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +41,8 @@ class Estimate:
         method does not say.
     refused
         Why nothing is OK; None where something is.
+    constants_covariance
+        (G, G) of what was constant; None where the method does not say.
     """
 
     time_s: Array
@@ -53,6 +53,7 @@ class Estimate:
     noise: Noise
     range_error_m: Array | None = None
     refused: Refused | None = None
+    constants_covariance: Array | None = None
 
     def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
         """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
@@ -88,7 +89,13 @@ def swapped(estimate: Estimate) -> Estimate:
     covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
     constants = estimate.constants[SWAPPED]
     constants[CLOCK] *= -1  # an offset between two clocks has the other sign from the other side
-    return replace(estimate, state=state, covariance=covariance, constants=constants)
+    return replace(
+        estimate,
+        state=state,
+        covariance=covariance,
+        constants=constants,
+        constants_covariance=None,
+    )
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:

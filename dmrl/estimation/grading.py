@@ -70,7 +70,7 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, 
         return found, solution
     faded, _, _, solution = _graded(flight, _fading(noise, TAILED * std_m), solved)
     halves = {name: float(np.sqrt(getattr(found, name) * getattr(faded, name))) for name in GRADED}
-    return replace(faded, **halves), solution
+    return replace(faded, **halves, known_std=faded.known_std), solution
 
 
 def _fading(noise: Noise, std_m: float) -> Noise:

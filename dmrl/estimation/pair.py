@@ -14,6 +14,8 @@ LONGEST_GAP_S = 0.5
 """Silence of a sensor that is bridged without a word."""
 LONGEST_RANGE_M = 60.0
 """Beyond the reach of UWB: 65535 and other fill values."""
+SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
+"""Order of ``GLOBALS`` seen from the peer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +85,9 @@ class Pair:
     own_sees, peer_sees
         What the camera of either showed; None: nothing, or it has none. Images outside the grid
         do not count.
+    known_std
+        (G,) standard deviations of what is constant over the flight, in the order of ``GLOBALS``,
+        where they are known to be smaller than usual; None: nowhere.
 
     Raises
     ------
@@ -98,6 +103,7 @@ class Pair:
     range_m: Array
     own_sees: Sightings | None = None
     peer_sees: Sightings | None = None
+    known_std: Array | None = None
 
     def __post_init__(self) -> None:
         count = len(self.time_s)
@@ -127,7 +133,9 @@ class Pair:
     def swapped(self) -> "Pair":
         """The same ranges seen from the peer."""
         ranges = self.range_time_s, self.range_m
-        return Pair(self.time_s, self.peer, self.own, *ranges, self.peer_sees, self.own_sees)
+        sees = self.peer_sees, self.own_sees
+        known_std = None if self.known_std is None else self.known_std[SWAPPED]
+        return Pair(self.time_s, self.peer, self.own, *ranges, *sees, known_std)
 
 
 def usable_ranges(time_s: Array, range_m: Array) -> Mask:

@@ -53,6 +53,9 @@ class Noise:
         Height difference.
     gap_speed_mps, gap_turn_radps
         How a robot may move while its sensors are silent, per square root of a second.
+    known_std
+        Of what is constant, in the order of ``GLOBALS``, where it is known from other flights;
+        empty where nothing is.
     """
 
     velocity_std_mps: float = 0.08
@@ -75,6 +78,7 @@ class Noise:
     height_std_m: float = 0.04
     gap_speed_mps: float = 0.5
     gap_turn_radps: float = 0.5
+    known_std: tuple[float, ...] = ()
 
     @property
     def velocity_psd(self) -> float:
@@ -100,7 +104,8 @@ class Noise:
         """(11,) of the globals, in the order of ``GLOBALS``."""
         pairwise = [self.gyro_std_radps] * 2 + [self.velocity_scale_std] * 2
         velocity = [self.velocity_bias_std_mps] * 4
-        return np.array([self.bias_std_m, self.scale_std, *pairwise, *velocity, self.clock_std_s])
+        usual = [self.bias_std_m, self.scale_std, *pairwise, *velocity, self.clock_std_s]
+        return np.minimum(usual, self.known_std or np.inf)
 
 
 GLOBALS = (
@@ -149,6 +154,8 @@ class Problem:
         (R,) peer's height less the observer's, metres.
     looks
         What cameras saw; None: nothing.
+    known_std
+        As of the pair.
     """
 
     key_s: Array
@@ -165,6 +172,7 @@ class Problem:
     range_level_m: Array
     height_m: Array
     looks: Looks | None = None
+    known_std: Array | None = None
 
     @property
     def steps_s(self) -> Array:
@@ -209,6 +217,7 @@ def problem(pair: Pair, rate_hz: float = 10.0) -> Problem:
         range_level_m=range_levels(pair),
         height_m=np.interp(pair.range_time_s, grid, height),
         looks=looks_of(pair, key_s, Noise().height_std_m),
+        known_std=pair.known_std,
     )
 
 

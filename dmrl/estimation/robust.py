@@ -90,9 +90,13 @@ def curvature_of(noise: Noise, constants: Array) -> Array:
     The weight says where the slope is that of a square. The loss itself is bent less: what is as
     far out as the prior is wide, the prior hardly holds.
     """
+    return curved((constants / noise.prior_std()) ** 2 / PRIOR) * noise.prior_std() ** -2
+
+
+def curved(out: Array) -> Array:
+    """By how much the loss is bent where r^2 / L is that, against a square."""
     # Half of the second derivative of L log(1 + r^2 / L) is (1 - r^2 / L) / (1 + r^2 / L)^2.
-    out = (constants / noise.prior_std()) ** 2 / PRIOR
-    return np.asarray(np.maximum(1 - out, 0.0) / (1 + out) ** 2 * noise.prior_std() ** -2)
+    return np.asarray(np.maximum(1 - out, 0.0) / (1 + out) ** 2)
 
 
 def _first(linear: Linear, noise: Noise) -> float:

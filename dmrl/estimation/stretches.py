@@ -150,13 +150,18 @@ def _cut(pair: Pair, start_s: float, end_s: float) -> Pair:
     at = (pair.time_s >= start_s) & (pair.time_s <= end_s)
     time_s = pair.time_s[at]
     inside = (pair.range_time_s >= time_s[0]) & (pair.range_time_s <= time_s[-1])
+    own_sees, peer_sees = (
+        within(seen, time_s[0], time_s[-1]) for seen in (pair.own_sees, pair.peer_sees)
+    )
     return Pair(
         time_s,
         _cut_track(pair.own, at),
         _cut_track(pair.peer, at),
         pair.range_time_s[inside],
         pair.range_m[inside],
-        *(within(seen, time_s[0], time_s[-1]) for seen in (pair.own_sees, pair.peer_sees)),
+        own_sees,
+        peer_sees,
+        pair.known_std,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.estimation.pair import RATE_HZ, Array, Pair, Track, usable_ranges
 from dmrl.estimation.sensors import Signals, track
+from dmrl.labelling.known import Sensors
 from dmrl.recording import Contents
 from dmrl.recording.check_units import unit_doubts
 
@@ -21,6 +22,7 @@ MOST = 1e6
 """No sensor says so many metres, radians or metres per second; their squares are no numbers."""
 SENSED = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE)
 """What positions are estimated from."""
+NOTHING = Sensors()
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +85,7 @@ class Logs:
     warnings: list[str]
 
 
-def read_logs(held: Contents, range_offset_m: float = 0.0) -> Logs:
+def read_logs(held: Contents, range_offset_m: float = 0.0, known: Sensors = NOTHING) -> Logs:
     """The logs of a recording.
 
     Parameters
@@ -92,6 +94,8 @@ def read_logs(held: Contents, range_offset_m: float = 0.0) -> Logs:
         A recording, best with what `SENSED` names.
     range_offset_m
         Subtracted from every range.
+    known
+        What is known of the sensors, and taken out of what they say.
 
     Raises
     ------
@@ -103,7 +107,7 @@ def read_logs(held: Contents, range_offset_m: float = 0.0) -> Logs:
     names = sorted({name for link in links for name in link.values()})
     robots = {}
     for name in names:
-        log = _robot(held, name, warnings)
+        log = _robot(held, name, known, warnings)
         if log is not None:
             robots[name] = log
     pairs = {}
@@ -114,8 +118,12 @@ def read_logs(held: Contents, range_offset_m: float = 0.0) -> Logs:
             for topic in both_ways
             if topic in held.topics
         ]
-        ranges = [(r[0], r[1] - range_offset_m) for r in found if r is not None]
-        pair = _pair(robots, one, other, ranges, warnings)
+        ranges = [
+            (r[0], known.ranges((one, other), r[1] - range_offset_m))
+            for r in found
+            if r is not None
+        ]
+        pair = _pair(robots, (one, other), ranges, known, warnings)
         if pair is not None:
             pairs[one, other] = pair
     flying = _flying(held)
@@ -133,7 +141,7 @@ def _flying(held: Contents) -> frozenset[str]:
     return frozenset(name for kind in kinds for name in topics.robots(list(held.topics), kind))
 
 
-def _robot(held: Contents, name: str, warnings: list[str]) -> RobotLog | None:
+def _robot(held: Contents, name: str, known: Sensors, warnings: list[str]) -> RobotLog | None:
     wanted = {
         topics.attitude(name): ("roll_rad", "pitch_rad", "yaw_rate_radps"),
         topics.velocity(name): ("vx_mps", "vy_mps"),
@@ -146,7 +154,8 @@ def _robot(held: Contents, name: str, warnings: list[str]) -> RobotLog | None:
     attitude, velocity, height = signals
     if attitude is None or velocity is None or height is None:
         return None
-    return RobotLog(attitude, velocity, height)
+    attitude[1][:, 2] = known.yaw_rate(name, attitude[1][:, 2])
+    return RobotLog(attitude, (velocity[0], known.velocity(name, velocity[1])), height)
 
 
 def _signals(
@@ -172,13 +181,17 @@ def _signals(
 
 
 def _pair(
-    robots: dict[str, RobotLog], one: str, other: str, ranges: list[Signals], warnings: list[str]
+    robots: dict[str, RobotLog],
+    names: tuple[str, str],
+    ranges: list[Signals],
+    known: Sensors,
+    warnings: list[str],
 ) -> Pair | None:
     """A pair on its common time grid; None, with a warning, where it cannot be used."""
-    name = f"{one}-{other}"
-    if not ranges or one not in robots or other not in robots:
+    name = "-".join(names)
+    if not ranges or not all(robot in robots for robot in names):
         return None
-    logs = robots[one], robots[other]
+    logs = [robots[robot] for robot in names]
     start_s, end_s = max(log.start_s for log in logs), min(log.end_s for log in logs)
     if end_s - start_s < LEAST_S:
         warnings.append(
@@ -191,13 +204,14 @@ def _pair(
         return None
     grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
     tracks = [log.track(grid_s) for log in logs]
-    for robot, sensed in zip((one, other), tracks, strict=True):
+    for robot, sensed in zip(names, tracks, strict=True):
         if sensed.gap.any():
             silent_s = sensed.gap.sum() / RATE_HZ
             warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
     time_s, range_m = measured
     on_grid = time_s <= grid_s[-1]  # which ends up to a step before the logs do
-    return Pair(grid_s, tracks[0], tracks[1], time_s[on_grid], range_m[on_grid])
+    ranged = time_s[on_grid], range_m[on_grid]
+    return Pair(grid_s, tracks[0], tracks[1], *ranged, known_std=known.std(names))
 
 
 def _ranges_within(

@@ -1,4 +1,4 @@
-"""``dmrl calibrate``: a camera's intrinsics from a board, its mount and delay from a flight."""
+"""``dmrl calibrate``: cameras, from a board or a flight, and what flights agree on of sensors."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -16,8 +16,10 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
 from dmrl.images.codec import decode
 from dmrl.output import partial_file, refuse_existing
+from dmrl.pipeline.crew import cores
+from dmrl.pipeline.spread import spread
 from dmrl.recording import Contents, read, summary
-from dmrl.terminal.arguments import AsJson, Flat
+from dmrl.terminal.arguments import AsJson, Flat, Workers
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
@@ -25,7 +27,9 @@ try:
     from dmrl.estimation import board
     from dmrl.estimation.camera_pose import LEAST, Calibration, calibrate
     from dmrl.estimation.camera_views import Noise
+    from dmrl.labelling.agreed import Constant, agreed, solutions
     from dmrl.labelling.camera import camera_given, camera_of
+    from dmrl.labelling.known import Sensors, write_sensors
     from dmrl.labelling.sight import SEEN, camera_flight
     from dmrl.labelling.truth import TOLD
 except ModuleNotFoundError as e:
@@ -44,6 +48,8 @@ class Settings:
     ----------
     board
         Inner corners of the chessboard, columns x rows, such as 9x6: for intrinsics.
+    sensors
+        What flights agree on of ranges, gyroscopes and flow, in place of a camera.
     robot
         Whose camera. Without it, the only one there is.
     against
@@ -61,6 +67,7 @@ class Settings:
     """
 
     board: str | None = None
+    sensors: bool = False
     robot: str | None = None
     against: Literal["estimate", "truth"] = "estimate"
     camera: Path | None = None
@@ -72,24 +79,33 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A calibrated camera, and figures about it by name."""
+    """What was calibrated, and figures about it by name."""
 
-    camera: Camera
+    made: Camera | Sensors
     figures: dict[str, Any]
 
+    @property
+    def camera(self) -> Camera:
+        """The camera; not with ``sensors``."""
+        assert isinstance(self.made, Camera)
+        return self.made
 
-def run(sources: list[Path], out: Path, settings: Settings) -> Result:
-    """Write the camera of ``sources`` to the TOML file ``out``.
+
+def run(sources: list[Path], out: Path, settings: Settings, workers: int = 1) -> Result:
+    """Write the camera of ``sources``, or what they agree on of sensors, to the TOML file ``out``.
 
     Parameters
     ----------
     sources
         With ``board``: a folder of pictures of a chessboard, or a recording of such images.
-        Without: recordings with detections and positions of peers, all by the same camera.
+        With ``sensors``: flights of the same robots, two or more. Without either: recordings with
+        detections and positions of peers, all by the same camera.
     out
-        TOML file to write: intrinsics, mount, delay. Must not exist.
+        TOML file to write. Must not exist.
     settings
         See `Settings`.
+    workers
+        Flights that are solved at a time. Changes no byte.
 
     Raises
     ------
@@ -101,7 +117,11 @@ def run(sources: list[Path], out: Path, settings: Settings) -> Result:
         If ``out`` exists.
     """
     refuse_existing(out)
-    if settings.board is None:
+    if settings.sensors:
+        if settings.board is not None:
+            raise SettingError("--sensors and --board are two calibrations. Do one after the other")
+        found = _sensors(sources, workers)
+    elif settings.board is None:
         if folder := next((source for source in sources if source.is_dir()), None):
             raise SettingError(f"{folder} is a folder. Name its board's inner corners: --board 9x6")
         found = _flights(sources, settings)
@@ -110,8 +130,21 @@ def run(sources: list[Path], out: Path, settings: Settings) -> Result:
     else:
         found = _board(sources[0], settings)
     with partial_file(out) as partial:
-        partial.write_text(write_camera(found.camera), encoding="utf-8")
+        made = found.made
+        text = write_camera(made) if isinstance(made, Camera) else write_sensors(made)
+        partial.write_text(text, encoding="utf-8")
     return found
+
+
+def _sensors(sources: list[Path], workers: int) -> Result:
+    flights = track(spread(solutions, sources, workers), "Solving flights", len(sources))
+    found = agreed(sources, flights)
+    return Result(found.sensors, {"sensors": [_constant(one) for one in found.constants]})
+
+
+def _constant(one: Constant) -> dict[str, Any]:
+    of = one.of if isinstance(one.of, str) else "-".join(one.of)
+    return {**asdict(one), "of": of}
 
 
 def _board(source: Path, settings: Settings) -> Result:
@@ -228,26 +261,37 @@ def command(
     /,
     *,
     settings: Flat[Settings] = DEFAULTS,
+    workers: Workers = None,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate a camera: intrinsics from a chessboard, mount and delay from a flight.
+    """Calibrate cameras by boards or flights, other sensors by what flights agree on.
 
     Parameters
     ----------
     sources
-        With --board, a folder of pictures or a recording; without, recordings with detections
-        (dmrl predict) and positions of peers (dmrl label). Several flights are better than one:
-        what biases a flight's positions biases its calibration.
+        With --board, a folder of pictures or a recording; with --sensors, flights of the same
+        robots; without, recordings with detections (dmrl predict) and positions of peers (dmrl
+        label). Several flights are better than one: what biases a flight's positions biases its
+        calibration.
     out
-        TOML file to write, for --camera of label, track and convert. Must not exist.
+        TOML file to write, for --camera of label, track and convert, or for --sensors of label.
+        Must not exist.
+    workers
+        --sensors: flights that are solved at a time, at most. Without it, as many as there are
+        cores. Changes no byte.
     as_json
         Print one JSON document in place of the table.
     """
-    found = run(sources, out, settings)
+    found = run(sources, out, settings, workers or cores())
     if as_json:
-        print_json({"camera": asdict(found.camera), **found.figures})
-        return
-    print_table(str(out), ("figure", "value"), [(k, _words(v)) for k, v in found.figures.items()])
+        made = {"camera": asdict(found.camera)} if isinstance(found.made, Camera) else {}
+        print_json({**made, **found.figures})
+    elif settings.sensors:
+        rows = found.figures["sensors"]
+        print_table(str(out), tuple(rows[0]), [tuple(row.values()) for row in rows])
+    else:
+        rows = [(k, _words(v)) for k, v in found.figures.items()]
+        print_table(str(out), ("figure", "value"), rows)
 
 
 def _words(value: Any) -> str:

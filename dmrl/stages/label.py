@@ -30,6 +30,7 @@ try:
     from dmrl.estimation.pair import Pair, Sightings
     from dmrl.estimation.swarm import estimate_swarm
     from dmrl.labelling.camera import camera_given, camera_of
+    from dmrl.labelling.known import Sensors, read_sensors
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import SENSED, Logs, read_logs
     from dmrl.labelling.report import PairReport, doubts, pair_report, refusal
@@ -79,6 +80,8 @@ class Settings:
         Error of such a detection in u and in v, pixels.
     range_offset_m
         Known offset of every range, subtracted first: an antenna delay, 0.35 m for some.
+    sensors
+        What flights of these robots agree on, as dmrl calibrate --sensors wrote it.
     undistorted
         The images have no lens distortion any more, whatever the calibration says.
     copy
@@ -95,6 +98,7 @@ class Settings:
     detections: bool = False
     pixel_std_px: Positive = 6.0
     range_offset_m: Annotated[float, Parameter(validator=validators.Number(gt=-60, lt=60))] = 0.0
+    sensors: Path | None = None
     undistorted: bool = False
     copy: bool = True
     camera: dict[str, Path] = field(default_factory=dict)
@@ -169,7 +173,7 @@ def side_by_side(recording: Path, out: Path, settings: Settings, workers: int) -
     replaced = [topics.labels(robot) for robot in filming]
     replaced += [topic for topic in held.topics if topics.names(topics.POSITION, topic)]
     replaced = replaced if settings.copy else list(held.topics)
-    inputs = [recording, *settings.camera.values()]
+    inputs = [recording, *settings.camera.values(), *filter(None, [settings.sensors])]
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     rewrite(recording, out, origin, without=replaced, fresh=made.values(), series=series)
     warnings = [*logs.warnings, *_blind(held, filming, cameras)]
@@ -180,7 +184,13 @@ def side_by_side(recording: Path, out: Path, settings: Settings, workers: int) -
 
 def _logs(held: Contents, settings: Settings) -> Logs:
     """Logs of all pairs, if there is a pair, and a robot for every camera file."""
-    logs = read_logs(held, settings.range_offset_m)
+    known = read_sensors(settings.sensors) if settings.sensors else Sensors()
+    logs = read_logs(held, settings.range_offset_m, known)
+    if settings.sensors and not set(logs.robots) & set(known.names):
+        raise SettingError(
+            f"{settings.sensors} is of {', '.join(known.names) or 'nobody'}, and {held.path} has "
+            f"{', '.join(logs.robots) or 'nobody'}. Calibrate with flights of these robots"
+        )
     if not logs.pairs:
         why = "; ".join(logs.warnings) or "there are no ranges"
         raise RecordingError(f"{held.path}: no pair can be estimated: {why}. Try: dmrl info")

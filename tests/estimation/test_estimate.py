@@ -54,7 +54,7 @@ def test_spreads_grow_with_what_else_may_be(
     known = np.tile(np.eye(6), (3, 1, 1))
     for name, given in (("solutions", ends), ("_weighed", ends), ("covariance", (known, None))):
         monkeypatch.setattr(entrance, name, lambda *_, given=given: given)
-    flight = SimpleNamespace(key_s=np.arange(3.0), looks=None)
+    flight = SimpleNamespace(key_s=np.arange(3.0), looks=None, known_std=None)
     found = entrance._from_batch(flight, Noise(), np.zeros(1), np.zeros((1, 3, 5)), [])  # type: ignore[arg-type]
     wanted = entrance.INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
     assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))

@@ -229,6 +229,16 @@ def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> N
         assert ours.status == STATUS_AMBIGUOUS
 
 
+@pytest.mark.heavy
+def test_a_known_offset_of_ranges_need_not_be_found(flight: Path, tmp_path: Path) -> None:
+    biases = []
+    for offset_m in (0.0, 0.3):
+        out = tmp_path / f"{offset_m}.mcap"
+        found = label.run(flight, out, Settings(range_offset_m=offset_m)).pairs
+        biases.append(found[0].range_bias_m)
+    assert biases[0] - biases[1] > 0.15
+
+
 @pytest.mark.slow
 def test_real_ranges_of_moving_robots_are_labelled_and_a_static_observer_is_not(
     data: Path, tmp_path: Path

@@ -1,0 +1,165 @@
+"""What many flights of the same robots agree on of their sensors, and the TOML file it stands in.
+
+``dmrl calibrate --sensors`` writes it, ``dmrl label --sensors`` starts from it: what is known is
+taken out of the logs, and how exactly it is known goes to the solve.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from dmrl.border.documents import parse_toml
+from dmrl.border.folders import refuse_pipe
+from dmrl.errors import SourceError
+from dmrl.estimation.linear import BIAS, OWN_GYRO, OWN_SCALE, PEER_GYRO, PEER_SCALE, SCALE
+from dmrl.estimation.pair import Array
+from dmrl.estimation.problem import GLOBALS
+
+Names = tuple[str, str]
+Value = tuple[float, float]
+"""A mean, and the standard deviation of the next flight about it."""
+Values = Mapping[str, Value]
+
+OF_ROBOT = {
+    "yaw_rate_bias_radps": (OWN_GYRO, PEER_GYRO),
+    "velocity_scale": (OWN_SCALE, PEER_SCALE),
+    "vx_bias_mps": (6, 8),
+    "vy_bias_mps": (7, 9),
+}
+"""Of one robot: places among ``GLOBALS`` where it is the observer, and where it is the peer."""
+OF_PAIR = {"range_offset_m": BIAS, "range_scale": SCALE}
+"""Of the ranges between two, in the order of their names. Clocks are another every time."""
+SCALES = ("velocity_scale", "range_scale")
+MOST, MOST_SCALE = 60.0, 0.9
+"""No mean is larger."""
+HEAD = """\
+# What flights agree on, for dmrl label --sensors: [mean, standard deviation of the next flight].
+# Logs show a velocity (1 + velocity_scale) v + bias and a range (1 + range_scale) d + offset.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """Constants that are known, by robot and by pair of robots.
+
+    Parameters
+    ----------
+    robots
+        By name: values under the keys of `OF_ROBOT`, or some of them.
+    pairs
+        By both names in their order: values under the keys of `OF_PAIR`, or some of them.
+    """
+
+    robots: Mapping[str, Values] = field(default_factory=dict)
+    pairs: Mapping[Names, Values] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        """The robots of which something is known."""
+        return sorted({*self.robots, *(name for pair in self.pairs for name in pair)})
+
+    def yaw_rate(self, robot: str, logged: Array) -> Array:
+        """Yaw rates without their bias, rad/s."""
+        return logged - _mean(self.robots.get(robot, {}), "yaw_rate_bias_radps")
+
+    def velocity(self, robot: str, logged: Array) -> Array:
+        """(N, 2) velocities without their bias and scale, m/s."""
+        known = self.robots.get(robot, {})
+        bias = [_mean(known, "vx_bias_mps"), _mean(known, "vy_bias_mps")]
+        return np.asarray((logged - bias) / (1 + _mean(known, "velocity_scale")))
+
+    def ranges(self, pair: Names, measured: Array) -> Array:
+        """Ranges without their offset and scale, metres."""
+        known = self.pairs.get(pair, {})
+        longer_m = _mean(known, "range_offset_m")
+        return np.asarray((measured - longer_m) / (1 + _mean(known, "range_scale")))
+
+    def std(self, pair: Names) -> Array | None:
+        """(G,) standard deviations of what is left, infinite where unknown; None: all of them."""
+        out = np.full(len(GLOBALS), np.inf)
+        for side, robot in enumerate(pair):
+            for key, value in self.robots.get(robot, {}).items():
+                out[OF_ROBOT[key][side]] = value[1]
+        for key, value in self.pairs.get(pair, {}).items():
+            out[OF_PAIR[key]] = value[1]
+        return out if np.isfinite(out).any() else None
+
+
+def _mean(known: Values, key: str) -> float:
+    return known.get(key, (0.0, 0.0))[0]
+
+
+def write_sensors(sensors: Sensors) -> str:
+    """A TOML document that `read_sensors` reads."""
+    robots = [{"name": name, **_lists(v)} for name, v in sensors.robots.items()]
+    pairs = [{"robots": list(names), **_lists(v)} for names, v in sensors.pairs.items()]
+    return HEAD + tomli_w.dumps({"robots": robots, "pairs": pairs})
+
+
+def _lists(values: Values) -> dict[str, list[float]]:
+    return {key: [float(f"{part:.6g}") for part in value] for key, value in values.items()}
+
+
+def read_sensors(path: Path) -> Sensors:
+    """What a TOML file says is known of sensors.
+
+    Raises
+    ------
+    SourceError
+        If there is no such file, or it is none of what `write_sensors` writes.
+    """
+    refuse_pipe(path)
+    try:
+        table = parse_toml(path.read_text(encoding="utf-8"))
+        if wrong := set(table) - {"robots", "pairs"}:
+            raise ValueError(f"it has {min(wrong)}, and not robots and pairs alone")
+        robots = {_name(one): _values(one, "name", OF_ROBOT) for one in _tables(table, "robots")}
+        pairs = {_names(one): _values(one, "robots", OF_PAIR) for one in _tables(table, "pairs")}
+    except FileNotFoundError:
+        raise SourceError(f"no file {path}. Write one: dmrl calibrate --sensors") from None
+    except (OSError, ValueError) as e:
+        raise SourceError(f"{path}: {e}. Write one: dmrl calibrate --sensors") from None
+    return Sensors(robots, pairs)
+
+
+def _tables(table: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+    found = table.get(key, [])
+    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+        raise ValueError(f"{key} is no list of tables [[{key}]]")
+    return found
+
+
+def _name(one: Mapping[str, Any]) -> str:
+    if not isinstance(name := one.get("name"), str):
+        raise ValueError("a table of robots has no name")
+    return name
+
+
+def _names(one: Mapping[str, Any]) -> Names:
+    found = one.get("robots")
+    if not isinstance(found, list) or len(found) != 2 or not all(isinstance(n, str) for n in found):
+        raise ValueError('a table of pairs has no robots = ["one", "other"]')
+    if not found[0] < found[1]:
+        raise ValueError(f"the robots {', '.join(found)} are not two in the order of their names")
+    return found[0], found[1]
+
+
+def _values(one: Mapping[str, Any], name: str, known: Mapping[str, Any]) -> Values:
+    given = {key: value for key, value in one.items() if key != name}
+    for key, value in given.items():
+        if key not in known:
+            raise ValueError(f"{key} is none of {', '.join(known)}")
+        if not _is_value(value) or abs(value[0]) > (MOST_SCALE if key in SCALES else MOST):
+            raise ValueError(f"{key} is no [mean, standard deviation] of a sensor")
+    return {key: (float(value[0]), float(value[1])) for key, value in given.items()}
+
+
+def _is_value(value: object) -> bool:
+    if not isinstance(value, list) or len(value) != 2:
+        return False
+    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    return numbers and all(map(np.isfinite, value)) and value[1] > 0

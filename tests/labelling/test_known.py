@@ -1,0 +1,115 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.estimation.estimate import estimate_pairs
+from dmrl.estimation.linear import BIAS, CLOCK, OWN_GYRO, PEER_GYRO, PEER_SCALE
+from dmrl.labelling.known import Sensors, read_sensors, write_sensors
+from dmrl.labelling.logs import read_logs
+from dmrl.recording import Contents
+
+from ..estimation.flights import flown, pair_of
+from .test_logs import flight, logs, ranges
+
+KNOWN = Sensors(
+    {
+        "cf1": {"yaw_rate_bias_radps": (0.01, 0.001)},
+        "cf2": {
+            "yaw_rate_bias_radps": (-0.05, 0.002),
+            "velocity_scale": (0.15, 0.01),
+            "vx_bias_mps": (0.02, 0.01),
+            "vy_bias_mps": (-0.03, 0.01),
+        },
+    },
+    {
+        ("cf1", "cf2"): {
+            "range_offset_m": (0.35, 0.04),
+            "range_scale": (0.02, 0.01),
+        }
+    },
+)
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "sensors.toml"
+    path.write_text(write_sensors(KNOWN))
+    assert read_sensors(path) == KNOWN
+    assert KNOWN.names == ["cf1", "cf2"]
+
+
+def test_logs_come_out_as_the_sensors_should_have_said() -> None:
+    true = np.array([[0.4, -0.2], [0.0, 1.0]])
+    logged = true * 1.15 + [0.02, -0.03]
+    assert KNOWN.velocity("cf2", logged) == pytest.approx(true)
+    assert KNOWN.velocity("cf1", logged) == pytest.approx(logged)
+    assert KNOWN.yaw_rate("cf2", np.array([0.25])) == pytest.approx([0.3])
+    assert KNOWN.ranges(("cf1", "cf2"), np.array([2.0 * 1.02 + 0.35])) == pytest.approx([2.0])
+    assert KNOWN.ranges(("cf1", "cf3"), np.array([2.0])) == pytest.approx([2.0])
+
+
+def test_sigmas_stand_where_the_solve_looks_for_them() -> None:
+    std = KNOWN.std(("cf1", "cf2"))
+    assert std is not None
+    told = std[[BIAS, OWN_GYRO, PEER_GYRO, PEER_SCALE]]
+    assert told == pytest.approx([0.04, 0.001, 0.002, 0.01])
+    assert np.isinf(std[CLOCK])
+    back = KNOWN.std(("cf2", "cf3"))
+    assert back is not None
+    assert back[OWN_GYRO] == 0.002
+    assert np.isinf(back[[PEER_GYRO, BIAS]]).all()
+    assert KNOWN.std(("cf3", "cf4")) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[[robots", "Write one: dmrl calibrate --sensors"),
+        ("width_px = 3", "it has width_px, and not robots and pairs alone"),
+        ("robots = 3", r"robots is no list of tables \[\[robots\]\]"),
+        ("[[robots]]\nvelocity_scale = [0.1, 0.1]", "a table of robots has no name"),
+        ('[[robots]]\nname = "a"\nmass = [0.1, 0.1]', "mass is none of yaw_rate_bias_radps"),
+        ('[[robots]]\nname = "a"\nvelocity_scale = 0.1', "velocity_scale is no"),
+        ('[[robots]]\nname = "a"\nvelocity_scale = [-1.0, 0.1]', "velocity_scale is no"),
+        ('[[robots]]\nname = "a"\nvelocity_scale = [0.1, 0.0]', "velocity_scale is no"),
+        ('[[robots]]\nname = "a"\nvelocity_scale = [nan, 0.1]', "velocity_scale is no"),
+        ('[[robots]]\nname = "a"\nvelocity_scale = [true, 0.1]', "velocity_scale is no"),
+        ('[[pairs]]\nrobots = ["a"]\nrange_scale = [0.1, 0.1]', "a table of pairs has no robots"),
+        ('[[pairs]]\nrobots = ["b", "a"]\nrange_scale = [0.1, 0.1]', "in the order of their names"),
+    ],
+)
+def test_a_file_of_something_else_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "sensors.toml"
+    path.write_text(text)
+    with pytest.raises(SourceError, match=words):
+        read_sensors(path)
+    with pytest.raises(SourceError, match=r"no file .*other\.toml"):
+        read_sensors(tmp_path / "other.toml")
+
+
+def test_a_recording_is_read_without_what_is_known_to_be_off(tmp_path: Path) -> None:
+    found = logs(tmp_path / "a.mcap", flight, ranges).pairs["cf1", "cf2"]
+    known = read_logs(Contents(tmp_path / "a.mcap"), 0.1, KNOWN).pairs["cf1", "cf2"]
+    assert known.range_m == pytest.approx((found.range_m - 0.1 - 0.35) / 1.02)
+    assert known.own.vx_mps == pytest.approx(found.own.vx_mps)
+    assert known.peer.vx_mps == pytest.approx((found.peer.vx_mps - 0.02) / 1.15)
+    assert known.own.yaw_rate_radps == pytest.approx(found.own.yaw_rate_radps - 0.01)
+    assert known.known_std == pytest.approx(KNOWN.std(("cf1", "cf2")))
+    assert found.known_std is None
+    swapped = known.swapped().known_std
+    assert swapped is not None
+    assert swapped[[OWN_GYRO, PEER_GYRO]] == pytest.approx([0.002, 0.001])
+
+
+@pytest.mark.heavy
+def test_what_is_known_exactly_is_not_solved_for() -> None:
+    pair = pair_of(flown("in_view", "realistic", 31))
+    free = estimate_pairs([pair])[0][0]
+    std = np.full(len(free.constants), np.inf)
+    std[[BIAS, PEER_SCALE]] = 1e-4
+    held = estimate_pairs([replace(pair, known_std=std)])[0][0]
+    assert np.abs(held.constants[[BIAS, PEER_SCALE]]).max() < 1e-3
+    assert np.abs(free.constants[[BIAS, PEER_SCALE]]).min() > 3e-3
+    assert np.abs(held.constants[OWN_GYRO] - free.constants[OWN_GYRO]) < 0.01

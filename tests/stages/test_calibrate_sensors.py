@@ -1,0 +1,93 @@
+"""Robots whose sensors are off in every flight, and what is made of it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import OutputError, RecordingError, SettingError
+from dmrl.flight import Fault
+from dmrl.labelling.known import Sensors, read_sensors, write_sensors
+from dmrl.recording import summary
+from dmrl.stages import calibrate, fly, label
+from dmrl.stages.calibrate import Settings
+
+pytestmark = pytest.mark.heavy
+OFF = [
+    Fault("range_offset", "cf1", "cf2"),
+    Fault("yaw_rate_bias", "cf2"),
+    Fault("velocity_scale", "cf1"),
+]
+SENSORS = Settings(sensors=True)
+
+
+def flown(path: Path, seed: int, length_s: float = 50.0) -> Path:
+    fly.run(path, fly.Settings(2, length_s, noise="calibrated", seed=seed, faults=OFF))
+    return path
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("sensors")
+    return [flown(folder / f"{seed}.mcap", seed) for seed in (9301, 9302, 9303)]
+
+
+@pytest.fixture(scope="module")
+def known(flights: list[Path]) -> Path:
+    out = flights[0].with_name("sensors.toml")
+    calibrate.run(flights, out, SENSORS)
+    return out
+
+
+def test_what_is_off_in_every_flight_is_found(known: Path) -> None:
+    found = read_sensors(known)
+    offset_m, std_m = found.pairs["cf1", "cf2"]["range_offset_m"]
+    assert offset_m == pytest.approx(0.35, abs=0.1)
+    assert std_m < 0.12
+    assert found.robots["cf2"]["yaw_rate_bias_radps"][0] == pytest.approx(0.05, abs=0.008)
+
+
+def test_a_short_flight_starts_from_it_and_comes_out_right(known: Path, tmp_path: Path) -> None:
+    flight = flown(tmp_path / "flight.mcap", 9310, 20.0)
+    without = label.run(flight, tmp_path / "without.mcap", label.Settings())
+    out = tmp_path / "with.mcap"
+    better = label.run(flight, out, label.Settings(sensors=known))
+    for before, after in zip(without.pairs, better.pairs, strict=True):
+        assert after.ok_share > before.ok_share + 0.3
+        assert after.rmse_ok_m is not None
+        assert after.rmse_ok_m < 0.2
+    assert better.warnings == []
+    assert known.name in [one.name for one in summary(out).provenance.inputs]
+
+
+def test_a_file_that_is_wrong_is_found_out(known: Path, tmp_path: Path) -> None:
+    sensors = read_sensors(known)
+    other = {**sensors.robots["cf2"], "yaw_rate_bias_radps": (-0.05, 0.004)}
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(write_sensors(replace(sensors, robots={"cf2": other})))
+    flight = flown(tmp_path / "flight.mcap", 9311)
+    found = label.run(flight, tmp_path / "out.mcap", label.Settings(sensors=wrong))
+    assert any("cf2's yaw rate seems biased" in line for line in found.warnings)
+
+
+def test_workers_change_no_byte(flights: list[Path], known: Path, tmp_path: Path) -> None:
+    calibrate.run(flights, tmp_path / "two.toml", SENSORS, workers=2)
+    assert (tmp_path / "two.toml").read_bytes() == known.read_bytes()
+
+
+def test_too_little_is_one_line(flights: list[Path], known: Path, tmp_path: Path) -> None:
+    out = tmp_path / "sensors.toml"
+    with pytest.raises(RecordingError, match="no pair of robots has 2 flights"):
+        calibrate.run(flights[:1], out, SENSORS)
+    with pytest.raises(SettingError, match="two calibrations"):
+        calibrate.run(flights, out, Settings(sensors=True, board="9x6"))
+    with pytest.raises(OutputError):
+        calibrate.run(flights, known, SENSORS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_other_robots_is_refused(flights: list[Path], tmp_path: Path) -> None:
+    path = tmp_path / "sensors.toml"
+    path.write_text(write_sensors(Sensors({"cf7": {"velocity_scale": (0.1, 0.01)}})))
+    with pytest.raises(SettingError, match=r"is of cf7, and .* has cf1, cf2"):
+        label.run(flights[0], tmp_path / "out.mcap", label.Settings(sensors=path))
