@@ -14,6 +14,7 @@ from dmrl.geometry.frames import Array, Camera
 from dmrl.geometry.lens import undistort
 from dmrl.images.codec import Rgb, crop_and_scale, decode, size
 from dmrl.rendering.lens import Picture, between
+from dmrl.rendering.sensor import LUMINANCE
 
 PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm")
 KEPT = 64
@@ -74,7 +75,11 @@ class Photos:
     def backdrop(
         self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True
     ) -> Picture:
-        """(H, W, 3) linear light of a photo at random, cropped to fill the image.
+        """(H, W, 3) linear light of `part`."""
+        return np.take(LIGHT_OF, self.part(rng, camera, zoom, averaged=averaged))
+
+    def part(self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True) -> Rgb:
+        """(H, W, 3) uint8 of a photo at random, cropped to fill the image.
 
         Parameters
         ----------
@@ -98,7 +103,7 @@ class Photos:
             rgb = crop_and_scale(photo, box, camera.width_px, camera.height_px, sharp=False)
         else:
             rgb = _middles(photo, (left, top), fit, camera)
-        return np.take(LIGHT_OF, rgb[:, ::-1] if mirrored < 0.5 else rgb)
+        return rgb[:, ::-1] if mirrored < 0.5 else rgb
 
 
 def photos_in(folder: Path) -> Photos:
@@ -181,6 +186,24 @@ def _panorama_from_camera(turn_rad: tuple[float, float, float]) -> Array:
     (cr, cp, cy), (sr, sp, sy) = np.cos(turn_rad), np.sin(turn_rad)
     tilt = np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
     return np.asarray(np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ tilt)
+
+
+def stretched(light: Picture, power: float) -> Picture:
+    """(H, W, 3) light whose brightness over its mean is raised to a power, the mean kept.
+
+    Parameters
+    ----------
+    light
+        (H, W, 3) linear light; not changed.
+    power
+        Over 1: bright places stand out more; under 1: less.
+    """
+    luminance = light @ LUMINANCE
+    mean = max(float(luminance.mean()), 1e-6)
+    share = np.power(np.maximum(luminance / mean, 1e-4), np.float32(power - 1))
+    other: Picture = light * share[..., None]
+    other *= np.float32(mean / max(float((other @ LUMINANCE).mean()), 1e-6))
+    return other
 
 
 def smeared(picture: Picture, move_px: Sequence[float]) -> Picture:

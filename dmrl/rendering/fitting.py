@@ -5,7 +5,7 @@ rest, and a small drone changes none of them. What the figures measure hangs tog
 go a step towards what they lack, again and again.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -13,15 +13,23 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
 from dmrl.images.codec import Rgb, decode, encode_jpeg
-from dmrl.rendering.backdrops import Photos
-from dmrl.rendering.likeness import FIGURES, mean_of, of_one
-from dmrl.rendering.randomise import random_sensor
-from dmrl.rendering.sensor import blur, expose
+from dmrl.rendering.backdrops import LIGHT_OF, Photos
+from dmrl.rendering.likeness import Seen, middle_of, seen
+from dmrl.rendering.randomise import behind, random_sensor, without_highlights
+from dmrl.rendering.sensor import expose
 from dmrl.rendering.settings import LIMITS, Settings
 
-ROUNDS, PICTURES = 12, 32
+COARSE, FINE = (8, 32), (5, 192)
+"""Rounds and pictures: first a few, then as many as tell a camera from chance."""
+ROUNDS = COARSE[0] + FINE[0]
+PIXELS = 24_000_000
+"""Of all pictures of a round, at most; of large frames there are fewer, but `COARSE` anyway."""
+FOCAL = 0.57
+"""Over the width, as the AI-deck's: how far pictures move when the camera turns."""
 GREY = 0.01
 """Colour under which a camera is grey."""
+MOSAIC = 0.15
+"""Correlation of grain from which it is not one pixel's own."""
 QUALITIES = ((98, 100), (90, 96), (75, 90))
 """Of JPEG: the worse, the coarser its grain."""
 
@@ -49,7 +57,8 @@ class Knob:
 
 KNOBS = (
     Knob("brightness", "brightness", "factor", 0.8),
-    Knob("contrast_gamma", "contrast", "factor", -0.5),
+    Knob("background_contrast", "contrast", "factor", 0.6),
+    Knob("contrast_gamma", "contrast", "factor", -0.2),
     Knob("warmth", "cast", "factor", 1.4),
     Knob("saturation", "colour", "factor", 0.7),
     Knob("vignetting", "corners", "lost", 0.7),
@@ -57,117 +66,134 @@ KNOBS = (
     Knob("read_noise", "grain", "factor", 0.8),
     Knob("shot_noise", "grain", "factor", 1.6),
 )
-LEAST = {"read_noise": 2e-4, "shot_noise": 1e-6, "saturation": 0.02, "vignetting": 0.0}
-"""Of a range that is multiplied: from 0 it would never move."""
+LEAST = {
+    "contrast_gamma": 1.0,  # a sensor's: what is missing is the scene's
+    "read_noise": 2e-4,
+    "shot_noise": 1e-6,
+    "saturation": 0.02,
+    "vignetting": 0.0,
+}
+"""Of a range that is fitted: from 0 it would never move."""
 
 
-def pictures(
-    settings: Settings, photos: Photos, size_px: tuple[int, int], seed: int
-) -> Iterator[Rgb]:
-    """`PICTURES` of backdrops as the settings' camera takes them, without robots.
+def scenes(photos: Photos, settings: Settings, size_px: tuple[int, int], seed: int) -> list[Rgb]:
+    """What is pictured: parts of photos, as many as `FINE` says.
+
+    Parameters
+    ----------
+    photos
+        Rooms, or photos.
+    settings
+        How far they are zoomed into.
+    size_px
+        Width and height.
+    seed
+        Another seed, other scenes.
+    """
+    width_px, height_px = size_px
+    camera = Camera(width_px, height_px, 1.0, 1.0, width_px / 2, height_px / 2)
+    count = int(np.clip(PIXELS // (width_px * height_px), COARSE[1], FINE[1]))
+    rngs = (np.random.default_rng((seed, number, 0)) for number in range(count))
+    return [photos.part(rng, camera, rng.uniform(*settings.background_zoom)) for rng in rngs]
+
+
+def pictures(settings: Settings, behind_all: Iterable[Rgb], seed: int) -> Iterator[Rgb]:
+    """Scenes as the settings' camera takes them, without robots.
 
     Parameters
     ----------
     settings
         Of the camera and the backdrops.
-    photos
-        What is pictured.
-    size_px
-        Width and height.
+    behind_all
+        `scenes`.
     seed
-        Another seed, other pictures.
+        Of noise and of what is drawn from ranges.
     """
-    width_px, height_px = size_px
-    camera = Camera(width_px, height_px, 1.0, 1.0, width_px / 2, height_px / 2)
-    for number in range(PICTURES):
-        rng = np.random.default_rng((seed, number))
-        backdrop = photos.backdrop(rng, camera, rng.uniform(*settings.background_zoom))
-        backdrop = blur(backdrop, rng.uniform(*settings.background_blur_px))
-        rgb = expose(backdrop, random_sensor(settings, rng), rng)
+    for number, scene in enumerate(behind_all):
+        rng = np.random.default_rng((seed, number, 1))
+        move_px = FOCAL * scene.shape[1] * rng.uniform(*settings.shutter_s)
+        light = behind(settings, rng, np.take(LIGHT_OF, scene), move_px)
+        rgb = expose(without_highlights(light), random_sensor(settings, rng), rng)
         low, high = settings.jpeg_quality
         quality = int(rng.integers(low, high + 1))
         yield rgb if settings.image_format == "png" else decode(encode_jpeg(rgb, quality))
 
 
-def fitted(real: Sequence[Rgb], settings: Settings, photos: Photos, seed: int = 0) -> Settings:
-    """Settings whose pictures have the figures of real frames.
+def fitted(
+    real: Seen, settings: Settings, all_scenes: Sequence[Rgb], seed: int
+) -> Iterator[Settings]:
+    """Settings whose pictures come nearer to the figures of real frames, round by round.
 
     Parameters
     ----------
     real
-        (H, W, 3) uint8, frames of one camera.
+        What was measured of frames of one camera.
     settings
         To start from.
-    photos
-        What stands for the scene.
+    all_scenes
+        `scenes`: what stands for that which the real camera saw.
     seed
         Of what is drawn.
     """
-    height_px, width_px, _ = real[0].shape
-    size_px = (width_px, height_px)
-    wanted = np.array([of_one(rgb) for rgb in real])
-    settings = _kind(settings, wanted)
+    settings = _kind(settings, real)
     for turn in range(ROUNDS):  # of the same draws, so that a step is not chance
-        have = np.array([of_one(rgb) for rgb in pictures(settings, photos, size_px, seed)])
-        settings = _step(settings, wanted, have, turn)
-    return settings
+        count = COARSE[1] if turn < COARSE[0] else FINE[1]
+        have = seen(pictures(settings, all_scenes[:count], seed))
+        settings = _step(settings, real, have)
+        if settings.image_format == "jpeg" and turn == COARSE[0] // 2:
+            settings = replace(settings, jpeg_quality=_quality(settings, real, have))
+        yield settings
 
 
-def _kind(settings: Settings, wanted: Array) -> Settings:
+def _kind(settings: Settings, real: Seen) -> Settings:
     """With or without colours, and a mosaic before the pixels where there is one."""
-    colour, correlation = (_middle(wanted, name) for name in ("colour", "grain_correlation"))
+    colour, correlation = (real.middle(name) or 0.0 for name in ("colour", "grain_correlation"))
     if colour < GREY:
         settings = replace(settings, bayer=False, saturation=(0.0, 0.0), warmth=(1.0, 1.0))
-        return replace(settings, image_format="png" if correlation < 0.1 else "jpeg")
-    return replace(settings, bayer=correlation > 0.15, image_format="jpeg")
+        return replace(settings, image_format="png" if correlation < MOSAIC else "jpeg")
+    return replace(settings, bayer=correlation > MOSAIC, image_format="jpeg")
 
 
-def _step(settings: Settings, wanted: Array, have: Array, turn: int) -> Settings:
+def _step(settings: Settings, real: Seen, have: Seen) -> Settings:
     """Settings with every range nearer to what its figure lacks, in its middle and its width."""
     changed: dict[str, Any] = {}
     for knob in KNOBS:
         if knob.key in ("saturation", "warmth") and settings.saturation[1] == 0:
             continue
-        want, got = (_column(rows, knob.figure) for rows in (wanted, have))
-        changed[knob.key] = _moved(knob, getattr(settings, knob.key), want, got)
-    if settings.image_format == "jpeg" and turn == ROUNDS // 2:
-        changed["jpeg_quality"] = _quality(settings, wanted, have)
+        limits = getattr(settings, knob.key)
+        changed[knob.key] = _moved(knob, limits, real.values(knob.figure), have.values(knob.figure))
     return replace(settings, **changed)
-
-
-def _quality(settings: Settings, wanted: Array, have: Array) -> tuple[int, int]:
-    """The next worse quality where the grain is finer than it should be by a fifth."""
-    want, got = (_middle(rows, "grain_correlation") for rows in (wanted, have))
-    at = QUALITIES.index(settings.jpeg_quality) if settings.jpeg_quality in QUALITIES else 0
-    return QUALITIES[min(at + (want > 1.2 * got), len(QUALITIES) - 1)]
 
 
 def _moved(knob: Knob, limits: tuple[float, float], want: Array, got: Array) -> tuple[float, float]:
     """A range a step on: shifted by what the figure lacks, widened by how far it spreads."""
+    if not len(want) or not len(got):
+        return limits
     least, most = LIMITS[knob.key]
     least = max(least, LEAST.get(knob.key, 0.0))
+    wanted, found = (max(middle_of(knob.figure, values), 1e-3) for values in (want, got))
     ends = np.clip(limits, max(least, LEAST.get(knob.key, 0.02)), most)
-    wanted, found = (max(mean_of(knob.figure, rows), 1e-3) for rows in (want, got))
-    if knob.by == "factor":
-        ends *= (wanted / found) ** knob.gain
-    elif knob.by == "lost":
-        ends = 1 - (1 - ends) * (wanted / found) ** knob.gain
-    else:
-        ends = np.sqrt(np.maximum(ends**2 + knob.gain * (wanted**2 - found**2), 0.0))
     if knob.by == "factor":
         want, got = np.log(np.maximum(want, 1e-3)), np.log(np.maximum(got, 1e-3))
-    spread = float(want.std() / max(got.std(), 1e-3))
-    middle, half = ends.mean(), np.ptp(ends) / 2 * np.clip(spread, 0.8, 1.15)
-    low, high = np.clip([middle - half, middle + half], least, most)
+        bounds = np.log([max(least, 1e-9), most])
+        ends = np.log(ends) + knob.gain * np.log(wanted / found)
+    elif knob.by == "lost":
+        ends, bounds = 1 - (1 - ends) * (wanted / found) ** knob.gain, np.array([least, most])
+    else:
+        ends = np.sqrt(np.maximum(ends**2 + knob.gain * (wanted**2 - found**2), 0.0))
+        bounds = np.array([least, most])
+    spread = np.clip(float(want.std() / max(got.std(), 1e-3)), 0.8, 1.15)
+    middle = np.clip(ends.mean(), *bounds)
+    # As far to both sides: an end that is cut off alone would move the middle back.
+    half = min(np.ptp(ends) / 2 * spread, *np.abs(bounds - middle))
+    low, high = np.clip([middle - half, middle + half], *bounds)
+    if knob.by == "factor":
+        low, high = np.clip(np.exp([low, high]), least, most)
     return float(low), float(high)
 
 
-def _column(rows: Array, figure: str) -> Array:
-    """Finite values of a figure; 0 where there is none."""
-    values = rows[:, FIGURES.index(figure)]
-    found = values[np.isfinite(values)]
-    return found if len(found) else np.zeros(1)
-
-
-def _middle(rows: Array, figure: str) -> float:
-    return mean_of(figure, _column(rows, figure))
+def _quality(settings: Settings, real: Seen, have: Seen) -> tuple[int, int]:
+    """The next worse quality where the grain is finer than it should be by a fifth."""
+    want, got = (one.middle("grain_correlation") or 0.0 for one in (real, have))
+    at = QUALITIES.index(settings.jpeg_quality) if settings.jpeg_quality in QUALITIES else 0
+    return QUALITIES[min(at + (want > 1.2 * got), len(QUALITIES) - 1)]

@@ -4,23 +4,19 @@ Every figure is of the picture as it is stored. None needs a target, a known sce
 they are meant to be compared between sets of pictures, not to calibrate a camera.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array
 from dmrl.images.codec import Rgb
+from dmrl.rendering.grain import blocks_of, grain_of
 from dmrl.rendering.lens import Picture
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-BLOCK_PX = 8
-SMOOTH_SHARE = 0.1
-"""Share of the blocks that are taken for smooth: those that differ least from a plane."""
-DARKEST, BRIGHTEST = 16.0, 235.0
-"""Levels between which neither black nor white hides the grain."""
 REACH_PX = 4
 """An edge is looked for within so many pixels to either side."""
 EDGE_SHARE = 0.02
@@ -31,7 +27,7 @@ CORNER, MIDDLE = 0.7, 0.1
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """What a set of pictures looks like, on average.
+    """What a set of pictures looks like, on average; None: nothing in them shows it.
 
     Parameters
     ----------
@@ -43,104 +39,124 @@ class Likeness:
         Mean red over mean blue: over 1 is warm.
     colour
         Standard deviation of red less blue, each over its mean: 0 for a grey camera.
-    grain
-        Standard deviation of luma in smooth blocks, levels of 256.
-    grain_correlation
-        Of the grain of neighbouring pixels: 0 is white noise.
     edge_px
         Step across an edge over its steepest slope, pixels.
     corners
-        Luma of the corners over that of the middle.
+        Luma of the corners over that of the middle, of all pictures together.
+    grain
+        Standard deviation of luma where things are smooth, levels of 256, of dark, grey and
+        bright places alike.
+    grain_correlation
+        Of the grain of neighbouring pixels: 0 is white noise.
     """
 
-    brightness: float
-    contrast: float
-    cast: float
-    colour: float
-    grain: float
-    grain_correlation: float
-    edge_px: float
-    corners: float
+    brightness: float | None
+    contrast: float | None
+    cast: float | None
+    colour: float | None
+    edge_px: float | None
+    corners: float | None
+    grain: float | None
+    grain_correlation: float | None
 
 
 FIGURES = tuple(field.name for field in fields(Likeness))
-RATIOS = ("contrast", "cast", "corners", "grain", "edge_px")
+OF_ONE = FIGURES[:5]
+"""Those that one picture has by itself."""
+RATIOS = ("contrast", "cast", "edge_px")
 
 
-def likeness(pictures: Sequence[Rgb]) -> Likeness:
-    """Figures of a set of pictures: means over pictures, of ratios the geometric mean; 0 for none.
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What was measured of a set of pictures.
 
     Parameters
     ----------
-    pictures
-        (H, W, 3) uint8 each, of any size over 16 px.
+    rows
+        (N, 5) `OF_ONE` of every picture; NaN where it cannot be known.
+    corners
+        (N, 2) luma of its corners and of its middle.
+    blocks
+        (M, 4) of all pictures, see `dmrl.rendering.grain`.
     """
-    rows = np.array([of_one(picture) for picture in pictures])
-    return Likeness(*(mean_of(name, column) for name, column in zip(FIGURES, rows.T, strict=True)))
+
+    rows: Array
+    corners: Array
+    blocks: NDArray[np.float32]
+
+    def values(self, figure: str) -> Array:
+        """(N,) a figure of the pictures in which it can be known; (1,) of a figure of them all."""
+        if figure in OF_ONE:
+            column = self.rows[:, OF_ONE.index(figure)]
+        elif figure == "corners":
+            corner, middle = self.corners.mean(axis=0)
+            column = np.array([corner / max(middle, 1.0)])
+        else:
+            column = np.array([getattr(grain_of(self.blocks), figure)])
+        return np.asarray(column[np.isfinite(column)])
+
+    def middle(self, figure: str) -> float | None:
+        """Mean over pictures, of ratios the geometric mean."""
+        found = self.values(figure)
+        return middle_of(figure, found) if len(found) else None
+
+    def likeness(self) -> Likeness:
+        """All figures."""
+        return Likeness(*(self.middle(figure) for figure in FIGURES))
 
 
-def mean_of(figure: str, values: Array) -> float:
-    """Mean of the values that could be measured, geometric for ratios; 0 without any.
+def middle_of(figure: str, values: Array) -> float:
+    """Mean of a figure's values, geometric for ratios.
 
     Parameters
     ----------
     figure
         One of `FIGURES`.
     values
-        (N,) of as many pictures; NaN where it could not be measured.
+        (N,) of as many pictures, one at least.
     """
-    found = values[np.isfinite(values)]
-    if not len(found):
-        return 0.0
     if figure in RATIOS:
-        return float(np.exp(np.log(np.maximum(found, 1e-3)).mean()))
-    return float(found.mean())
+        return float(np.exp(np.log(np.maximum(values, 1e-3)).mean()))
+    return float(values.mean())
 
 
-def of_one(picture: Rgb) -> list[float]:
-    """``FIGURES`` of one picture; NaN where it has no smooth block or no edge."""
-    levels = picture.astype(np.float32)
-    luma = levels @ LUMA
+def seen(pictures: Iterable[Rgb]) -> Seen:
+    """What can be measured of pictures.
+
+    Parameters
+    ----------
+    pictures
+        (H, W, 3) uint8 each, of any size over 16 px; one at least.
+    """
+    rows, corners, blocks = [], [], []
+    for picture in pictures:
+        levels = picture.astype(np.float32)
+        luma: Picture = levels @ LUMA
+        rows.append(_of_one(levels, luma))
+        corners.append(_corners(luma))
+        blocks.append(blocks_of(luma))
+    return Seen(np.array(rows), np.array(corners), np.concatenate(blocks))
+
+
+def _of_one(levels: Picture, luma: Picture) -> list[float]:
+    """`OF_ONE` of one picture."""
     mean = max(float(luma.mean()), 1.0)
     red, blue = (levels[..., k] / max(float(levels[..., k].mean()), 1.0) for k in (0, 2))
     cast = max(float(levels[..., 0].mean()), 1.0) / max(float(levels[..., 2].mean()), 1.0)
     colour = float((red - blue).std())
-    return [
-        *(mean / 255, float(luma.std()) / mean, cast, colour),
-        *(*_grain(luma), _edge_px(luma), _corners(luma)),
-    ]
-
-
-def _grain(luma: Picture) -> tuple[float, float]:
-    """Strength and neighbour correlation of what is left of smooth blocks without their plane."""
-    height, width = (side // BLOCK_PX * BLOCK_PX for side in luma.shape)
-    tiles = luma[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, -1, BLOCK_PX)
-    blocks: Picture = tiles.swapaxes(1, 2).reshape(-1, BLOCK_PX * BLOCK_PX)
-    middle = blocks.mean(axis=1)
-    blocks = blocks[(middle > DARKEST) & (middle < BRIGHTEST)]
-    if len(blocks) < 1 / SMOOTH_SHARE:
-        return np.nan, np.nan
-    place = np.linspace(-1, 1, BLOCK_PX, dtype=np.float32)
-    v, u = (grid.ravel() for grid in np.meshgrid(place, place, indexing="ij"))
-    plane = np.stack([np.ones_like(u), u, v], axis=1)
-    left = blocks - (blocks @ np.linalg.pinv(plane).T) @ plane.T
-    order = np.argsort(left.std(axis=1), kind="stable")[: int(len(left) * SMOOTH_SHARE)]
-    smooth = left[order].reshape(-1, BLOCK_PX, BLOCK_PX)
-    variance = float((smooth**2).mean())
-    beside = float((smooth[:, :, 1:] * smooth[:, :, :-1]).mean())
-    below = float((smooth[:, 1:] * smooth[:, :-1]).mean())
-    return variance**0.5, (beside + below) / 2 / max(variance, 1e-6)
+    return [mean / 255, float(luma.std()) / mean, cast, colour, _edge_px(luma)]
 
 
 def _edge_px(luma: Picture) -> float:
-    """Median width of the strongest edges, across and down."""
+    """Median width of the strongest edges, across and down; NaN without any."""
     steps, slopes = [], []
     for lines in (luma, luma.T):
         step = np.abs(lines[:, 2 * REACH_PX :] - lines[:, : -2 * REACH_PX])
         slope = np.abs(np.diff(lines, axis=1))
-        steepest = sliding_window_view(slope, 2 * REACH_PX, axis=1).max(axis=-1)
+        for reach in (1, 2, 4):  # the steepest of two, of four, of eight
+            slope = np.maximum(slope[:, reach:], slope[:, :-reach])
         steps.append(step.ravel())
-        slopes.append(steepest.ravel())
+        slopes.append(slope.ravel())
     step, steep = np.concatenate(steps), np.concatenate(slopes)
     strong = step >= np.quantile(step, 1 - EDGE_SHARE)
     if not step[strong].min() > 0:
@@ -148,12 +164,13 @@ def _edge_px(luma: Picture) -> float:
     return float(np.median(step[strong] / steep[strong]))
 
 
-def _corners(luma: Picture) -> float:
+def _corners(luma: Picture) -> list[float]:
+    """Luma of the corners, and of the middle."""
     radius2 = radius2_of(*luma.shape)
-    middle = float(luma[radius2 < MIDDLE].mean())
-    return float(luma[radius2 > CORNER].mean()) / max(middle, 1.0)
+    return [float(luma[part].mean()) for part in (radius2 > CORNER, radius2 < MIDDLE)]
 
 
+@cache
 def radius2_of(height: int, width: int) -> NDArray[np.float64]:
     """(H, W) squared distance from the middle, 1 in the corners."""
     v, u = np.mgrid[:height, :width] + 0.5

@@ -9,7 +9,7 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.rendering.backdrops import Photos, panorama_view, smeared
+from dmrl.rendering.backdrops import Photos, panorama_view, smeared, stretched
 from dmrl.rendering.crazyflie import CRAZYFLIE
 from dmrl.rendering.lens import Picture, pinhole_from_image
 from dmrl.rendering.sensor import Sensor, blur
@@ -215,18 +215,42 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
             backdrop = backdrop[..., rng.permutation(3)]
     else:
         backdrop = panorama_view(world.panorama(name), world.camera, turn)
-    backdrop = blur(backdrop, _between(rng, settings.background_blur_px))
-    shake = rng.normal(size=2)
-    shake *= np.radians(settings.shake_max_dps) * rng.random() / np.linalg.norm(shake)
-    backdrop = smeared(backdrop, (shake * shutter_s * world.camera.fx_px).tolist())
+    backdrop = behind(settings, rng, backdrop, world.camera.fx_px * shutter_s)
     gain = _factor(rng, settings.robot_gain)
     if not pasted:
-        backdrop = np.minimum(backdrop, HIGHLIGHTS * max(float(backdrop.mean()), 1e-3))
+        backdrop = without_highlights(backdrop)
         gain *= float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
     light = _light(settings, rng, name, turn, pasted=pasted)
     sensor = random_sensor(settings, rng, exposed=not pasted)
     return Look(backdrop, light, sensor, gain, _between(rng, settings.robot_blur_px), seed)
+
+
+def behind(settings: Settings, rng: Generator, light: Picture, px_per_rps: float) -> Picture:
+    """What is behind the robots as it meets the camera: its contrast, out of focus, smeared.
+
+    Parameters
+    ----------
+    settings
+        Ranges.
+    rng
+        Draws from them.
+    light
+        (H, W, 3) linear light.
+    px_per_rps
+        How far it moves while the shutter is open, of a camera that turns by a radian a second.
+    """
+    if settings.background_contrast != (1.0, 1.0):
+        light = stretched(light, _factor(rng, settings.background_contrast))
+    light = blur(light, _between(rng, settings.background_blur_px))
+    shake = rng.normal(size=2)
+    shake *= np.radians(settings.shake_max_dps) * rng.random() / np.linalg.norm(shake)
+    return smeared(light, (shake * px_per_rps).tolist())
+
+
+def without_highlights(light: Picture) -> Picture:
+    """(H, W, 3) light, of which suns and lamps are cut off."""
+    return np.minimum(light, HIGHLIGHTS * max(float(light.mean()), 1e-3))
 
 
 def _light(

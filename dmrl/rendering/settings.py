@@ -40,6 +40,7 @@ LIMITS: dict[str, Range] = {
     "robot_blur_px": (0, 5),
     "background_zoom": (1, 8),
     "recoloured_share": (0, 1),
+    "background_contrast": (0.2, 5),
     "background_blur_px": (0, 20),
     "brightness": (0.02, 0.98),
     "contrast_gamma": (0.5, 3),
@@ -148,6 +149,9 @@ class Settings:
         Range of how far photos are zoomed into.
     recoloured_share
         Share of photos whose colours are exchanged: leaves may be blue.
+    background_contrast
+        Range of the power that the background's light is raised to, about its mean; every factor
+        is as likely. Over 1, its bright places stand out more.
     background_blur_px
         Range of the background's blur, a standard deviation, pixels.
     brightness
@@ -217,6 +221,7 @@ class Settings:
     pasted: bool = False
     background_zoom: Range = (1.0, 2.0)
     recoloured_share: float = 0.0
+    background_contrast: Range = (1.0, 1.0)
     background_blur_px: Range = (0.0, 1.0)
     brightness: Range = (0.3, 0.6)
     contrast_gamma: Range = (2.2, 2.2)

@@ -16,31 +16,38 @@ from dmrl import topics
 from dmrl.datasets.backgrounds import photos_of
 from dmrl.errors import RecordingError, SettingError
 from dmrl.formats.image_folder import list_pictures
-from dmrl.images.codec import Rgb, crop_and_scale, decode, encode_png
+from dmrl.images.codec import Rgb, decode, size
 from dmrl.output import partial_file, partial_of, refuse_existing
 from dmrl.recording import read, summary
 from dmrl.rendering import settings as looks
-from dmrl.rendering.fitting import KNOBS, fitted, pictures
+from dmrl.rendering.contact_sheet import evenly, sheet
+from dmrl.rendering.fitting import KNOBS, ROUNDS, fitted, pictures, scenes
 from dmrl.rendering.interiors import ROOMS
-from dmrl.rendering.likeness import FIGURES, Likeness, likeness
+from dmrl.rendering.likeness import FIGURES, Likeness, Seen, seen
 from dmrl.terminal.arguments import AsJson, Flat
-from dmrl.terminal.progress import say
+from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_line, print_table
 
-LEAST_PX = 48
-"""Side of a frame, at least."""
-TILE_PX, COLUMNS = (192, 144), 8
+LEAST_PX, MOST_PX = 48, 2_100_000
+"""Side of a frame, at least; pixels of one, at most."""
+TOGETHER_PX = 100_000_000
+"""Of all frames, at most; of large ones fewer are looked at."""
 FEW = 20
 WORDS = {
     "brightness": "mean luma, 0 to 1",
     "contrast": "contrast, of luma",
     "cast": "red over blue",
     "colour": "spread of colours",
-    "grain": "grain, levels of 256",
-    "grain_correlation": "grain, neighbours alike",
     "edge_px": "width of edges, px",
     "corners": "corners over middle",
+    "grain": "grain, levels of 256",
+    "grain_correlation": "grain, neighbours alike",
 }
+SMALL, WHITE_NOISE = 0.1, 0.15
+"""A figure under it is compared by its difference: of hardly anything, per cent say nothing. A
+correlation under the second is that of white noise and its error."""
+FAR = 0.2
+WHITE, MUCH_WHITE = 250, 0.4
 
 
 Count = Annotated[int, Parameter(validator=validators.Number(gte=2))]
@@ -70,13 +77,18 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Figures of real frames, of the preset's pictures and the fitted ones; the recipe's keys."""
+    """Figures of real frames, of both their halves, of the preset's pictures and the fitted ones.
+
+    ``keys`` are the recipe's, ``notes`` what cannot be known, a sentence each.
+    """
 
     frames: int
     real: Likeness
+    halves: tuple[Likeness, ...]
     preset: Likeness
     fitted: Likeness
     keys: dict[str, object]
+    notes: list[str]
 
 
 def run(real: Path, out: Path, settings: Settings) -> Result:
@@ -98,7 +110,8 @@ def run(real: Path, out: Path, settings: Settings) -> Result:
     RecordingError
         If a recording cannot be read, or has no images.
     SettingError
-        If the frames are not of one size, or too small; if the backgrounds cannot be used.
+        If the frames are not of one size and kind, too small or too large, or show nothing; if
+        the backgrounds cannot be used.
     RecipeError
         If there is no such preset.
     OutputError
@@ -114,14 +127,70 @@ def run(real: Path, out: Path, settings: Settings) -> Result:
     preset = {"preset": settings.preset}
     start = recipes.check(settings.preset, looks.filled(preset), looks.Settings)
     photos = photos_of(settings.backgrounds)
-    found = fitted(own, start, photos, settings.seed)
+    measured = seen(own)
+    _refuse_nothing(real, own, measured)
     size_px = (own[0].shape[1], own[0].shape[0])
-    before, after = (
-        list(pictures(way, photos, size_px, settings.seed + 1)) for way in (start, found)
-    )
+    there = scenes(photos, start, size_px, settings.seed)
+    *_, found = track(fitted(measured, start, there, settings.seed), "Fitting", ROUNDS)
+    fresh = settings.seed + 1  # what the fit has not seen
+    there = scenes(photos, start, size_px, fresh)
+    before, after = (list(pictures(way, there, fresh)) for way in (start, found))
     keys = _keys(found, start)
-    _write(out, _recipe(settings.preset, keys), picture, _sheet([own, before, after]))
-    return Result(len(own), likeness(own), likeness(before), likeness(after), keys)
+    _write(out, _recipe(settings.preset, keys), picture, sheet([own, before, after]))
+    middle = max(len(own) // 2, 1)
+    parts = (own[:middle], own[-middle:]) if len(own) > 1 else ()
+    wanted, got = measured.likeness(), seen(after).likeness()
+    return Result(
+        frames=len(own),
+        real=wanted,
+        halves=tuple(seen(part).likeness() for part in parts),
+        preset=seen(before).likeness(),
+        fitted=got,
+        keys=keys,
+        notes=_notes(real, own, wanted, got),
+    )
+
+
+def _refuse_nothing(real: Path, own: Sequence[Rgb], measured: Seen) -> None:
+    """Raise SettingError if frames are of two kinds, or none shows anything."""
+    grey = sum(bool(np.ptp(rgb, axis=2).max() == 0) for rgb in own)
+    if 0 < grey < len(own):
+        raise SettingError(
+            f"{real} holds {grey} grey frames and {len(own) - grey} with colours. Give frames of "
+            "one camera alone"
+        )
+    if not measured.values("contrast").max() > 0:
+        level = measured.middle("brightness") or 0.0
+        raise SettingError(
+            f"{real}: every frame is one plain colour, of brightness {level:.2f}: nothing to "
+            "measure. Give frames in which something is seen"
+        )
+
+
+def _notes(real: Path, own: Sequence[Rgb], wanted: Likeness, got: Likeness) -> list[str]:
+    """What of the frames cannot be known or was not reached, a sentence each."""
+    notes = []
+    if len(own) < FEW:
+        frames = "frame" if len(own) == 1 else "frames"
+        notes.append(f"{real} holds {len(own)} {frames}: few to know a camera by. {FEW} are better")
+    white = float(np.mean([(rgb.min(axis=2) >= WHITE).mean() for rgb in own]))
+    if white > MUCH_WHITE:
+        notes.append(
+            f"{white:.0%} of the pixels of {real} are white: overexposed, nothing is known there"
+        )
+    unknown = [WORDS[name] for name in FIGURES if getattr(wanted, name) is None]
+    if unknown:
+        notes.append(
+            f"{real} does not show {', '.join(unknown)}: it is left as the preset has it. Frames "
+            "with plain walls and sharp edges, neither black nor white, would show it"
+        )
+    off = {name: _apart(name, getattr(wanted, name), getattr(got, name))[0] for name in FIGURES}
+    if far := [WORDS[name] for name in FIGURES if abs(off[name]) > FAR]:
+        notes.append(
+            f"the fit is off by more than a fifth in {', '.join(far)}: no range of the preset "
+            "reaches it over these backgrounds. Photos nearer to the frames may: --backgrounds DIR"
+        )
+    return notes
 
 
 def _write(out: Path, recipe: str, picture: Path, sheet: bytes) -> None:
@@ -149,30 +218,29 @@ def _frames(real: Path, most: int) -> list[Rgb]:
     """Frames of a folder or recording, at most so many, evenly over all."""
     if real.is_dir():
         paths = [path for _, path in list_pictures(real, 10.0)]
-        data = [(paths[k].read_bytes(), str(paths[k])) for k in _evenly(len(paths), most)]
+        data = [(paths[k].read_bytes(), str(paths[k])) for k in evenly(len(paths), most)]
     else:
         held = summary(real).topics
         topic = next((name for name in held if topics.names(topics.CAMERA_IMAGE, name)), None)
         if topic is None:
             raise RecordingError(f"{real} has no images. Give a folder of frames, or another")
-        chosen, count = set(_evenly(held[topic].count, most)), held[topic].count
+        chosen, count = set(evenly(held[topic].count, most)), held[topic].count
         stream = enumerate(islice(read(real, topic), count))
         data = [(bytes(s.message.data), f"{real}: image {k}") for k, s in stream if k in chosen]
-    own = [decode(content, name) for content, name in data]
-    sizes = sorted({(rgb.shape[1], rgb.shape[0]) for rgb in own})
+    sizes = sorted({size(content, name)[:2] for content, name in data})
     if len(sizes) != 1:
         words = ", ".join(f"{width}x{height}" for width, height in sizes)
         raise SettingError(f"{real} holds frames of {words} px. Give frames of one camera alone")
-    if min(sizes[0]) < LEAST_PX:
+    ((width, height),) = sizes
+    if min(sizes[0]) < LEAST_PX or width * height > MOST_PX:
+        small = min(sizes[0]) < LEAST_PX
+        way = f"at least {LEAST_PX} px each way" if small else "1920x1080 at most, as flown"
         raise SettingError(
-            f"{real}: frames of {sizes[0][0]}x{sizes[0][1]} px are too small to measure. Give "
-            f"frames of at least {LEAST_PX} px each way"
+            f"{real}: frames of {width}x{height} px are too {'small' if small else 'large'} to "
+            f"measure. Give frames of {way}"
         )
-    return own
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    return sorted({int(k) for k in np.linspace(0, count - 1, min(count, most)).round()})
+    few = evenly(len(data), max(2, TOGETHER_PX // (width * height)))
+    return [decode(*data[k]) for k in few]
 
 
 def _keys(found: looks.Settings, start: looks.Settings) -> dict[str, object]:
@@ -207,20 +275,6 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
-def _sheet(ways: Sequence[Sequence[Rgb]]) -> bytes:
-    """PNG of two rows each: real frames, the preset's pictures, the fitted ones."""
-    rows = []
-    for way in ways:
-        tiles = [
-            crop_and_scale(way[k], (0, 0, way[k].shape[1], way[k].shape[0]), *TILE_PX)
-            for k in _evenly(len(way), 2 * COLUMNS)
-        ]
-        tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
-        rows += [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
-        rows.append(np.full((8, rows[-1].shape[1], 3), 255, np.uint8))
-    return encode_png(np.vstack(rows))
-
-
 DEFAULTS = Settings()
 
 
@@ -245,12 +299,29 @@ def command(
         Print one JSON document in place of the table.
     """
     result = run(real, out, settings)
-    if result.frames < FEW:
-        say(f"{real} holds {result.frames} frames: few to know a camera by. {FEW} are better")
+    for note in result.notes:
+        say(note)
     if as_json:
         print_json({"recipe": str(out), "picture": str(out.with_suffix(".png")), **asdict(result)})
         return
-    three = (result.real, result.preset, result.fitted)
-    rows = [(WORDS[name], *(f"{getattr(one, name):.3f}" for one in three)) for name in FIGURES]
-    print_table(str(out), ("figure", f"{result.frames} real", settings.preset, "fitted"), rows)
+    head = ("figure", f"{result.frames} real", settings.preset, "fitted", "off", "halves of real")
+    rows = [(WORDS[name], *_row(result, name)) for name in FIGURES]
+    print_table(str(out), head, rows)
     print_line(f"beside each other: {out.with_suffix('.png')}")
+
+
+def _row(result: Result, name: str) -> list[str]:
+    """A figure of all, how far the fit is off, and how far the halves of the frames are apart."""
+    three = [getattr(one, name) for one in (result.real, result.preset, result.fitted)]
+    halves = [getattr(half, name) for half in result.halves] or [None, None]
+    words = ["-" if value is None else f"{value:.3f}" for value in three]
+    return [*words, _apart(name, three[0], three[2])[1], _apart(name, *halves)[1]]
+
+
+def _apart(name: str, first: float | None, second: float | None) -> tuple[float, str]:
+    """How much more the second is: a share, or a difference where there is hardly any; in words."""
+    if first is None or second is None:
+        return 0.0, "-"
+    if abs(first) < (WHITE_NOISE if name == "grain_correlation" else SMALL):
+        return second - first, f"{second - first:+.3f}"
+    return second / first - 1, f"{second / first - 1:+.0%}"

@@ -1,0 +1,35 @@
+"""Pictures of several cameras, one below the other, to be looked at."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dmrl.images.codec import Rgb, crop_and_scale, encode_png
+
+TILE_PX, COLUMNS, ROWS = (192, 144), 8, 2
+GAP_PX = 8
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Numbers from 0 to count - 1, at most so many, evenly over all."""
+    return sorted({int(k) for k in np.linspace(0, count - 1, min(count, most)).round()})
+
+
+def sheet(ways: Sequence[Sequence[Rgb]]) -> bytes:
+    """PNG of two rows of each set of pictures, evenly over all of it.
+
+    Parameters
+    ----------
+    ways
+        (H, W, 3) uint8 each, one picture of each set at least.
+    """
+    rows = []
+    for way in ways:
+        tiles = [
+            crop_and_scale(way[k], (0, 0, way[k].shape[1], way[k].shape[0]), *TILE_PX)
+            for k in evenly(len(way), ROWS * COLUMNS)
+        ]
+        tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
+        rows += [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
+        rows.append(np.full((GAP_PX, rows[-1].shape[1], 3), 255, np.uint8))
+    return encode_png(np.vstack(rows))
