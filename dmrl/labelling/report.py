@@ -155,12 +155,13 @@ def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
         if abs(scale) > FASTER:
             lines.append(
                 f"{name}: {robot}'s velocity seems {abs(scale):.0%} too "
-                f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right?"
+                f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right? Where "
+                "it is so in every flight: dmrl calibrate --sensors"
             )
     if abs(found[BIAS]) > LONGER_M:
         lines.append(
             f"{name}: ranges seem {found[BIAS]:+.2f} m off; it was solved for. Measure it once, "
-            "and give it with --range-offset-m"
+            "and give it with --range-offset-m, or let flights tell: dmrl calibrate --sensors"
         )
     if abs(found[CLOCK]) > LATER_S:
         lines.append(f"{name}: {pair[1]}'s log seems {found[CLOCK]:+.2f} s off. Try: dmrl align")
