@@ -155,8 +155,8 @@ def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
         if abs(scale) > FASTER:
             lines.append(
                 f"{name}: {robot}'s velocity seems {abs(scale):.0%} too "
-                f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right? Where "
-                "it is so in every flight: dmrl calibrate --sensors"
+                f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right? "
+                "Where it is so in every flight: dmrl calibrate --sensors"
             )
     if abs(found[BIAS]) > LONGER_M:
         lines.append(
