@@ -87,7 +87,7 @@ def detections(
     width_px: int,
     colour: Colour = RGB["detection"],
 ) -> Iterator[Entity]:
-    """Points with confidence and depth; without text and faint below the model's threshold.
+    """Points with confidence and depth; those below the model's threshold in `weak_path`.
 
     Of two whose texts would cover each other the surer has one. ``width_px`` is the images'.
     """
@@ -100,16 +100,22 @@ def detections(
     surest = surest[np.lexsort([-confidence[surest], row_of[surest]])]
     told = set(surest[_uncovered(uv_px[surest] / width_px, row_of[surest])].tolist())
     texts = [
-        f"conf {c:.2f}, {d:.2f} m" if k in told else ""
-        for k, (c, d) in enumerate(zip(confidence, depth_m, strict=True))
+        f"conf {confidence[k]:.2f}, {depth_m[k]:.2f} m" if k in told else ""
+        for k in np.flatnonzero(believed)
     ]
-    columns = rr.Points2D.columns(
-        positions=uv_px,
-        labels=texts,
-        radii=np.where(believed, POINT_UI, FAINT_POINT_UI),
-    )
-    style = _detection_style(colour)
-    yield Entity(path, columns.partition(column.value_lengths().to_numpy()), (style,), frame)
+    columns = rr.Points2D.columns(positions=uv_px[believed], labels=texts)
+    weak = rr.Points2D.columns(positions=uv_px[~believed])
+    for where, points, kept, radius in (
+        (path, columns, believed, POINT_UI),
+        (weak_path(path), weak, ~believed, FAINT_POINT_UI),
+    ):
+        lengths = np.bincount(row_of[kept], minlength=batch.num_rows)
+        yield Entity(where, points.partition(lengths), (_detection_style(colour, radius),), frame)
+
+
+def weak_path(path: str) -> str:
+    """Entity of detections below the threshold: in no view until it is added to one."""
+    return f"{path}/weak"
 
 
 def _uncovered(places: NDArray[np.float64], row_of: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -131,8 +137,8 @@ def _uncovered(places: NDArray[np.float64], row_of: NDArray[np.intp]) -> NDArray
 
 
 @cache
-def _detection_style(colour: Colour) -> rr.Points2D:
-    return rr.Points2D.from_fields(colors=[colour], draw_order=40.0)
+def _detection_style(colour: Colour, radius: float) -> rr.Points2D:
+    return rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=40.0)
 
 
 def grids(

@@ -54,3 +54,15 @@ def panels(path: Path) -> set[str]:
         if "ViewBlueprint:display_name" in batch.schema.names:
             names |= {name for (name,) in batch["ViewBlueprint:display_name"].to_pylist()}
     return names
+
+
+def queries(path: Path) -> list[list[str]]:
+    """What each view of the layout shows, line by line."""
+    reader = RrdReader(path)
+    found: list[list[str]] = []
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name == "ViewContents:query":
+                found += batch[name].to_pylist()
+    return found

@@ -16,7 +16,7 @@ from dmrl.stages import view
 from dmrl.viewer import Settings, save
 from dmrl.viewer.session import prepare, write
 
-from .rrd import column, logged, panels
+from .rrd import column, logged, panels, queries
 
 Make = Callable[..., Path]
 IMAGES = "/cf1/camera/image"
@@ -39,6 +39,7 @@ def test_every_topic_becomes_its_archetypes(make: Make, rrd: Path) -> None:
         ("/cf1/labels/published/boxes", "Boxes2D"): 10,
         ("/cf1/labels/published/texts", "Points2D"): 10,
         ("/cf1/detections", "Points2D"): 10,
+        ("/cf1/detections/weak", "Points2D"): 10,
         ("/cf1/detections/grid/confidence", "DepthImage"): 10,
         ("/cf1/detections/grid/depth_m", "DepthImage"): 10,
         ("/cf1/detections/grid/best", "Boxes2D"): 10,
@@ -79,11 +80,18 @@ def test_labels_say_peer_and_depth_and_disappear_with_the_peer(make: Make, rrd: 
     }
 
 
-def test_a_detection_below_the_threshold_is_faint_and_has_no_text(make: Make, rrd: Path) -> None:
+def test_a_detection_below_the_threshold_is_in_no_view_and_has_no_text(
+    make: Make, rrd: Path
+) -> None:
     save([make()], rrd, Settings())
-    assert column(rrd, "/cf1/detections", "Points2D:labels") == [["conf 0.90, 1.20 m", ""]] * 10
-    radii = column(rrd, "/cf1/detections", "Points2D:radii")
-    assert radii == [[-4.0, -1.5]] * 10
+    assert column(rrd, "/cf1/detections", "Points2D:labels") == [["conf 0.90, 1.20 m"]] * 10
+    assert column(rrd, "/cf1/detections", "Points2D:radii") == [[-4.0]]
+    weak = column(rrd, "/cf1/detections/weak", "Points2D:positions")
+    assert [len(points) for points in weak] == [1] * 10
+    assert column(rrd, "/cf1/detections/weak", "Points2D:radii") == [[-1.5]]
+    lines = {line for query in queries(rrd) for line in query}
+    assert "/cf1/detections" in lines
+    assert not any("weak" in line or "detections/**" in line for line in lines)
 
 
 def test_maps_have_fixed_ranges_and_cells_of_eight_pixels(make: Make, rrd: Path) -> None:
