@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import median_filter
 
-from dmrl.estimation import ekf, keyframe_filter
+from dmrl.estimation import ekf
 from dmrl.estimation.batch import ROUGH, Solution, solve_batch
 from dmrl.estimation.confidence import covariance, restlessness
 from dmrl.estimation.estimated import Estimate, Refused, swapped
@@ -19,14 +19,14 @@ from dmrl.estimation.gate import (
     Statuses,
     statuses,
 )
-from dmrl.estimation.glances import glances_of, repeated
 from dmrl.estimation.grading import noise_of, with_range_noise
-from dmrl.estimation.hypotheses import KEPT, START_STD, candidates, spread_of
-from dmrl.estimation.linear import RANGE_ERROR
+from dmrl.estimation.hypotheses import spread_of
+from dmrl.estimation.linear import BIAS, RANGE_ERROR
 from dmrl.estimation.looks import agreeing, trusted
 from dmrl.estimation.pair import LONGEST_GAP_S, Array, Mask, Pair
-from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
-from dmrl.estimation.search import KEY_HZ, distinct, solutions
+from dmrl.estimation.problem import GLOBALS, KEY_HZ, Noise, Problem, problem
+from dmrl.estimation.search import distinct, solutions
+from dmrl.estimation.starts import Starts, likely_starts
 from dmrl.estimation.stretches import joined, mended, stretches
 
 INFLATION = 1.03
@@ -34,6 +34,11 @@ INFLATION = 1.03
 GATE_SIGMA = 0.75
 """The gate goes by sigmas this much smaller: those of the ellipse expect more bad positions than
 there are, as they make room for what is constant."""
+WORSE = 1.1, 1.5
+"""Velocities this many times as noisy as the default's: with the first the gate goes by those
+smaller sigmas, with the second by all of them, as where errors of ranges seem to fade. What lasts
+of the errors of worse sensors than are usual is not known either, and what looks best of such a
+flight is mostly luck."""
 SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
@@ -72,16 +77,17 @@ def estimate_pairs(
     """
     problems = [problem(pair, KEY_HZ) for pair in pairs]
     made = []
-    for pair, flight, starts in zip(pairs, problems, _starts(problems, noise), strict=True):
+    begun = likely_starts(problems, noise or Noise())
+    for pair, flight, starts in zip(pairs, problems, begun, strict=True):
         if method == "smoother":
-            made.append(_both(flight, _from_smoother(flight, noise or Noise(), *starts), gate_m))
+            made.append(_both(flight, _from_smoother(flight, noise or Noise(), starts), gate_m))
             continue
         # Where a flight has gaps, each stretch between them is solved first, as a flight of its
         # own. Put together they are one more start for the whole.
         cut = stretches(pair)
         parts = estimate_pairs(cut, noise=noise, gate_m=gate_m) if cut else []
         pieced = [joined(flight, [here for here, _ in parts])] if parts else []
-        whole = _from_batch(flight, noise, starts.score, starts.tracks, pieced)
+        whole = _from_batch(flight, noise, starts, pieced)
         made.append(mended(_both(flight, whole, gate_m), parts))
     return made
 
@@ -102,10 +108,26 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
         None if seen else unmoved(moved, relative)
         for seen, moved in zip(enough, (own, peer), strict=True)
     ]
+    sigma = gate_sigma(estimate.noise)
     return (
-        with_status(estimate, silent, why[0], gate_m, far=far, sigma=GATE_SIGMA),
-        with_status(swapped(estimate), silent, why[1], gate_m, far=far, sigma=GATE_SIGMA),
+        with_status(estimate, silent, why[0], gate_m, far=far, sigma=sigma),
+        with_status(swapped(estimate), silent, why[1], gate_m, far=far, sigma=sigma),
     )
+
+
+def gate_sigma(noise: Noise) -> float:
+    """By sigmas how many times as large as those written the gate goes.
+
+    Parameters
+    ----------
+    noise
+        What the sensors turned out to be like.
+    """
+    usual = Noise()
+    if noise.range_error_std_m > usual.range_error_std_m:  # they fade, or seem to
+        return 1.0
+    worse = noise.velocity_std_mps / usual.velocity_std_mps
+    return float(np.interp(worse, WORSE, (GATE_SIGMA, 1.0)))
 
 
 def unmoved(moved: float, relative: float) -> Refused | None:
@@ -215,63 +237,29 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
     return [out[n] for n in range(len(pairs))]
 
 
-class _Starts(NamedTuple):
-    """Where a solve of a flight of K keyframes may start: what the smoother makes of guesses."""
-
-    score: Array
-    """(KEPT,) log likelihoods."""
-    tracks: Array
-    """(K, KEPT, ...) states."""
-    covariances: Array
-    """(K, KEPT, ...)."""
-
-
-def _starts(problems: list[Problem], noise: Noise | None) -> list[_Starts]:
-    """Likely starts of each flight. Flights of equal length are smoothed side by side."""
-    found: dict[int, _Starts] = {}
-    lengths = np.array([len(p.key_s) for p in problems], int)
-    for length in np.unique(lengths):
-        numbers = np.flatnonzero(lengths == length).tolist()
-        scores, states, covariances = _smoothed([problems[n] for n in numbers], noise or Noise())
-        for column, number in enumerate(numbers):
-            mine = slice(column * KEPT, (column + 1) * KEPT)
-            found[number] = _Starts(scores[mine], states[:, mine], covariances[:, mine])
-    return [found[number] for number in range(len(problems))]
-
-
-def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Array]:
-    """Scores (P KEPT,), states and covariances (K, P KEPT, ...) of P flights of one length."""
-    inputs = keyframe_filter.inputs_of(problems, noise)
-    glances = glances_of([flight.looks for flight in problems])
-    start = candidates(inputs, KEY_HZ, glances).reshape(-1, 3)
-    count = len(problems[0].key_s)
-    given = inputs.repeated(KEPT, count), start, START_STD
-    filtered = keyframe_filter.run(*given, repeated(glances, KEPT))
-    return filtered.log_likelihood, *keyframe_filter.smoothed(filtered)
-
-
-def _from_smoother(
-    flight: Problem, noise: Noise, score: Array, tracks: Array, covariances: Array
-) -> Estimate:
-    order = np.argsort(-score)
+def _from_smoother(flight: Problem, noise: Noise, starts: Starts) -> Estimate:
+    order = np.argsort(-starts.score)
     best = int(order[0])
-    apart = spread_of(-score[order], tracks[..., :3].swapaxes(0, 1)[order])
+    ends = starts.tracks[..., :3].swapaxes(0, 1)[order]
+    apart = spread_of(-starts.score[order], ends)
+    constants = np.zeros(len(GLOBALS))
+    constants[BIAS] = starts.offset_m
     return Estimate(
         flight.key_s,
-        tracks[:, best, :3],
-        covariances[:, best, :3, :3] * SMOOTHER_INFLATION**2 + apart,
-        np.zeros(len(tracks), np.int8),
-        np.zeros(len(GLOBALS)),
+        starts.tracks[:, best, :3],
+        starts.covariances[:, best, :3, :3] * SMOOTHER_INFLATION**2 + apart,
+        np.zeros(len(flight.key_s), np.int8),
+        constants,
         noise,
     )
 
 
 def _from_batch(
-    flight: Problem, noise: Noise | None, score: Array, tracks: Array, pieced: Sequence[Array]
+    flight: Problem, noise: Noise | None, starts: Starts, pieced: Sequence[Array]
 ) -> Estimate:
     known = () if flight.known_std is None else tuple(flight.known_std.tolist())
     first = noise or Noise(known_std=known)
-    ends = solutions(flight, first, score, tracks.swapaxes(0, 1), pieced)
+    ends = solutions(flight, first, starts, pieced)
     if flight.looks is not None:
         flight = replace(flight, looks=trusted(flight.looks, ends[0].state))
     found, best = (noise, ends[0]) if noise else noise_of(flight, first, ends[0])
@@ -282,7 +270,7 @@ def _from_batch(
         found, best = with_range_noise(flight, found, best)
     keyframes, constants = covariance(flight, found, best)
     spread = keyframes[:, :3, :3] * INFLATION**2 + apart
-    none = np.zeros(len(tracks), np.int8)
+    none = np.zeros(len(flight.key_s), np.int8)
     state, error_m = best.state[:, :3], best.state[:, RANGE_ERROR]
     made = Estimate(flight.key_s, state, spread, none, best.constants, found, error_m)
     return replace(made, constants_covariance=constants)

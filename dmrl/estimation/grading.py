@@ -15,7 +15,7 @@ TAKEN = (
     (0.41, 0.55, 0.65, 0.80, 2.80),
     (0.55, 0.60, 1.00, 1.00, 3.50),
     (0.80, 0.90, 1.20, 1.20, 3.50),
-    (0.08, 0.08, 0.15, 0.15, 0.15),
+    (0.08, 0.08, 0.15, 0.15, 0.35),
 )
 """The likeliest grade, the grade that velocities are taken for, that of scales, and the standard
 deviation of the ranges' offset, metres: who calibrated one sensor will have measured the other.

@@ -10,6 +10,8 @@ from dmrl.estimation.looks import Looks, looks_of
 from dmrl.estimation.motion import Increments, odometry
 from dmrl.estimation.pair import LONGEST_GAP_S, Array, Mask, Pair
 
+KEY_HZ = 10.0
+"""Keyframes per second."""
 BLOCK_S, REACH = 0.1, 3
 """Ranges jump between medians of so many blocks of this length."""
 JUMP_M = 0.45
@@ -180,7 +182,7 @@ class Problem:
         return np.diff(self.key_s)
 
 
-def problem(pair: Pair, rate_hz: float = 10.0) -> Problem:
+def problem(pair: Pair, rate_hz: float = KEY_HZ) -> Problem:
     """Keyframes of a pair.
 
     Parameters

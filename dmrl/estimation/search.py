@@ -6,12 +6,11 @@ import numpy as np
 
 from dmrl.estimation.batch import ROUGH, Solution, near, solve_batch
 from dmrl.estimation.hypotheses import BESIDE, mirrored, passed_by
-from dmrl.estimation.linear import OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
+from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
 from dmrl.estimation.pair import Array
-from dmrl.estimation.problem import GLOBALS, Noise, Problem
+from dmrl.estimation.problem import GLOBALS, KEY_HZ, Noise, Problem
+from dmrl.estimation.starts import Starts
 
-KEY_HZ = 10.0
-"""Keyframes per second."""
 HOPELESS = 100.0
 """Smoothed starts whose log likelihood is this far below the best's are not solved."""
 BESIDE_PIECES = 2
@@ -24,7 +23,7 @@ CHEAPER = 0.5
 
 
 def solutions(
-    flight: Problem, noise: Noise, score: Array, tracks: Array, pieced: Sequence[Array]
+    flight: Problem, noise: Noise, starts: Starts, pieced: Sequence[Array]
 ) -> list[Solution]:
     """What likely starts lead to, best first.
 
@@ -35,20 +34,20 @@ def solutions(
     ----------
     flight, noise
         The flight, and what is believed about its sensors.
-    score
-        (S,) log likelihoods of smoothed starts.
-    tracks
-        (S, K, 5) those: x, y (m), psi (rad), biases of the yaw rates (rad/s).
+    starts
+        Of this flight.
     pieced
         (K, 6) states each, joined of what stretches of the flight led to.
     """
     begun: list[Array] = []
     found = [solve_batch(flight, noise, start, tolerance=ROUGH) for start in pieced]
+    score = starts.score
     for number in np.argsort(-score)[: BESIDE_PIECES if pieced else None]:
-        start = tracks[number]
+        start = starts.tracks[:, number]
         if score[number] > score.max() - HOPELESS and not any(near(start, s) for s in begun):
             begun.append(start)
-            found.append(solve_batch(flight, noise, *_start(flight, start), found, ROUGH))
+            first = _start(flight, start, starts.offset_m)
+            found.append(solve_batch(flight, noise, *first, found, ROUGH))
     found += [
         solve_batch(flight, noise, _afresh(flight, s.state), known=found, tolerance=ROUGH)
         for s in distinct(found, STUCK)[: 1 if pieced else AGAIN]
@@ -103,10 +102,10 @@ def _afresh(flight: Problem, state: Array) -> Array:
     return out
 
 
-def _start(flight: Problem, track: Array) -> tuple[Array, Array]:
+def _start(flight: Problem, track: Array, offset_m: float) -> tuple[Array, Array]:
     """States (K, 6) and globals (G,) that a smoothed track (K, 5) says, with jumped ranges."""
     state, constants = np.zeros((len(track), SIZE)), np.zeros(len(GLOBALS))
     state[:, :3] = track[:, :3]
     state[flight.range_key, RANGE_ERROR] = flight.range_level_m
-    constants[[OWN_GYRO, PEER_GYRO]] = track[-1, 3:]
+    constants[[BIAS, OWN_GYRO, PEER_GYRO]] = offset_m, *track[-1, 3:]
     return state, constants

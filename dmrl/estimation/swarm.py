@@ -17,8 +17,7 @@ from dmrl.estimation.keyframe_filter import QUARTER
 from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.estimation.motion import odometry, rotation
 from dmrl.estimation.pair import Array, Pair, Track
-from dmrl.estimation.problem import GLOBALS, silence, unheard
-from dmrl.estimation.search import KEY_HZ
+from dmrl.estimation.problem import GLOBALS, KEY_HZ, silence, unheard
 from dmrl.estimation.stretches import contradicts
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Link, Swarm, inverse, solved
 

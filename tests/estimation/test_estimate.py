@@ -12,8 +12,10 @@ from dmrl.estimation import gate as room
 from dmrl.estimation.batch import Solution
 from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
 from dmrl.estimation.estimated import Estimate, from_peer, swapped
+from dmrl.estimation.linear import BIAS
 from dmrl.estimation.pair import Pair, Track
 from dmrl.estimation.problem import GLOBALS, Noise
+from dmrl.estimation.starts import Starts
 from dmrl.flight import Trajectory
 
 from .flights import flown, pair_of, truth_at
@@ -55,7 +57,7 @@ def test_spreads_grow_with_what_else_may_be(
     for name, given in (("solutions", ends), ("_weighed", ends), ("covariance", (known, None))):
         monkeypatch.setattr(entrance, name, lambda *_, given=given: given)
     flight = SimpleNamespace(key_s=np.arange(3.0), looks=None, known_std=None)
-    found = entrance._from_batch(flight, Noise(), np.zeros(1), np.zeros((1, 3, 5)), [])  # type: ignore[arg-type]
+    found = entrance._from_batch(flight, Noise(), Starts(*np.zeros((3, 1))), [])  # type: ignore[arg-type]
     wanted = entrance.INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
     assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
 
@@ -65,9 +67,20 @@ def test_a_smoother_s_spread_is_its_own_and_that_between_its_tracks() -> None:
     tracks[:, 1, 0] = 1.0
     known = np.tile(np.eye(5), (3, 2, 1, 1))
     flight = SimpleNamespace(key_s=np.arange(3.0))
-    found = entrance._from_smoother(flight, Noise(), np.zeros(2), tracks, known)  # type: ignore[arg-type]
+    starts = Starts(np.zeros(2), tracks, known, offset_m=-0.4)
+    found = entrance._from_smoother(flight, Noise(), starts)  # type: ignore[arg-type]
+    assert found.constants[BIAS] == -0.4
     wanted = entrance.SMOOTHER_INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
     assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
+
+
+def test_the_gate_makes_no_allowance_for_sensors_worse_than_any_that_were_tried() -> None:
+    usual = Noise()
+    grades = [entrance.gate_sigma(usual.graded(grade)) for grade in (0.55, 1.0, 1.3, 1.5, 3.0)]
+    assert grades[:2] == [entrance.GATE_SIGMA] * 2
+    assert entrance.GATE_SIGMA < grades[2] < 1.0
+    assert grades[3:] == [1.0, 1.0]
+    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.1)) == 1.0
 
 
 def test_the_statuses_are_those_of_the_schema() -> None:

@@ -7,9 +7,10 @@ import pytest
 
 from dmrl.estimation import search
 from dmrl.estimation.batch import Solution
-from dmrl.estimation.linear import RANGE_ERROR, SIZE
+from dmrl.estimation.linear import BIAS, RANGE_ERROR, SIZE
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS, Noise, Problem, problem
+from dmrl.estimation.starts import Starts
 
 from .flights import flown, pair_of
 
@@ -19,6 +20,11 @@ def solution(x_m: float, cost: float, error_m: float = 0.0) -> Solution:
     state = np.zeros((11, SIZE))
     state[:, 0], state[:, RANGE_ERROR] = 10.0 + x_m, error_m
     return Solution(state, np.zeros(len(GLOBALS)), cost)
+
+
+def smoothed(score: Array, tracks: Array) -> Starts:
+    """Starts (S, K, 5) with their scores."""
+    return Starts(score, tracks.swapaxes(0, 1), np.zeros(0))
 
 
 def flight() -> Problem:
@@ -44,7 +50,7 @@ def test_what_sticks_above_the_best_is_solved_afresh(monkeypatch: pytest.MonkeyP
     short = flight()
     level = replace(short, range_level_m=np.zeros(len(short.range_m)))
     tracks = np.stack([solution(x, 0.0).state[:, :5] for x in (2.0, 3.0)])
-    best = search.solutions(level, Noise(), np.zeros(2), tracks, [])[0]
+    best = search.solutions(level, Noise(), smoothed(np.zeros(2), tracks), [])[0]
     assert best.cost == 1.0
 
 
@@ -60,7 +66,7 @@ def test_of_a_flight_in_stretches_their_join_and_the_two_likeliest_starts_are_so
     monkeypatch.setattr(search, "solve_batch", solved)
     tracks = np.stack([solution(x, 0.0).state[:, :5] for x in (5.0, 6.0, 7.0)])
     joined = [solution(1.0, 0.0).state]
-    found = search.solutions(flight(), Noise(), np.array([3.0, 1.0, 2.0]), tracks, joined)
+    found = search.solutions(flight(), Noise(), smoothed(np.array([3.0, 1.0, 2.0]), tracks), joined)
     assert begun == [1, 5, 7, 1]  # and the best again, afresh
     assert (found[0].cost, round(float(found[0].state[0, 0]))) == (10.0, 11)
 
@@ -86,3 +92,18 @@ def test_other_sides_are_tried_six_times_and_from_the_best_on(
     found = search._passed_by(flight(), Noise(), [solution(0.0, 50.0), solution(30.0, 70.0)])
     assert begun == [1, 2, 3, 31, 32, 33]
     assert len(found) == 2 + 6 and min(s.cost for s in found) == 20.0
+
+
+def test_a_start_with_longer_ranges_is_solved_from_their_offset(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    offsets: list[float] = []
+
+    def solved(_: Problem, __: Noise, state: Array, *given: Array, **____: object) -> Solution:
+        offsets.append(float(given[0][BIAS]) if given else 0.0)
+        return solution(float(state[0, 0]) - 10.0, 1.0)
+
+    monkeypatch.setattr(search, "solve_batch", solved)
+    start = smoothed(np.zeros(1), solution(5.0, 0.0).state[None, :, :5])
+    search.solutions(flight(), Noise(), replace(start, offset_m=-0.4), [])
+    assert offsets[0] == -0.4
