@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl.datasets import Dataset, Split
-from dmrl.errors import SettingError
+from dmrl.errors import DatasetError, SettingError
 from dmrl.learn.batches import BOX, CLASS_ID, FIELDS, Examples
 from dmrl.learn.settings import FitSettings
 
@@ -40,12 +40,18 @@ def material(data: Dataset, settings: FitSettings) -> Material:
     Raises
     ------
     DatasetError
-        If there is no train split.
+        If there is no train split, or no robot in it.
     SettingError
         If the shares do not fit the recordings, or the classes the peers.
     """
     train = data.split("train")
     every = examples_of(train, settings.classes)
+    if not np.isfinite(every.robots).any():
+        raise DatasetError(
+            f"{data.path} shows no robot in any of the {len(every)} images of its train split: of "
+            "them alone a network learns that nobody is ever there. Add images with robots: dmrl "
+            f"dataset ROBOTS.mcap {data.path} --add"
+        )
     _require_classes(train, every, settings.classes)
     sources = np.array(train.table.column("source").to_pylist())
     held = np.zeros(len(every), bool)
@@ -128,7 +134,7 @@ def examples_of(split: Split, classes: Sequence[str] = ()) -> Examples:
 def _class_ids(names: pa.Array, classes: Sequence[str]) -> NDArray[np.float32]:
     """(n,) number of the first pattern that fits a peer's name, NaN where none does."""
     known = pc.unique(names).to_pylist()
-    place = np.array(pc.index_in(names, pa.array(known)).to_pylist(), np.int64)
+    place = np.array(pc.index_in(names, pa.array(known, names.type)).to_pylist(), np.int64)
     of_name = np.full(len(known), np.nan, np.float32)
     for k in reversed(range(len(classes))):
         of_name[[fnmatch.fnmatchcase(name, classes[k]) for name in known]] = k

@@ -17,10 +17,11 @@ from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.datasets.for_training import examples_of, material
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
+from dmrl.images.codec import encode_png
 from dmrl.learn import fit
 from dmrl.learn.batches import FIELDS
 from dmrl.learn.model import load_model
-from dmrl.stages import train
+from dmrl.stages import convert, dataset, train
 from dmrl.stages.train import Flags, Settings, run
 
 from .trainings import SETTINGS
@@ -120,6 +121,7 @@ def test_classes_are_patterns_of_peer_names(dots_dataset: Path, tmp_path: Path) 
 KILLED = """
 import sys, time
 from pathlib import Path
+from dmrl.images.codec import encode_png
 from dmrl.learn import fit
 from dmrl.stages.train import Settings, run
 step = fit.train_step
@@ -216,6 +218,19 @@ def test_what_cannot_be_trained_is_said_in_one_line(dots_dataset: Path, tmp_path
     with pytest.raises(OutputError, match="exists"):
         run(dots_dataset, tmp_path / "taken", SETTINGS)
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_images_in_which_nobody_is_are_not_enough(tmp_path: Path) -> None:
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    for name in ("a", "b"):
+        (shots / f"{name}.png").write_bytes(encode_png(np.zeros((64, 64, 3), np.uint8)))
+    table = "file,peer,u_px,v_px,depth_m\na.png,,,,\nb.png,,,,\n"
+    (shots / "labels.csv").write_text(table, encoding="utf-8")
+    convert.run(shots, tmp_path / "shots.mcap", convert.Settings())
+    dataset.run([tmp_path / "shots.mcap"], tmp_path / "dataset", dataset.Settings())
+    with pytest.raises(DatasetError, match="no robot in any of the 2 images.*--add"):
+        run(tmp_path / "dataset", tmp_path / "run", SETTINGS)
 
 
 def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers() -> None:
