@@ -26,7 +26,7 @@ from dmrl.deploy.c import write_c
 from dmrl.deploy.equalise import equalise
 from dmrl.deploy.graph import graph_of, grey_of
 from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.measure import rates, state_bytes
+from dmrl.deploy.measure import Memory, memory_of, rates
 from dmrl.deploy.quantise import About, quantise
 from dmrl.deploy.ranges import calibrate
 from dmrl.deploy.rounding import moments_of
@@ -131,19 +131,20 @@ def judged(data: Dataset, form: Form, settings: FitSettings, most: int) -> Judge
     found = figures_of(len(test), labels, _scaled(points, form.shrink), THRESHOLD)
     names = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
     figures = {name: float(found[name] or 0) for name in names}
-    state = ram_bytes(small)
-    return Judged(form.name, small.macs / 1e6, state, rates(small, None, state)[0][0], **figures)
+    kept = memory(small)
+    rate_hz = rates(small, None, kept)[0][0]
+    return Judged(form.name, small.macs / 1e6, kept.state_bytes, rate_hz, **figures)
 
 
 def _scaled(points: Points, factor: int) -> Points:
     return replace(points, u_px=points.u_px * factor, v_px=points.v_px * factor)
 
 
-def ram_bytes(network: IntegerNetwork) -> int:
-    """Bytes of state of the C."""
+def memory(network: IntegerNetwork) -> Memory:
+    """What the C keeps."""
     with tempfile.TemporaryDirectory(prefix="dmrl-sizes-") as folder:
         write_c(network, Path(folder), [])
-        return state_bytes(network, Path(folder))
+        return memory_of(network, Path(folder))
 
 
 def print_line(each: Judged) -> None:

@@ -65,8 +65,32 @@ def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cos
     return Cost(code, constants, counted)
 
 
-def state_bytes(network: IntegerNetwork, folder: Path) -> int:
-    """Bytes of RAM that the header of an export folder states; compilers hold it to that.
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """What the C of an export keeps between rows.
+
+    Parameters
+    ----------
+    state_bytes
+        Of RAM; of the near one of two memories.
+    far_bytes
+        Of the far one; 0: there is none.
+    traffic_bytes
+        That an image copies between the two.
+    """
+
+    state_bytes: int
+    far_bytes: int = 0
+    traffic_bytes: int = 0
+
+    @property
+    def fits_l1(self) -> bool:
+        """Whether the state fits a GAP8's L1, the cores' stacks beside it."""
+        return self.state_bytes <= L1_FOR_STATE
+
+
+def memory_of(network: IntegerNetwork, folder: Path) -> Memory:
+    """What the header of an export folder states; compilers hold it to the sizes.
 
     Raises
     ------
@@ -75,10 +99,11 @@ def state_bytes(network: IntegerNetwork, folder: Path) -> int:
     """
     header = folder / f"{c_name(network)}.h"
     text = header.read_text(encoding="utf-8", errors="replace")
-    found = re.search(r"_STATE_BYTES \((\d+)", text)
-    if not found:
+    names = ("STATE", "FAR", "TRAFFIC")
+    found = [re.search(rf"_{name}_BYTES \((\d+)", text) for name in names]
+    if not found[0]:
         raise ModelError(f"{header} is damaged. Export the model again: dmrl export")
-    return int(found[1])
+    return Memory(*(int(one[1]) if one else 0 for one in found))
 
 
 def _sizes(network: IntegerNetwork, folder: Path, build: Path) -> tuple[int, int]:
@@ -121,12 +146,7 @@ def _instructions(
     return counts[1] - counts[0]
 
 
-def fits_l1(state: int) -> bool:
-    """Whether a state of so many bytes fits a GAP8's L1, the cores' stacks beside it."""
-    return state <= L1_FOR_STATE
-
-
-def rates(network: IntegerNetwork, found: Cost | None, state: int) -> list[tuple[float, str]]:
+def rates(network: IntegerNetwork, found: Cost | None, kept: Memory) -> list[tuple[float, str]]:
     """Estimated images a second on a GAP8, each with what it assumes.
 
     Parameters
@@ -135,13 +155,18 @@ def rates(network: IntegerNetwork, found: Cost | None, state: int) -> list[tuple
         The network.
     found
         Its cost, if known.
-    state
-        Bytes of RAM that the C keeps.
+    kept
+        What the C keeps.
     """
     out = []
     memory = "no waiting for memory"
-    if not fits_l1(state):
-        memory = f"without the waits for L2, where {state:,} bytes of state lie that do not fit L1"
+    if not kept.fits_l1:
+        what = f"{kept.state_bytes:,} bytes of state"
+        memory = f"without the waits for L2, where {what} lie that do not fit L1"
+    elif kept.far_bytes:
+        memory = (
+            f"no waiting for the {kept.traffic_bytes:,} bytes that are copied from L2 and to it"
+        )
     if found and found.instructions:
         out.append(
             (

@@ -11,7 +11,8 @@ from dmrl.deploy.toolchain import EMULATOR, RISCV, missing, run
 RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding",
                "-Wl,--no-relax")  # fmt: skip
 """For rv32imc without any library. No start-up code sets the register that relaxed code needs."""
-SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
+              "-DHARNESS_GUARD")  # fmt: skip
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
 
 
@@ -65,6 +66,8 @@ class Build:
         name = c_name(network)
         mode = f"-D{name.upper()}_BAYER={int(self.bayer)}"
         flags: tuple[str | Path, ...] = (*self.flags, mode, "-iquote", folder)
+        if "-DHARNESS_GUARD" in flags:
+            flags = (*flags, f"-D{name.upper()}_COPY=harness_copy")
         sources = [harness_c, folder / f"{name}.c"]
         if refine:
             flags = (*flags, "-DHARNESS_REFINE")

@@ -144,24 +144,6 @@ class Residual(nn.Module):
         return torch.relu(x + self.pointwise(self.depthwise(x)))
 
 
-class Widened(nn.Module):
-    """A dilated depthwise 3x3, then 1x1 to twice the channels and back, beside a shortcut.
-
-    What is wide between the two is needed for a row at a time: it costs a small chip products and
-    no memory (the order of ConvNeXt's blocks, Liu et al. 2022).
-    """
-
-    def __init__(self, width: int, dilation: int) -> None:
-        super().__init__()
-        self.depthwise = ConvNorm(width, width, dilation=dilation, depthwise=True)
-        self.expand = ConvNorm(width, 2 * width, 1)
-        self.reduce = ConvNorm(2 * width, width, 1, relu=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, width, rows, cols) of the same."""
-        return torch.relu(x + self.reduce(self.expand(self.depthwise(x))))
-
-
 class DmrlNano(Network):
     """dmrl's own small network: 24,836 parameters, 57.7 million products, receptive field 287 px.
 
@@ -171,8 +153,6 @@ class DmrlNano(Network):
     """
 
     own: ClassVar[tuple[str, ...]] = SUB_CELL
-    block: ClassVar[type[nn.Module]] = Residual
-    """Made of its width in channels and its dilation."""
     widths: ClassVar[tuple[int, int, int]] = (16, 32, 48)
     dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 1), (1, 2, 4, 8, 1))
 
@@ -182,10 +162,10 @@ class DmrlNano(Network):
         self.body = nn.Sequential(
             ConvNorm(CHANNELS, stem, stride=2),
             ConvNorm(stem, fine, stride=2),
-            *(self.block(fine, dilation) for dilation in self.dilations[0]),
+            *(Residual(fine, dilation) for dilation in self.dilations[0]),
             ConvNorm(fine, fine, stride=2, depthwise=True),
             ConvNorm(fine, coarse, 1),
-            *(self.block(coarse, dilation) for dilation in self.dilations[1]),
+            *(Residual(coarse, dilation) for dilation in self.dilations[1]),
         )
         self.head = nn.Conv2d(coarse, len(self.channels), 1)
         nn.init.normal_(self.head.weight, std=0.01)
@@ -208,14 +188,6 @@ class DmrlNanoFine(DmrlNano):
     dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 2, 1, 2, 1, 2), (2, 4, 8))
 
 
-class DmrlNanoL1(DmrlNano):
-    """dmrl-nano for the 64 kB of a GAP8's L1: narrower, and with less reach, which rows cost."""
-
-    block: ClassVar[type[nn.Module]] = Widened
-    widths: ClassVar[tuple[int, int, int]] = (12, 24, 32)
-    dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1,), (1, 2, 4, 1))
-
-
 class DmrlLarge(DmrlNano):
     """The same, wider: a teacher, too large for a microcontroller."""
 
@@ -225,7 +197,6 @@ class DmrlLarge(DmrlNano):
 ARCHITECTURES: dict[str, type[Network]] = {
     "dmrl-nano": DmrlNano,
     "dmrl-nano-fine": DmrlNanoFine,
-    "dmrl-nano-l1": DmrlNanoL1,
     "dmrl-large": DmrlLarge,
     "locanet": LocaNet,
 }

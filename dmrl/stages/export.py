@@ -2,13 +2,15 @@
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import Parameter, validators
 
 from dmrl.deploy.backends import seen_by
-from dmrl.deploy.c import L1_FOR_STATE, write_c
+from dmrl.deploy.c import L1_FOR_STATE, STACKS_BYTES, write_c
 from dmrl.deploy.detector import (
     DESCRIPTION_NAME,
     FLOAT_ONNX_NAME,
@@ -16,7 +18,7 @@ from dmrl.deploy.detector import (
     WEIGHTS_NAME,
 )
 from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.measure import fits_l1, state_bytes
+from dmrl.deploy.measure import Memory, memory_of
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError
@@ -40,10 +42,14 @@ class Settings:
     refine
         Write C that learns on in the last layer too, from images of which it is told who is in
         view. The state then holds all that the last layer reads.
+    l1_kb
+        The C works in a near memory of so many kilobytes, 8 of which are left for stacks, such as
+        the 64 of a GAP8's L1: rings that do not fit lie in a far one, and rows are copied.
     """
 
     bayer: bool = False
     refine: bool = False
+    l1_kb: Annotated[int | None, Parameter(validator=validators.Number(gte=9))] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +124,8 @@ def _write_int8(network: IntegerNetwork, model: Path, folder: Path, settings: Se
     for name in (INTEGER_NAME, SAMPLES_NAME):
         shutil.copyfile(model / name, folder / name)
     images = [seen_by(network, image) for image in load_samples(model)]
-    write_c(network, folder, images, bayer=settings.bayer, refine=settings.refine)
+    near = None if settings.l1_kb is None else settings.l1_kb * 1024 - STACKS_BYTES
+    write_c(network, folder, images, bayer=settings.bayer, refine=settings.refine, near_bytes=near)
 
 
 def _written(path: Path) -> Written:
@@ -129,15 +136,14 @@ def _written(path: Path) -> Written:
 def document(out: Path, written: list[Written]) -> dict[str, Any]:
     """What was written, as JSON values; without an int8 network nothing is said of its memory."""
     said = {"folder": str(out), "files": {each.name: each.size_bytes for each in written}}
-    if (state := _state_bytes(out, written)) is None:
-        return said
-    return {**said, "state_bytes": state, "fits_gap8_l1": fits_l1(state)}
+    kept = _memory(out, written)
+    return {**said, **asdict(kept), "fits_gap8_l1": kept.fits_l1} if kept else said
 
 
-def _state_bytes(out: Path, written: list[Written]) -> int | None:
-    """RAM of the C; None: there is none."""
+def _memory(out: Path, written: list[Written]) -> Memory | None:
+    """What the C keeps; None: there is none."""
     int8 = any(each.name == INTEGER_NAME for each in written)
-    return state_bytes(load(out), out) if int8 else None
+    return memory_of(load(out), out) if int8 else None
 
 
 DEFAULTS = Settings()
@@ -169,9 +175,15 @@ def command(
         return
     rows = [(each.name, each.size_bytes, each.what) for each in written]
     print_table(str(out), ("file", "bytes", "what it is"), rows)
-    if (state := _state_bytes(out, written)) is not None:
-        fit = "fits" if fits_l1(state) else "does not fit"
+    if kept := _memory(out, written):
+        fit = "fits" if kept.fits_l1 else "does not fit"
         print_line(
-            f"{state:,} bytes of RAM, which {fit} a GAP8's L1: {L1_FOR_STATE:,} beside stacks"
+            f"{kept.state_bytes:,} bytes of RAM, which {fit} a GAP8's L1: {L1_FOR_STATE:,} beside "
+            "stacks"
         )
+        if kept.far_bytes:
+            print_line(
+                f"{kept.far_bytes:,} bytes more in a far memory; {kept.traffic_bytes:,} bytes are "
+                "copied an image"
+            )
         print_line(f"prove the C with: dmrl verify {out}")

@@ -15,7 +15,7 @@ from dmrl.deploy.backends import seen_by
 from dmrl.deploy.c import L1_FOR_STATE
 from dmrl.deploy.compiled import require_c
 from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.measure import Cost, cost, fits_l1, rates, state_bytes
+from dmrl.deploy.measure import Cost, Memory, cost, memory_of, rates
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import load
 from dmrl.deploy.targets import targets
@@ -74,8 +74,8 @@ class Result:
         What each gave.
     cost
         On rv32imc; None without its compiler.
-    state_bytes
-        RAM of the C.
+    memory
+        What the C keeps.
     """
 
     network: IntegerNetwork
@@ -83,7 +83,7 @@ class Result:
     noise: int
     targets: list[TargetResult]
     cost: Cost | None
-    state_bytes: int
+    memory: Memory
 
     @property
     def wrong(self) -> bool:
@@ -157,7 +157,7 @@ def _tried(folder: Path, settings: Settings) -> Result:
         tried,
         # C that a target could not compile or run is not worth measuring.
         None if any(t.error for t in tried) else cost(network, folder, images[0]),
-        state_bytes(network, folder),
+        memory_of(network, folder),
     )
 
 
@@ -216,8 +216,8 @@ def document(result: Result) -> dict[str, Any]:
             for t in result.targets
         ],
         "macs": network.macs,
-        "state_bytes": result.state_bytes,
-        "fits_gap8_l1": fits_l1(result.state_bytes),
+        **asdict(result.memory),
+        "fits_gap8_l1": result.memory.fits_l1,
         "stack_bytes": stack_bytes(result.targets),
         "code_bytes": found.code_bytes if found else None,
         "constant_bytes": found.constant_bytes if found else None,
@@ -225,7 +225,7 @@ def document(result: Result) -> dict[str, Any]:
         "instructions_per_mac": executed / network.macs if executed else None,
         "gap8_estimates": [
             {"images_per_s": rate, "assuming": assumption}
-            for rate, assumption in rates(network, found, result.state_bytes)
+            for rate, assumption in rates(network, found, result.memory)
         ],
     }
 
@@ -248,19 +248,23 @@ def print_result(folder: Path, result: Result) -> None:
     tried = f"{result.pictures} images and {result.noise} of noise"
     print_table(f"{folder}: the C against the integer reference, {tried}", columns, rows)
     print_table("Cost of the C", ("what", "", "how"), _cost_rows(result))
-    for rate, assumption in rates(result.network, result.cost, result.state_bytes):
+    for rate, assumption in rates(result.network, result.cost, result.memory):
         print(f"estimated {rate:.2f} images/s on a GAP8: {assumption}")
 
 
 def _cost_rows(result: Result) -> list[tuple[object, ...]]:
+    kept = result.memory
     rows: list[tuple[object, ...]] = [
-        ("RAM, bytes", f"{result.state_bytes:,}", "state, RGB or grey"),
+        ("RAM, bytes", f"{kept.state_bytes:,}", "state, RGB or grey"),
         (
             "fits a GAP8's L1",
-            "yes" if fits_l1(result.state_bytes) else "no",
+            "yes" if kept.fits_l1 else "no",
             f"{L1_FOR_STATE:,} bytes, beside stacks",
         ),
     ]
+    if kept.far_bytes:
+        rows.append(("far memory, bytes", f"{kept.far_bytes:,}", "no layer works on it"))
+        rows.append(("copied, bytes", f"{kept.traffic_bytes:,}", "an image, near and far"))
     if (stack := stack_bytes(result.targets)) is not None:
         rows.append(("stack, bytes", f"{stack:,}", "the most of rv32imc's builds, measured"))
     if found := result.cost:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dmrl.deploy.bayer import demosaic
-from dmrl.deploy.c import L1_FOR_STATE, c_name, write_c
+from dmrl.deploy.c import c_name, write_c
 from dmrl.deploy.c.harness import answers
 from dmrl.deploy.c.source import source
 from dmrl.deploy.c.text import names_of
@@ -268,7 +268,6 @@ def test_without_a_compiler_the_package_to_install_is_named(
         ("locanet", 25_000),
         ("dmrl-nano", 103_200),
         ("dmrl-nano-fine", 132_000),
-        ("dmrl-nano-l1", L1_FOR_STATE),
     ],
 )
 def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
@@ -278,7 +277,7 @@ def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("name", ["locanet", "dmrl-nano", "dmrl-nano-l1"])
+@pytest.mark.parametrize("name", ["locanet", "dmrl-nano"])
 def test_the_architectures_come_through_bit_for_bit(name: str, tmp_path: Path) -> None:
     result = proved(untrained(name, 176, 96), tmp_path, QUICK)
     assert (result.error, result.mismatches) == ("", 0)

@@ -9,7 +9,7 @@ import pytest
 from dmrl.deploy import measure, verification
 from dmrl.deploy.c.harness import Answer
 from dmrl.deploy.c.source import STACK_BYTES
-from dmrl.deploy.measure import CLUSTER_HZ, KERNEL_MACS, Cost, rates, state_bytes
+from dmrl.deploy.measure import CLUSTER_HZ, KERNEL_MACS, Cost, Memory, memory_of, rates
 from dmrl.deploy.reference import Detection
 from dmrl.deploy.targets import Build, Target
 from dmrl.deploy.verification import BuildResult, TargetResult, expected, prove, same
@@ -82,13 +82,17 @@ def test_a_build_answers_every_image_within_its_stack(
 
 def test_rates_are_images_a_second() -> None:
     network = random_network(1)
-    both = rates(network, Cost(1, 2, round(CLUSTER_HZ / 25)), 49_152)
+    both = rates(network, Cost(1, 2, round(CLUSTER_HZ / 25)), Memory(49_152))
     assert [rate for rate, _ in both] == pytest.approx(
         [25, CLUSTER_HZ * KERNEL_MACS / network.macs]
     )
-    assert len(rates(network, Cost(1, 2, None), 1)) == len(rates(network, None, 1)) == 1
+    assert (
+        len(rates(network, Cost(1, 2, None), Memory(1)))
+        == len(rates(network, None, Memory(1)))
+        == 1
+    )
     assert not any("L1" in assumed for _, assumed in both)
-    over = rates(network, Cost(1, 2, 3), 102_138)
+    over = rates(network, Cost(1, 2, 3), Memory(102_138))
     assert all(
         "L2, where 102,138 bytes of state lie that do not fit L1" in said for _, said in over
     )
@@ -97,10 +101,10 @@ def test_rates_are_images_a_second() -> None:
 def test_the_header_states_the_bytes_of_the_state(tmp_path: Path) -> None:
     header = tmp_path / "random.h"
     header.write_text("#define RANDOM_STATE_BYTES (1234 + 8)\n")
-    assert state_bytes(random_network(1), tmp_path) == 1234
+    assert memory_of(random_network(1), tmp_path) == Memory(1234)
     header.write_text("nothing")
     with pytest.raises(ModelError, match=r"random\.h is damaged"):
-        state_bytes(random_network(1), tmp_path)
+        memory_of(random_network(1), tmp_path)
 
 
 def test_the_cost_of_an_image_is_what_a_second_one_adds(

@@ -25,14 +25,10 @@ def test_the_small_networks_keep_to_their_budget() -> None:
     assert product_count(build("dmrl-nano")) == 57_720_320
     assert parameter_count(build("dmrl-nano-fine")) == 24_740
     assert product_count(build("dmrl-nano-fine")) == 75_102_720
-    assert parameter_count(build("dmrl-nano-l1")) == 25_488
-    assert product_count(build("dmrl-nano-l1")) == 49_593_600
     assert product_count(build("locanet")) == 77_557_760
 
 
-@pytest.mark.parametrize(
-    ("name", "wide_px"), [("dmrl-nano", 287), ("dmrl-nano-fine", 311), ("dmrl-nano-l1", 151)]
-)
+@pytest.mark.parametrize(("name", "wide_px"), [("dmrl-nano", 287), ("dmrl-nano-fine", 311)])
 def test_how_far_a_network_sees(name: str, wide_px: int) -> None:
     network = build(name).eval()
     for layer in network.modules():

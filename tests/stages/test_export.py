@@ -66,6 +66,25 @@ def test_an_export_says_what_it_holds(
     assert made["inputs"][0]["provenance"]["stage"] == "quantize"
 
 
+@pytest.mark.heavy
+def test_an_export_for_a_small_near_memory_says_what_lies_where(
+    quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, two, none = (tmp_path / name for name in ("whole", "two", "none"))
+    said = []
+    for out, kb in ((whole, 64), (two, 18)):
+        words = ["export", str(quantised), str(out), "--l1-kb", str(kb), "--json"]
+        app(words, result_action="return_value")
+        said.append(json.loads(capsys.readouterr().out))
+    assert said[0]["far_bytes"] == said[0]["traffic_bytes"] == 0
+    if quantised.name == "dmrl-nano":
+        assert said[1]["state_bytes"] <= 10 * 1024 < said[0]["state_bytes"]
+        assert min(said[1]["far_bytes"], said[1]["traffic_bytes"]) > 0
+    with pytest.raises(SettingError, match="Give more: --l1-kb"):
+        run(quantised, none, Settings(l1_kb=9))
+    assert sorted(tmp_path.iterdir()) == [two, whole]
+
+
 def test_a_float_model_becomes_float_onnx_alone(
     settled: Path, dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

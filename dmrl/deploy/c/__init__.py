@@ -7,15 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c.refinement import refinement
-from dmrl.deploy.c.source import source
+from dmrl.deploy.c.source import Source, source
 from dmrl.deploy.c.text import c_name, fill, names_of
 from dmrl.deploy.c.vectors import MOST, vectors
 from dmrl.deploy.integer import IntegerNetwork
 
 __all__ = ["c_name", "write_c"]
 
-L1_FOR_STATE = 64 * 1024 - 8 * 1024
-"""Bytes of the GAP8's L1 that a state may take, beside eight cores' stacks of a kilobyte each."""
+STACKS_BYTES = 8 * 1024
+"""What eight cores' stacks of a kilobyte each take of a GAP8's L1."""
+L1_FOR_STATE = 64 * 1024 - STACKS_BYTES
+"""Bytes of the GAP8's L1 that a state may take."""
 
 
 def write_c(
@@ -25,6 +27,7 @@ def write_c(
     *,
     bayer: bool = False,
     refine: bool = False,
+    near_bytes: int | None = None,
 ) -> list[str]:
     """Write the C of a network into a folder.
 
@@ -41,6 +44,8 @@ def write_c(
         Whether the C takes raw colour mosaics unless compiler flags say otherwise.
     refine
         Write the C that learns on as well, see `refinement`.
+    near_bytes
+        Bytes of a near memory that the state has to fit, see `memories`. None: there is one memory.
 
     Returns
     -------
@@ -51,9 +56,11 @@ def write_c(
     ------
     ModelError
         If the C cannot carry the network; the layer is named.
+    SettingError
+        If the near memory is too small.
     """
     names, name = names_of(network), c_name(network)
-    made = source(network, names, bayer=bayer, features=refine)
+    made = source(network, names, bayer=bayer, features=refine, near_bytes=near_bytes)
     files = refinement(network, names) if refine else {}
     files |= {
         f"{name}.c": made.code,
@@ -61,18 +68,27 @@ def write_c(
         f"{name}_vectors.h": vectors(network, images, names, bayer=bayer),
         "main.c": fill("main.c", **names, most=MOST),
         "Makefile": fill("Makefile", **names),
-        "README.md": fill(
-            "README.md",
-            **names,
-            state_bytes=made.state_bytes,
-            bayer_bytes=made.bayer_bytes,
-            constant_bytes=made.constant_bytes,
-            stack_bytes=made.stack_bytes,
-            input="raw Bayer images" if bayer else "RGB" if network.channels == 3 else "grey",
-            macs=f"{network.macs / 1e6:.1f}",
-            memory="L1" if made.state_bytes <= L1_FOR_STATE else "L2",
-        ),
+        "README.md": _readme(network, names, made, bayer=bayer),
     }
     for file, text in files.items():
         (folder / file).write_text(text, encoding="utf-8")
     return list(files)
+
+
+def _readme(network: IntegerNetwork, names: dict[str, str], made: Source, *, bayer: bool) -> str:
+    far = f"static {names['prefix']}_far_t away;" if made.far_bytes else ""
+    return fill(
+        "README.md",
+        **names,
+        state_bytes=made.state_bytes,
+        bayer_bytes=made.bayer_bytes,
+        constant_bytes=made.constant_bytes,
+        stack_bytes=made.stack_bytes,
+        input="raw Bayer images" if bayer else "RGB" if network.channels == 3 else "grey",
+        macs=f"{network.macs / 1e6:.1f}",
+        memory="L1" if made.state_bytes <= L1_FOR_STATE else "L2",
+        refs="&net, &away" if far else "&net",
+        away=f"{far} /* {made.far_bytes} bytes, in a larger one */\n" if far else "",
+        l2_away=f"PI_L2 {far}\n" if far else "",
+        far=fill("readme_far.md", **names, traffic_bytes=made.traffic_bytes) if far else "",
+    )

@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from dmrl.deploy.c.places import RANGES, TYPES, body, plus, read, suffixes, target, values
-from dmrl.deploy.c.plan import Buffer, Plan, along
+from dmrl.deploy.c.memories import rows_read
+from dmrl.deploy.c.places import RANGES, TYPES, Desk, body, plus, suffixes
+from dmrl.deploy.c.plan import Plan, along, taps_of
 from dmrl.deploy.c.rings import Step
+from dmrl.deploy.c.text import wrapped
 from dmrl.deploy.integer import Conv
 
 
@@ -77,7 +79,7 @@ def _kernel(plan: Plan, index: int, step: Step, conv: Conv) -> Kernel:
         shape = f"/* across */ {conv.dilation * width}, /* step */ {stride}, /* channels */ {width}"
     else:
         name = f"convolve{'_pool' if step.pooled else ''}_{suffixes([b.signed for b in inputs])}"
-        taps = _taps(conv)
+        taps = taps_of(conv)
         run = width if taps == conv.kernel**2 else width * conv.kernel
         shape = f"/* taps */ {taps}, /* run */ {run}, /* step */ {stride}, /* outs */ {outs}"
     adds = "/* adds */ 1, " if inputs[1:] else "0, 0, /* adds */ 0, "
@@ -87,32 +89,22 @@ def _kernel(plan: Plan, index: int, step: Step, conv: Conv) -> Kernel:
     return Kernel(name, bool(inputs[1:]), numbers)
 
 
-def _taps(conv: Conv) -> int:
-    """Pointers of a convolution.
-
-    A pointer leads to one row of the kernel, whose columns stand side by side in memory; with
-    dilation they do not, and each weight of the kernel has a pointer of its own.
-    """
-    spread = conv.dilation > 1 and not conv.depthwise and conv.kernel > 1
-    return conv.kernel**2 if spread else conv.kernel
-
-
-def row_of_convolution(plan: Plan, index: int) -> str:
+def row_of_convolution(desk: Desk, index: int) -> str:
     """Pointers to what the kernel reads, then its call.
 
     A pooled step makes two rows at once and so has twice as many pointers.
     """
-    step, out = plan.steps[index], plan.buffers[index + 1]
-    inputs, conv = [plan.buffers[k] for k in step.sources], step.layer
+    step, conv = desk.plan.steps[index], desk.plan.steps[index].layer
     assert isinstance(conv, Conv)
-    source, taps = inputs[0], _taps(conv)
-    count = taps * (2 if step.pooled else 1)
+    source, taps = desk.plan.buffers[step.sources[0]], taps_of(conv)
+    count = rows_read(step)
     row = _row(step.stride, _row_of_pointer(step, conv, taps))
     padding = 0 if along(conv) else conv.padding
     start = plus((source.gap - padding) * source.channels)
     spread = conv.dilation * source.channels
     column = f" + k % {conv.kernel} * {spread}" if taps > conv.kernel else ""
-    place = f"{read(source, row)}{start}{column}"
+    pointer = "k" if count > 1 else "0"
+    place = f"{desk.read(0, source, row, pointer)}{start}{column}"
     lines = [f"const uint8_t *const in[1] = {{{place}}};"]
     if count > 1:
         lines = [
@@ -120,16 +112,23 @@ def row_of_convolution(plan: Plan, index: int) -> str:
             f"for (int k = 0; k < {count}; k++)",
             f"    in[k] = {place};",
         ]
-    return body([*lines, *_call(plan, index, inputs, out)])
+    return body([*lines, *_call(desk, index)])
 
 
-def _call(plan: Plan, index: int, inputs: list[Buffer], out: Buffer) -> list[str]:
-    name, kernel = plan.steps[index].name, dict(_convolutions(plan))[index]
-    number = _kernels(plan).index(kernel)
-    call = f"convolution_{number}(in, {target(out)}, {name}_weights, {name}_scales"
+def _call(desk: Desk, index: int) -> list[str]:
+    plan, step, out = desk.plan, desk.plan.steps[index], desk.plan.buffers[index + 1]
+    kernel = dict(_convolutions(plan))[index]
+    words = ["in", desk.target(out)]
+    words += [desk.table(kind, f"{step.name}_{kind}") for kind in ("weights", "scales")]
     if kernel.shortcut:
-        return [f"{call},", f"    {values(inputs[1])}, {name}_gains);"]
-    return [f"{call});"]
+        words.append(desk.values(1, plan.buffers[step.sources[1]]))
+        words.append(desk.table("gains", f"{step.name}_gains"))
+    call = f"convolution_{_kernels(plan).index(kernel)}("
+    return [
+        call,
+        *wrapped([f"{w}," for w in words[:-1]] + [f"{words[-1]});"], "    "),
+        *desk.sent(out),
+    ]
 
 
 def _row(factor: int, offset: str) -> str:

@@ -1,12 +1,18 @@
 """The C of each step: its kernel, its function of one row, its constants."""
 
-import re
-
-import numpy as np
-
 from dmrl.deploy.c.convolutions import row_of_convolution, templates_of
-from dmrl.deploy.c.places import RANGES, TYPES, body, plus, read, suffixes, target, values
-from dmrl.deploy.c.plan import Buffer, Plan
+from dmrl.deploy.c.memories import loads
+from dmrl.deploy.c.places import (
+    RANGES,
+    TYPES,
+    Desk,
+    body,
+    marked_unused,
+    plus,
+    state_names,
+    suffixes,
+)
+from dmrl.deploy.c.plan import Plan
 from dmrl.deploy.c.rings import Step
 from dmrl.deploy.c.text import array, fill
 from dmrl.deploy.integer import Add, Conv, MaxPool
@@ -51,18 +57,16 @@ def _templates(step: Step) -> list[str]:
 
 def row_function(plan: Plan, index: int, prefix: str) -> str:
     """C function that makes one output row of a step."""
-    step, out = plan.steps[index], plan.buffers[index + 1]
-    inputs = [plan.buffers[k] for k in step.sources]
+    step, desk = plan.steps[index], Desk(plan, loads(plan, index))
     if isinstance(step.layer, Conv):
-        text = row_of_convolution(plan, index)
-    elif isinstance(step.layer, Add):
-        text = _add_body(step.layer, inputs, out)
+        text = row_of_convolution(desk, index)
     else:
-        text = _pool_body(inputs[0], out)
-    comment = f"/* {describe(plan, index)}. */\n"
-    unused = "" if "row" in re.findall(r"\w+", text) else "    (void)row;\n"
+        text = (_add_body if isinstance(step.layer, Add) else _pool_body)(desk, index)
+    names = state_names(plan, prefix)
+    unused = marked_unused(text, *names["args"].split(", "), "row")
     return (
-        f"{comment}APART void make_{step.name}({prefix}_t *net, int row)\n{{\n{unused}{text}}}\n\n"
+        f"/* {describe(plan, index)}. */\n"
+        f"APART void make_{step.name}({names['params']}, int row)\n{{\n{unused}{text}}}\n\n"
     )
 
 
@@ -87,28 +91,34 @@ def describe(plan: Plan, index: int) -> str:
     return f"{step.name}: {kind}{relu}{', 2x2 max-pool' if step.pooled else ''}, {size} -> {after}"
 
 
-def _add_body(layer: Add, inputs: list[Buffer], out: Buffer) -> str:
-    rows = [values(b) for b in inputs]
+def _add_body(desk: Desk, index: int) -> str:
+    step, out = desk.plan.steps[index], desk.plan.buffers[index + 1]
+    inputs, layer = [desk.plan.buffers[k] for k in step.sources], step.layer
+    assert isinstance(layer, Add)
+    rows = [desk.values(k, b) for k, b in enumerate(inputs)]
     name = f"add_{suffixes([b.signed for b in inputs])}"
     first, second = layer.multipliers
     return body(
         [
             f"const uint8_t *const in[2] = {{{rows[0]}, {rows[1]}}};",
-            f"{name}(in, {target(out)}, /* values */ {out.cols * out.channels},",
+            f"{name}(in, {desk.target(out)}, /* values */ {out.cols * out.channels},",
             f"{' ' * (len(name) + 1)}{first}, {second}, /* shift */ {layer.shift}, "
             f"/* range */ {RANGES[layer.signed]});",
+            *desk.sent(out),
         ]
     )
 
 
-def _pool_body(source: Buffer, out: Buffer) -> str:
+def _pool_body(desk: Desk, index: int) -> str:
+    source, out = (desk.plan.buffers[k] for k in (desk.plan.steps[index].sources[0], index + 1))
     start = plus(source.gap * source.channels)
-    rows = [f"{read(source, f'2 * row{k}')}{start}" for k in ("", " + 1")]
+    rows = [desk.read(0, source, f"2 * row + {k}", f"{k}") + start for k in range(2)]
     return body(
         [
             f"const uint8_t *const in[2] = {{{rows[0]}, {rows[1]}}};",
-            f"pool_{TYPES[source.signed][0]}(in, {target(out)}, /* cols */ {out.cols}, "
+            f"pool_{TYPES[source.signed][0]}(in, {desk.target(out)}, /* cols */ {out.cols}, "
             f"/* channels */ {out.channels});",
+            *desk.sent(out),
         ]
     )
 
@@ -141,9 +151,3 @@ def declarations(plan: Plan) -> str:
             if step.layer.gain.size:
                 lines.append(f"static const int32_t {step.name}_gains[{step.layer.gain.size}];\n")
     return "".join(lines)
-
-
-def longest_zero_row(plan: Plan) -> int:
-    """Bytes of the longest row of padding that holds zeros; 0: there is none."""
-    rows = [b.row_bytes + b.gap * b.channels for b in plan.buffers if b.above and b.pad_value == 0]
-    return int(np.max(rows, initial=0))

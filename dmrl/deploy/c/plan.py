@@ -40,6 +40,8 @@ class Buffer:
         Whether it holds int8.
     shift
         Place in the ring of row 0: several buffers may take turns in one.
+    far
+        Whether it lies in the far memory, see `memories`.
     """
 
     name: str
@@ -53,11 +55,17 @@ class Buffer:
     ring: int
     signed: bool
     shift: int = 0
+    far: bool = False
 
     @property
     def row_bytes(self) -> int:
         """Bytes from the start of a row to that of the next."""
         return (self.gap + self.cols) * self.channels
+
+    @property
+    def padded_bytes(self) -> int:
+        """Bytes of a row with the padding on both of its sides."""
+        return self.row_bytes + self.gap * self.channels
 
     @property
     def size(self) -> int:
@@ -74,14 +82,37 @@ class Plan:
     buffers: tuple[Buffer, ...]
     tensors: tuple[int, ...]
     """Buffer of every tensor of the network; -1 where a fused max-pool left none."""
+    whole: frozenset[int]
+    """Buffers that are read after the last row."""
+    stage: int = 0
+    """Bytes that steps work in where there are two memories, see `memories`; 0: there is one."""
 
-    @property
-    def homes(self) -> dict[str, int]:
-        """Members of the state that hold rings, and their bytes."""
+    def homes(self, *, far: bool) -> dict[str, int]:
+        """Members of the near or the far state that hold rings, and their bytes."""
         return {
             name: max(b.size for b in self.buffers if b.home == name)
-            for name in dict.fromkeys(b.home for b in self.buffers)
+            for name in dict.fromkeys(b.home for b in self.buffers if b.far == far)
         }
+
+    @property
+    def zero_bytes(self) -> int:
+        """Bytes of the longest row of padding that holds zeros; 0: there is none."""
+        rows = (b.padded_bytes for b in self.buffers if b.above and b.pad_value == 0)
+        return max(rows, default=0)
+
+    def state_bytes(self, *, bayer: bool) -> int:
+        """Bytes of the state for raw Bayer images or without; of the near one of two."""
+        used = 2 * len(self.buffers) + sum(self.homes(far=False).values()) + self.pad_bytes
+        used += 2 + 3 * self.network.width_px if bayer else 0
+        if not self.stage:
+            return up(used, 2)
+        return up(used + self.zero_bytes + self.stage, 4)
+
+    @property
+    def pad_bytes(self) -> int:
+        """Bytes of the row of padding that the image needs of its own; 0: it needs none."""
+        image = self.buffers[0]
+        return image.padded_bytes if image.above and image.pad_value else 0
 
 
 def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
@@ -106,9 +137,9 @@ def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
         )
     steps, tensors = _steps(network)
     shapes = [network.shapes[tensors.index(k)] for k in range(len(steps) + 1)]
-    whole = {tensors[h.tensor] for h in network.heads.values()}
+    whole = frozenset(tensors[h.tensor] for h in network.heads.values())
     if features:
-        whole |= {k for step in steps[-1:] for k in step.sources}
+        whole |= set(steps[-1].sources)
     writes = play(steps, [rows for _, rows, _ in shapes])
     rings = rows_held(writes, len(shapes))
     drafts = [_buffer(k, shapes[k], rings[k], steps) for k in range(len(shapes))]
@@ -120,10 +151,10 @@ def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
     buffers = [replace(d, home=homes.get(k, d.name)) for k, d in enumerate(drafts)]
     for chain in _chains(steps, buffers, whole):
         buffers = _joined(buffers, chain, writes)
-    return Plan(network, tuple(steps), tuple(buffers), tuple(tensors))
+    return Plan(network, tuple(steps), tuple(buffers), tuple(tensors), whole)
 
 
-def _chains(steps: list[Step], buffers: list[Buffer], whole: set[int]) -> list[list[int]]:
+def _chains(steps: list[Step], buffers: list[Buffer], whole: frozenset[int]) -> list[list[int]]:
     """Buffers whose rows may lie in one ring: each is written by a step that reads the one before.
 
     Their rows are of one size. Where a step has a shortcut, that is the one before.
@@ -209,9 +240,9 @@ def _identifier(name: str, taken: list[str]) -> str:
 
 
 RESERVED = """
-image image_pad done raw raw_rows auto break case char const continue default do double else enum
-extern float for goto if inline int long register restrict return short signed sizeof static
-struct switch typedef union unsigned void volatile while
+image image_pad stage zeros done raw raw_rows auto break case char const continue default do double
+else enum extern float for goto if inline int long register restrict return short signed sizeof
+static struct switch typedef union unsigned void volatile while
 """
 """Words of C, and other members of the state."""
 SHARED = "passing_"
@@ -222,6 +253,16 @@ def along(conv: Conv) -> bool:
     """Whether a convolution's C slides along the row, and needs no columns of padding there."""
     same = conv.stride == 1 and conv.padding == conv.dilation
     return conv.depthwise and conv.kernel == 3 and same
+
+
+def taps_of(conv: Conv) -> int:
+    """Pointers of a convolution.
+
+    A pointer leads to one row of the kernel, whose columns stand side by side in memory; with
+    dilation they do not, and each weight of the kernel has a pointer of its own.
+    """
+    spread = conv.dilation > 1 and not conv.depthwise and conv.kernel > 1
+    return conv.kernel**2 if spread else conv.kernel
 
 
 def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
@@ -240,3 +281,8 @@ def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
         ring=ring,
         signed=bool(index) and steps[index - 1].layer.signed,
     )
+
+
+def up(size: int, step: int) -> int:
+    """The next multiple of ``step``."""
+    return -(-size // step) * step

@@ -7,12 +7,13 @@ from dmrl.deploy.c.layers import (
     constants,
     declarations,
     kernels,
-    longest_zero_row,
     require_carried,
     row_function,
 )
-from dmrl.deploy.c.places import one_row, slot
+from dmrl.deploy.c.memories import split, traffic_bytes
+from dmrl.deploy.c.places import marked_unused, one_row, slot, state_names
 from dmrl.deploy.c.plan import Buffer, Plan, plan
+from dmrl.deploy.c.state import members, rings
 from dmrl.deploy.c.text import array, fill
 from dmrl.deploy.integer import SUBPIXEL, Head, IntegerNetwork
 from dmrl.deploy.integer_layers import GAIN_SHIFT
@@ -31,7 +32,9 @@ class Source:
     code, header
         Text of the two files.
     state_bytes, bayer_bytes
-        Bytes of the state, and what raw Bayer images add to it.
+        Bytes of the state, the near one where there are two, and what raw Bayer images add to it.
+    far_bytes, traffic_bytes
+        Bytes of the far state, and those that an image copies to it and from it; 0: there is none.
     constant_bytes
         Bytes of weights and tables.
     stack_bytes
@@ -42,12 +45,19 @@ class Source:
     header: str
     state_bytes: int
     bayer_bytes: int
+    far_bytes: int
+    traffic_bytes: int
     constant_bytes: int
     stack_bytes: int = STACK_BYTES
 
 
 def source(
-    network: IntegerNetwork, names: dict[str, str], *, bayer: bool, features: bool = False
+    network: IntegerNetwork,
+    names: dict[str, str],
+    *,
+    bayer: bool,
+    features: bool = False,
+    near_bytes: int | None = None,
 ) -> Source:
     """The C file and the header of a network.
 
@@ -61,46 +71,39 @@ def source(
         Whether images are raw colour mosaics unless the user's compiler flags say otherwise.
     features
         Whether the state holds all that the last layer reads, for `refinement`.
+    near_bytes
+        Bytes of a near memory; what does not fit goes to a far one, see `memories`. None: one
+        memory holds all.
 
     Raises
     ------
     ModelError
         If the C does not carry the network; the layer is named.
+    SettingError
+        If the near memory is too small in any case.
     """
     planned = plan(network, features=features)
     require_carried(planned)
+    if near_bytes is not None:
+        planned = split(planned, near_bytes)
+    names = {**names, **state_names(planned, names["prefix"])}
     weights, weight_bytes = constants(planned)
     tables = {f"{name}_table": head for name, head in network.heads.items()}
-    zeros = longest_zero_row(planned)
-    counters = 2 * len(planned.buffers)
-    used = counters + sum(planned.homes.values()) + _pad_bytes(planned)
     done = Source(
-        code=_code(planned, names, weights, tables, zeros),
+        code=_code(planned, names, weights, tables),
         header="",
-        state_bytes=_even(used),
-        bayer_bytes=_even(used + 2 + 3 * network.width_px) - _even(used),
-        constant_bytes=weight_bytes + 512 * len(tables) + zeros,
+        state_bytes=planned.state_bytes(bayer=False),
+        bayer_bytes=planned.state_bytes(bayer=True) - planned.state_bytes(bayer=False),
+        far_bytes=sum(planned.homes(far=True).values()),
+        traffic_bytes=traffic_bytes(planned),
+        constant_bytes=weight_bytes
+        + 512 * len(tables)
+        + (0 if planned.stage else planned.zero_bytes),
     )
     return replace(done, header=_header(planned, names, done, bayer=bayer))
 
 
-def _even(size: int) -> int:
-    return (size + 1) // 2 * 2
-
-
-def _pad_bytes(planned: Plan) -> int:
-    image = planned.buffers[0]
-    return image.row_bytes + image.gap * image.channels if _has_pad(image) else 0
-
-
-def _has_pad(image: Buffer) -> bool:
-    """Whether the image needs a row of padding of its own."""
-    return image.above and image.pad_value != 0
-
-
-def _code(
-    planned: Plan, names: dict[str, str], weights: str, tables: dict[str, Head], zeros: int
-) -> str:
+def _code(planned: Plan, names: dict[str, str], weights: str, tables: dict[str, Head]) -> str:
     image, steps, prefix = planned.buffers[0], planned.steps, names["prefix"]
     parts = [
         fill("prelude.c", **names, gain_shift=GAIN_SHIFT),
@@ -109,14 +112,15 @@ def _code(
     ]
     parts.append("/* Defined at the end of the file. */\n" + declarations(planned))
     parts += [f"static const {_table_type(n)} {n}[256];\n" for n in tables]
-    if zeros:
+    if planned.zero_bytes and not planned.stage:
         parts.append(
-            f"\nstatic const uint8_t zeros[{zeros}] = {{0}}; /* padding above and below */\n"
+            f"\nstatic const uint8_t zeros[{planned.zero_bytes}] = {{0}}; "
+            "/* padding above and below */\n"
         )
-    parts.append("\n")
+    parts.append("\n" + (fill("stage.c", **names) if planned.stage else ""))
     read = {k for step in steps for k in step.sources}
     several = [b for k in sorted(read) if not one_row(b := planned.buffers[k])]
-    parts += [_row_access(b, prefix) for b in several]
+    parts += [_row_access(planned, b, names) for b in several]
     parts += [row_function(planned, k, prefix) for k in range(len(steps))]
     parts.append(_schedule(planned, names))
     mosaic = fill("bayer.c", **names, store=_store(image.channels))
@@ -136,15 +140,17 @@ def _table_type(name: str) -> str:
     return "int16_t" if name.startswith("offset") else "uint16_t"
 
 
-def _row_access(buffer: Buffer, prefix: str) -> str:
+def _row_access(planned: Plan, buffer: Buffer, names: dict[str, str]) -> str:
     """C function that gives a row of a buffer, or of its padding."""
-    outside = ""
+    text = f"    return {slot(buffer)};\n"
     if buffer.above:
-        pad = "net->image_pad" if _has_pad(buffer) else "zeros"
-        outside = f"    if (row < 0 || row >= {buffer.rows})\n        return {pad};\n"
+        zeros = "net->zeros" if planned.stage else "zeros"
+        pad = "net->image_pad" if buffer.pad_value else zeros
+        text = f"    if (row < 0 || row >= {buffer.rows})\n        return {pad};\n{text}"
+    unused = marked_unused(text, *names["args"].split(", "))
     return (
-        f"static const uint8_t *row_of_{buffer.name}(const {prefix}_t *net, int row)\n"
-        f"{{\n{outside}    return {slot(buffer)};\n}}\n\n"
+        f"static const uint8_t *row_of_{buffer.name}({names['reads']}, int row)\n"
+        f"{{\n{unused}{text}}}\n\n"
     )
 
 
@@ -162,16 +168,28 @@ def _schedule(planned: Plan, names: dict[str, str]) -> str:
             planned.buffers[k + 1].rows,
         )
         table += f"    {{{', '.join(map(str, numbers))}}}, /* {step.name} */\n"
-        cases += f"    case {k}: make_{step.name}(net, row); break;\n"
-    image, pads = planned.buffers[0], ""
-    padded = {b.home: b.pad_value for b in planned.buffers if b.gap}
-    for home, value in padded.items():
-        pads += f"    fill(net->{home}, {value}, sizeof net->{home});\n"
-    if _has_pad(image):
-        pads += f"    fill(net->image_pad, {image.pad_value}, sizeof net->image_pad);\n"
+        cases += f"    case {k}: make_{step.name}({names['args']}, row); break;\n"
     return fill(
-        "schedule.c", **names, count=len(planned.steps), table=table, cases=cases, pads=pads
+        "schedule.c",
+        **names,
+        count=len(planned.steps),
+        table=table,
+        cases=cases,
+        pads=_pads(planned, names),
     )
+
+
+def _pads(planned: Plan, names: dict[str, str]) -> str:
+    """C that fills what no layer writes."""
+    places = {
+        f"{'away' if b.far else 'net'}->{b.home}": b.pad_value for b in planned.buffers if b.gap
+    }
+    if planned.pad_bytes:
+        places["net->image_pad"] = planned.buffers[0].pad_value
+    if planned.zero_bytes and planned.stage:
+        places["net->zeros"] = 0
+    text = "".join(f"    fill({at}, {value}, sizeof {at});\n" for at, value in places.items())
+    return marked_unused("net" + text, *names["args"].split(", ")) + text
 
 
 def _store(channels: int) -> str:
@@ -247,31 +265,18 @@ def _header(planned: Plan, names: dict[str, str], done: Source, *, bayer: bool) 
         threshold=f"{network.threshold:g}",
         threshold_step=network.threshold_q,
         state_bytes=done.state_bytes,
-        plain_bytes=done.state_bytes,
         bayer_bytes=done.bayer_bytes,
         heads=", ".join(_head_name(names, name) for name in network.heads),
-        members=_members(planned).replace("@", names["PREFIX"]),
+        far=_far(planned, names, done) if done.far_bytes else "",
+        members=members(planned, names["PREFIX"]),
     )
 
 
-def _members(planned: Plan) -> str:
-    lines = [f"    int16_t done[{len(planned.buffers)}]; /* rows of each tensor that are there */"]
-    lines += ["#if @_BAYER", "    int16_t raw_rows;", "    uint8_t raw[3][@_WIDTH];", "#endif"]
-    for name, size in planned.homes.items():
-        held = [b for b in planned.buffers if b.home == name]
-        text = _columns(held[0])
-        if len(held) > 1 and held[0].ring > 1:
-            text = f"{held[0].ring} rows of {len(held)} layers, which take turns"
-        elif len(held) > 1:
-            text = f"rows of {len(held)} layers, each read at once by the next"
-        lines.append(f"    uint8_t {name}[{size}]; /* {text} */")
-    if _has_pad(planned.buffers[0]):
-        lines.append(f"    uint8_t image_pad[{_pad_bytes(planned)}];")
-    return "\n".join(lines) + "\n"
-
-
-def _columns(buffer: Buffer) -> str:
-    rows = f"{buffer.ring} of {buffer.rows} rows" if buffer.ring < buffer.rows else "whole"
-    padding = f" and {buffer.gap} of padding" if buffer.gap else ""
-    kind = "int8" if buffer.signed else "uint8"
-    return f"{rows}: {buffer.cols} pixels{padding} x {buffer.channels} {kind}"
+def _far(planned: Plan, names: dict[str, str], done: Source) -> str:
+    return fill(
+        "far.h",
+        **names,
+        far_bytes=done.far_bytes,
+        traffic_bytes=done.traffic_bytes,
+        members=rings(planned, far=True),
+    )

@@ -78,11 +78,11 @@ int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int m
     return $count;
 }
 
-int ${prefix}_run(${prefix}_t *net, const uint8_t *image, ${prefix}_detection_t *found, int most)
+int ${prefix}_run($params, const uint8_t *image, ${prefix}_detection_t *found, int most)
 {
-    ${prefix}_init(net);
+    ${prefix}_init($args);
     for (int row = 0; row < ${PREFIX}_HEIGHT; row++)
-        ${prefix}_row(net, image + row * ${PREFIX}_ROW_BYTES);
+        ${prefix}_row($args, image + row * ${PREFIX}_ROW_BYTES);
     return ${prefix}_detect(net, found, most);
 }
 

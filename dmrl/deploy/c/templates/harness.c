@@ -7,11 +7,52 @@
 #include "$prefix.h"
 
 static ${prefix}_t net;
+#ifdef ${PREFIX}_FAR_BYTES
+static ${prefix}_far_t away;
+#define STATE &net, &away
+#else
+#define STATE &net
+#endif
+
+#if defined(HARNESS_GUARD) && defined(${PREFIX}_FAR_BYTES)
+/* Under the address sanitizer nothing but copies may touch the far state, and they copy as many
+ * bytes as the header states. */
+void __asan_poison_memory_region(const volatile void *place, size_t size);
+void __asan_unpoison_memory_region(const volatile void *place, size_t size);
+void *memmove(void *to, const void *from, size_t bytes);
+static long copied;
+
+void harness_copy(void *to, const void *from, int bytes)
+{
+    copied += bytes;
+    __asan_unpoison_memory_region(&away, sizeof away);
+    memmove(to, from, (size_t)bytes);
+    __asan_poison_memory_region(&away, sizeof away);
+}
+
+static int network(const uint8_t *image, ${prefix}_detection_t *found, int most)
+{
+    copied = 0;
+    __asan_unpoison_memory_region(&away, sizeof away);
+    ${prefix}_init(STATE);
+    __asan_poison_memory_region(&away, sizeof away);
+    for (int row = 0; row < ${PREFIX}_HEIGHT; row++)
+        ${prefix}_row(STATE, image + row * ${PREFIX}_ROW_BYTES);
+    if (copied != ${PREFIX}_TRAFFIC_BYTES)
+        __builtin_trap();
+    return ${prefix}_detect(&net, found, most);
+}
+#else
+static int network(const uint8_t *image, ${prefix}_detection_t *found, int most)
+{
+    return ${prefix}_run(STATE, image, found, most);
+}
+#endif
 
 /* Runs one image; `grids` takes every head's grid, `found` as many detections as it returns. */
 int harness_run(const uint8_t *image, int8_t *grids, ${prefix}_detection_t *found, int most)
 {
-    const int count = ${prefix}_run(&net, image, found, most);
+    const int count = network(image, found, most);
     for (int head = 0; head < ${PREFIX}_HEADS; head++)
         for (int row = 0; row < ${PREFIX}_ROWS; row++)
             for (int col = 0; col < ${PREFIX}_COLS; col++)
@@ -106,7 +147,7 @@ int main(void)
 {
     ${prefix}_head_init(&head);
     while (take(image, sizeof image) && take(seen, sizeof seen)) {
-        ${prefix}_run(&net, image, found, MOST);
+        network(image, found, MOST);
         ${prefix}_head_apply(&head, &net);
         ${prefix}_head_learn(&head, &net, seen[0], seen[1], seen[2], seen[3]);
         give(&head, sizeof head);

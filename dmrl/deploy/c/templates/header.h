@@ -44,7 +44,7 @@
 #define ${PREFIX}_THRESHOLD_STEP ($threshold_step)
 #endif
 
-#define ${PREFIX}_STATE_BYTES ($plain_bytes + (${PREFIX}_BAYER ? $bayer_bytes : 0))
+#define ${PREFIX}_STATE_BYTES ($state_bytes + (${PREFIX}_BAYER ? $bayer_bytes : 0))
 #define ${PREFIX}_STACK_BYTES $stack_bytes
 
 /* What the network gives for every cell. */
@@ -57,16 +57,16 @@ typedef struct {
     int8_t confidence_step;  /* the same as the network gives it; what peaks are compared by */
 } ${prefix}_detection_t;
 
-/* Rings of rows between the layers; yours to hold, not to touch. */
+$far/* Rings of rows between the layers; yours to hold, not to touch. */
 typedef struct {
 $members} ${prefix}_t;
 
 /* Makes ready for an image. Call it before the first row of every image. */
-void ${prefix}_init(${prefix}_t *net);
+void ${prefix}_init($params);
 
 /* Takes the next row, ${PREFIX}_ROW_BYTES bytes, and computes all that it allows; `row` may be
  * overwritten afterwards. Returns 1 once the image is whole; rows beyond that are ignored. */
-int ${prefix}_row(${prefix}_t *net, const uint8_t *row);
+int ${prefix}_row($params, const uint8_t *row);
 
 /* After the last row: writes at most `most` detections, best first, and returns how many. */
 int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int most);
@@ -79,6 +79,6 @@ int8_t ${prefix}_output(const ${prefix}_t *net, int head, int row, int col);
 int32_t ${prefix}_meaning(int head, int8_t value);
 
 /* All of it for an image that lies in memory, ${PREFIX}_IMAGE_BYTES bytes from the top left. */
-int ${prefix}_run(${prefix}_t *net, const uint8_t *image, ${prefix}_detection_t *found, int most);
+int ${prefix}_run($params, const uint8_t *image, ${prefix}_detection_t *found, int most);
 
 #endif

@@ -14,6 +14,12 @@
 #endif
 
 static ${prefix}_t net;
+#ifdef ${PREFIX}_FAR_BYTES
+static ${prefix}_far_t away;
+#define STATE &net, &away
+#else
+#define STATE &net
+#endif
 static ${prefix}_detection_t found[$most];
 static uint8_t line[${PREFIX}_ROW_BYTES];
 
@@ -47,9 +53,9 @@ static int same(const ${prefix}_detection_t *a, const ${prefix}_detection_t *b)
 static int passes(const vector_t *vector)
 {
     uint32_t state = 1;
-    ${prefix}_init(&net);
+    ${prefix}_init(STATE);
     for (int row = 0; row < ${PREFIX}_HEIGHT; row++)
-        ${prefix}_row(&net, next_row(vector, row, &state));
+        ${prefix}_row(STATE, next_row(vector, row, &state));
     const int count = ${prefix}_detect(&net, found, $most);
     int right = count == vector->count && checksum() == vector->checksum;
     for (int k = 0; k < count; k++) {

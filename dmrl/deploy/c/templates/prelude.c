@@ -74,3 +74,21 @@ INLINE uint8_t scaled(int32_t sum, int32_t multiplier, int shift, int32_t low, i
     return (uint8_t)clamped;
 }
 
+/* Compilers would make these two loops calls of memset and memcpy, which not every target has:
+ * hence volatile. */
+static void fill(uint8_t *out, uint8_t value, size_t count)
+{
+    volatile uint8_t *to = out;
+    for (size_t i = 0; i < count; i++)
+        to[i] = value;
+}
+
+static void copy(uint8_t *out, const uint8_t *values, int count)
+{
+    volatile uint8_t *to = out;
+    for (; count >= 4; count -= 4, to += 4, values += 4)
+        to[0] = values[0], to[1] = values[1], to[2] = values[2], to[3] = values[3];
+    for (int i = 0; i < count; i++)
+        to[i] = values[i];
+}
+

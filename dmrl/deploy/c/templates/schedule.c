@@ -8,7 +8,7 @@ typedef struct {
 static const layer_t layers[$count] = {
 $table};
 
-static void compute(${prefix}_t *net, int layer, int row)
+static void compute($params, int layer, int row)
 {
     switch (layer) {
 $cases    }
@@ -25,12 +25,12 @@ static int ready(const ${prefix}_t *net, int index)
 
 /* Makes every output row that can be made: of all layers that are ready the deepest first. Those
  * below were not before a row was made; those that read the row may be now. */
-static void advance(${prefix}_t *net)
+static void advance($params)
 {
     int layer = $count - 1;
     while (layer >= 0) {
         if (ready(net, layer)) {
-            compute(net, layer, net->done[layer + 1]);
+            compute($args, layer, net->done[layer + 1]);
             net->done[layer + 1]++;
             layer = layers[layer].reader;
         } else {
@@ -39,25 +39,7 @@ static void advance(${prefix}_t *net)
     }
 }
 
-/* Compilers would make these two loops calls of memset and memcpy, which not every target has:
- * hence volatile. */
-static void fill(uint8_t *out, uint8_t value, size_t count)
-{
-    volatile uint8_t *to = out;
-    for (size_t i = 0; i < count; i++)
-        to[i] = value;
-}
-
-static void copy(uint8_t *out, const uint8_t *values, int count)
-{
-    volatile uint8_t *to = out;
-    for (; count >= 4; count -= 4, to += 4, values += 4)
-        to[0] = values[0], to[1] = values[1], to[2] = values[2], to[3] = values[3];
-    for (int i = 0; i < count; i++)
-        to[i] = values[i];
-}
-
-void ${prefix}_init(${prefix}_t *net)
+void ${prefix}_init($params)
 {
     fill((uint8_t *)net->done, 0, sizeof net->done);
 #if ${PREFIX}_BAYER

@@ -1,0 +1,134 @@
+"""Two memories: rings of long reach in the large, far one; in the near one what layers work on.
+
+A GAP8 has 64 kB of L1, in which its cores work without waiting, and 512 kB of L2. While a step
+makes a row, its tables and the rows of far rings that it reads lie in the stage, a part of the near
+memory; what it makes of a far ring goes out from there.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+
+from dmrl.deploy.c.plan import SHARED, Plan, taps_of, up
+from dmrl.deploy.c.rings import Step
+from dmrl.deploy.integer import Conv, MaxPool
+from dmrl.errors import SettingError
+
+MOST_CHOICES = 12
+"""Rings that may be far, the largest: every choice of them is tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What of one kind lies in the stage while a step makes a row.
+
+    Parameters
+    ----------
+    size_bytes, count
+        Of one, and how many.
+    at
+        Where the first lies.
+    """
+
+    size_bytes: int
+    count: int
+    at: int
+
+    @property
+    def end(self) -> int:
+        """Where the next kind may lie."""
+        return up(self.at + self.size_bytes * self.count, 4)
+
+
+def loads(plan: Plan, index: int) -> dict[str, Load]:
+    """What lies in the stage while a step makes a row: its tables, and rows of far rings.
+
+    Returns
+    -------
+    dict
+        By kind: "scales", "gains", "weights", "0" and "1" of the inputs, "out"; empty where there
+        is one memory.
+    """
+    if not plan.stage:
+        return {}
+    step, out = plan.steps[index], plan.buffers[index + 1]
+    inputs = [plan.buffers[k] for k in step.sources]
+    sizes: list[tuple[str, int, int]] = []
+    if isinstance(step.layer, Conv):
+        conv = step.layer
+        tables = {"scales": 8 * conv.bias.size, "gains": 4 * conv.gain.size}
+        sizes = [(k, n, 1) for k, n in (tables | {"weights": conv.weight.size}).items() if n]
+    rows = (rows_read(step), 1)
+    sizes += [(f"{k}", b.padded_bytes, rows[k]) for k, b in enumerate(inputs) if b.far]
+    sizes += [("out", out.cols * out.channels, 1)] if out.far else []
+    staged: dict[str, Load] = {}
+    at = 0
+    for name, size, count in sizes:
+        staged[name] = Load(size, count, at)
+        at = staged[name].end
+    return staged
+
+
+def rows_read(step: Step) -> int:
+    """Rows of its first input that a step has pointers to while it makes a row."""
+    if isinstance(step.layer, Conv):
+        return taps_of(step.layer) * (2 if step.pooled else 1)
+    return 2 if isinstance(step.layer, MaxPool) else 1
+
+
+def traffic_bytes(plan: Plan) -> int:
+    """Bytes that an image copies between the two memories; 0 where there is one."""
+    return sum(
+        load.size_bytes * load.count * out.rows
+        for index, out in enumerate(plan.buffers[1:])
+        for load in loads(plan, index).values()
+    )
+
+
+def split(plan: Plan, most_bytes: int) -> Plan:
+    """The plan as it is where it fits; else with two memories, and the fewest bytes copied.
+
+    Parameters
+    ----------
+    plan
+        With one memory.
+    most_bytes
+        That the near state may have, for raw Bayer images too.
+
+    Raises
+    ------
+    SettingError
+        If it has more in any case.
+    """
+    if plan.state_bytes(bayer=True) <= most_bytes:
+        return plan
+    ways = [_with_far(plan, far) for far in _choices(plan)]
+    sizes = [way.state_bytes(bayer=True) for way in ways]
+    fitting = [
+        (traffic_bytes(way), size, k)
+        for k, (way, size) in enumerate(zip(ways, sizes, strict=True))
+        if size <= most_bytes
+    ]
+    if fitting:
+        return ways[min(fitting)[-1]]
+    least = min([*sizes, plan.state_bytes(bayer=True)])
+    raise SettingError(
+        f"{plan.network.name} keeps at least {least:,} bytes in the near memory, of which "
+        f"{most_bytes:,} are given. Give more: --l1-kb"
+    )
+
+
+def _choices(plan: Plan) -> list[tuple[str, ...]]:
+    """Sets of members of the state that may be far."""
+    near, sizes = {plan.buffers[k].home for k in plan.whole | {0}}, plan.homes(far=False)
+    rings = [name for name in sizes if name not in near and not name.startswith(SHARED)]
+    rings = sorted(rings, key=lambda name: -sizes[name])[:MOST_CHOICES]
+    return [
+        far for count in range(1, len(rings) + 1) for far in itertools.combinations(rings, count)
+    ]
+
+
+def _with_far(plan: Plan, far: tuple[str, ...]) -> Plan:
+    buffers = tuple(replace(b, far=b.home in far) for b in plan.buffers)
+    draft = replace(plan, buffers=buffers, stage=1)
+    ends = [load.end for k in range(len(plan.steps)) for load in loads(draft, k).values()]
+    return replace(draft, stage=max(ends))

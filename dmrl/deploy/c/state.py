@@ -1,0 +1,45 @@
+"""Members of the state, as C text."""
+
+from dmrl.deploy.c.plan import Buffer, Plan
+
+
+def members(planned: Plan, prefix: str) -> str:
+    """Members of the state, of the near one where there are two; ``prefix`` is that of macros."""
+    stage = [
+        f"    int32_t stage[{planned.stage // 4}]; /* tables and far rows of the layer at work */"
+    ]
+    lines = stage if planned.stage else []
+    lines += [f"    int16_t done[{len(planned.buffers)}]; /* rows of each tensor that are there */"]
+    lines += [
+        f"#if {prefix}_BAYER",
+        "    int16_t raw_rows;",
+        f"    uint8_t raw[3][{prefix}_WIDTH];",
+        "#endif",
+    ]
+    lines.append(rings(planned, far=False).rstrip("\n"))
+    if planned.zero_bytes and planned.stage:
+        lines.append(f"    uint8_t zeros[{planned.zero_bytes}]; /* padding above and below */")
+    if planned.pad_bytes:
+        lines.append(f"    uint8_t image_pad[{planned.pad_bytes}];")
+    return "\n".join(lines) + "\n"
+
+
+def rings(planned: Plan, *, far: bool) -> str:
+    """Members of the near or of the far state that hold rings."""
+    lines = []
+    for name, size in planned.homes(far=far).items():
+        held = [b for b in planned.buffers if b.home == name]
+        text = _columns(held[0])
+        if len(held) > 1 and held[0].ring > 1:
+            text = f"{held[0].ring} rows of {len(held)} layers, which take turns"
+        elif len(held) > 1:
+            text = f"rows of {len(held)} layers, each read at once by the next"
+        lines.append(f"    uint8_t {name}[{size}]; /* {text} */")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _columns(buffer: Buffer) -> str:
+    rows = f"{buffer.ring} of {buffer.rows} rows" if buffer.ring < buffer.rows else "whole"
+    padding = f" and {buffer.gap} of padding" if buffer.gap else ""
+    kind = "int8" if buffer.signed else "uint8"
+    return f"{rows}: {buffer.cols} pixels{padding} x {buffer.channels} {kind}"

@@ -1,0 +1,159 @@
+"""Two memories: what lies in which, and that layers work in the near one alone."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.deploy.c import L1_FOR_STATE, write_c
+from dmrl.deploy.c.memories import split, traffic_bytes
+from dmrl.deploy.c.plan import Plan, plan
+from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.measure import Memory, memory_of
+from dmrl.deploy.targets import SANITIZERS, Build, Target
+from dmrl.deploy.verification import TargetResult, expected, prove
+from dmrl.errors import SettingError
+
+from .graphs import quantised_network, untrained
+from .networks import random_network
+
+GUARDED = Target("sanitizers", (Build("-O1", "gcc", SANITIZERS),))
+no_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+
+
+def smallest(network: IntegerNetwork) -> int:
+    """The least near memory that will do, as the error says; 0: all of it has to be near."""
+    whole = plan(network)
+    with pytest.raises(SettingError, match="at least") as error:
+        split(whole, 0)
+    least = int(re.findall(r"at least (\S+) bytes", str(error.value))[0].replace(",", ""))
+    return least if least < whole.state_bytes(bayer=True) else 0
+
+
+def splittable(seed: int) -> IntegerNetwork:
+    """A random network that gains by a far memory; of every hundredth seed from this one on."""
+    make = random_network if seed % 2 else quantised_network
+    return next(n for k in range(seed, 10_000, 100) if smallest(n := make(k)))
+
+
+def proved(network: IntegerNetwork, folder: Path, near_bytes: int) -> TargetResult:
+    write_c(network, folder, [], near_bytes=near_bytes)
+    return prove(network, folder, GUARDED, expected(network, images(network)))
+
+
+def images(network: IntegerNetwork) -> list[np.ndarray]:
+    shape = (3, network.height_px, network.width_px, network.channels)
+    return list(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8))
+
+
+@no_gcc
+@pytest.mark.heavy
+@pytest.mark.parametrize("seed", [*range(4), 5, 12, 15, 19, 47])  # every way to read rows
+def test_layers_touch_the_near_memory_alone_and_copy_as_much_as_is_stated(
+    seed: int, tmp_path: Path
+) -> None:
+    network = splittable(seed)
+    result = proved(network, tmp_path, smallest(network))
+    assert (result.error, result.mismatches) == ("", 0)
+    assert memory_of(network, tmp_path).far_bytes > 0
+
+
+@no_gcc
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", ["dmrl-nano", "dmrl-nano-fine", "locanet"])
+def test_networks_that_ship_come_through_bit_for_bit(name: str, tmp_path: Path) -> None:
+    network = untrained(name, 176, 96)
+    result = proved(network, tmp_path, smallest(network))
+    assert (result.error, result.mismatches) == ("", 0)
+
+
+@no_gcc
+@pytest.mark.heavy
+def test_a_layer_that_works_in_the_far_memory_is_found_out(tmp_path: Path) -> None:
+    network = splittable(3)
+    write_c(network, tmp_path, [], near_bytes=smallest(network))
+    code = tmp_path / "random.c"
+    text = code.read_text()
+    assert "    return to;" in text
+    code.write_text(text.replace("    return to;", "    return from;"))
+    result = prove(network, tmp_path, GUARDED, expected(network, images(network)))
+    assert result.error
+
+
+@no_gcc
+@pytest.mark.heavy
+def test_less_copied_than_stated_is_found_out(tmp_path: Path) -> None:
+    network = splittable(3)
+    write_c(network, tmp_path, [], near_bytes=smallest(network))
+    header = tmp_path / "random.h"
+    stated = memory_of(network, tmp_path).traffic_bytes
+    header.write_text(header.read_text().replace(f"({stated})", f"({stated + 1})"))
+    assert prove(network, tmp_path, GUARDED, expected(network, images(network))).error
+
+
+@no_gcc
+def test_the_c_with_two_memories_is_strict_c99_without_a_warning(tmp_path: Path) -> None:
+    flags = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
+    for seed in range(4):
+        network = splittable(seed)
+        write_c(network, tmp_path, [], near_bytes=smallest(network))
+        for more in ("-DRANDOM_BAYER=0", "-DRANDOM_BAYER=1", "-DRANDOM_COPY=dma"):
+            command = ["gcc", *flags, more, "-fsyntax-only", "random.c"]
+            subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+
+
+@no_gcc
+@pytest.mark.heavy
+def test_the_self_test_passes_with_two_memories(tmp_path: Path) -> None:
+    network = splittable(0)
+    write_c(network, tmp_path, images(network)[:1], near_bytes=smallest(network))
+    done = subprocess.run(["make", "test"], cwd=tmp_path, check=True, capture_output=True)
+    assert done.stdout.count(b"as the reference") == 2
+    assert "run(&net, &away, image" in (tmp_path / "README.md").read_text()
+
+
+@pytest.mark.heavy
+def test_what_ships_fits_a_gap8_with_the_rings_of_long_reach_far() -> None:
+    nano, fine = plan(untrained("dmrl-nano")), plan(untrained("dmrl-nano-fine"))
+    for whole, far in ((nano, {"body_5_0"}), (fine, {"body_1_0", "body_9_0"})):
+        two = split(whole, L1_FOR_STATE)
+        assert set(two.homes(far=True)) == far
+        assert two.state_bytes(bayer=True) <= L1_FOR_STATE
+    rows = traffic_bytes(split(nano, L1_FOR_STATE)) - tables(nano)
+    # A row of 40 x 48: five depthwise read three, five shortcuts one, five layers write one.
+    assert rows == 28 * 40 * 48 * (5 * 3 + 5 + 5)
+
+
+def tables(whole: Plan) -> int:
+    """Bytes of weights, biases, multipliers and gains that every row of every step takes."""
+    total = 0
+    for step, out in zip(whole.steps, whole.buffers[1:], strict=True):
+        layer = step.layer
+        total += out.rows * (layer.weight.size + 8 * layer.bias.size + 4 * layer.gain.size)
+    return total
+
+
+def test_of_all_that_fits_the_least_is_copied() -> None:
+    network = splittable(5)
+    whole = plan(network)
+    least, most = smallest(network), whole.state_bytes(bayer=True)
+    assert split(whole, most) is whole
+    sizes = range(least, most, 64)
+    ways = [split(whole, size) for size in sizes]
+    copied = [traffic_bytes(way) for way in ways]
+    assert all(w.state_bytes(bayer=True) <= size for w, size in zip(ways, sizes, strict=True))
+    assert copied == sorted(copied, reverse=True)
+    with pytest.raises(SettingError, match=rf"at least {least:,} bytes .* {least - 4:,} are given"):
+        split(whole, least - 4)
+
+
+def test_the_header_states_both_sizes(tmp_path: Path) -> None:
+    network = splittable(1)
+    write_c(network, tmp_path, [], near_bytes=smallest(network))
+    two = split(plan(network), smallest(network))
+    far = sum(two.homes(far=True).values())
+    wanted = Memory(two.state_bytes(bayer=False), far, traffic_bytes(two))
+    assert memory_of(network, tmp_path) == wanted
