@@ -128,9 +128,8 @@ def _instructions(
     # Version 1 of the plugin interface until QEMU 9, which no longer takes it.
     version = 1 if emulator_version() < 9 else 2
     flags = ("-O2", "-shared", "-fPIC", f"-DPLUGIN_VERSION={version}")
-    program = Build("-O3", RISCV, ("-O3", *RISCV_FLAGS), emulated=True).program(
-        network, folder, build
-    )
+    harness = ("-O3", *RISCV_FLAGS, "-DHARNESS_COUNT")
+    program = Build("-O3", RISCV, harness, emulated=True).program(network, folder, build)
     counts = []
     try:
         run((host_compiler(), *flags, source, "-o", plugin), "counting instructions")

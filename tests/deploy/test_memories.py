@@ -63,7 +63,7 @@ def test_layers_touch_the_near_memory_alone_and_copy_as_much_as_is_stated(
 
 @no_gcc
 @pytest.mark.heavy
-@pytest.mark.parametrize("name", ["dmrl-nano", "dmrl-nano-fine", "locanet"])
+@pytest.mark.parametrize("name", ["dmrl-nano", "dmrl-nano-fine"])
 def test_networks_that_ship_come_through_bit_for_bit(name: str, tmp_path: Path) -> None:
     network = untrained(name, 176, 96)
     result = proved(network, tmp_path, smallest(network))

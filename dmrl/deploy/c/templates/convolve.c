@@ -22,26 +22,33 @@ INLINE void convolve_$suffixes(const uint8_t *const *in, uint8_t *out, const int
     for (int next = 0; next < outs; next += 4) {
         const int o = smallest(next, outs - 4);
         const scale_t *scale = scales + o;
+        const int8_t *filters = weights + o * filter;
+        uint8_t *row = out + o;
+        const $other *added = adds ? (const $other *)shortcut + o : 0;
+        const int32_t *gain = adds ? gains + o : 0;
         for (int after = 0; after < cols; after += 4) {
             const int x = smallest(after, cols - 4);
-            uint8_t *place = out + x * outs + o;
-            int32_t sum[16];
-            AS_IT_IS(place);
-            block_$suffix(sum, scale, in, weights + o * filter, taps, run, x * step, step, 0);
+            int32_t sum[16]; /* begun with what is added, while registers are free */
+            for (int k = 0; k < 16; k++)
+                sum[k] = scale[k % 4].bias;
             if (adds) {
-                const $other *s = (const $other *)shortcut + x * outs + o;
-                const int32_t g[4] = {gains[o], gains[o + 1], gains[o + 2], gains[o + 3]};
+                const $other *s = added + x * outs;
+                AS_IT_IS(s);
+                const int32_t g[4] = {gain[0], gain[1], gain[2], gain[3]};
                 for (int k = 0; k < 16; k++) {
                     sum[k] += gained(g[k % 4], s[k / 4 * outs + k % 4]);
                     AS_IT_IS(sum[k]);
                 }
             }
+            block_$suffix(sum, in, filters, taps, run, x * step, step, 0);
+            uint8_t *place = row + x * outs;
+            AS_IT_IS(place);
             const int32_t m[4] = {scale[0].multiplier, scale[1].multiplier, scale[2].multiplier,
                                   scale[3].multiplier};
             int32_t most = high;
             AS_IT_IS(most); /* once a block, not once a value */
             for (int k = 0; k < 16; k++)
-                place[k / 4 * outs + k % 4] = scaled(sum[k], m[k % 4], shift, low, most);
+                store(&place[k / 4 * outs + k % 4], sum[k], m[k % 4], shift, low, most);
         }
     }
 }

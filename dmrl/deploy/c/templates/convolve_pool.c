@@ -10,7 +10,9 @@ INLINE void convolve_pool_$suffix(const uint8_t *const *in, uint8_t *out, const 
         for (int x = 0; x < cols; x++) {
             const scale_t *scale = scales + o;
             int32_t sum[16];
-            block_$suffix(sum, scale, in, weights + o * filter, taps, run, 2 * x * step, step, 1);
+            for (int k = 0; k < 16; k++)
+                sum[k] = scale[k % 4].bias;
+            block_$suffix(sum, in, weights + o * filter, taps, run, 2 * x * step, step, 1);
             for (int k = 0; k < 4; k++)
                 out[x * outs + o + k] = scaled(
                     largest(largest(sum[k], sum[k + 4]), largest(sum[k + 8], sum[k + 12])),

@@ -33,24 +33,33 @@ INLINE int32_t dot_$suffix(int32_t sum, const uint8_t *const *in, const int8_t *
         IN_ORDER;                                                         \
     }
 
-/* The sums of four output channels at four pixels: four side by side, `step` values apart, the
- * first at in[t] + at; or two of each of two rows, where a 2x2 max-pool follows. */
-INLINE void block_$suffix(int32_t sum[16], const scale_t *scales, const uint8_t *const *in,
-                     const int8_t *weights, int taps, int run, int at, int step, int pooled)
+#define EIGHT_$suffix(i)                                                                  \
+    FOUR_$suffix(i) FOUR_$suffix((i) + 1) FOUR_$suffix((i) + 2) FOUR_$suffix((i) + 3)         \
+    FOUR_$suffix((i) + 4) FOUR_$suffix((i) + 5) FOUR_$suffix((i) + 6) FOUR_$suffix((i) + 7)
+
+/* Adds to the sums of four output channels at four pixels: four side by side, `step` values apart,
+ * the first at in[t] + at; or two of each of two rows, where a 2x2 max-pool follows. */
+INLINE void block_$suffix(int32_t sum[16], const uint8_t *const *in, const int8_t *weights,
+                     int taps, int run, int at, int step, int pooled)
 {
     const int filter = taps * run;
-    int32_t a0 = scales[0].bias, a1 = scales[1].bias, a2 = scales[2].bias, a3 = scales[3].bias;
-    int32_t b0 = a0, b1 = a1, b2 = a2, b3 = a3, c0 = a0, c1 = a1, c2 = a2, c3 = a3;
-    int32_t d0 = a0, d1 = a1, d2 = a2, d3 = a3;
+    int32_t a0 = sum[0], a1 = sum[1], a2 = sum[2], a3 = sum[3];
+    int32_t b0 = sum[4], b1 = sum[5], b2 = sum[6], b3 = sum[7];
+    int32_t c0 = sum[8], c1 = sum[9], c2 = sum[10], c3 = sum[11];
+    int32_t d0 = sum[12], d1 = sum[13], d2 = sum[14], d3 = sum[15];
     for (int t = 0; t < taps; t++) {
         const $type *x = (const $type *)in[t] + at;
         const $type *y = pooled ? (const $type *)in[t + taps] + at : x + 2 * step;
         const int8_t *w = weights + t * run;
-        for (const int8_t *end = w + run / 8 * 8; w != end; x += 8, y += 8, w += 8) {
+        for (const int8_t *end = w + run / 16 * 16; w != end; x += 16, y += 16, w += 16) {
             if (!pooled)
                 y = x + 2 * step;
-            FOUR_$suffix(0) FOUR_$suffix(1) FOUR_$suffix(2) FOUR_$suffix(3)
-            FOUR_$suffix(4) FOUR_$suffix(5) FOUR_$suffix(6) FOUR_$suffix(7)
+            EIGHT_$suffix(0)
+            EIGHT_$suffix(8)
+        }
+        if (run % 16 >= 8) {
+            EIGHT_$suffix(0)
+            x += 8, y += 8, w += 8;
         }
         for (int i = 0; i < run % 8; i++)
             FOUR_$suffix(i)
@@ -62,7 +71,7 @@ INLINE void block_$suffix(int32_t sum[16], const scale_t *scales, const uint8_t 
 }
 #else
 /* Large cores take several values of a run at once, and two pixels fill their registers. */
-INLINE void pair_$suffix(int32_t sum[8], const scale_t *scales, const uint8_t *const *in,
+INLINE void pair_$suffix(int32_t sum[8], const uint8_t *const *in,
                     const int8_t *weights, int taps, int run, int at, int step)
 {
     const int filter = taps * run;
@@ -73,17 +82,15 @@ INLINE void pair_$suffix(int32_t sum[8], const scale_t *scales, const uint8_t *c
         for (int i = 0; i < run; i++)
             PAIR_$suffix(i, x[i], x[i + step], a, b)
     }
-    sum[0] = a0, sum[1] = a1, sum[2] = a2, sum[3] = a3;
-    sum[4] = b0, sum[5] = b1, sum[6] = b2, sum[7] = b3;
-    for (int k = 0; k < 8; k++)
-        sum[k] += scales[k % 4].bias;
+    sum[0] += a0, sum[1] += a1, sum[2] += a2, sum[3] += a3;
+    sum[4] += b0, sum[5] += b1, sum[6] += b2, sum[7] += b3;
 }
 
-INLINE void block_$suffix(int32_t sum[16], const scale_t *scales, const uint8_t *const *in,
-                     const int8_t *weights, int taps, int run, int at, int step, int pooled)
+INLINE void block_$suffix(int32_t sum[16], const uint8_t *const *in, const int8_t *weights,
+                     int taps, int run, int at, int step, int pooled)
 {
-    pair_$suffix(sum, scales, in, weights, taps, run, at, step);
-    pair_$suffix(sum + 8, scales, pooled ? in + taps : in, weights, taps, run,
+    pair_$suffix(sum, in, weights, taps, run, at, step);
+    pair_$suffix(sum + 8, pooled ? in + taps : in, weights, taps, run,
             pooled ? at : at + 2 * step, step);
 }
 #endif

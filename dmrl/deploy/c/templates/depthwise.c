@@ -15,7 +15,7 @@ INLINE void depthwise_$suffix(const uint8_t *const *in, uint8_t *out, const int8
             const int32_t sum = scale.bias + p[0] * w0 + p[across] * w1 + p[2 * across] * w2
                                 + q[0] * w3 + q[across] * w4 + q[2 * across] * w5
                                 + r[0] * w6 + r[across] * w7 + r[2 * across] * w8;
-            out[x * channels + c] = scaled(sum, scale.multiplier, shift, low, high);
+            store(out + x * channels + c, sum, scale.multiplier, shift, low, high);
             p += step, q += step, r += step;
         }
     }

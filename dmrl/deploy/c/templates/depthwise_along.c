@@ -3,6 +3,15 @@
     (bias + (a##0 * w0 + b##0 * w1 + c##0 * w2) + (a##1 * w3 + b##1 * w4 + c##1 * w5) \
      + (a##2 * w6 + b##2 * w7 + c##2 * w8))
 
+/* Three values from one place on, and the columns that follow: what is loaded takes turns. */
+#define THREE(at)                                                                        \
+    c0 = p[((at) + 1) * step], c1 = q[((at) + 1) * step], c2 = r[((at) + 1) * step];     \
+    store(to + (at) * step, NINE(a, b, c), multiplier, shift, low, high);                \
+    a0 = p[((at) + 2) * step], a1 = q[((at) + 2) * step], a2 = r[((at) + 2) * step];     \
+    store(to + ((at) + 1) * step, NINE(b, c, a), multiplier, shift, low, high);          \
+    b0 = p[((at) + 3) * step], b1 = q[((at) + 3) * step], b2 = r[((at) + 3) * step];     \
+    store(to + ((at) + 2) * step, NINE(c, a, b), multiplier, shift, low, high);
+
 /* One output row of a depthwise 3x3 convolution of stride 1, with as much padding as dilation.
  * Every channel is convolved alone, its nine weights held while the row passes, and so are two of
  * the three columns: of columns `dilation` apart each is loaded once. What lies left and right
@@ -24,22 +33,22 @@ INLINE void depthwise_along_$suffix(const uint8_t *const *in, uint8_t *out, cons
             uint8_t *to = out + at;
             int32_t a0 = pad, a1 = pad, a2 = pad, b0 = p[0], b1 = q[0], b2 = r[0], c0, c1, c2;
             int left = (cols - 1 - first) / dilation; /* columns to the right of b */
-            for (; left >= 3; left -= 3) {
-                p += 3 * step, q += 3 * step, r += 3 * step, to += 3 * step;
+            for (; left >= 6; left -= 6) {
+                p += 6 * step, q += 6 * step, r += 6 * step, to += 6 * step;
                 AS_IT_IS(p); AS_IT_IS(q); AS_IT_IS(r); AS_IT_IS(to);
-                c0 = p[-2 * step], c1 = q[-2 * step], c2 = r[-2 * step];
-                to[-3 * step] = scaled(NINE(a, b, c), multiplier, shift, low, high);
-                a0 = p[-step], a1 = q[-step], a2 = r[-step];
-                to[-2 * step] = scaled(NINE(b, c, a), multiplier, shift, low, high);
-                b0 = p[0], b1 = q[0], b2 = r[0];
-                to[-step] = scaled(NINE(c, a, b), multiplier, shift, low, high);
+                THREE(-6) THREE(-3)
+            }
+            if (left >= 3) {
+                left -= 3, p += 3 * step, q += 3 * step, r += 3 * step, to += 3 * step;
+                AS_IT_IS(p); AS_IT_IS(q); AS_IT_IS(r); AS_IT_IS(to);
+                THREE(-3)
             }
             for (; left >= 0; left--) {
                 p += step, q += step, r += step;
                 c0 = c1 = c2 = pad;
                 if (left)
                     c0 = p[0], c1 = q[0], c2 = r[0];
-                to[0] = scaled(NINE(a, b, c), multiplier, shift, low, high);
+                store(to, NINE(a, b, c), multiplier, shift, low, high);
                 a0 = b0, a1 = b1, a2 = b2, b0 = c0, b1 = c1, b2 = c2;
                 to += step;
             }

@@ -136,7 +136,15 @@ static int32_t unpainted(void)
 }
 #endif
 
-#ifdef HARNESS_REFINE
+#if defined(HARNESS_COUNT)
+/* Nothing but the network, for the number of its instructions. */
+int main(void)
+{
+    while (take(image, sizeof image))
+        network(image, found, MOST);
+    return 0;
+}
+#elif defined(HARNESS_REFINE)
 #include "${prefix}_refine.h"
 
 static ${prefix}_head_t head;

@@ -23,7 +23,8 @@
 /* The sums of a block fill the registers of a 32-bit RISC-V: nothing may be loaded ahead of its
  * turn. Compilers for large cores know better what to do. */
 #if defined(__GNUC__) && !defined(__clang__) && defined(__riscv)
-#pragma GCC optimize("no-predictive-commoning", "no-schedule-insns", "no-tree-coalesce-vars")
+#pragma GCC optimize("no-predictive-commoning", "no-schedule-insns", "no-tree-coalesce-vars", \
+                     "no-tree-sink")
 #define SMALL_CORE
 #define IN_ORDER __asm__ volatile("" ::: "memory")
 #define AS_IT_IS(value) __asm__ volatile("" : "+r"(value)) /* to be computed, not to be reasoned about */
@@ -74,6 +75,30 @@ INLINE uint8_t scaled(int32_t sum, int32_t multiplier, int shift, int32_t low, i
     return (uint8_t)clamped;
 }
 
+/* Stores a value of a sum. Half of what a ReLU sees is negative and needs no multiplication, and few
+ * values are too large; large cores rather compute than branch. */
+INLINE void store(uint8_t *out, int32_t sum, int32_t multiplier, int shift, int32_t low, int32_t high)
+{
+#ifdef SMALL_CORE
+    if (low == 0 && shift == 32) {
+        if (sum < 0) {
+            *out = 0;
+            IN_ORDER;
+            return;
+        }
+        sum = (int32_t)(((int64_t)sum * multiplier) >> 32);
+        AS_IT_IS(sum);
+        *out = (uint8_t)sum;
+        if (sum > high) {
+            *out = (uint8_t)high;
+            IN_ORDER;
+        }
+        return;
+    }
+#endif
+    *out = scaled(sum, multiplier, shift, low, high);
+}
+
 /* Compilers would make these two loops calls of memset and memcpy, which not every target has:
  * hence volatile. */
 static void fill(uint8_t *out, uint8_t value, size_t count)
@@ -83,11 +108,14 @@ static void fill(uint8_t *out, uint8_t value, size_t count)
         to[i] = value;
 }
 
-static void copy(uint8_t *out, const uint8_t *values, int count)
+APART void copy(uint8_t *out, const uint8_t *values, int count)
 {
     volatile uint8_t *to = out;
-    for (; count >= 4; count -= 4, to += 4, values += 4)
+    for (const uint8_t *end = values + count / 8 * 8; values != end; to += 8, values += 8) {
         to[0] = values[0], to[1] = values[1], to[2] = values[2], to[3] = values[3];
+        to[4] = values[4], to[5] = values[5], to[6] = values[6], to[7] = values[7];
+    }
+    count %= 8;
     for (int i = 0; i < count; i++)
         to[i] = values[i];
 }
