@@ -1,7 +1,7 @@
 """Figures of datasets and evaluations, as PNG and SVG. The only home of matplotlib."""
 
 from dmrl.plots.datasets import depth_histogram, peers_per_image, position_heat
-from dmrl.plots.errors import error_by_distance, error_trace, error_violins, trade_offs
+from dmrl.plots.errors import error_by_distance, error_trace, error_violins
 from dmrl.plots.models import Side, model_sides
 from dmrl.plots.pictures import Circled, Example, MapPair, examples, gallery, map_pairs
 from dmrl.plots.style import save
@@ -22,5 +22,4 @@ __all__ = [
     "peers_per_image",
     "position_heat",
     "save",
-    "trade_offs",
 ]

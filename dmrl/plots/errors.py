@@ -1,6 +1,6 @@
 """Figures of errors: their spread, over time, over distance, against what they cost."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -161,44 +161,3 @@ def _medians(
         for k in range(len(edges) - 1)
     ]
     return edges, np.array(medians)
-
-
-def trade_offs(
-    costs: Mapping[str, Sequence[float]],
-    gains: Sequence[float],
-    names: Sequence[str],
-    gain: str,
-    stem: Path,
-) -> None:
-    """A gain against each of several costs, one marker per name, the same in all.
-
-    Parameters
-    ----------
-    costs
-        Words of an axis to a value per name.
-    gains
-        A value per name.
-    names
-        What was measured.
-    gain
-        Words of the axis up.
-    stem
-        Path without suffix.
-    """
-    with mpl.rc_context(STYLE):
-        figure = Figure((4.0 * len(costs), 4.2), layout="constrained")
-        for axes, (words, values) in zip(
-            figure.subplots(1, len(costs), sharey=True, squeeze=False)[0],
-            costs.items(),
-            strict=True,
-        ):
-            for place, name in enumerate(names):
-                axes.plot(
-                    values[place], gains[place], "osD^vP*X"[place % 8], markersize=8, label=name
-                )
-            axes.set(xlabel=words, xlim=(0, 1.08 * max(values)))
-            axes.grid(alpha=0.3)
-        figure.axes[0].set_ylabel(gain)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    save(figure, stem)

@@ -177,9 +177,10 @@ def command(
     print_table(str(out), ("file", "bytes", "what it is"), rows)
     if kept := _memory(out, written):
         fit = "fits" if kept.fits_l1 else "does not fit"
+        other = "" if kept.fits_l1 else "; --l1-kb 64 makes two memories of it"
         print_line(
             f"{kept.state_bytes:,} bytes of RAM, which {fit} a GAP8's L1: {L1_FOR_STATE:,} beside "
-            "stacks"
+            f"stacks{other}"
         )
         if kept.far_bytes:
             print_line(
