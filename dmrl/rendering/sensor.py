@@ -84,7 +84,9 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
         values = values.repeat(3, axis=2)
     if sensor.contrast_gamma != 1:
         values = np.power(values, np.float32(1 / sensor.contrast_gamma))
-    return np.asarray(np.clip(values * 255 + 0.5, 0, 255), np.uint8)
+    levels = values * np.float32(255)
+    levels += np.float32(0.5)
+    return np.clip(levels, 0, 255, out=levels).astype(np.uint8)
 
 
 def _mixed(light: Picture, saturation: float) -> Picture:
