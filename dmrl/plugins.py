@@ -19,12 +19,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, wraps
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from traceback import extract_tb
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dmrl.errors import DmrlError, PluginError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 FORMATS, NETWORKS, STAGES = "dmrl.formats", "dmrl.networks", "dmrl.stages"
 """The groups of entry points."""
@@ -50,7 +52,7 @@ class Plugin:
     name: str
     package: str
     summary: str
-    entry: EntryPoint
+    entry: "EntryPoint"
 
     def load(self) -> Any:
         """What the entry point names, imported.
@@ -106,6 +108,8 @@ class Plugin:
 @cache
 def found(group: str) -> dict[str, Plugin]:
     """What installed packages add to a group, by name; two of one name: the first package's."""
+    from importlib.metadata import entry_points  # noqa: PLC0415 - 30 ms of every start
+
     every = [_plugin(entry) for entry in entry_points(group=group) if NAME.fullmatch(entry.name)]
     by_name: dict[str, Plugin] = {}
     for plugin in sorted(every, key=lambda plugin: (plugin.name, plugin.package)):
@@ -113,7 +117,7 @@ def found(group: str) -> dict[str, Plugin]:
     return by_name
 
 
-def _plugin(entry: EntryPoint) -> Plugin:
+def _plugin(entry: "EntryPoint") -> Plugin:
     if entry.dist is None:
         return Plugin(entry.name, entry.module.split(".")[0], "", entry)
     # A missing key of the metadata is None.
