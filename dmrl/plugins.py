@@ -146,6 +146,7 @@ def stage_command(plugin: Plugin) -> Callable[..., Any]:
 
 def __getattr__(name: str) -> Callable[..., Any]:
     """The command of a stage: the command line finds it as ``dmrl.plugins:NAME``, when called."""
-    if name not in found(STAGES):
+    # Whoever imports this asks for __path__ as well.
+    if not NAME.fullmatch(name) or name not in found(STAGES):
         raise AttributeError(name)
     return stage_command(found(STAGES)[name])

@@ -7,6 +7,7 @@ docs/add-a-format.md.
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -25,8 +26,9 @@ FIRST = (
 """Their order matters: the sources of some hold files that others know."""
 
 
-def _files() -> dict[str, Format]:
-    """The ``FORMAT`` of every file here: those of ``FIRST``, then the others, by name.
+@cache
+def own() -> dict[str, Format]:
+    """The ``FORMAT`` of every file here, by name: those of ``FIRST``, then the others in order.
 
     Plain pictures come last, as any folder with pictures is a folder of pictures.
     """
@@ -42,11 +44,8 @@ def _files() -> dict[str, Format]:
     return {form.name: form for form in sorted(found, key=turn)}
 
 
-FORMATS = _files()
-
-
 def format_of(source: Path, name: str | None = None) -> Format:
-    """The row of ``FORMATS`` for a source.
+    """The row of ``own`` or of a plug-in for a source.
 
     Parameters
     ----------
@@ -62,8 +61,8 @@ def format_of(source: Path, name: str | None = None) -> Format:
     PluginError
         If a plug-in that is asked for by name cannot be loaded.
     """
-    added = {n: p for n, p in plugins.found(plugins.FORMATS).items() if n not in FORMATS}
-    known = ", ".join([*FORMATS, *added])
+    added = {n: p for n, p in plugins.found(plugins.FORMATS).items() if n not in own()}
+    known = ", ".join([*own(), *added])
     if not source.exists():
         raise SourceError(f"no file or folder {source}. Name one to convert")
     if not (source.is_file() or source.is_dir()):
@@ -72,12 +71,12 @@ def format_of(source: Path, name: str | None = None) -> Format:
         raise SourceError(f"{odd} is neither a file nor a folder. Move it out of {source}")
     if name in added:
         return _plugged(added[name])
-    if name is not None and name not in FORMATS:
-        near = get_close_matches(name, [*FORMATS, *added], n=1)
+    if name is not None and name not in own():
+        near = get_close_matches(name, [*own(), *added], n=1)
         hint = f"Did you mean {near[0]}? " if near else ""
         raise SourceError(f"--from {name}: no such kind. {hint}Kinds: {known}")
     if name is not None:
-        return FORMATS[name]
+        return own()[name]
     if source.is_file() and source.stat().st_size == 0:
         raise SourceError(f"{source} is empty, 0 bytes. Name another file")
     if source.is_dir() and not any(source.iterdir()):
@@ -100,8 +99,8 @@ def _is_neither(path: Path) -> bool:
 
 def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:
     """The first format that knows a source: plug-ins after dmrl's own, before plain pictures."""
-    *own, pictures = FORMATS.values()
-    if found := next((f for f in own if f.recognises(source)), None):
+    *first, pictures = own().values()
+    if found := next((f for f in first if f.recognises(source)), None):
         return found
     for plugin in added:
         try:

@@ -137,7 +137,7 @@ def _middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera
         np.clip(first + (np.arange(count) + 0.5) * fit, 0, size - 1).astype(int)
         for first, count, size in limits
     )
-    return photo[v].take(u, axis=1)
+    return np.asarray(photo[v].take(u, axis=1), np.uint8)
 
 
 def _begins(path: Path) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.formats.known import FORMATS
+from dmrl.formats.known import own
 
 from ..formats.test_fuzz import SOURCES
 from .conftest import Count
@@ -41,7 +41,7 @@ def _text(name: str) -> Make:
     return make
 
 
-OTHERS = FORMATS.keys() - {name for name, _ in SOURCES.values()}
+OTHERS = own().keys() - {name for name, _ in SOURCES.values()}
 ALL = {**SOURCES, **{name: (name, _text(name)) for name in sorted(OTHERS)}}
 
 

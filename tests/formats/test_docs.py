@@ -8,7 +8,7 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.format import Options
 from dmrl.formats.image_folder import SUFFIXES
-from dmrl.formats.known import FORMATS
+from dmrl.formats.known import own
 from dmrl.formats.label_table import COLUMNS
 from dmrl.geometry.camera_file import KNOWN
 from dmrl.geometry.frames import Camera
@@ -16,7 +16,7 @@ from dmrl.geometry.frames import Camera
 TEXT = (Path(__file__).parents[2] / "docs" / "sources.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", own())
 def test_every_kind_is_documented(kind: str) -> None:
     assert f"## `{kind}`" in TEXT
 

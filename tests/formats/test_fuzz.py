@@ -12,7 +12,7 @@ import pytest
 
 from dmrl.errors import DmrlError
 from dmrl.formats.format import Options
-from dmrl.formats.known import FORMATS
+from dmrl.formats.known import own
 from dmrl.messages import message
 
 from ..faults.mutate import mutated
@@ -109,7 +109,7 @@ SOURCES = {
 def convert(name: str, source: Path) -> int:
     """Messages of a source. DmrlError is the one error that may come."""
     count = 0
-    for sample in FORMATS[name].content(source, Options()).samples:
+    for sample in own()[name].content(source, Options()).samples:
         message(sample.message)(**sample.fields).SerializeToString()
         count += 1
     return count

@@ -11,7 +11,7 @@ from dmrl import plugins
 from dmrl.errors import PluginError, SourceError
 from dmrl.formats import known
 from dmrl.formats.format import Content, Format, Options
-from dmrl.formats.known import FIRST, FORMATS, format_of
+from dmrl.formats.known import FIRST, format_of, own
 from dmrl.plugins import Plugin
 from dmrl.samples.sample import Sample
 
@@ -55,11 +55,11 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def test_formats_stand_in_the_order_in_which_they_are_tried() -> None:
-    names = list(FORMATS)
+    names = list(own())
     assert tuple(names[: len(FIRST)]) == FIRST
     assert names[-1] == "images"
     assert names[len(FIRST) : -1] == sorted(names[len(FIRST) : -1]) != []
-    assert all(name == form.name for name, form in FORMATS.items())
+    assert all(name == form.name for name, form in own().items())
 
 
 def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
     for name, data in foreign.coloured().items():
         (folder / name).write_bytes(data)
     assert format_of(folder).name == "images"
-    assert format_of(folder, "csv") is FORMATS["csv"]  # who says so is believed
+    assert format_of(folder, "csv") is own()["csv"]  # who says so is believed
 
 
 @pytest.mark.parametrize(
