@@ -229,7 +229,7 @@ def test_images_in_which_nobody_is_are_not_enough(tmp_path: Path) -> None:
     (shots / "labels.csv").write_text(table, encoding="utf-8")
     convert.run(shots, tmp_path / "shots.mcap", convert.Settings())
     dataset.run([tmp_path / "shots.mcap"], tmp_path / "dataset", dataset.Settings())
-    with pytest.raises(DatasetError, match="no robot in any of the 2 images.*--add"):
+    with pytest.raises(DatasetError, match=r"no robot in any of the 2 images.*--add"):
         run(tmp_path / "dataset", tmp_path / "run", SETTINGS)
 
 
