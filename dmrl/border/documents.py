@@ -1,6 +1,7 @@
 """JSON, TOML and NumPy archives of strangers, read within their budgets."""
 
 import json
+import lzma
 import struct
 import tomllib
 import zipfile
@@ -46,6 +47,11 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError(_TOO_DEEP) from None
 
 
+LEAKS = (
+    *(MemoryError, RuntimeError, LookupError, SyntaxError),
+    *(struct.error, zlib.error, lzma.LZMAError),
+)
+"""What NumPy and zipfile let through of a damaged archive, beside what they say."""
 _TOO_DEEP = f"it nests deeper than {limits.DEPTH}"
 
 
@@ -88,5 +94,5 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
         try:
             with np.load(stream, allow_pickle=False) as arrays:
                 return {name: np.asarray(arrays[name]) for name in arrays.files}
-        except (MemoryError, RuntimeError, LookupError, SyntaxError, zlib.error, struct.error) as e:
-            raise ValueError(str(e)) from e  # what NumPy and zipfile leak
+        except LEAKS as e:
+            raise ValueError(str(e)) from e

@@ -40,7 +40,11 @@ LINE_CHARACTERS = 100_000
 """Of a line of numbers in a log: `VARIABLES` and more."""
 
 PIXELS = 64 * MB
-"""Of a picture: 8,000 x 8,000. With its copies in other orders that is 0.7 GB."""
+"""Of a photo, which is scaled down: 8,000 x 8,000. With its copies that is 0.7 GB."""
+
+FRAME_PIXELS = 9 * MB
+"""Of an image of a recording, and of images that are held together: 3840 x 2160. A blank one has
+30 kB, and a network takes 50 bytes for each of its pixels."""
 
 SIDE_PX = 65_535
 """Of a picture's width or height, a JPEG's largest; decoders keep a place for every row."""

@@ -16,6 +16,8 @@ from dmrl.images.codec import encode_png
 
 BATCH_IMAGES = 64
 """Rows per record batch: 14 MB of 320 x 224 pixels, all that a split keeps in memory."""
+BATCH_PIXELS = 20_000_000
+"""Of these rows together: of images that are larger than 640 x 480 there are fewer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +89,11 @@ class SplitWriter:
     _sink: Any = None
 
     def add(self, row: Row) -> None:
-        """Add one row; every ``BATCH_IMAGES`` rows go to disk."""
+        """Add one row; every ``BATCH_IMAGES`` rows, or ``BATCH_PIXELS``, go to disk."""
         self._rows.append(row)
         room = self.shard_images - (self._lengths[-1] if self._sink else 0)
-        if len(self._rows) >= min(BATCH_IMAGES, room):
+        most = min(BATCH_IMAGES, room, max(1, 3 * BATCH_PIXELS // row.rgb.size))
+        if len(self._rows) >= most:
             self._flush()
             if self._lengths[-1] >= self.shard_images:
                 self._close_shard()

@@ -25,6 +25,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+from dmrl.border import limits
 from dmrl.border.folders import refuse_pipes
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import aideck
@@ -182,7 +183,7 @@ def _samples(
 def _stored(path: Path, options: Options) -> tuple[Crop, bytes, str]:
     """How a picture is cropped, and its bytes and format: as they are, where nothing changes."""
     data = path.read_bytes()
-    rgb = _colours(data, path) if options.raw else codec.decode(data, path)
+    rgb = _colours(data, path) if options.raw else codec.decode(data, path, limits.PIXELS)
     crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
     if crop.changes:
         return crop, codec.encode_png(crop.pixels(rgb)), "png"
@@ -193,7 +194,7 @@ def _stored(path: Path, options: Options) -> tuple[Crop, bytes, str]:
 
 
 def _colours(data: bytes, path: Path) -> codec.Rgb:
-    rgb = codec.decode(data, path)
+    rgb = codec.decode(data, path, limits.PIXELS)
     if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
         raise SourceError(f"{path} has colours already, so it is not raw. Leave out --raw")
     return rgb_of(rgb[..., 0].copy())

@@ -37,7 +37,7 @@ def _open(data: bytes, what: object) -> Image.Image:
             warnings.simplefilter("ignore")
             return Image.open(BytesIO(data), formats=FORMATS)
     except Image.DecompressionBombError:
-        raise _too_many(what) from None
+        raise _too_many(what, limits.PIXELS) from None
     except BROKEN:
         names = ", ".join(FORMATS)
         raise SourceError(
@@ -51,18 +51,18 @@ def _has_header(data: bytes) -> bool:
     return len(words) >= (3 if data[:2] in (b"P1", b"P4") else 4)
 
 
-def _too_many(what: object) -> SourceError:
-    most = f"{limits.PIXELS / 1e6:.0f} million pixels"
-    return SourceError(f"{what} has more than {most}, or too many scans. Scale it down")
+def _too_many(what: object, most: int) -> SourceError:
+    words = f"{most / 1e6:.0f} million pixels"
+    return SourceError(f"{what} has more than {words}, or too many scans. Scale it down")
 
 
-def _decodable(image: Image.Image, data: bytes, what: object) -> None:
+def _decodable(image: Image.Image, data: bytes, what: object, most: int) -> None:
     """Nothing, if decoding takes no more time and memory than a picture may."""
     pixels = image.width * image.height
     # Every scan of a progressive JPEG goes over all pixels; FF DA starts one.
     scans = data.count(b"\xff\xda") if image.format == "JPEG" else 1
-    if pixels > limits.PIXELS or pixels * scans > limits.DECODED_PIXELS:
-        raise _too_many(what)
+    if pixels > most or pixels * scans > limits.DECODED_PIXELS:
+        raise _too_many(what, most)
     if max(image.size) > limits.SIDE_PX:
         raise SourceError(f"{what} is {max(image.size)} px long. Cut it into pieces")
     global _spent
@@ -75,7 +75,7 @@ def _decodable(image: Image.Image, data: bytes, what: object) -> None:
             )
 
 
-def decode(data: bytes, what: object = "the image") -> Rgb:
+def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIXELS) -> Rgb:
     """Pixels of a PNG, JPEG, PPM or BMP.
 
     Parameters
@@ -84,6 +84,8 @@ def decode(data: bytes, what: object = "the image") -> Rgb:
         The encoded picture. Bytes after its end are ignored.
     what
         Name of the picture in the error.
+    most
+        Pixels that it may have.
 
     Returns
     -------
@@ -96,7 +98,7 @@ def decode(data: bytes, what: object = "the image") -> Rgb:
         If the bytes are no such picture, end too soon, or ask for more pixels than a picture may.
     """
     with _open(data, what) as image:
-        _decodable(image, data, what)
+        _decodable(image, data, what, most)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from dmrl.border import limits
 from dmrl.errors import DmrlError, one_line
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 
@@ -118,7 +119,7 @@ def _small(path: Path) -> tuple[bytes, str]:
     data = path.read_bytes()
     if len(data) <= PLAIN_BYTES and data.startswith(b"\x89PNG"):
         return data, "png"
-    rgb = decode(data, path)
+    rgb = decode(data, path, limits.PIXELS)
     height, width = rgb.shape[:2]
     if width > WIDEST_PX:
         to = (WIDEST_PX, max(1, round(height * WIDEST_PX / width)))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
+from dmrl.border import limits
 from dmrl.border.folders import refuse_pipes
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Array, Camera
@@ -126,7 +127,11 @@ def photos_in(folder: Path) -> Photos:
             f"{folder} holds no photo that can be read{why} "
             f"({', '.join(PHOTO_KINDS)}). Choose another --backgrounds"
         )
-    return Photos(lambda k: decode(paths[k].read_bytes(), paths[k]), len(paths), broken)
+
+    def photo(k: int) -> Rgb:
+        return decode(paths[k].read_bytes(), paths[k], limits.PIXELS)
+
+    return Photos(photo, len(paths), broken)
 
 
 def _middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera) -> Rgb:

@@ -10,6 +10,7 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.border import limits
 from dmrl.border.folders import refuse_pipes
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError, SourceError
 from dmrl.geometry.camera_file import write_camera
@@ -153,7 +154,7 @@ def _board(source: Path, settings: Settings) -> Result:
     size_px: tuple[int, int] | None = None
     pictures = 0
     for name, data in _pictures(source, settings):
-        rgb = decode(data, name)
+        rgb = decode(data, name, limits.PIXELS)
         own = rgb.shape[1], rgb.shape[0]
         if own != (size_px := size_px or own):
             raise SourceError(

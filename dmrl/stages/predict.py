@@ -1,10 +1,10 @@
 """``dmrl predict``: a model and a recording to a recording with detections."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import groupby, islice
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -13,6 +13,7 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.border import limits
 from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, fastest, open_detector
 from dmrl.errors import MissingTopic
 from dmrl.images.ahead import ahead
@@ -174,7 +175,7 @@ def _messages(
     pictured = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
     total = sum(held.topics[t].count for t in pictured)
     raws = track(read_raw(recording, *pictured), "Predicting", total)
-    batches = iter(lambda: list(islice(raws, settings.batch_size)), [])
+    batches = _batches(raws, settings.batch_size, recording)
     decoded = partial(_pictures, detector, recording)
     for batch, pictures in ahead(decoded, batches, threads=1, held=1):
         seen = _seen(pictures, detector, settings)
@@ -184,6 +185,22 @@ def _messages(
             robot = _robot(raw)
             yield Timed(raw.time_ns, topics.detections(robot), made, raw.publish_ns)
             yield Timed(raw.time_ns, topics.grid(robot), grid, raw.publish_ns)
+
+
+def _batches(raws: Iterable[RawMessage], most: int, recording: Path) -> Iterator[list[RawMessage]]:
+    """So many images at a time; fewer where they are large, one at least."""
+    batch: list[RawMessage] = []
+    pixels = 0
+    for raw in raws:
+        data = parsed(raw, message("CompressedImage"), recording).data
+        width_px, height_px, _ = size(data, _named(recording, raw))
+        pixels += width_px * height_px
+        if len(batch) == most or (batch and pixels > limits.FRAME_PIXELS):
+            yield batch
+            batch, pixels = [], width_px * height_px
+        batch.append(raw)
+    if batch:
+        yield batch
 
 
 def _robot(raw: RawMessage) -> str:

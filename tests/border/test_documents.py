@@ -65,3 +65,34 @@ def test_an_array_that_is_said_to_be_huge_is_refused(tmp_path: Path) -> None:
         archive.writestr("a.npy", header.getvalue() + bytes(80))
     with pytest.raises(ValueError):
         load_npz(path)
+
+
+@pytest.mark.parametrize(
+    "kind", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
+)
+def test_a_damaged_archive_of_any_compression_is_refused(kind: int, tmp_path: Path) -> None:
+    array = io.BytesIO()
+    np.save(array, np.random.default_rng(0).integers(0, 9, 500, np.uint8))
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        archive.writestr("a.npy", array.getvalue())
+    assert len(load_npz(path)["a"]) == 500
+    data = bytearray(path.read_bytes())
+    for at in (60, 100, 150):
+        for value in (0, 1, 255):
+            path.write_bytes(data[:at] + bytes([value]) * 20 + data[at + 20 :])
+            with pytest.raises((ValueError, OSError, EOFError, zipfile.BadZipFile)):
+                load_npz(path)
+
+
+def test_a_member_that_hides_its_size_unpacks_to_what_it_says(tmp_path: Path) -> None:
+    """The list of an archive may say less than its members hold: no more than that is read."""
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", bytes(10 << 20))
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"PK\x01\x02") + 24
+    data[at : at + 4] = (100).to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises((ValueError, zipfile.BadZipFile)):
+        load_npz(path)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl.datasets import open_dataset
+from dmrl.datasets import open_dataset, write
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message, schema_bytes
@@ -15,7 +15,7 @@ from dmrl.stages import dataset as stage
 from dmrl.stages.dataset import Settings, run
 from dmrl.topics import camera_image, labels
 
-from .conftest import STEP_NS, WIDTH_PX, Record, peer, pixels_of
+from .conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
 
 PLAIN = Settings()
 
@@ -215,6 +215,26 @@ def test_shards_hold_no_more_images_than_asked(record: Record, tmp_path: Path) -
     assert [len(p) for p in split.pixels] == [64, 6, 64, 6, 10]
     got = np.concatenate(split.pixels)
     assert np.array_equal(got, np.stack([pixels_of(k) for k in range(150)]))
+
+
+def test_of_large_images_few_are_in_memory(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    batch = write._record_batch
+    monkeypatch.setattr(
+        write, "_record_batch", lambda rows, *more: made.append(len(rows)) or batch(rows, *more)
+    )
+    flight = record(peers=[[peer()]] * 5)
+    for name, pixels, wanted in (("a", 10**9, [5]), ("b", 2 * WIDTH_PX * HEIGHT_PX, [2, 2, 1])):
+        monkeypatch.setattr(write, "BATCH_PIXELS", pixels)
+        made.clear()
+        run([flight], tmp_path / name, Settings())
+        assert made == wanted
+    monkeypatch.setattr(write, "BATCH_PIXELS", 1)
+    made.clear()
+    run([flight], tmp_path / "c", Settings())
+    assert made == [1] * 5
 
 
 def test_images_of_two_sizes_are_refused_with_both_sizes(record: Record, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dmrl.border import limits
 from dmrl.errors import SourceError
 from dmrl.images import codec
 
@@ -118,7 +119,16 @@ def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(
         b"P5 %d %d 255 " % (side_px, side_px),
     ):
         with pytest.raises(SourceError, match=r"a\.png has more than 64 million pixels"):
-            codec.decode(data, "a.png")
+            codec.decode(data, "a.png", limits.PIXELS)
+
+
+def test_an_image_of_a_recording_is_no_larger_than_a_network_can_take() -> None:
+    """A blank one of 190 kB took `dmrl predict` 6.5 GB."""
+    large = _png_of(3840, 2352)
+    with pytest.raises(SourceError, match=r"a\.png has more than 9 million pixels.* Scale it down"):
+        codec.decode(large, "a.png")
+    assert codec.decode(large, "a.png", limits.PIXELS).shape == (2352, 3840, 3)
+    assert codec.decode(_png_of(3840, 2160)).shape == (2160, 3840, 3)
 
 
 def test_a_jpeg_of_endless_scans_is_refused() -> None:
@@ -126,16 +136,16 @@ def test_a_jpeg_of_endless_scans_is_refused() -> None:
     buffer = BytesIO()
     grey.save(buffer, "JPEG", progressive=True)
     data = buffer.getvalue()
-    assert codec.decode(data).shape == (4000, 4000, 3)
+    assert codec.decode(data, most=limits.PIXELS).shape == (4000, 4000, 3)
     at = data.index(b"\xff\xda")
     second = data.index(b"\xff\xda", at + 2)
     endless = data[:second] + data[at:second] * 1000 + data[second:]
     with pytest.raises(SourceError, match="too many scans"):
-        codec.decode(endless)
+        codec.decode(endless, most=limits.PIXELS)
 
 
 def test_a_large_photo_is_no_bomb() -> None:
-    assert codec.decode(_png_of(6000, 4000)).shape == (4000, 6000, 3)
+    assert codec.decode(_png_of(6000, 4000), most=limits.PIXELS).shape == (4000, 6000, 3)
 
 
 def test_a_ppm_whose_header_does_not_end_is_refused() -> None:

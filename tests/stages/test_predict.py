@@ -139,6 +139,18 @@ def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None
     assert [(g.rows, g.cols) for g in grids] == [(6, 8), (4, 4), (4, 4), (6, 8)]
 
 
+def test_of_large_images_few_are_in_memory(
+    dots: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes: list[int] = []
+    seen = predict._seen
+    monkeypatch.setattr(predict, "_seen", lambda p, *more: sizes.append(len(p)) or seen(p, *more))
+    run(model, dots, tmp_path / "a.mcap", Settings())
+    monkeypatch.setattr("dmrl.border.limits.FRAME_PIXELS", 4 * 64 * 48)
+    run(model, dots, tmp_path / "b.mcap", Settings())
+    assert sizes == [16, 14, *[4] * 7, 2]
+
+
 def test_bad_input_is_one_line_and_leaves_nothing(dots: Path, model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     odd = recording(tmp_path / "odd.mcap", (60, 48))
