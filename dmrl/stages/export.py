@@ -21,7 +21,7 @@ from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.measure import Memory, memory_of
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import INTEGER_NAME, load
-from dmrl.errors import MissingExtra, ModelError
+from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.learn.pretrained import resolved
 from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import provenance
@@ -90,7 +90,13 @@ def run(model: Path, out: Path, settings: Settings) -> list[Written]:
         If torch or onnx is not installed.
     OutputError
         If ``out`` exists.
+    SettingError
+        If two memories are wanted with ``refine``, or the near one is too small.
     """
+    if settings.refine and settings.l1_kb is not None:
+        raise SettingError(
+            "--refine holds all that the last layer reads, in one memory. Leave out --l1-kb"
+        )
     refuse_existing(out)
     model = resolved(model)
     if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():

@@ -146,7 +146,7 @@ def test_of_all_that_fits_the_least_is_copied() -> None:
     copied = [traffic_bytes(way) for way in ways]
     assert all(w.state_bytes(bayer=True) <= size for w, size in zip(ways, sizes, strict=True))
     assert copied == sorted(copied, reverse=True)
-    with pytest.raises(SettingError, match=rf"at least {least:,} bytes .* {least - 4:,} are given"):
+    with pytest.raises(SettingError, match=rf"at least {least:,} bytes .* {least - 4:,} are there"):
         split(whole, least - 4)
 
 

@@ -113,7 +113,7 @@ def split(plan: Plan, most_bytes: int) -> Plan:
     least = min([*sizes, plan.state_bytes(bayer=True)])
     raise SettingError(
         f"{plan.network.name} keeps at least {least:,} bytes in the near memory, of which "
-        f"{most_bytes:,} are given. Give more: --l1-kb"
+        f"{most_bytes:,} are there beside stacks. Give more: --l1-kb"
     )
 
 
