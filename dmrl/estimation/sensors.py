@@ -1,7 +1,7 @@
 """A robot's logs as they came, on a time grid, without what no robot can have done."""
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 
 from dmrl.estimation.jumps import levelled_height
 from dmrl.estimation.pair import LONGEST_GAP_S, RATE_HZ, Array, Mask, Track, resample
@@ -12,6 +12,8 @@ sample, which is 4 px at 1 m, and a drone climbs slowly."""
 FAST_MPS, FAST_RADPS, TIMES_USUAL, LASTING_S = 3.0, 5.0, 4.0, 0.2
 """An estimate runs away after a crash: beyond these, and so many times the flight's median, for so
 long. The robot lies still then, so its rates count as zero and as unknown."""
+AROUND = 2 * round(RATE_HZ) + 1
+"""Samples of a second before and after, in which the rates may be those of a fall already."""
 FROZEN_SHARE = 0.5
 """Where more of a log than this repeats itself, that is how it is written."""
 
@@ -42,9 +44,8 @@ def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) 
     lost = wild(np.hypot(*speed.T), FAST_MPS) | wild(np.abs(turn[:, 0]), FAST_RADPS)
     known = ~lost
     gap |= turn_gap | lost
-    return Track(
-        speed[:, 0] * known, speed[:, 1] * known, turn[:, 0] * known, smooth_m, gap, height_gap
-    )
+    rates = (speed[:, 0] * known, speed[:, 1] * known, turn[:, 0] * known)
+    return Track(*rates, np.where(down(lost), 0.0, smooth_m), gap, height_gap)
 
 
 def wild(size: Array, fast: float) -> Mask:
@@ -59,7 +60,19 @@ def wild(size: Array, fast: float) -> Mask:
     """
     limit = max(fast, TIMES_USUAL * float(np.median(size)))
     lasting = median_filter(size, round(LASTING_S * RATE_HZ), mode="mirror") > limit
-    return np.asarray(maximum_filter1d(lasting, 2 * round(RATE_HZ) + 1))
+    return np.asarray(maximum_filter1d(lasting, AROUND))
+
+
+def down(lost: Mask) -> Mask:
+    """(K,) where a robot whose estimate ran away for good lies on the floor, at a height of zero.
+
+    Parameters
+    ----------
+    lost
+        (K,) where it ran away, and a second around, at 100 Hz.
+    """
+    ran = minimum_filter1d(lost, AROUND)
+    return np.asarray(np.logical_and.accumulate(ran[::-1])[::-1])
 
 
 def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:

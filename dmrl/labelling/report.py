@@ -1,5 +1,6 @@
 """What was estimated of each ordered pair, in numbers."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -56,6 +57,8 @@ class PairReport:
         Median over the flight of sigma along the worst direction.
     rmse_ok_m, rmse_m
         Horizontal error of those that are OK, and of all; None without truth.
+    refused
+        Why nothing is OK, in a word; None where something is.
     """
 
     observer: str
@@ -68,6 +71,7 @@ class PairReport:
     sigma_m: float
     rmse_ok_m: float | None
     rmse_m: float | None
+    refused: Refused | None
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:
@@ -111,11 +115,42 @@ def pair_report(
         sigma_m=float(np.median(sigma)),
         rmse_ok_m=_rms(error, ok),
         rmse_m=_rms(error, np.ones_like(ok)),
+        refused=estimate.refused,
     )
 
 
-def refusal(pair: tuple[str, str], estimate: Estimate) -> list[str]:
-    """A line that says why nothing of a pair is kept, and what to do; none where something is.
+def reasons(
+    pairs: Iterable[tuple[str, str]], estimates: Mapping[tuple[str, str], Estimate]
+) -> list[str]:
+    """One line for each ordered pair of which nothing is kept, and for each sensor that is off.
+
+    Where nothing is kept in either direction, what is off stands in those lines: it is the reason
+    that somebody can do something about.
+
+    Parameters
+    ----------
+    pairs
+        Each once: observer and peer.
+    estimates
+        Of the peer by the observer; the other way round too, where the method makes it.
+    """
+    lines = []
+    for pair in pairs:
+        off = doubts(pair, estimates[pair])
+        ways = [way for way in (pair, pair[::-1]) if way in estimates]
+        refused = {way: why for way in ways if (why := refusal(way, estimates[way]))}
+        if len(refused) < len(ways):
+            lines += [f"{'-'.join(pair)}: {text}" for text in off]
+            off = []
+        lines += [
+            f"{observer} sees {peer}: nothing is kept: {'; '.join([*off, why])}"
+            for (observer, peer), why in refused.items()
+        ]
+    return lines
+
+
+def refusal(pair: tuple[str, str], estimate: Estimate) -> str | None:
+    """Why nothing of a pair is kept, and what to do; None where something is.
 
     Parameters
     ----------
@@ -125,15 +160,14 @@ def refusal(pair: tuple[str, str], estimate: Estimate) -> list[str]:
         Of the peer by the observer.
     """
     if (estimate.status == OK).any():
-        return []
+        return None
     largest = np.linalg.eigvalsh(estimate.covariance[:, :2, :2])[:, -1]
     why = WHY[estimate.refused or "imprecise"]
-    told = why.format(observer=pair[0], sigma_m=float(np.sqrt(np.median(largest))))
-    return [f"{pair[0]} sees {pair[1]}: nothing is kept: {told}"]
+    return why.format(observer=pair[0], sigma_m=float(np.sqrt(np.median(largest))))
 
 
 def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
-    """One line for each sensor that a solve found to be off, with what to do about it.
+    """What a solve found to be off, sensor by sensor, with what to do about it.
 
     Parameters
     ----------
@@ -142,30 +176,29 @@ def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
     estimate
         Of the peer by the observer.
     """
-    found, name = estimate.constants, "-".join(pair)
-    lines = []
+    found, said = estimate.constants, []
     for robot, turn, scale in zip(
         pair, found[[OWN_GYRO, PEER_GYRO]], found[[OWN_SCALE, PEER_SCALE]], strict=True
     ):
         if abs(turn) > TURNS_RADPS:
-            lines.append(
-                f"{name}: {robot}'s yaw rate seems biased by {turn:.2g} rad/s; it was solved for. "
+            said.append(
+                f"{robot}'s yaw rate seems biased by {turn:.2g} rad/s; it was solved for. "
                 "Let its gyroscope settle before the flight"
             )
         if abs(scale) > FASTER:
-            lines.append(
-                f"{name}: {robot}'s velocity seems {abs(scale):.0%} too "
+            said.append(
+                f"{robot}'s velocity seems {abs(scale):.0%} too "
                 f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right? "
                 "Where it is so in every flight: dmrl calibrate --sensors"
             )
     if abs(found[BIAS]) > LONGER_M:
-        lines.append(
-            f"{name}: ranges seem {found[BIAS]:+.2f} m off; it was solved for. Measure it once, "
+        said.append(
+            f"ranges seem {found[BIAS]:+.2f} m off; it was solved for. Measure it once, "
             "and give it with --range-offset-m, or let flights tell: dmrl calibrate --sensors"
         )
     if abs(found[CLOCK]) > LATER_S:
-        lines.append(f"{name}: {pair[1]}'s log seems {found[CLOCK]:+.2f} s off. Try: dmrl align")
-    return lines
+        said.append(f"{pair[1]}'s log seems {found[CLOCK]:+.2f} s off. Try: dmrl align")
+    return said
 
 
 def _rms(error: Any, chosen: Any) -> float | None:

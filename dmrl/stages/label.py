@@ -33,7 +33,7 @@ try:
     from dmrl.labelling.known import Sensors, read_sensors
     from dmrl.labelling.labels import SOURCE, Look, Positions
     from dmrl.labelling.logs import SENSED, Logs, read_logs
-    from dmrl.labelling.report import PairReport, doubts, pair_report, refusal
+    from dmrl.labelling.report import PairReport, pair_report, reasons
     from dmrl.labelling.sight import SEEN, read_sight
     from dmrl.labelling.sighted import levelled, sightings_of, with_sightings
     from dmrl.labelling.truth import TOLD
@@ -176,9 +176,8 @@ def side_by_side(recording: Path, out: Path, settings: Settings, workers: int) -
     inputs = [recording, *settings.camera.values(), *filter(None, [settings.sensors])]
     origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     rewrite(recording, out, origin, without=replaced, fresh=made.values(), series=series)
-    warnings = [*logs.warnings, *_blind(held, filming, cameras)]
-    warnings += [line for pair in logs.pairs for line in doubts(pair, estimates[pair])]
-    warnings += [line for pair, found in estimates.items() for line in refusal(pair, found)]
+    blind = _blind(held, filming, cameras)
+    warnings = [*logs.warnings, *blind, *reasons(logs.pairs, estimates)]
     return Result(reports, _count(made.values()), warnings)
 
 

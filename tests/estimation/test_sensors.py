@@ -32,6 +32,9 @@ def test_an_estimate_that_runs_away_at_the_end_is_cut_off() -> None:
     found = track((GRID_S, turn), (GRID_S, velocity), (GRID_S, height), GRID_S)
     assert found.gap[GRID_S > 16].all() and not found.gap[GRID_S < 14].any()
     assert not found.vx_mps[crash].any()
+    # Its height says 1 m still, but it lies on the floor.
+    assert not found.height_m[GRID_S > 17].any()
+    assert found.height_m[GRID_S < 16] == pytest.approx(1.0)
 
 
 def test_fast_flight_and_single_outliers_do_not_run_away() -> None:
@@ -65,6 +68,7 @@ def test_a_robot_that_spins_is_lost_for_a_second_around() -> None:
     assert GRID_S[found.gap].min() == pytest.approx(9.0, abs=0.12)
     assert GRID_S[found.gap].max() == pytest.approx(12.0, abs=0.12)
     assert not found.yaw_rate_radps[found.gap].any()
+    assert found.height_m == pytest.approx(1.0)  # it flies on
 
 
 @pytest.mark.parametrize(

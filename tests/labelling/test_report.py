@@ -33,6 +33,7 @@ def estimate() -> Estimate:
     constants[[BIAS, OWN_GYRO, PEER_GYRO]] = 0.35, 0.02, 0.05
     made = object.__new__(Estimate)
     object.__setattr__(made, "constants", constants)
+    object.__setattr__(made, "refused", None)
     return made
 
 
