@@ -18,6 +18,7 @@ from dmrl.colours import RGB
 from dmrl.viewer.entity import (
     DETECTION_TEXT_WIDTH,
     FAINT_POINT_UI,
+    INVISIBLE,
     LINE_UI,
     POINT_UI,
     TEXT_HEIGHT,
@@ -31,6 +32,9 @@ STRIDE_PX = 8
 
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 CELL_COLOUR = (255, 255, 255)
+HALF_HEIGHT_M, FOCAL, NEAR_M = 0.03, 0.57, 0.1
+"""A text stands so far below a detection: half a small drone, focal length in widths, and the least
+depth that is believed for it."""
 BELIEVED = 0.05
 """Confidence below which a cell's depth is left dark: it is no robot's."""
 
@@ -87,30 +91,36 @@ def detections(
     width_px: int,
     colour: Colour = RGB["detection"],
 ) -> Iterator[Entity]:
-    """Points with confidence and depth; those below the model's threshold in `weak_path`.
+    """Points, their confidence and depth in `texts_path`; below the threshold in `weak_path`.
 
-    Of two whose texts would cover each other the surer has one. ``width_px`` is the images'.
+    Texts stand below the robots. Of two whose texts would cover each other the surer has one.
+    ``width_px`` is the images'.
     """
     column = batch["detections"]
     found = column.flatten()
     confidence, depth_m = (found.field(key).to_numpy() for key in ("confidence", "depth_m"))
     row_of, uv_px = rows_of(column), points_px(found)
     believed = confidence >= batch["threshold"].to_numpy()[row_of]
+    half_px = HALF_HEIGHT_M * FOCAL * width_px / np.fmax(depth_m, NEAR_M)
+    texts_px = uv_px + np.column_stack([np.zeros(len(uv_px)), half_px])
     (surest,) = np.nonzero(believed)
     surest = surest[np.lexsort([-confidence[surest], row_of[surest]])]
-    told = set(surest[_uncovered(uv_px[surest] / width_px, row_of[surest])].tolist())
-    texts = [
-        f"conf {confidence[k]:.2f}, {depth_m[k]:.2f} m" if k in told else ""
-        for k in np.flatnonzero(believed)
-    ]
-    columns = rr.Points2D.columns(positions=uv_px[believed], labels=texts)
-    weak = rr.Points2D.columns(positions=uv_px[~believed])
-    for where, points, kept, radius in (
-        (path, columns, believed, POINT_UI),
-        (weak_path(path), weak, ~believed, FAINT_POINT_UI),
+    told = np.zeros(len(uv_px), bool)
+    told[surest[_uncovered(texts_px[surest] / width_px, row_of[surest])]] = True
+    texts = [f"conf {confidence[k]:.2f}, {depth_m[k]:.2f} m" for k in np.flatnonzero(told)]
+    for where, kept, at_px, radius, words in (
+        (path, believed, uv_px, POINT_UI, None),
+        (texts_path(path), told, texts_px, INVISIBLE, texts),
+        (weak_path(path), ~believed, uv_px, FAINT_POINT_UI, None),
     ):
+        points = rr.Points2D.columns(positions=at_px[kept], labels=words)
         lengths = np.bincount(row_of[kept], minlength=batch.num_rows)
         yield Entity(where, points.partition(lengths), (_detection_style(colour, radius),), frame)
+
+
+def texts_path(path: str) -> str:
+    """Entity of what is written below detections."""
+    return f"{path}/texts"
 
 
 def weak_path(path: str) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import rerun as rr
 import rerun.blueprint as rrb
 
-from dmrl.viewer.entities import Scale, channel_path
+from dmrl.viewer.entities import Scale, channel_path, texts_path
 from dmrl.viewer.entity import escaped, image_frame
 from dmrl.viewer.legend import HEIGHT_PX, bar_path, legend_path
 
@@ -216,7 +216,8 @@ def eye_views(
 ) -> list[rrb.View]:
     """The image, and a panel for each map; ``both``: confidence also laid over the image."""
     picture = escaped(eye.picture)
-    marks = [f"{escaped(eye.labels)}/**", escaped(eye.detections)]
+    found = [eye.detections, texts_path(eye.detections)]
+    marks = [f"{escaped(eye.labels)}/**", *map(escaped, found)]
     cell = escaped(f"{eye.grid}/best")
     views = [_view(eye, "image", [picture, *marks, escaped(legend_path(eye.robot))])]
     heat = {

@@ -76,7 +76,8 @@ def load(path: Path) -> IntegerNetwork:
     refuse_pipes(path)
     file = path / INTEGER_NAME if path.is_dir() else path
     if not file.is_file():
-        raise ModelError(f"no {file.name} in {file.parent}. Make one with: dmrl quantize")
+        missing = f"{file.name} in {path}" if path.is_dir() else str(path)
+        raise ModelError(f"no {missing}. Make one with: dmrl quantize, and of it dmrl export")
     try:
         arrays = load_npz(file)
         said = parse_json(arrays.pop("description").tobytes())

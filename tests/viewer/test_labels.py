@@ -36,10 +36,10 @@ def test_of_detections_whose_texts_would_meet_the_surer_has_one() -> None:
     near = [(100.0, 80.0, 0.5), (130.0, 90.0, 0.9), (130.0, 180.0, 0.6), (260.0, 90.0, 0.7)]
     found = [dict(zip(("u_px", "v_px", "confidence"), d, strict=True)) for d in near]
     rows = [{"threshold": 0.4, "detections": [{**d, "depth_m": 1.0} for d in found]}] * 2
-    entity, weak = detections("/a", "a", pa.RecordBatch.from_pylist(rows), 320)
-    assert weak.path == "/a/weak"
+    points, entity, weak = detections("/a", "a", pa.RecordBatch.from_pylist(rows), 320)
+    assert (points.path, entity.path, weak.path) == ("/a", "/a/texts", "/a/weak")
     (texts,) = (c for c in entity.columns if "labels" in str(c.component_descriptor()))
-    told = ["", "conf 0.90, 1.00 m", "conf 0.60, 1.00 m", "conf 0.70, 1.00 m"]
+    told = ["conf 0.90, 1.00 m", "conf 0.60, 1.00 m", "conf 0.70, 1.00 m"]
     assert texts.as_arrow_array().to_pylist() == [told, told]
 
 

@@ -39,6 +39,7 @@ def test_every_topic_becomes_its_archetypes(make: Make, rrd: Path) -> None:
         ("/cf1/labels/published/boxes", "Boxes2D"): 10,
         ("/cf1/labels/published/texts", "Points2D"): 10,
         ("/cf1/detections", "Points2D"): 10,
+        ("/cf1/detections/texts", "Points2D"): 10,
         ("/cf1/detections/weak", "Points2D"): 10,
         ("/cf1/detections/grid/confidence", "DepthImage"): 10,
         ("/cf1/detections/grid/depth_m", "DepthImage"): 10,
@@ -84,13 +85,18 @@ def test_a_detection_below_the_threshold_is_in_no_view_and_has_no_text(
     make: Make, rrd: Path
 ) -> None:
     save([make()], rrd, Settings())
-    assert column(rrd, "/cf1/detections", "Points2D:labels") == [["conf 0.90, 1.20 m"]] * 10
+    texts = "/cf1/detections/texts"
+    assert column(rrd, texts, "Points2D:labels") == [["conf 0.90, 1.20 m"]] * 10
+    ((_, point_v),), ((_, text_v),) = (
+        column(rrd, path, "Points2D:positions")[0] for path in ("/cf1/detections", texts)
+    )
+    assert 0 < text_v - point_v < 2  # half the robot lower: 64 px wide images, 1.2 m away
     assert column(rrd, "/cf1/detections", "Points2D:radii") == [[-4.0]]
     weak = column(rrd, "/cf1/detections/weak", "Points2D:positions")
     assert [len(points) for points in weak] == [1] * 10
     assert column(rrd, "/cf1/detections/weak", "Points2D:radii") == [[-1.5]]
     lines = {line for query in queries(rrd) for line in query}
-    assert "/cf1/detections" in lines
+    assert {"/cf1/detections", texts} <= lines
     assert not any("weak" in line or "detections/**" in line for line in lines)
 
 
