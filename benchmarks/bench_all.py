@@ -3,7 +3,9 @@
 Run as ``python benchmarks/bench_all.py [OUT] [--only recording ...]``; ``make bench`` does. In OUT:
 a .txt of each, .json where it writes one, machine.json and ratios.png: what others take of CPU
 time for what dmrl does, of the same rounds. One that fails, for want of a package or of Blender,
-is told with its last line, the others go on, and the exit status is 1.
+is told with its last line, the others go on, and the exit status is 1. With ``--model
+crazyflie-published.blend --backgrounds DIR``, which are the authors' and photos, rendering is
+compared with the published way; without, it is timed alone.
 """
 
 import argparse
@@ -25,13 +27,12 @@ WORK: Mapping[str, tuple[str, ...]] = {
     "commands": ("bench_commands.py", "--json"),
     "memory": ("bench_memory.py", "--json"),
     "training": ("bench_training.py",),
+    "render": ("bench_render.py", "speed", "--images", "100", "--rounds", "2", "--json"),
     "dataset": ("bench_dataset.py",),
     "labels": ("bench_labels.py", "--costs-only"),
 }
 """Scripts and what they are given; one that ends in ``--json`` is told where to."""
 ASKS = {
-    "render": "python benchmarks/bench_render.py speed --model crazyflie-published.blend "
-    "--backgrounds DIR: of the authors' model and of photos",
     "deploy": "python benchmarks/bench_deploy.py EXPORT: of a network of one's own",
 }
 """What is left out, and why."""
@@ -51,11 +52,13 @@ def machine() -> dict[str, Any]:
     }
 
 
-def run(name: str, out: Path) -> str:
+def run(name: str, out: Path, material: list[str]) -> str:
     """One benchmark; nothing, or the last line of what went wrong."""
     script, *words = WORK[name]
     if words and words[-1] == "--json":
         words.append(str(out / f"{name}.json"))
+    if name == "render":
+        words += material
     done = subprocess.run(
         [sys.executable, str(HERE / script), *words], capture_output=True, text=True, check=False
     )
@@ -74,6 +77,13 @@ def draw(out: Path) -> None:
         rows = {row["who"]: row for row in json.loads(path.read_text())}
         own = rows.pop("dmrl predict --backend onnx")["cpu_ms"]
         bars += [(f"predict: {who}", row["cpu_ms"] / own) for who, row in rows.items()]
+    if (path := out / "render.json").exists():
+        found = json.loads(path.read_text())
+        bars += [
+            (f"render: {name}", sum(ratios) / len(ratios))
+            for name, ratios in found.items()
+            if " / ours, published model" in name and not name.startswith("ours")
+        ]
     if not bars:
         return
     figure = Figure(figsize=(9, 0.3 * len(bars) + 1), layout="constrained")
@@ -90,10 +100,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/bench"))
     parser.add_argument("--only", nargs="+", choices=list(WORK), default=list(WORK))
+    parser.add_argument("--model", type=Path, help="crazyflie-published.blend")
+    parser.add_argument("--backgrounds", type=Path, help="a folder of photos")
     arguments = parser.parse_args()
+    given = {"--model": arguments.model, "--backgrounds": arguments.backgrounds}
+    material = [w for flag, path in given.items() if path for w in (flag, str(path.resolve()))]
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "machine.json").write_text(json.dumps(machine(), indent=1) + "\n")
-    failed = {name: why for name in arguments.only if (why := run(name, arguments.out))}
+    failed = {name: why for name in arguments.only if (why := run(name, arguments.out, material))}
     draw(arguments.out)
     for name, why in ASKS.items():
         print(f"left out: {name}: {why}")

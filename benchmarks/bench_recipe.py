@@ -1,7 +1,7 @@
 """What each ingredient of a training recipe gives, on images held out of the training split.
 
-    python benchmarks/bench_recipe.py DATASET [--recipe published_best] [--epochs 12] [--seeds 1]
-        [--only "no paste" ...] [--json OUT.json]
+    python benchmarks/bench_recipe.py DATASET [--recipe published_best] [--epochs 12]
+        [--seeds 1] [--first-seed 0] [--only "no paste" ...] [--json OUT.json]
 
 Every row is the recipe with one thing taken out or put in its place, trained anew and judged
 on the same images, one in ten of the training split. The test split is never opened. Short
@@ -71,7 +71,7 @@ HELD_OUT = 0.1
 
 
 def rows(
-    dataset: Path, name: str, epochs: int, seeds: int, only: list[str]
+    dataset: Path, name: str, epochs: int, seeds: range, only: list[str]
 ) -> Iterator[dict[str, Any]]:
     """One row per variant: mean and spread over the seeds of each figure."""
     for title in only or VARIANTS:
@@ -83,12 +83,16 @@ def rows(
                 # One for all seeds. The row's CPU time includes its own.
                 teacher = runs / "teacher"
                 run(dataset, teacher, replace(settings, architecture=TEACHER))
-            for seed in range(seeds):
+            for seed in seeds:
                 run(dataset, runs / str(seed), replace(settings, seed=seed), teacher=teacher)
-            histories = [load_model(runs / str(seed)).training["history"] for seed in range(seeds)]
+            histories = [load_model(runs / str(seed)).training["history"] for seed in seeds]
         spent = time.process_time() - begun
         said = [history[-1] for history in histories]
-        row: dict[str, Any] = {"variant": title, "cpu_s": spent / seeds, "epochs": settings.epochs}
+        row: dict[str, Any] = {
+            "variant": title,
+            "cpu_s": spent / len(seeds),
+            "epochs": settings.epochs,
+        }
         row["within_20_px_by_epoch"] = np.mean(
             [[epoch["validation_within_20_px"] for epoch in history] for history in histories],
             axis=0,
@@ -96,7 +100,7 @@ def rows(
         for figure in WATCHED:
             values = [epoch[f"validation_{figure}"] for epoch in said]
             row[figure] = float(np.mean(values))
-            row[f"{figure}_std"] = float(np.std(values, ddof=1)) if seeds > 1 else math.nan
+            row[f"{figure}_std"] = float(np.std(values, ddof=1)) if len(seeds) > 1 else math.nan
         yield row
 
 
@@ -128,11 +132,13 @@ def main() -> None:
     parser.add_argument("--recipe", default="published_best")
     parser.add_argument("--epochs", type=int, default=12)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[], choices=list(VARIANTS))
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     found = []
-    for row in rows(args.dataset, args.recipe, args.epochs, args.seeds, args.only):
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    for row in rows(args.dataset, args.recipe, args.epochs, seeds, args.only):
         found.append(row)
         if args.json:
             args.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

@@ -2,7 +2,7 @@
 
     python benchmarks/bench_render.py reprojection [--images 500]
     python benchmarks/bench_render.py grain --images 24 --backgrounds DIR
-    python benchmarks/bench_render.py speed --model crazyflie-published.blend --backgrounds DIR
+    python benchmarks/bench_render.py speed [--model crazyflie-published.blend --backgrounds DIR]
     python benchmarks/bench_render.py memory [--images 3000]
 
 CPU seconds are those of all processes together, start-up included where not said otherwise.
@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from dmrl.stages.render import camera_of, run, settings_of
 from dmrl.terminal.progress import say
 
 PUBLISHED_WAY = Path(__file__).parent / "published_way.py"
+PUBLISHED = "the published way"
 SAMPLES, FEW = 16, 4
 MM_PER_UNIT = 0.002  # the published model, at twice life size as the authors rendered it
 
@@ -44,7 +46,9 @@ def _own_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def published_way(model: Path, backgrounds: Path, images: int, samples: int) -> dict[str, float]:
+def published_way(
+    model: Path, backgrounds: Path, images: int, samples: int, *, lean: bool
+) -> dict[str, float]:
     """CPU seconds per image of the published way, start-up included, on our own scenes.
 
     Parameters
@@ -57,6 +61,8 @@ def published_way(model: Path, backgrounds: Path, images: int, samples: int) -> 
         How many.
     samples
         Light paths per pixel.
+    lean
+        2 bounces and a filter as wide as the pixel, as dmrl has them, in place of 12 and a wider.
     """
     settings = replace(settings_of("synthetic_paper"), images=images, robots_max=1)
     world = World(
@@ -77,7 +83,8 @@ def published_way(model: Path, backgrounds: Path, images: int, samples: int) -> 
             matrices.append(matrix.tolist())
         listed.append({"background": str(photos[k % len(photos)]), "robots": matrices})
     with tempfile.TemporaryDirectory() as folder:
-        job = {"model": str(model), "samples": samples, "folder": folder, "images": listed}
+        job = {"model": str(model), "samples": samples, "lean": lean, "folder": folder}
+        job["images"] = listed
         (Path(folder) / "job.json").write_text(json.dumps(job))
         before, begin = _children_s(), time.monotonic()
         subprocess.run(
@@ -158,33 +165,14 @@ def _resident_mb() -> float:
     return total * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def speed(model: Path, backgrounds: Path, images: int, rounds: int) -> dict[str, object]:
-    """The published way, and ours with its model and with our own, turn by turn in one run.
+Way = tuple[Callable[[int], dict[str, float]], int]
+"""What a number of images costs, and how many to take."""
 
-    The first two take equal samples; what is called by a recipe's name is as that recipe says.
 
-    Every way is timed with few and with many images; the difference is what an image costs
-    without the start. What else runs on the machine then disturbs all ways alike.
-
-    Parameters
-    ----------
-    model
-        crazyflie-published.blend.
-    backgrounds
-        Folder of photos.
-    images
-        How many of ours in a round; the published way gets a tenth.
-    rounds
-        How often; the least and the median are told.
-    """
-    as_published = {"model": model, "scale": MM_PER_UNIT, "model_up": "y"}
-    one = {"backgrounds": backgrounds, "robots_max": 1}
-    ways: dict[str, tuple[Callable[[int], dict[str, float]], int]] = {
-        "published way": (lambda n: published_way(model, backgrounds, n, SAMPLES), images // 10),
-        "ours, published model": (
-            lambda n: ours("synthetic_paper", n, 2, samples=SAMPLES, **one, **as_published),
-            images,
-        ),
+def ways_of(model: Path | None, backgrounds: Path | None, images: int) -> dict[str, Way]:
+    """The published way, as published and lean, and ours; without its model ours alone."""
+    one = {"backgrounds": backgrounds or Path("rooms"), "robots_max": 1}
+    own: dict[str, Way] = {
         "ours, default model": (
             lambda n: ours("synthetic_paper", n, 2, samples=SAMPLES, **one),
             images,
@@ -192,6 +180,44 @@ def speed(model: Path, backgrounds: Path, images: int, rounds: int) -> dict[str,
         "synthetic_paper": (lambda n: ours("synthetic_paper", n, 2, **one), images),
         "synthetic_large": (lambda n: ours("synthetic_large", n, 2, **one), images),
     }
+    if model is None or backgrounds is None:
+        return own
+    as_published = {"model": model, "scale": MM_PER_UNIT, "model_up": "y"}
+    theirs = partial(published_way, model, backgrounds, samples=SAMPLES)
+    return {
+        PUBLISHED: (partial(theirs, lean=False), images // 10),
+        f"{PUBLISHED}, 2 bounces and a box": (partial(theirs, lean=True), images // 10),
+        "ours, published model": (
+            lambda n: ours("synthetic_paper", n, 2, samples=SAMPLES, **one, **as_published),
+            images,
+        ),
+        **own,
+    }
+
+
+def speed(
+    model: Path | None, backgrounds: Path | None, images: int, rounds: int
+) -> dict[str, object]:
+    """The published way, and ours with its model and with our own, turn by turn in one run.
+
+    The published way, twice, and the first two of ours take equal samples; what is called by a
+    recipe's name is as that recipe says.
+
+    Every way is timed with few and with many images; the difference is what an image costs
+    without the start. What else runs on the machine then disturbs all ways alike.
+
+    Parameters
+    ----------
+    model
+        crazyflie-published.blend. None: without the published way.
+    backgrounds
+        Folder of photos; None: rooms made by code, and without the published way.
+    images
+        How many of ours in a round; the published way gets a tenth.
+    rounds
+        How often; the least and the median are told.
+    """
+    ways = ways_of(model, backgrounds, images)
     found: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
     for _ in range(rounds):
         for name, (way, many) in ways.items():
@@ -210,10 +236,11 @@ def speed(model: Path, backgrounds: Path, images: int, rounds: int) -> dict[str,
             for key in rates[0]
             if (values := [rate[key] for rate in rates])
         }
-        result[f"published way / {name}"] = [
-            theirs["cpu_s_without_start"] / rate["cpu_s_without_start"]
-            for theirs, rate in zip(found["published way"], rates, strict=True)
-        ]
+        for peer in (way for way in found if way.startswith(PUBLISHED)):
+            result[f"{peer} / {name}"] = [
+                theirs["cpu_s_without_start"] / rate["cpu_s_without_start"]
+                for theirs, rate in zip(found[peer], rates, strict=True)
+            ]
     return result
 
 
@@ -225,21 +252,23 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--model", type=Path)
     parser.add_argument("--backgrounds", type=Path)
+    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     if asked.what == "reprojection":
         result: object = {p: reprojection(p, asked.images) for p in ("published", "himax")}
     elif asked.what == "memory":
         result = memory(asked.images)
+    elif asked.what == "speed":
+        result = speed(asked.model, asked.backgrounds, asked.images, asked.rounds)
     elif asked.backgrounds is None:
         sys.exit(f"{asked.what} needs --backgrounds DIR")
-    elif asked.what == "grain":
+    else:
         recipes = ("synthetic_paper", "synthetic_large")
         result = {r: grain(r, asked.images, asked.backgrounds) for r in recipes}
-    elif asked.model is None:
-        sys.exit("speed needs --model crazyflie-published.blend")
-    else:
-        result = speed(asked.model, asked.backgrounds, asked.images, asked.rounds)
-    print(json.dumps(result, indent=2))
+    text = json.dumps(result, indent=2)
+    print(text)
+    if asked.json:
+        asked.json.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 An image is made of layers. A layer shows a window of one source image, turned, mirrored and
 zoomed, in a rectangle of the canvas: the whole canvas, the parts of a mosaic, or a patch cut
-out around one robot. One bicubic sampling a layer does all of the geometry.
+out around one robot. One sampling a layer does all of the geometry.
 
 A camera of fixed intrinsics sees a robot z times as large when it is z times as near, so a
 zoom by z divides the depth by z. A turn about the optical axis keeps it.
@@ -16,15 +16,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dmrl.learn.batches import BOX, DEPTH, FIELDS, Batch, Examples, Robots, U, V
+from dmrl.learn.batches import BOX, DEPTH, FIELDS, Batch, Examples, U, V
 from dmrl.learn.windows import (
-    CORNERS,
     Intrinsics,
     Opacity,
     Pixels,
     Point,
     Rect,
     Rng,
+    Robot,
+    Turn,
     Window,
     blended,
     defocused,
@@ -150,13 +151,13 @@ class Augmenter:
         canvas = np.empty((len(chosen), self._height, self._width, 3), np.uint8)
         robots = np.full((len(chosen), MAX_ROBOTS, len(FIELDS)), np.nan, np.float32)
         for slot, number in enumerate(chosen):
-            found = self._draw(canvas[slot], int(number), rng)
-            robots[slot, : min(len(found), MAX_ROBOTS)] = found[:MAX_ROBOTS]
+            if found := self._draw(canvas[slot], int(number), rng)[:MAX_ROBOTS]:
+                robots[slot, : len(found)] = found
         return Batch(torch.from_numpy(canvas).permute(0, 3, 1, 2), torch.from_numpy(robots))
 
-    def _draw(self, canvas: Pixels, number: int, rng: Rng) -> Robots:
-        """Fill a canvas (H, W, 3); returns (n, 11) the robots in it."""
-        robots = np.empty((0, len(FIELDS)), np.float32)
+    def _draw(self, canvas: Pixels, number: int, rng: Rng) -> list[Robot]:
+        """Fill a canvas (H, W, 3); returns the robots in it."""
+        robots: list[Robot] = []
         whole = (0, 0, self._width, self._height)
         mosaic = rng.random() < self._settings.mosaic_share
         rects = parts(whole, rng) if mosaic else [whole]
@@ -168,29 +169,31 @@ class Augmenter:
         self._spoil(canvas, rng)
         return robots
 
-    def _layer(self, canvas: Pixels, rect: Rect, source: int, robots: Robots, rng: Rng) -> Robots:
+    def _layer(
+        self, canvas: Pixels, rect: Rect, source: int, robots: list[Robot], rng: Rng
+    ) -> list[Robot]:
         """Show a window of a source in a rectangle; the robots of the canvas after it."""
         width, height = rect[2] - rect[0], rect[3] - rect[1]
         mine = present(self._examples.robots[source])
-        focus = mine[rng.integers(len(mine))] if len(mine) else None
+        focus = mine[int(rng.integers(len(mine)))] if mine else None
         zoom = self._zoom(focus, rng)
         zoom = max(zoom, width / self._width, height / self._height)  # no look past the source
-        middle = np.array([self._width / 2, self._height / 2])
-        half = np.array([width, height]) / (2 * zoom)
-        low, high = half, np.maximum(2 * middle - half, half)
-        if focus is not None and rng.random() < FOCUS_SHARE:
-            nearest, farthest = (focus[[U, V]] + sign * half for sign in (-1, 1))
-            low, high = np.clip(nearest, low, high), np.clip(farthest, low, high)
-        seen, shown = rng.uniform(low, high), np.array([width, height]) / 2
+        held = focus if focus and rng.random() < FOCUS_SHARE else None
+        seen = (
+            _looked_at(self._width, width / (2 * zoom), held[U] if held else None, rng),
+            _looked_at(self._height, height / (2 * zoom), held[V] if held else None, rng),
+        )
+        shown = (width / 2, height / 2)
         turn = self._turn(zoom, rng)
-        if focus is not None:  # a camera is turned about where the robot comes to be
-            at = np.linalg.inv(turn) @ (focus[[U, V]] - seen) + shown
-            if (at >= 0).all() and (at < (width, height)).all():
-                seen, shown = focus[[U, V]], at
+        if focus:  # a camera is turned about where the robot comes to be
+            at = _back(turn, focus[U] - seen[0], focus[V] - seen[1])
+            at = (at[0] + shown[0], at[1] + shown[1])
+            if 0 <= at[0] < width and 0 <= at[1] < height:
+                seen, shown = (focus[U], focus[V]), at
         window = self._window(turn, zoom, seen, shown, rect)
         return self._show(canvas, rect, source, window, mine, robots, rng)
 
-    def _patch(self, canvas: Pixels, robots: Robots, rng: Rng) -> Robots:
+    def _patch(self, canvas: Pixels, robots: list[Robot], rng: Rng) -> list[Robot]:
         """Paste a robot of another image, or as much without one.
 
         Along its mask where that is known, else with what is close around it. Without patches
@@ -199,60 +202,58 @@ class Augmenter:
         if not len(self._pasteable):
             return robots
         source, which = self._pasteable[rng.integers(len(self._pasteable))].tolist()
-        robot = self._examples.robots[source, which]
+        robot: Robot = self._examples.robots[source, which].tolist()
         zoom = self._zoom(robot, rng)
-        box = robot[BOX]
-        size = np.ceil(zoom * PATCH_MARGIN * np.array([box[2] - box[0], box[3] - box[1]])) + 8
-        room = np.array([self._width, self._height]) - size
-        if (room < 0).any():
+        west, north, east, south = robot[BOX]
+        width = math.ceil(zoom * PATCH_MARGIN * (east - west)) + 8
+        height = math.ceil(zoom * PATCH_MARGIN * (south - north)) + 8
+        if width > self._width or height > self._height:
             return robots
-        left, top = np.floor(rng.uniform(0, room + 1)).astype(int).tolist()
-        rect = (left, top, left + int(size[0]), top + int(size[1]))
+        left = int(rng.uniform(0, self._width - width + 1))
+        top = int(rng.uniform(0, self._height - height + 1))
+        rect, shown = (left, top, left + width, top + height), (width / 2, height / 2)
         mask = self._examples.mask(source, which)
-        middle = np.array([box[0] + box[2], box[1] + box[3]]) / 2 + rng.uniform(-2, 2, 2)
+        middle = ((west + east) / 2 + rng.uniform(-2, 2), (north + south) / 2 + rng.uniform(-2, 2))
         centre = middle
         if rng.random() < DISTRACTOR_SHARE:
             source = int(rng.integers(len(self._examples)))
-            centre = rng.uniform((0, 0), (self._width, self._height))
+            centre = (rng.uniform(0, self._width), rng.uniform(0, self._height))
         turn = self._turn(zoom, rng)
-        window = self._window(turn, zoom, centre, size / 2, rect)
-        if mask is None:
-            opacity = feather(int(size[1]), int(size[0]))
-        else:
-            about = self._window(turn, zoom, middle, size / 2, rect)
-            shown = sample(255 * mask, about, (int(size[1]), int(size[0])))
-            opacity = np.asarray(shown / np.float32(255), np.float32)
+        window = self._window(turn, zoom, centre, shown, rect)
+        opacity = feather(height, width)
+        if mask is not None:
+            about = self._window(turn, zoom, middle, shown, rect)
+            cut = sample(255 * mask, about, (height, width), sharp=False)
+            opacity = np.asarray(cut / np.float32(255), np.float32)
         mine = present(self._examples.robots[source])
         return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
 
-    def _zoom(self, robot: Robots | None, rng: Rng) -> float:
+    def _zoom(self, robot: Robot | None, rng: Rng) -> float:
         """A magnification, log-uniform; the robot's depth stays in the range of the labels."""
         low, high = self._settings.zoom
         if robot is not None:
-            depth_m = float(robot[DEPTH])
+            depth_m = robot[DEPTH]
             low = max(low, min(depth_m / self._depths[1], 1.0))
             high = max(min(high, max(depth_m / self._depths[0], 1.0)), low)
         return math.exp(rng.uniform(math.log(low), math.log(high)))
 
-    def _turn(self, zoom: float, rng: Rng) -> NDArray[np.float64]:
-        """(2, 2) from steps on the canvas to steps in the source."""
+    def _turn(self, zoom: float, rng: Rng) -> Turn:
+        """From steps on the canvas to steps in the source."""
         most = math.radians(self._settings.rotation_deg)
         angle = rng.uniform(-most, most)
         mirror = -1.0 if rng.random() < self._settings.flip_share else 1.0
-        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        return turn @ np.diag([mirror, 1.0]) / zoom
+        along, across = math.cos(angle) / zoom, math.sin(angle) / zoom
+        return (mirror * along, -across), (mirror * across, along)
 
-    def _window(
-        self, turn: NDArray[np.float64], zoom: float, seen: Point, shown: Point, rect: Rect
-    ) -> Window:
+    def _window(self, turn: Turn, zoom: float, seen: Point, shown: Point, rect: Rect) -> Window:
         """The window of a rectangle that shows a source's point at one of its own."""
         camera = self._settings.intrinsics
         if camera:
-            corner = np.array(rect[:2], float)
-            matrix = turned(camera, turn, seen, shown, corner)
-            size = np.array([rect[2] - rect[0], rect[3] - rect[1]])
-            ahead = CORNERS * size @ matrix[2, :2] + matrix[2, 2]
-            if ahead.min() > LEAST_AHEAD * ahead.max():
+            matrix = turned(camera, turn, seen, shown, (rect[0], rect[1]))
+            x, y, whole = matrix[2].tolist()
+            right, down = x * (rect[2] - rect[0]), y * (rect[3] - rect[1])
+            ahead = (whole, whole + right, whole + down, whole + right + down)
+            if min(ahead) > LEAST_AHEAD * max(ahead):
                 return Window(matrix, zoom, camera)
         return Window(flat(turn, seen, shown), zoom)
 
@@ -262,30 +263,29 @@ class Augmenter:
         rect: Rect,
         source: int,
         window: Window,
-        mine: Robots,
-        robots: Robots,
+        mine: list[Robot],
+        robots: list[Robot],
         rng: Rng,
         opacity: Opacity | None = None,
-    ) -> Robots:
+    ) -> list[Robot]:
         left, top, right, bottom = rect
         pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
         pixels = self._tinted(pixels, rng)
         place = canvas[top:bottom, left:right]
         place[:] = pixels if opacity is None else blended(place, pixels, opacity)
-        seen = moved(mine, window, rect)
-        kept = robots[~under(robots, rect, opacity)]
-        return np.concatenate([kept, seen[under(seen, rect, opacity) & self._in_source(mine)]])
-
-    def _in_source(self, robots: Robots) -> NDArray[np.bool_]:
-        return inside(robots, (0, 0, self._width, self._height))
+        whole = (0, 0, self._width, self._height)
+        new = moved([robot for robot in mine if inside(robot, whole)], window, rect)
+        kept = [robot for robot in robots if not under(robot, rect, opacity)]
+        return kept + [robot for robot in new if under(robot, rect, opacity)]
 
     def _tinted(self, pixels: Pixels, rng: Rng) -> Pixels:
         """With other contrast, brightness and white balance."""
         spread = self._settings.colour
         if not spread:
             return pixels
-        gain = np.exp(rng.normal(0, spread, 1) + rng.normal(0, spread / 2, 3))
-        return levelled(pixels, gain, 128 * (1 - gain) + rng.normal(0, 128 * spread, 1))
+        contrast, *white, light = rng.normal(0, spread, 5).tolist()
+        gain = [math.exp(contrast + channel / 2) for channel in white]
+        return levelled(pixels, gain, [128 * (1 - times + light) for times in gain])
 
     def _spoil(self, canvas: Pixels, rng: Rng) -> None:
         """Defocus, sensor noise and the loss of colours, in place."""
@@ -297,3 +297,21 @@ class Augmenter:
             canvas[:] = grained(canvas, grain, 255 * self._settings.noise * rng.random())
         if self._settings.grey_share and rng.random() < self._settings.grey_share:
             canvas[:] = greyed(canvas)
+
+
+def _looked_at(whole: float, half: float, held: float | None, rng: Rng) -> float:
+    """Where along an axis the middle of a window lies, that reaches so far to either side.
+
+    Within the whole; about what is to be held, where there is such.
+    """
+    low, high = half, max(whole - half, half)
+    if held is not None:
+        low, high = (min(max(held + far, low), high) for far in (-half, half))
+    return float(rng.uniform(low, high))
+
+
+def _back(turn: Turn, right: float, down: float) -> Point:
+    """Steps on the canvas from those in the source."""
+    (a, b), (c, d) = turn
+    area = a * d - b * c
+    return (d * right - b * down) / area, (a * down - c * right) / area

@@ -10,7 +10,7 @@ from dmrl.learn import augment
 from dmrl.learn.augment import Augmentation, Augmenter
 from dmrl.learn.batches import FIELDS, Batch, Examples
 from dmrl.learn.settings import FitSettings
-from dmrl.learn.windows import facing, through
+from dmrl.learn.windows import Robot, facing, through
 
 from .squares import GEOMETRY, SIDE_M, augmenter, batches, squares
 
@@ -129,10 +129,8 @@ def test_a_grey_share_of_images_has_no_colours() -> None:
     assert (whole.amax(dim=1) == whole.amin(dim=1)).all()
 
 
-def at_depth(depth_m: float) -> NDArray[np.float32]:
-    robot = np.zeros(len(FIELDS), np.float32)
-    robot[2] = depth_m
-    return robot
+def at_depth(depth_m: float) -> Robot:
+    return [0.0, 0.0, depth_m, *[0.0] * (len(FIELDS) - 3)]
 
 
 @pytest.mark.parametrize(
@@ -215,14 +213,15 @@ def test_a_camera_is_turned_no_further_than_a_quarter_of_the_depth_is_left() -> 
         left, top = rng.integers(0, 60, 2).tolist()
         rect = (left, top, left + int(rng.integers(20, 100)), top + int(rng.integers(20, 50)))
         size = np.array([rect[2] - left, rect[3] - top])
-        seen, shown = rng.uniform((-100, -100), (260, 210)), size * rng.random(2)
-        turn = facing(camera, seen) @ facing(camera, shown + rect[:2]).T
+        seen = (rng.uniform(-100, 260), rng.uniform(-100, 210))
+        shown = (size[0] * rng.random(), size[1] * rng.random())
+        turn = facing(camera, seen) @ facing(camera, (shown[0] + left, shown[1] + top)).T
         corners = np.array([[x, y, 1.0] for x in (left, rect[2]) for y in (top, rect[3])])
         ahead = (turn @ np.linalg.inv(k) @ corners.T)[2]
-        window = maker._window(np.eye(2), 1.0, seen, shown, rect)
+        window = maker._window(((1.0, 0.0), (0.0, 1.0)), 1.0, seen, shown, rect)
         kept.append(window.camera is not None)
         assert kept[-1] == (ahead.min() > 0.25 * ahead.max())
-        found = through(window.matrix, shown[None])[0]
+        found = through(window.matrix.tolist(), *shown)
         assert found == pytest.approx(seen, abs=1e-6)  # as far as it is shown where it should be
     assert 0.2 < np.mean(kept) < 0.9
 
@@ -238,13 +237,13 @@ def test_a_window_is_turned_about_where_the_robot_comes_to_be(
     made = maker._window
     monkeypatch.setattr(maker, "_window", lambda *given: asked.append(given) or made(*given))
     robot, whole = maker._examples.robots[0, 0], (0, 0, 160, 112)
-    empty, shown_at = np.empty((0, len(FIELDS)), np.float32), []
+    shown_at = []
     for _ in range(60):
-        found = maker._layer(np.empty((112, 160, 3), np.uint8), whole, 0, empty, rng)
+        found = maker._layer(np.empty((112, 160, 3), np.uint8), whole, 0, [], rng)
         _, _, seen, shown, _ = asked[-1]
         if len(found):
             np.testing.assert_allclose(seen, robot[:2])
-            np.testing.assert_allclose(found[0, :2], shown, atol=1e-3)
+            np.testing.assert_allclose(found[0][:2], shown, atol=1e-3)
             shown_at.append(shown)
     assert len(shown_at) > 40  # most windows hold the robot
     assert np.std(shown_at, axis=0).min() > 2  # not always at one place
@@ -264,15 +263,15 @@ def layered(
 
     monkeypatch.setattr(maker, "_window", window)
     monkeypatch.setattr(maker, "_show", lambda *given: given[5])
-    robots, rng = np.empty((0, len(FIELDS)), np.float32), np.random.default_rng(8)
+    rng = np.random.default_rng(8)
     size = np.array([rect[2] - rect[0], rect[3] - rect[1]])
     found, canvas = [], np.empty((112, 160, 3), np.uint8)
     for _ in range(300):
-        maker._layer(canvas, rect, 0, robots, rng)
-        turn, zoom, seen, shown = asked[-1]
+        maker._layer(canvas, rect, 0, [], rng)
+        turn, zoom, seen, shown = map(np.asarray, asked[-1])
         corners = np.array([seen + turn @ (at - shown) for at in (0 * size, size)])
         robot = maker._examples.robots[0, 0, :2]
-        found.append((zoom, corners, np.linalg.inv(turn) @ (robot - seen) + shown))
+        found.append((float(zoom), corners, np.linalg.inv(turn) @ (robot - seen) + shown))
     return found
 
 

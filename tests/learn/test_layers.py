@@ -6,6 +6,10 @@ from numpy.typing import NDArray
 
 from dmrl.learn.batches import FIELDS
 from dmrl.learn.windows import (
+    Intrinsics,
+    Pixels,
+    Point,
+    Rect,
     Window,
     facing,
     feather,
@@ -25,6 +29,9 @@ CAMERA = (120.0, 118.0, 160.0, 100.0)
 WHOLE = (0, 0, 320, 224)
 
 
+UPRIGHT = ((1.0, 0.0), (0.0, 1.0))
+
+
 def seen_at(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixels of points (n, 3) to the right, below and ahead of the camera."""
     fx, fy, cx, cy = CAMERA
@@ -38,6 +45,15 @@ def robots_at(points: NDArray[np.float64]) -> NDArray[np.float32]:
     return out
 
 
+def pair(at: NDArray[np.float64]) -> Point:
+    u, v = at.tolist()
+    return u, v
+
+
+def shown_by(robots: NDArray[np.float32], window: Window, rect: Rect) -> NDArray[np.float64]:
+    return np.array(moved(robots.tolist(), window, rect))
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -45,9 +61,9 @@ def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: in
     source = seen_at(points[:1])[0]
     shown = rng.uniform((60, 40), (260, 180))
     corner = np.array([7.0, 5.0])
-    matrix = turned(CAMERA, np.eye(2), source, shown - corner, corner)
-    got = moved(robots_at(points), Window(matrix, 1.0, CAMERA), (7, 5, 320, 224))
-    then = points @ (facing(CAMERA, source) @ facing(CAMERA, shown).T)
+    matrix = turned(CAMERA, UPRIGHT, pair(source), pair(shown - corner), pair(corner))
+    got = shown_by(robots_at(points), Window(matrix, 1.0, CAMERA), (7, 5, 320, 224))
+    then = points @ (facing(CAMERA, pair(source)) @ facing(CAMERA, pair(shown)).T)
     np.testing.assert_allclose(got[:, :2], seen_at(then), atol=1e-3)
     np.testing.assert_allclose(got[:, 2], then[:, 2], rtol=1e-5)
     np.testing.assert_allclose(got[0, :2], shown, atol=1e-4)
@@ -56,30 +72,30 @@ def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: in
 
 def test_what_is_straight_above_stays_straight_above() -> None:
     post = np.array([[0.5, y, 1.0] for y in (-0.4, 0.0, 0.3)])
-    matrix = turned(CAMERA, np.eye(2), seen_at(post)[1], np.array([90.0, 100.0]), np.zeros(2))
-    got = moved(robots_at(post), Window(matrix, 1.0, CAMERA), WHOLE)
+    matrix = turned(CAMERA, UPRIGHT, pair(seen_at(post)[1]), (90.0, 100.0), (0.0, 0.0))
+    got = shown_by(robots_at(post), Window(matrix, 1.0, CAMERA), WHOLE)
     np.testing.assert_allclose(got[:, 0], 90.0, atol=1e-3)
 
 
 def test_a_zoom_brings_the_point_it_is_about_nearer_by_as_much() -> None:
     point = np.array([[0.4, 0.1, 1.2]])
-    at = seen_at(point)[0]
-    matrix = turned(CAMERA, np.eye(2) / 1.5, at, at, np.zeros(2))
-    got = moved(robots_at(point), Window(matrix, 1.5, CAMERA), WHOLE)
+    at = pair(seen_at(point)[0])
+    matrix = turned(CAMERA, ((1 / 1.5, 0.0), (0.0, 1 / 1.5)), at, at, (0.0, 0.0))
+    got = shown_by(robots_at(point), Window(matrix, 1.5, CAMERA), WHOLE)
     np.testing.assert_allclose(got[0, :3], [*at, 1.2 / 1.5], rtol=1e-5)
 
 
 def test_what_is_behind_a_turned_camera_is_nowhere() -> None:
     away = np.array([[-3.0, 0.0, 1.0]])
-    matrix = turned(CAMERA, np.eye(2), np.array([318.0, 100]), np.array([0.0, 100]), np.zeros(2))
-    got = moved(robots_at(away), Window(matrix, 1.0, CAMERA), WHOLE)
+    matrix = turned(CAMERA, UPRIGHT, (318.0, 100.0), (0.0, 100.0), (0.0, 0.0))
+    got = shown_by(robots_at(away), Window(matrix, 1.0, CAMERA), WHOLE)
     assert np.isnan(got[0, :2]).all()
 
 
 def test_what_is_beside_the_camera_is_nowhere() -> None:
-    with np.errstate(all="raise"):
-        got = through(np.eye(3)[[0, 1, 0]], np.array([[0.0, 1.0], [2.0, 1.0]]))
-    assert np.isnan(got[0]).all() and got[1].tolist() == [1.0, 0.5]
+    sideways = np.eye(3)[[0, 1, 0]].tolist()
+    assert np.isnan(through(sideways, 0.0, 1.0)).all()
+    assert through(sideways, 2.0, 1.0) == (1.0, 0.5)
 
 
 def test_pixels_go_where_labels_go() -> None:
@@ -87,8 +103,8 @@ def test_pixels_go_where_labels_go() -> None:
     u, v = seen_at(point)[0]
     down, across = np.indices((224, 320)) + 0.5
     spot = 255 * np.exp(-((across - u) ** 2 + (down - v) ** 2) / 50)
-    shown = np.array([180.0, 90.0])
-    window = Window(turned(CAMERA, np.eye(2), np.array([u, v]), shown, np.zeros(2)), 1.0, CAMERA)
+    shown = (180.0, 90.0)
+    window = Window(turned(CAMERA, UPRIGHT, (u, v), shown, (0.0, 0.0)), 1.0, CAMERA)
     image = sample(spot[..., None].astype(np.uint8), window, (224, 320))[..., 0].astype(float)
     centre = np.array([(image * across).sum(), (image * down).sum()]) / image.sum()
     # A spot of 5 px is stretched a little to one side.
@@ -98,31 +114,76 @@ def test_pixels_go_where_labels_go() -> None:
 
 def test_without_a_camera_a_window_is_cut_out() -> None:
     picture = (np.arange(40 * 60 * 3) % 251).astype(np.uint8).reshape(40, 60, 3)
-    window = Window(flat(np.eye(2), np.array([20.0, 10.0]), np.array([0.0, 0.0])), 1.0)
+    window = Window(flat(UPRIGHT, (20.0, 10.0), (0.0, 0.0)), 1.0)
     assert (sample(picture, window, (15, 25)) == picture[10:25, 20:45]).all()
+    mirror = Window(flat(((-1.0, 0.0), (0.0, 1.0)), (45.0, 10.0), (0.0, 0.0)), 1.0)
+    assert (sample(picture, mirror, (15, 25)) == picture[10:25, 20:45][:, ::-1]).all()
+
+
+def natural(height: int, width: int) -> Pixels:
+    """A picture of three colours whose detail grows coarser, as that of photos does."""
+    rng, out = np.random.default_rng(0), np.full((height, width, 3), 128.0)
+    for step in (1, 2, 4, 8):
+        grain = rng.normal(0, 10, (height // step + 1, width // step + 1, 3))
+        out += grain.repeat(step, 0).repeat(step, 1)[:height, :width]
+    return np.clip(out, 0, 255).astype(np.uint8)
+
+
+def steps(pixels: Pixels) -> float:
+    """Root mean square of what lies between neighbours."""
+    return float(np.sqrt(np.mean(np.diff(pixels[..., 0].astype(float), axis=1) ** 2)))
 
 
 def test_a_window_is_sharper_than_a_bilinear_one() -> None:
-    rng = np.random.default_rng(0)
-    picture = rng.integers(60, 200, (112, 160, 1), np.uint8)
-    window = Window(flat(np.eye(2), np.array([10.5, 10.5]), np.zeros(2)), 1.0)
-    shown = sample(picture, window, (80, 80))[..., 0]
-    # Halfway between pixels: the mean of four, as a bilinear window is, halves the spread.
-    assert shown.std() > 0.6 * picture.std()
+    picture = natural(112, 160)
+    window = Window(flat(UPRIGHT, (10.5, 10.5), (0.0, 0.0)), 1.0)
+    blurred = sample(picture, window, (80, 80), sharp=False)
+    # Halfway between pixels: the mean of four.
+    near = picture[10:91, 10:91].astype(float)
+    mean = (near[1:, 1:] + near[:-1, 1:] + near[1:, :-1] + near[:-1, :-1]) / 4
+    np.testing.assert_allclose(blurred, mean, atol=1)
+    assert steps(sample(picture, window, (80, 80))) > 1.15 * steps(blurred)
+
+
+@pytest.mark.parametrize("camera", [None, CAMERA])
+def test_a_window_shows_the_same_whether_of_a_whole_image_or_of_a_part(
+    camera: Intrinsics | None,
+) -> None:
+    picture, rng = natural(224, 320), np.random.default_rng(1)
+    for _ in range(40):
+        turn = tuple(map(tuple, (np.eye(2) + rng.uniform(-0.4, 0.4, (2, 2))).tolist()))
+        seen, shown = (rng.uniform(low, high, 2).tolist() for low, high in ((20, 200), (0, 30)))
+        matrix = (
+            turned(camera, turn, seen, shown, (9.0, 4.0)) if camera else flat(turn, seen, shown)
+        )
+        size = (30, 30)
+        whole = np.linalg.inv(_beyond(60)) @ matrix
+        padded = np.pad(picture, ((60, 60), (60, 60), (0, 0)), mode="edge")
+        got = sample(picture, Window(matrix, 1.0), size).astype(int)
+        wanted = sample(padded, Window(whole, 1.0), size).astype(int)
+        # OpenCV rounds to 1/32 px, now and then to the other side.
+        assert abs(got - wanted).max() <= 6 and abs(got - wanted).mean() < 0.2
+
+
+def _beyond(margin_px: int) -> NDArray[np.float64]:
+    return np.array([[1, 0, -margin_px], [0, 1, -margin_px], [0, 0, 1.0]])
 
 
 def test_beyond_an_image_its_border_goes_on() -> None:
     picture = np.arange(40, dtype=np.uint8).reshape(4, 10)[..., None].repeat(3, axis=2)
-    window = Window(flat(np.eye(2), np.array([-5.0, 0.0]), np.zeros(2)), 1.0)
-    shown = sample(picture, window, (4, 10))
+    window = Window(flat(UPRIGHT, (-5.0, 0.0), (0.0, 0.0)), 1.0)
+    shown = sample(picture, window, (4, 10), sharp=False)
     assert (shown[:, :6] == picture[:, :1]).all()
     assert (shown[:, 5:] == picture[:, :5]).all()
+    nowhere = Window(flat(UPRIGHT, (-50.0, 20.0), (0.0, 0.0)), 1.0)
+    assert (sample(picture, nowhere, (4, 10)) == picture[3, 0]).all()
 
 
 def test_pixels_without_channels_have_one() -> None:
     mask = np.full((4, 6), 255, np.uint8)
     for zoom in (1, 2):
-        window = Window(flat(np.eye(2) / zoom, np.zeros(2), np.zeros(2)), zoom)
+        turn = ((1 / zoom, 0.0), (0.0, 1 / zoom))
+        window = Window(flat(turn, (0.0, 0.0), (0.0, 0.0)), zoom)
         shape = (4 * zoom, 6 * zoom)
         assert sample(mask, window, shape).shape == (*shape, 1)
 
@@ -155,27 +216,28 @@ def test_a_feathered_patch_grows_by_quarters_from_its_border() -> None:
 
 def test_a_rectangle_holds_its_left_and_upper_border() -> None:
     at = centres((5, 7), (4.9, 7), (5, 6.9), (14.9, 16.9), (15, 10), (10, 17))
-    assert inside(at, (5, 7, 15, 17)).tolist() == [True, False, False, True, False, False]
-    assert present(np.concatenate([at, centres((np.nan, 1))])).shape == at.shape
+    held = [True, False, False, True, False, False]
+    robots, rect = present(np.concatenate([at, centres((np.nan, 1))])), (5, 7, 15, 17)
+    assert [robot[:2] for robot in robots] == at[:, :2].tolist()
+    assert [inside(robot, rect) for robot in robots] == held
     opacity = np.zeros((10, 10, 1), np.float32)
     opacity[0, 0], opacity[9, 9] = 0.51, 0.49
-    assert under(at, (5, 7, 15, 17), opacity).tolist() == [True] + [False] * 5
-    assert under(at, (5, 7, 15, 17), None).tolist() == inside(at, (5, 7, 15, 17)).tolist()
+    assert [under(robot, rect, opacity) for robot in robots] == [True] + [False] * 5
+    assert [under(robot, rect, None) for robot in robots] == held
 
 
 def test_distance_over_depth_is_the_length_of_a_ray_one_deep() -> None:
     points = np.array([[0.0, 0, 2], [1, 0, 2], [0, -1.5, 3], [1, 2, 2]])
     wanted = np.linalg.norm(points, axis=1) / points[:, 2]
-    assert slant(CAMERA, seen_at(points)) == pytest.approx(wanted)
+    assert [slant(CAMERA, *pair(at)) for at in seen_at(points)] == pytest.approx(wanted)
 
 
 def test_a_flat_window_is_a_turn_about_a_point() -> None:
-    turn = np.array([[0.0, -0.5], [0.5, 0.0]])
-    matrix = flat(turn, np.array([30.0, 40.0]), np.array([7.0, 9.0]))
-    shown = np.array([[7.0, 9.0], [9.0, 9.0], [7.0, 11.0]])
-    assert through(matrix, shown).tolist() == [[30, 40], [30, 41], [29, 40]]
+    matrix = flat(((0.0, -0.5), (0.5, 0.0)), (30.0, 40.0), (7.0, 9.0))
+    shown = [(7.0, 9.0), (9.0, 9.0), (7.0, 11.0)]
+    assert [through(matrix.tolist(), *at) for at in shown] == [(30, 40), (30, 41), (29, 40)]
     robots = centres((30, 40), (30, 41))
     robots[:, 2:6] = 4.0, 1.0, 2.0, 0.5
-    got = moved(robots, Window(matrix, 2.0), (100, 200, 120, 220))
+    got = shown_by(robots, Window(matrix, 2.0), (100, 200, 120, 220))
     assert got[:, :2].tolist() == [[107, 209], [109, 209]]
     assert got[:, 2:6].tolist() == [[2.0, 2.0, 4.0, 0.25]] * 2

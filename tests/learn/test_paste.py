@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dmrl.learn import augment
 from dmrl.learn.augment import Augmentation, Augmenter
 from dmrl.learn.batches import FIELDS, Examples
-from dmrl.learn.windows import feather, through
+from dmrl.learn.windows import Point, Robot, feather, through
 
 from .squares import GEOMETRY, augmenter, batches, squares
 
@@ -71,17 +71,17 @@ class Patches:
     def __init__(self, maker: Augmenter, monkeypatch: pytest.MonkeyPatch) -> None:
         self.rects: list[tuple[int, int, int, int]] = []
         self.sources: list[int] = []
-        self.middles: list[NDArray[np.float64]] = []
+        self.middles: list[Point] = []
         self.zooms: list[float] = []
-        self.mine: list[NDArray[np.float32]] = []
+        self.mine: list[list[Robot]] = []
 
         def show(*given: object) -> object:
             _, rect, source, window, mine, robots, _, opacity = given
             left, top, right, bottom = rect  # type: ignore[misc]
             self.rects.append((left, top, right, bottom))
             self.sources.append(source)  # type: ignore[arg-type]
-            size = np.array([[right - left, bottom - top]])
-            self.middles.append(through(window.matrix, size / 2)[0])  # type: ignore[attr-defined]
+            matrix = window.matrix.tolist()  # type: ignore[attr-defined]
+            self.middles.append(through(matrix, (right - left) / 2, (bottom - top) / 2))
             self.zooms.append(window.zoom)  # type: ignore[attr-defined]
             self.mine.append(mine)  # type: ignore[arg-type]
             if len(self.rects) < 20:
@@ -90,9 +90,9 @@ class Patches:
 
         monkeypatch.setattr(maker, "_show", show)
         rng = np.random.default_rng(9)
-        before, canvas = np.empty((0, len(FIELDS)), np.float32), np.empty((112, 160, 3), np.uint8)
+        canvas = np.empty((112, 160, 3), np.uint8)
         for _ in range(300):
-            maker._patch(canvas, before, rng)
+            maker._patch(canvas, [], rng)
 
 
 def boxed() -> Examples:
@@ -121,7 +121,7 @@ def test_a_patch_is_a_quarter_larger_than_its_robot_and_lies_anywhere(
     away = np.array(found.middles) - [70, 33]
     assert away.min(axis=0) == pytest.approx([-2, -2], abs=0.1)
     assert away.max(axis=0) == pytest.approx([2, 2], abs=0.1)
-    assert all(len(mine) == 1 and mine[0, 0] == 71 for mine in found.mine)
+    assert all(len(mine) == 1 and mine[0][0] == 71 for mine in found.mine)
 
 
 def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +129,7 @@ def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatc
     found = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
     assert np.mean(found.sources) == pytest.approx(0.5, abs=0.06)
     assert {
-        (source, mine[0, 0]) for source, mine in zip(found.sources, found.mine, strict=True)
+        (source, mine[0][0]) for source, mine in zip(found.sources, found.mine, strict=True)
     } == {
         (0, 30.0),
         (1, 71.0),
