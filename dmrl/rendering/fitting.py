@@ -136,7 +136,7 @@ def fitted(
         Of what is drawn.
     """
     settings = _kind(settings, real)
-    for turn in range(ROUNDS):  # of the same draws, so that a step is not chance
+    for turn in range(COARSE[0] + FINE[0]):  # of the same draws, so that a step is not chance
         count = COARSE[1] if turn < COARSE[0] else FINE[1]
         have = seen(pictures(settings, all_scenes[:count], seed))
         settings = _step(settings, real, have)

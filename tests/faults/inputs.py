@@ -30,7 +30,7 @@ STAND_INS = {
     "run": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
     "trim": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
     "evaluate": (("matplotlib.figure:Figure", "draw", "blank"),),
-    "likeness": tuple(("dmrl.rendering.fitting:", name, "FEW") for name in ("PICTURES", "ROUNDS")),
+    "likeness": tuple(("dmrl.rendering.fitting:", name, "FEW") for name in ("COARSE", "FINE")),
     "index": (("dmrl.pipeline.crew:", "subprocess", "Processes"),),
     "report": (("matplotlib.figure:Figure", "draw", "blank"),),
     "dataset": (("dmrl.card:", "plots", "nothing"),),

@@ -20,8 +20,8 @@ from dmrl.rendering import crazyflie
 from dmrl.rendering.blender.protocol import Arrays
 from dmrl.rendering.pool import Start
 
-FEW = 3
-"""In place of the pictures, and the rounds, that `dmrl likeness` fits a camera by."""
+FEW = (2, 3)
+"""In place of the rounds, and the pictures, that `dmrl likeness` fits a camera by."""
 
 
 class Painter:
