@@ -34,11 +34,11 @@ INFLATION = 1.03
 GATE_SIGMA = 0.75
 """The gate goes by sigmas this much smaller: those of the ellipse expect more bad positions than
 there are, as they make room for what is constant."""
-WORSE = 1.1, 1.5
+WORSE, FADED_M = (1.1, 1.5), 0.1
 """Velocities this many times as noisy as the default's: with the first the gate goes by those
-smaller sigmas, with the second by all of them, as where errors of ranges seem to fade. What lasts
-of the errors of worse sensors than are usual is not known either, and what looks best of such a
-flight is mostly luck."""
+smaller sigmas, with the second by all of them, as where errors of ranges larger than this seem to
+fade. What lasts of the errors of worse sensors than are usual is not known either, and what looks
+best of such a flight is mostly luck."""
 SMOOTHER_INFLATION = 1.5
 STILL, ALIKE = 0.022, 0.04
 """Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
@@ -124,7 +124,7 @@ def gate_sigma(noise: Noise) -> float:
         What the sensors turned out to be like.
     """
     usual = Noise()
-    if noise.range_error_std_m > usual.range_error_std_m:  # they fade, or seem to
+    if noise.range_error_std_m > FADED_M:
         return 1.0
     worse = noise.velocity_std_mps / usual.velocity_std_mps
     return float(np.interp(worse, WORSE, (GATE_SIGMA, 1.0)))

@@ -80,7 +80,8 @@ def test_the_gate_makes_no_allowance_for_sensors_worse_than_any_that_were_tried(
     assert grades[:2] == [entrance.GATE_SIGMA] * 2
     assert entrance.GATE_SIGMA < grades[2] < 1.0
     assert grades[3:] == [1.0, 1.0]
-    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.1)) == 1.0
+    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.06)) == entrance.GATE_SIGMA
+    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.12)) == 1.0
 
 
 def test_the_statuses_are_those_of_the_schema() -> None:
