@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dmrl.border.disk import sync, sync_one
+from dmrl.border.disk import empty, sync, sync_one
 from dmrl.border.folders import refuse_no_text
 from dmrl.border.locking import is_held, refuse_locked, take_file, take_folder
 from dmrl.errors import FullDisk, OutputError
@@ -125,7 +125,7 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
         held, kept = None, keep_on_error
         try:
             held = take_file(partial)  # in here, as Ctrl-C comes between any two lines
-            _begin(path)
+            _begin(path, partial)
             yield partial
             sync(partial)
             _link(partial, path)
@@ -199,9 +199,9 @@ def partial_folder(
     with _refusals(path, partial):
         held, kept = take_folder(partial), keep_on_error
         try:
-            _begin(path)
+            _begin(path, partial)
             if not resume:
-                _empty(partial)
+                empty(partial)
             yield partial
             sync(partial)
             _rename(partial, path)
@@ -242,7 +242,7 @@ def grown_folder(path: Path, last: str) -> Iterator[Path]:
     with _refusals(path, partial):
         held = take_folder(partial)
         try:
-            _empty(partial)
+            empty(partial)
             yield partial
             sync(partial)
             _move(partial, path, last)
@@ -275,16 +275,14 @@ def _noted(path: Path) -> Iterator[None]:
         _ended.append(path)
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _begin(path: Path) -> None:
+def _begin(path: Path, partial: Path) -> None:
     """Note an output that is now ours, unless another process has just finished it."""
-    _refuse_taken(path)
+    try:
+        _refuse_taken(path)
+    except OutputError:
+        with suppress(OSError):  # ours is new; a folder is left if anything is in it
+            partial.rmdir() if partial.is_dir() else partial.unlink()
+        raise
     _begun.append(path)
 
 
@@ -343,8 +341,3 @@ def _rename(partial: Path, path: Path) -> None:
     except BaseException:
         path.rename(partial)
         raise
-
-
-def _empty(folder: Path) -> None:
-    for inner in folder.iterdir():
-        _remove(inner)

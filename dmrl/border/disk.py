@@ -1,6 +1,7 @@
 """Bringing files to the disk, so that a power loss does not take them back."""
 
 import os
+import shutil
 from pathlib import Path
 
 from dmrl.border.locking import UNSUPPORTED
@@ -31,3 +32,12 @@ def sync_one(path: Path) -> None:
             raise
     finally:
         os.close(held)
+
+
+def empty(folder: Path) -> None:
+    """Remove everything in a folder; links in it, not what they lead to."""
+    for inner in folder.iterdir():
+        if inner.is_dir() and not inner.is_symlink():
+            shutil.rmtree(inner)
+        else:
+            inner.unlink(missing_ok=True)

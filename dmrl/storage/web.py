@@ -9,11 +9,14 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from aiohttp import ClientTimeout
 from fsspec.implementations.http import HTTPFileSystem
 
 from dmrl.errors import StorageError
 
 STEP_BYTES = 1 << 20
+PATIENCE_S, SLOWEST_BPS = 30.0, 50_000
+"""An answer takes so many seconds, and one more for so many bytes; a server could drip for ever."""
 PARTIAL = 206
 RANGE = re.compile(r"bytes (\d+)-(\d+)/(?:\d+|\*)")
 VERSION = ("ETag", "Last-Modified")
@@ -27,7 +30,8 @@ class Web(HTTPFileSystem):  # type: ignore[misc]
 
     def __init__(self, **given: Any) -> None:
         # What is packed could unpack to any size.
-        super().__init__(client_kwargs={"auto_decompress": False}, **given)
+        told = {"auto_decompress": False, "timeout": _patience(0)}
+        super().__init__(client_kwargs=told, **given)
         self._versions: dict[str, dict[str, str]] = {}
 
     async def _info(self, url: str, **given: Any) -> dict[str, Any]:
@@ -45,13 +49,14 @@ class Web(HTTPFileSystem):  # type: ignore[misc]
         assert start is not None and end is not None
         session = await self.set_session()
         asked = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity"}
-        async with session.get(self.encode_url(url), headers=asked) as answer:
+        wait = _patience(end - start)
+        async with session.get(self.encode_url(url), headers=asked, timeout=wait) as answer:
             self._raise_not_found_for_status(answer, url)
             if answer.status != PARTIAL:
                 raise StorageError(f"{url}: the server cannot send parts of a file. Copy the file")
             found = RANGE.fullmatch(answer.headers.get("Content-Range", ""))
             self._refuse_other(url, answer)
-            data = await _read(answer, end - start)
+            data = await _read(answer, end - start, url)
             if not found or int(found[1]) != start or len(data) != end - start:
                 raise _other(url)
             return data
@@ -65,12 +70,14 @@ class Web(HTTPFileSystem):  # type: ignore[misc]
         session = await self.set_session()
         with Path(path).open("wb") as out:
             async with session.get(
-                self.encode_url(url), headers={"Accept-Encoding": "identity"}
+                self.encode_url(url),
+                headers={"Accept-Encoding": "identity"},
+                timeout=_patience(size),
             ) as answer:
                 self._raise_not_found_for_status(answer, url)
                 self._refuse_other(url, answer)
                 left = size
-                while left and (data := await _read(answer, min(left, STEP_BYTES))):
+                while left and (data := await _read(answer, min(left, STEP_BYTES), url)):
                     out.write(data)
                     left -= len(data)
         if left:
@@ -89,13 +96,25 @@ class Web(HTTPFileSystem):  # type: ignore[misc]
             raise _other(url)
 
 
-async def _read(answer: Any, size: int) -> bytes:
+async def _read(answer: Any, size: int, url: str) -> bytes:
     """So many bytes of an answer, or all that there are."""
     parts, left = [], size
-    while left and (data := await answer.content.read(left)):
-        parts.append(data)
-        left -= len(data)
+    try:
+        while left and (data := await answer.content.read(left)):
+            parts.append(data)
+            left -= len(data)
+    except TimeoutError:
+        raise _slow(url) from None
     return b"".join(parts)
+
+
+def _patience(size: int) -> ClientTimeout:
+    """How long an answer of so many bytes is waited for."""
+    return ClientTimeout(total=PATIENCE_S + size / SLOWEST_BPS)
+
+
+def _slow(url: str) -> StorageError:
+    return StorageError(f"{url}: the server is too slow. Try later, or copy the file")
 
 
 def _other(url: str) -> StorageError:

@@ -3,6 +3,7 @@
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -12,7 +13,7 @@ import pytest
 
 from dmrl.errors import StorageError
 from dmrl.recording import summary
-from dmrl.storage import path_of
+from dmrl.storage import path_of, web
 from dmrl.storage.system import system
 
 from ..faults.ending import ended
@@ -65,6 +66,9 @@ class Handler(BaseHTTPRequestHandler):
         """A range, or the whole file."""
         site = self.site
         site.asked += 1
+        if site.wrong.startswith("leads "):
+            self._head(302, 0, {"Location": site.wrong.removeprefix("leads ")})
+            return
         site.paths.append(self.path)
         asked = self.headers.get("Range")
         if site.wrong == "lists":
@@ -90,6 +94,11 @@ class Handler(BaseHTTPRequestHandler):
                 more["Content-Range"] = f"bytes {first + 1}-{last + 1}/{len(site.data)}"
                 self._head(206, len(part), more)
                 self._send(part)
+            case "drips":
+                self._head(206, len(part), more)
+                for k in range(20):
+                    self._send(part[k : k + 1])
+                    time.sleep(0.1)
             case "packed":
                 self._head(206, len(part), {**more, "Content-Encoding": "deflate"})
                 self._send(part)
@@ -192,6 +201,28 @@ def test_a_server_that_sends_what_was_not_asked_is_one_line(
         status, text = ended(lambda c=command: cli(c, site.url))
         assert status == 1 and f"{site.url}" in text and said in text, text
     assert site.most_sent < MOST_SENT
+
+
+def test_a_server_that_drips_is_not_waited_for(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web, "PATIENCE_S", 0.3)
+    system.cache_clear()
+    web.Web.clear_instance_cache()
+    site.wrong = "drips"
+    status, said = ended(lambda: cli("info", site.url))
+    assert status == 1 and "the server is too slow" in said, said
+    monkeypatch.undo()
+    system.cache_clear()
+    web.Web.clear_instance_cache()  # its session has that patience
+
+
+@pytest.mark.parametrize("address", ["file:///etc/passwd", "s3://a/b", "http://127.0.0.1:1/a"])
+def test_a_server_leads_to_no_file_of_this_machine(address: str, site: Site) -> None:
+    site.wrong = f"leads {address}"
+    for command in ("info", "check"):
+        status, said = ended(lambda c=command: cli(c, site.url))
+        assert status == 1 and site.url in said, said
+    with pytest.raises((StorageError, FileNotFoundError)):
+        os.fspath(path_of(site.url))
 
 
 @pytest.mark.parametrize(

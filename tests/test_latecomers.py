@@ -1,0 +1,45 @@
+"""A writer that comes just after another has finished leaves nothing, and takes nothing away."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dmrl import output
+from dmrl.errors import OutputError
+from dmrl.output import partial_file, partial_folder, partial_of
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("keep", [True, False])
+def test_who_comes_just_after_another_leaves_nothing(
+    kind: str, keep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Six times `dmrl train` or `render` into one name left a NAME.partial beside it."""
+    out, take = tmp_path / "out", getattr(output, f"take_{kind}")
+
+    def taken_late(partial: Path) -> int:
+        out.touch()  # between the look at the name and the lock
+        held: int = take(partial)
+        return held
+
+    monkeypatch.setattr(output, f"take_{kind}", taken_late)
+    write: Callable[..., object] = partial_file if kind == "file" else partial_folder
+    with pytest.raises(OutputError, match="exists"), write(out, keep_on_error=keep):  # type: ignore[attr-defined]
+        raise AssertionError
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_work_that_can_be_resumed_is_not_taken_away_by_who_comes_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, take = tmp_path / "out", output.take_folder
+    partial_of(out).mkdir()
+    (partial_of(out) / "epochs").write_text("a night")
+    monkeypatch.setattr(output, "take_folder", lambda partial: (out.touch(), take(partial))[1])
+    with (
+        pytest.raises(OutputError, match="exists"),
+        partial_folder(out, keep_on_error=True, resume=True),
+    ):
+        raise AssertionError
+    assert (partial_of(out) / "epochs").read_text() == "a night"
