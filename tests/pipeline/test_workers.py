@@ -28,8 +28,12 @@ CALLS: Mapping[str, tuple[str, ...]] = {
     "track": ("found", "out"),
     "trim": ("flights", "out", "--from", "2"),
 }
-ELSEWHERE = {"run": "tests/pipeline/test_pipeline.py", "render": "tests/stages/test_render.py"}
-"""Which tests do the same for a recipe, and for Blender."""
+ELSEWHERE = {
+    "run": "tests/pipeline/test_pipeline.py",
+    "render": "tests/stages/test_render.py",
+    "calibrate": "tests/stages/test_calibrate_sensors.py",
+}
+"""Which tests do the same for a recipe, for Blender, and for flights that tell of their sensors."""
 
 
 @pytest.fixture(scope="module")
