@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dmrl.estimation.batch import ROUGH, Solution, evidence, solve_batch
-from dmrl.estimation.linear import linearise
+from dmrl.estimation.linear import OWN_GYRO, PEER_GYRO, linearise
 from dmrl.estimation.problem import Noise, Problem
 
 _Z = np.linspace(-8.0, 8.0, 1601)
@@ -29,6 +29,9 @@ or two seconds, was seen between robots on the ground. Standard deviations that 
 GRADED = "velocity_std_mps", "velocity_white_psd", "velocity_scale_std", "scale_std", "bias_std_m"
 """What one flight can hardly tell from errors of ranges that fade: taken half-way, as a geometric
 mean, between what it would be with them and without. Heights over a table were taken for them."""
+OFF, UNMEASURED = 5.0, (0.25, 0.1)
+"""A yaw rate that is biased by so many standard deviations was not calibrated, and who did not
+calibrate that will not have measured ranges and flow: their offset, metres, and scale."""
 SURE, TAILED = 15.0, 2.0
 """So much more evidence, a logarithm, it takes: clean ranges were seen to have some. Steps with
 Cauchy's loss leave half of their spread to its tails."""
@@ -59,6 +62,7 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, 
         The flight's solution under that guess.
     """
     found, number, likely, solution = _graded(flight, noise, solution)
+    found = _unmeasured(found, solution)
     tried: list[tuple[float, float, Solution]] = []
     for std_m in FADING_M:
         fading = _fading(noise, std_m).graded(GRADES[number])
@@ -71,6 +75,19 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, 
     faded, _, _, solution = _graded(flight, _fading(noise, TAILED * std_m), solved)
     halves = {name: float(np.sqrt(getattr(found, name) * getattr(faded, name))) for name in GRADED}
     return replace(faded, **halves, known_std=faded.known_std), solution
+
+
+def _unmeasured(noise: Noise, solution: Solution) -> Noise:
+    """The noise where nobody seems to have measured sensors: one is far off, others may be."""
+    turns = np.abs(solution.constants[[OWN_GYRO, PEER_GYRO]]) / noise.prior_std()[OWN_GYRO]
+    if turns.max() < OFF:
+        return noise
+    offset_m, scale = UNMEASURED
+    return replace(
+        noise,
+        bias_std_m=max(noise.bias_std_m, offset_m),
+        velocity_scale_std=max(noise.velocity_scale_std, scale),
+    )
 
 
 def _fading(noise: Noise, std_m: float) -> Noise:

@@ -9,9 +9,10 @@ from dmrl.estimation.batch import Solution
 from dmrl.estimation.estimate import estimate_pairs
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK
-from dmrl.estimation.grading import FADING_S, GRADES, ONE, TAKEN, excess
+from dmrl.estimation.grading import FADING_S, GRADES, ONE, TAKEN, UNMEASURED, excess
 from dmrl.estimation.pair import Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
+from dmrl.flight import NOISE, Fault, Scenario, simulate
 
 from .flights import flown, pair_of, truth_at
 
@@ -114,3 +115,24 @@ def test_seconds_are_counted_from_the_flight_s_first_keyframe(
         flight = SimpleNamespace(key_s=key / 8 + began, range_key=key)
         found.add(excess(flight, Noise(), solution))  # type: ignore[arg-type]
     assert len(found) == 1 and found.pop() > 2
+
+
+def test_a_yaw_rate_that_is_far_off_tells_that_nobody_measured_the_sensors() -> None:
+    """Otherwise a short flight takes the offset of its ranges for a bias that is not there."""
+    flight = simulate(
+        Scenario(2, 30.0),
+        NOISE["calibrated"],
+        15000,
+        [
+            Fault("range_offset", "cf1", "cf2"),
+            Fault("yaw_rate_bias", "cf2"),
+            Fault("velocity_scale", "cf1"),
+        ],
+    )
+    found = estimate_pairs([pair_of(flight)])[0][0]
+    assert found.noise.bias_std_m == pytest.approx(UNMEASURED[0])
+    assert found.noise.velocity_scale_std >= UNMEASURED[1]
+    off_m = np.hypot(*(found.state[:, :2] - truth_at(flight, found.time_s)).T)
+    assert ((off_m > 0.3) & (found.status == OK)).mean() < 0.05
+    usual = estimate_pairs([pair_of(flown("in_view", "calibrated", 15000))])[0][0]
+    assert usual.noise.velocity_scale_std < UNMEASURED[1]
