@@ -165,7 +165,7 @@ def _model(schema: type[Any]) -> type[BaseModel]:
     hints = get_type_hints(schema)
     required = {f.name for f in fields(schema) if f.default is f.default_factory is MISSING}
     keys = {n: (t, ... if n in required else None) for n, t in hints.items()}
-    config = ConfigDict(strict=True, extra="forbid", frozen=True)
+    config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
     with warnings.catch_warnings():
         # A setting may be called as a method of pydantic's is: only fields are asked for.
         warnings.filterwarnings("ignore", "Field name .* shadows an attribute")

@@ -6,6 +6,7 @@ protobuf types; ``dmrl convert`` reads all of them back. Bag times are log times
 """
 
 from collections.abc import Callable
+from keyword import iskeyword
 from pathlib import Path
 from typing import Any
 
@@ -153,13 +154,19 @@ class _Types:
 
 
 def _field_name(name: str) -> str:
-    """As ROS 2 wants it: lower case, no two underscores in a row, none at the end."""
-    return "_".join(part for part in name.lower().split("_") if part)
+    """As ROS 2 wants it: lower case, a letter in front, no two underscores in a row, none behind.
+
+    Nor a word of Python, which rosbags makes of it.
+    """
+    plain = "_".join(part for part in name.lower().split("_") if part)
+    fits = plain[:1].isalpha() and not iskeyword(plain)
+    return plain if fits else f"field_{plain}".rstrip("_")
 
 
 def _type_name(kind: Descriptor) -> str:
     words = kind.name.replace("-", "_").split("_")
     name = "".join(word[:1].upper() + word[1:] for word in words)
+    name = name if name[:1].isalpha() else f"Type{name}"
     return f"Log{name}" if kind.full_name.startswith("dmrl.log.") else name
 
 

@@ -6,7 +6,8 @@ first columns are ``log_time`` and ``publish_time``, nanoseconds. A field of a s
 row; a message without any has one row with empty cells. Pictures lie in
 ``cf1.camera.image/<log_time>.png``, the second of a time in ``<log_time>-2.png``, and ``data``
 names them.
-In CSV, lists are JSON and other bytes base64; in Parquet both stay what they are.
+In CSV, lists are JSON and other bytes base64, and a text that a spreadsheet would run as a formula
+has an apostrophe in front; in Parquet all stay what they are.
 """
 
 import base64
@@ -28,6 +29,9 @@ from dmrl.terminal.progress import track
 
 Kind = Literal["csv", "parquet"]
 TIME_DIGITS = 12  # as a folder of pictures wants its names
+_FORMULA = "^(['=+@\t\r\n\uff1d\uff0b\uff0d\uff20-])"
+"""What a spreadsheet runs (OWASP, CSV injection). With the apostrophe itself among them, to take
+one away from every text that begins with one gives back what was there."""
 
 
 def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
@@ -134,12 +138,18 @@ def _write(table: pa.Table, path: Path, kind: Kind) -> None:
         pq.write_table(table, path)
         return
     frame = table.to_pandas(types_mapper=_nullable)
+    ends = "\n"
     for field in table.schema:
         if pa.types.is_list(field.type):
             frame[field.name] = [_json(v) for v in table[field.name].to_pylist()]
         elif pa.types.is_binary(field.type):
             frame[field.name] = [_base64(v) for v in table[field.name].to_pylist()]
-    frame.to_csv(path, index=False)
+        elif pa.types.is_string(field.type):
+            shown = pc.replace_substring_regex(table[field.name], _FORMULA, r"'\1")
+            frame[field.name] = shown.to_pandas(types_mapper=_nullable)
+            if pc.any(pc.match_substring(shown, "\r")).as_py():
+                ends = "\r\n"  # only then does csv quote a cell with \r, which ends a line as well
+    frame.to_csv(path, index=False, lineterminator=ends)
 
 
 def _nullable(kind: pa.DataType) -> Any:

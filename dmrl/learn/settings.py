@@ -155,6 +155,8 @@ class FitSettings(LossSettings):
         )
         for name in NOT_NEGATIVE:
             _refuse(getattr(self, name) < 0, f"{name}: must not be negative")
+        for name, most in MOST.items():
+            _refuse(getattr(self, name) > most, f"{name}: must be at most {most}")
         for name in SHARES:
             value = getattr(self, name)
             _refuse(value is not None and not 0 <= value <= 1, f"{name}: must be between 0 and 1")
@@ -163,8 +165,10 @@ class FitSettings(LossSettings):
         _refuse(not 0 < least <= greatest, "zoom: must be over 0, the lesser first")
         focal_px = self.intrinsics[:2] if self.intrinsics else (1.0,)
         _refuse(min(focal_px) <= 0, "intrinsics: fx and fy must be over 0")
-        negative = any(share < 0 for share in self.shares.values())
-        _refuse(negative, "shares: must not be negative")
+        wide = max(map(abs, self.intrinsics or (0.0,))) > LARGE
+        _refuse(wide, f"intrinsics: must be at most {LARGE}")
+        beyond = any(not 0 <= share <= LARGE for share in self.shares.values())
+        _refuse(beyond, f"shares: must be between 0 and {LARGE}")
 
     @property
     def extra(self) -> tuple[str, ...]:
@@ -202,6 +206,14 @@ NOT_NEGATIVE = (
     *("rotation_deg", "paste"),
     *("plain_epochs", "frozen_norm_epochs", "false_alarms"),
 )
+LARGE = 10_000_000
+MOST = dict.fromkeys(("learning_rate", *AT_LEAST_ONE, *NOT_NEGATIVE), LARGE) | {
+    "processes": 256,
+    "paste": 100,
+    "seed": 2**63 - 1,
+}
+"""What no training reaches: a recipe may come from a stranger, and asks for no more processes,
+pictures or peers in one, and for no number that float32 cannot hold."""
 
 
 def _refuse(wrong: bool, why: str) -> None:

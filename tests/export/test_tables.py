@@ -1,4 +1,5 @@
 import base64
+import csv
 import json
 from pathlib import Path
 
@@ -88,6 +89,42 @@ def test_topics_that_one_disk_would_put_into_one_table_are_refused(
     with pytest.raises(UnsafeName, match=r"/cf1/.* and another topic would both become"):
         write_tables(recording, tmp_path / "out", "csv")
     assert list(tmp_path.iterdir()) == [recording]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "=1+1",
+        "+1",
+        "-1",
+        "@A1",
+        "\t=1",
+        "\r=1",
+        "\n=1",
+        "\uff1d1+1",
+        "'=1",
+        "cf1",
+        "",
+        "a=1",
+        "a\r=1",
+    ],
+)
+def test_no_text_of_a_csv_is_a_formula(tmp_path: Path, kind: str, text: str) -> None:
+    path = tmp_path / "in.mcap"
+    with RecordingWriter(path, provenance("test")) as sink:
+        labels = message("PeerLabels")(peers=[{"peer": text, "u_px": -1.5, "source": "hand"}])
+        sink.write(0, "/cf1/labels", labels)
+    write_tables(path, tmp_path / "out", kind)  # type: ignore[arg-type]
+    file = tmp_path / "out" / f"cf1.labels.{kind}"
+    as_it_is = kind == "parquet" or text in ("cf1", "", "a=1", "a\r=1")
+    if kind == "csv":
+        with file.open(newline="") as stream:
+            (row,) = csv.DictReader(stream)
+    else:
+        (row,) = pd.read_parquet(file).to_dict("records")
+    assert row["peers.peer"] == (text if as_it_is else f"'{text}")
+    assert float(row["peers.u_px"]) == -1.5  # a number stays one
 
 
 def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:

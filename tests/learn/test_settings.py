@@ -6,7 +6,7 @@ import pytest
 
 from dmrl.learn.losses import TERMS
 from dmrl.learn.network import CLASS, SPREAD
-from dmrl.learn.settings import AT_LEAST_ONE, NOT_NEGATIVE, SHARES, FitSettings
+from dmrl.learn.settings import AT_LEAST_ONE, LARGE, MOST, NOT_NEGATIVE, SHARES, FitSettings
 
 
 def refused(**settings: Any) -> bool:
@@ -36,6 +36,12 @@ def test_shares_are_from_nothing_to_all(name: str) -> None:
     assert [refused(**{name: value}) for value in values] == [True, False, False, True]
 
 
+@pytest.mark.parametrize("name", MOST)
+def test_what_no_training_reaches_is_refused(name: str) -> None:
+    """A recipe of a stranger: 2^63 images an epoch, a rate of 1e308, a billion patches."""
+    assert [refused(**{name: value}) for value in (MOST[name], MOST[name] + 1)] == [False, True]
+
+
 def test_rates_windows_and_cameras_that_cannot_be() -> None:
     for rate, last, wrong in (
         (1e-3, 1e-3, False),
@@ -51,9 +57,11 @@ def test_rates_windows_and_cameras_that_cannot_be() -> None:
         ((1.0, 1.0, -5.0, 0.0), False),
         ((0.0, 1.0, 5.0, 5.0), True),
         ((1.0, 0.0, 5.0, 5.0), True),
+        ((1.0, 1.0, -1e308, 5.0), True),
     ):
         assert refused(intrinsics=intrinsics) == wrong
-    assert [refused(shares={"a": 1.0, "b": share}) for share in (0.0, -1e-9)] == [False, True]
+    for share, wrong in ((0.0, False), (-1e-9, True), (LARGE, False), (1e308, True)):
+        assert refused(shares={"a": 1.0, "b": share}) == wrong
 
 
 def test_a_recipe_s_own_channels_are_the_spread_then_the_classes() -> None:

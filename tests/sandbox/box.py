@@ -102,6 +102,11 @@ def untouched(box: Box) -> Iterator[None]:
 
 def run_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
     """Exit status of a command that touches nothing; it is 0, or 1 with one line."""
+    return said_in(box, capsys, *words)[0]
+
+
+def said_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
+    """The same, and what it said on standard error."""
     with untouched(box):
         status = boundary.status_of(lambda: app([str(word) for word in words]))
     said = capsys.readouterr()
@@ -111,7 +116,7 @@ def run_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
     last = said.err.strip().splitlines()[-1:]
     told = words[0] == "check" and not last  # what it found, on standard output
     assert status == 0 or told or last[0].startswith("dmrl: "), said.err
-    return status
+    return status, said.err
 
 
 def hostile(
