@@ -31,6 +31,8 @@ SCALARS = {
     F.TYPE_UINT64: "uint64",
     F.TYPE_FIXED32: "uint32",
     F.TYPE_FIXED64: "uint64",
+    F.TYPE_SFIXED32: "int32",
+    F.TYPE_SFIXED64: "int64",
     F.TYPE_ENUM: "int32",
     F.TYPE_BOOL: "bool",
     F.TYPE_STRING: "string",
@@ -55,7 +57,7 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     MissingExtra
         If rosbags is not installed.
     RecordingError
-        If the recording cannot be read.
+        If the recording cannot be read, or a type has no form in ROS 2.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -64,7 +66,7 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     except ModuleNotFoundError as e:
         raise MissingExtra("rosbags", "ros", "convert --to ros2") from e
     found = summary(recording)
-    types = _Types()
+    types = _Types(recording)
     counts = dict.fromkeys(found.topics, 0)
     connections: dict[str, Any] = {}  # by topic; a bag names a topic's type once, before its data
     with partial_folder(out) as folder:
@@ -88,12 +90,17 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     return counts
 
 
+class _NoForm(ValueError):
+    """A type that no type of ROS 2 can be made of."""
+
+
 class _Types:
     """Types of ROS 2 for those of a recording, made up where there is none."""
 
-    def __init__(self) -> None:
+    def __init__(self, recording: Path) -> None:
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
+        self._recording = recording
         self.store = get_typestore(Stores.ROS2_HUMBLE)
         self._names: dict[Descriptor, str] = {}
         self._fields: dict[Descriptor, dict[str, FieldDescriptor]] = {}
@@ -105,14 +112,20 @@ class _Types:
         if standard is not None:
             name, make = standard
             return name, make(self.store.types, sample.message, sample.time_ns)
-        return self._name(kind), self._message(sample.message)
+        try:
+            return self._name(kind), self._message(sample.message)
+        except _NoForm as e:
+            raise RecordingError(
+                f"{self._recording}: {sample.topic}: {e}, which ROS 2 cannot say. Leave it out: "
+                "dmrl trim"
+            ) from None
 
     def _name(self, kind: Descriptor) -> str:
         """Name of a type, after it and those it holds are registered."""
         from rosbags.typesys import get_types_from_msg  # noqa: PLC0415
 
-        if kind in self._names:
-            return self._names[kind]
+        if found := self._names.setdefault(kind, ""):
+            return found
         names = {f.name: _field_name(f.name) for f in kind.fields}
         if len(set(names.values())) < len(names):  # they differ in case only
             names = {f.name: f"{_field_name(f.name)}_{f.number}" for f in kind.fields}
@@ -127,9 +140,14 @@ class _Types:
 
     def _type(self, field: FieldDescriptor) -> str:
         if field.message_type is not None:
+            inner = field.message_type
+            if inner.GetOptions().map_entry or self._names.get(inner) == "":
+                raise _NoForm(f"{field.full_name} is a map, or its type contains itself")
             own = self._name(field.message_type).replace("/msg/", "/")
         else:
             own = SCALARS[field.type]
+        if field.is_repeated and field.type == F.TYPE_BYTES:
+            raise _NoForm(f"{field.full_name} is a list of bytes")
         return f"{own}[]" if field.is_repeated else own
 
     def _message(self, message: Any) -> Any:

@@ -160,7 +160,7 @@ def _nullable(kind: pa.DataType) -> Any:
 
 
 def _json(value: list[Any] | None) -> str | None:
-    return None if value is None else json.dumps(value)
+    return None if value is None else json.dumps(value, default=_base64)
 
 
 def _base64(value: bytes | None) -> str | None:

@@ -102,7 +102,13 @@ def integers(
 
 
 def text(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa.Array:
-    """(N,) strings or bytes that fill these spans."""
+    """(N,) strings or bytes that fill these spans.
+
+    Raises
+    ------
+    WireError
+        If there are too many for a block, or one of strings is not UTF-8.
+    """
     size = end - start
     offsets = np.zeros(len(size) + 1, np.int64)
     np.cumsum(size, out=offsets[1:])
@@ -115,4 +121,9 @@ def text(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa.Array:
         index = np.arange(offsets[-1]) + np.repeat(start - offsets[:-1], size)
         body = data[index].tobytes()
     buffers = [None, pa.py_buffer(offsets.astype(np.int32)), pa.py_buffer(body)]
-    return pa.Array.from_buffers(kind, len(size), buffers)
+    made = pa.Array.from_buffers(kind, len(size), buffers)
+    try:
+        made.validate(full=True)
+    except pa.ArrowInvalid:
+        raise WireError("a text is not UTF-8") from None
+    return made
