@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, Shard
+from dmrl.errors import UnsafeName
 from dmrl.images.codec import encode_png
 
 BATCH_IMAGES = 64
@@ -163,15 +164,31 @@ def write_shards(
         See `SplitWriter`.
     before
         Of the dataset that they are for, whose shards are counted on.
+
+    Raises
+    ------
+    UnsafeName
+        If the names of two splits differ only in case.
     """
     writers: dict[str, SplitWriter] = {}
     for split, row in rows:
         if split not in writers:
+            _refuse_case(split, (*writers, *before.splits))
             schema = layout.schema(*row.rgb.shape[:2], png=png, masks=row.mask is not None)
             first = len(before.splits.get(split, ()))
             writers[split] = SplitWriter(folder, split, schema, before.parquet, shard_images, first)
         writers[split].add(row)
     return {name: writer.close() for name, writer in writers.items()}
+
+
+def _refuse_case(split: str, others: Iterable[str]) -> None:
+    """Refuse what a disk of macOS or Windows, where a dataset may go, takes for one name."""
+    for other in others:
+        if other != split and other.casefold() == split.casefold():
+            raise UnsafeName(
+                f"the splits {other} and {split} differ only in case, and are one folder on many "
+                "disks. Rename one in its recording"
+            )
 
 
 def _record_batch(rows: list[Row], schema: pa.Schema, split: str) -> pa.RecordBatch:

@@ -15,7 +15,7 @@ from dmrl.deploy.store import INTEGER_NAME
 from dmrl.images.codec import encode_png
 
 from ..deploy.networks import random_network
-from .box import ELSEWHERE, HOSTILE_TEXT, Box, hostile, quantised, run_in, untouched
+from .box import ELSEWHERE, HOSTILE_TEXT, Box, hostile, quantised, run_in, said_in, untouched
 
 
 @pytest.mark.heavy
@@ -39,6 +39,18 @@ def test_a_split_of_a_recording_stays_in_the_dataset(
                 *extra,
             )
     assert not any("keep" in path.name for path in box.out.rglob("*"))
+
+
+@pytest.mark.parametrize("extra", [(), ("--parquet",)], ids=["arrow", "parquet"])
+def test_two_splits_that_a_disk_takes_for_one_are_refused(
+    extra: tuple[str, ...], box: Box, capsys: pytest.CaptureFixture[str]
+) -> None:
+    halves = {"near": "[[0, 100000001]]", "Near": "[[200000000, 900000000]]"}
+    bad = hostile(box.root / "in" / "bad.mcap", halves, ("cf1",))
+    words = ("dataset", bad, box.out / "set", "--split", "auto", *extra)
+    status, said = said_in(box, capsys, *words)
+    assert status == 1 and "the splits near and Near differ only in case" in said
+    assert list(box.out.iterdir()) == []
 
 
 @pytest.mark.usefixtures("empty_figures")
