@@ -15,7 +15,16 @@ import tomli_w
 from dmrl.border.documents import parse_toml
 from dmrl.border.folders import refuse_pipe
 from dmrl.errors import SourceError
-from dmrl.estimation.linear import BIAS, OWN_GYRO, OWN_SCALE, PEER_GYRO, PEER_SCALE, SCALE
+from dmrl.estimation.linear import (
+    BIAS,
+    OWN_GYRO,
+    OWN_SCALE,
+    OWN_VELOCITY,
+    PEER_GYRO,
+    PEER_SCALE,
+    PEER_VELOCITY,
+    SCALE,
+)
 from dmrl.estimation.pair import Array
 from dmrl.estimation.problem import GLOBALS
 
@@ -27,8 +36,8 @@ Values = Mapping[str, Value]
 OF_ROBOT = {
     "yaw_rate_bias_radps": (OWN_GYRO, PEER_GYRO),
     "velocity_scale": (OWN_SCALE, PEER_SCALE),
-    "vx_bias_mps": (6, 8),
-    "vy_bias_mps": (7, 9),
+    "vx_bias_mps": (OWN_VELOCITY.start, PEER_VELOCITY.start),
+    "vy_bias_mps": (OWN_VELOCITY.start + 1, PEER_VELOCITY.start + 1),
 }
 """Of one robot: places among ``GLOBALS`` where it is the observer, and where it is the peer."""
 OF_PAIR = {"range_offset_m": BIAS, "range_scale": SCALE}

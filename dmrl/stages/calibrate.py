@@ -20,6 +20,7 @@ from dmrl.output import partial_file, refuse_existing
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.spread import spread
 from dmrl.recording import Contents, read, summary
+from dmrl.recording.inputs import refuse_twice
 from dmrl.terminal.arguments import AsJson, Flat, Workers
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
@@ -138,6 +139,7 @@ def run(sources: list[Path], out: Path, settings: Settings, workers: int = 1) ->
 
 
 def _sensors(sources: list[Path], workers: int) -> Result:
+    refuse_twice(sources)
     flights = track(spread(solutions, sources, workers), "Solving flights", len(sources))
     found = agreed(sources, flights)
     return Result(found.sensors, {"sensors": [_constant(one) for one in found.constants]})

@@ -79,6 +79,8 @@ def test_too_little_is_one_line(flights: list[Path], known: Path, tmp_path: Path
     out = tmp_path / "sensors.toml"
     with pytest.raises(RecordingError, match="no pair of robots has 2 flights"):
         calibrate.run(flights[:1], out, SENSORS)
+    with pytest.raises(RecordingError, match="twice"):
+        calibrate.run([*flights, flights[0]], out, SENSORS)
     with pytest.raises(SettingError, match="two calibrations"):
         calibrate.run(flights, out, Settings(sensors=True, board="9x6"))
     with pytest.raises(OutputError):
