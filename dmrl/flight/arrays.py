@@ -1,14 +1,34 @@
 """What a flight is: each robot's log on its own clock, ranges, and the truth."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.flight.faults import Happened
 from dmrl.geometry.frames import Array
 
 RATE_HZ = 100.0
 """Samples per second of logs and truth."""
+STRETCH = 4096
+
+Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
+
+
+def numbers(values: NDArray[Any]) -> Iterator[Any]:
+    """Python's numbers of an array, few at a time: as such they take five times the memory."""
+    for first in range(0, len(values), STRETCH):
+        yield from values[first : first + STRETCH].tolist()
+
+
+def scanned(step: Callable[[Any, Any], Any], values: Signal) -> Signal:
+    """(N,) what a step makes, from zero on, of what it made before and the next value."""
+    made = accumulate(numbers(values), step, initial=values.dtype.type(0).item())
+    next(made)
+    return np.fromiter(made, values.dtype, len(values))
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,20 +4,18 @@ The plane is complex inside this file: x is the real part, y the imaginary one, 
 ``yaw`` is a product with exp(1j yaw).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import accumulate
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dmrl.flight.arrays import RATE_HZ, Truth
+from dmrl.flight.arrays import RATE_HZ, Signal, Truth, numbers, scanned
 from dmrl.geometry.frames import Array
 
 Plane = NDArray[np.complex128]
-Signal = TypeVar("Signal", Plane, Array)
 Trajectory = Literal[
     "in_view",
     "random",
@@ -87,8 +85,7 @@ Mover = Callable[[Generator, Start, "Motion | None"], Motion]
 def lagged(commands: Signal, lag_s: float) -> Signal:
     """(N,) what becomes of piecewise constant commands behind a first-order lag, from rest."""
     share = 1.0 - np.exp(-1.0 / (RATE_HZ * lag_s))
-    values = accumulate(commands.tolist(), lambda v, u: v + share * (u - v), initial=0.0)
-    return np.array(list(values)[1:], commands.dtype)
+    return scanned(lambda v, u: v + share * (u - v), commands)
 
 
 def _integrated(rate: Signal, start: complex) -> Signal:
@@ -178,15 +175,18 @@ def _following(target: Plane, carried: Plane) -> Plane:
     """(N,) world velocity of a robot that starts on a moving target and stays near it."""
     share = 1.0 - np.exp(-1.0 / (RATE_HZ * VELOCITY_LAG_S))
     position, velocity = complex(target[0]), 0j
-    flown = []
-    for goal, speed in zip(target.tolist(), carried.tolist(), strict=True):
-        wanted = speed + FOLLOW_GAIN_PER_S * (goal - position)
-        wanted *= min(1.0, SPEED_MAX_MPS / max(abs(wanted), 1e-9))
-        before = velocity
-        velocity += share * (wanted - velocity)
-        position += (velocity + before) / (2 * RATE_HZ)
-        flown.append(velocity)
-    return np.array(flown)
+
+    def flown() -> Iterator[complex]:
+        nonlocal position, velocity
+        for goal, speed in zip(numbers(target), numbers(carried), strict=True):
+            wanted = speed + FOLLOW_GAIN_PER_S * (goal - position)
+            wanted *= min(1.0, SPEED_MAX_MPS / max(abs(wanted), 1e-9))
+            before = velocity
+            velocity += share * (wanted - velocity)
+            position += (velocity + before) / (2 * RATE_HZ)
+            yield velocity
+
+    return np.fromiter(flown(), complex, len(target))
 
 
 def still(_rng: Generator, start: Start, _leader: Motion | None) -> Motion:
@@ -260,7 +260,8 @@ def truth_of(motion: Motion, height_m: Array) -> Truth:
     roll = -np.arctan2(pull_xy.imag, np.hypot(pull_xy.real, pull_z))
     return Truth(
         time_s=np.arange(len(height_m)) / RATE_HZ,
-        position=np.stack([motion.position.real, motion.position.imag, height_m], axis=1),
+        # Axis by axis in memory: what is asked for at a time is interpolated without a copy.
+        position=np.stack([motion.position.real, motion.position.imag, height_m]).T,
         velocity=np.stack([motion.velocity.real, motion.velocity.imag, climb], axis=1),
         yaw=motion.yaw,
         roll=roll,

@@ -1,11 +1,9 @@
 """What sensors make of the truth."""
 
-from itertools import accumulate
-
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.flight.arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
+from dmrl.flight.arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth, scanned
 from dmrl.flight.noise import Noise
 from dmrl.geometry.frames import Array
 
@@ -15,7 +13,7 @@ def coloured(rng: Generator, samples: int, std: float, tau_s: float) -> Array:
     keep = float(np.exp(-1.0 / (RATE_HZ * tau_s)))
     steps = rng.normal(0.0, std, samples)
     steps[1:] *= np.sqrt(1.0 - keep**2)
-    return np.array(list(accumulate(steps.tolist(), lambda x, w: keep * x + w)))
+    return scanned(lambda x, w: keep * x + w, steps)
 
 
 def robot_log(

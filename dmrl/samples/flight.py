@@ -6,6 +6,7 @@ Time goes in as (N,) int64 nanoseconds, values as (N,) arrays.
 import heapq
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,19 @@ LOG_COLUMNS = (
 """What a robot's log holds, as ``robot_log`` wants it."""
 
 EXACT = [0.0] * 9
+STRETCH = 256
+"""Rows that become Python's numbers at a time: as such they take ten times the memory."""
+
+
+def stretches(count: int) -> Iterator[slice]:
+    """Rows of a column, so few at a time that hundreds of streams hold little."""
+    return (slice(first, first + STRETCH) for first in range(0, count, STRETCH))
+
+
+def rows_of(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
+    """Python's numbers of (N,) columns side by side, made a stretch at a time."""
+    for part in stretches(len(columns[0])):
+        yield from zip(*(column[part].tolist() for column in columns), strict=True)
 
 
 def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
@@ -51,25 +65,23 @@ def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Itera
         rate = np.interp(time_ns, time_ns[turning], rate[turning])
     turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
     yaw = np.concatenate([[0.0], np.cumsum(turned)])
-    rows = np.stack([*(columns[name] for name in LOG_COLUMNS), yaw], axis=1)
-    silent = ~np.isfinite(rows)
-    turns, moves, climbs = (~silent[:, part].any(axis=1) for part in ([0, 1, 2], [3, 4], [5]))
     names = topics.attitude(robot), topics.velocity(robot), topics.height(robot)
-    for k, (moment, row) in enumerate(zip(time_ns.tolist(), rows.tolist(), strict=True)):
+    series = [*(columns[name] for name in LOG_COLUMNS), yaw]
+    for moment, *row in rows_of(time_ns, *series):
         roll, pitch, yaw_rate, vx, vy, height, yaw_rad = row
         attitude = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw_rad}
-        if turns[k]:
+        if isfinite(roll) and isfinite(pitch) and isfinite(yaw_rate):
             yield Sample(moment, names[0], "Attitude", {**attitude, "yaw_rate_radps": yaw_rate})
-        if moves[k]:
+        if isfinite(vx) and isfinite(vy):
             yield Sample(moment, names[1], "Velocity", {"vx_mps": vx, "vy_mps": vy})
-        if climbs[k]:
+        if isfinite(height):
             yield Sample(moment, names[2], "Height", {"height_m": height})
 
 
 def ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sample]:
     """UWB distances that a robot measured to a peer."""
     topic = topics.uwb_range(robot, peer)
-    for moment, value in zip(time_ns.tolist(), range_m.tolist(), strict=True):
+    for moment, value in rows_of(time_ns, range_m):
         yield Sample(moment, topic, "UwbRange", {"range_m": value})
 
 
@@ -79,14 +91,14 @@ def sensor(
     """What a sensor said, where all of its (N,) columns are numbers; named as the fields."""
     values = np.stack(list(columns.values()), axis=1)
     known = np.isfinite(values).all(axis=1)
-    for moment, row in zip(time_ns[known].tolist(), values[known].tolist(), strict=True):
+    for moment, *row in rows_of(time_ns[known], *values[known].T):
         yield Sample(moment, topic, message, dict(zip(columns, row, strict=True)))
 
 
 def truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[Sample]:
     """Exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
     topic, frame = topics.truth(robot, peer), f"{robot}/horizontal"
-    for moment, (x, y, z) in zip(time_ns.tolist(), xyz_m.tolist(), strict=True):
+    for moment, x, y, z in rows_of(time_ns, *xyz_m.T):
         fields = {"frame_id": frame, "x": x, "y": y, "z": z, "covariance": EXACT}
         yield Sample(moment, topic, "PeerPosition", fields)
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from itertools import permutations
+from itertools import permutations, tee
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -187,9 +187,15 @@ def _true(flight: Flight) -> Iterator[Iterator[Sample]]:
     end_s = next(iter(flight.truth.values())).time_s[-1]
     time_s = np.arange(0.0, end_s, 1.0 / TRUTH_RATE_HZ)
     for robot, peer in permutations(flight.truth, 2):
-        xyz = flight.peer_in_horizontal(robot, peer, time_s)
-        yield samples.truth(robot, peer, _stamps(flight.clocks[robot], time_s), xyz)
+        yield _peer(flight, robot, peer, time_s)
     yield (_transforms(flight, float(moment)) for moment in time_s)
+
+
+def _peer(flight: Flight, robot: str, peer: str, true_time_s: Array) -> Iterator[Sample]:
+    for part in samples.stretches(len(true_time_s)):
+        time_s = true_time_s[part]
+        xyz = flight.peer_in_horizontal(robot, peer, time_s)
+        yield from samples.truth(robot, peer, _stamps(flight.clocks[robot], time_s), xyz)
 
 
 def _transforms(flight: Flight, true_time_s: float) -> Sample:
@@ -229,12 +235,13 @@ def _camera(
     def bodies(moment_s: float) -> dict[str, Body]:
         return {name: _body(truth, moment_s) for name, truth in flight.truth.items()}
 
-    views = [
+    views = (
         view(bodies, robot, moment_s, (settings.seed, number, k))
         for k, moment_s in enumerate(time_s.tolist())
-    ]
+    )
+    seen_in, drawn = tee(views)  # which holds what is drawn ahead of what is written
     stamps = _stamps(flight.clocks[robot], time_s).tolist()
-    for time_ns, seen, picture in zip(stamps, views, draw(AIDECK_PINHOLE, views), strict=True):
+    for time_ns, seen, picture in zip(stamps, seen_in, draw(AIDECK_PINHOLE, drawn), strict=True):
         yield image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
         yield labels(time_ns, robot, list(_labels(list(seen.poses), picture)), ["truth"])
 
