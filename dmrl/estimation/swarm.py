@@ -14,7 +14,16 @@ from dmrl.estimation.estimate import unmoved, with_status
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import GATE_M
 from dmrl.estimation.keyframe_filter import QUARTER
-from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
+from dmrl.estimation.linear import (
+    BIAS,
+    OWN_GYRO,
+    OWN_SCALE,
+    OWN_VELOCITY,
+    PEER_GYRO,
+    PEER_SCALE,
+    PEER_VELOCITY,
+    SCALE,
+)
 from dmrl.estimation.motion import odometry, rotation
 from dmrl.estimation.pair import Array, Pair, Track
 from dmrl.estimation.problem import GLOBALS, KEY_HZ, silence, unheard
@@ -22,6 +31,11 @@ from dmrl.estimation.stretches import contradicts
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Link, Swarm, inverse, solved
 
 Names = tuple[str, str]
+OF_ROBOTS = (
+    [OWN_GYRO, OWN_SCALE, *range(OWN_VELOCITY.start, OWN_VELOCITY.stop)],
+    [PEER_GYRO, PEER_SCALE, *range(PEER_VELOCITY.start, PEER_VELOCITY.stop)],
+)
+"""Places among ``GLOBALS`` of what a swarm has of either robot, in its order."""
 LEAST_S = 5.0
 """Shortest time that all robots share and that is worth a solve."""
 
@@ -122,7 +136,21 @@ def flight_of(pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]) 
         links.append(Link(both, key, range_m, shifts[0], shifts[1], height_m))
     moves = [ways[name].increments(key_s[:-1], key_s[1:]) for name in names]
     paths = [ways[name].at(key_s)[:2] for name in names]
-    return Flight(names, key_s, moves, paths, np.array(gaps), links)
+    return Flight(names, key_s, moves, paths, np.array(gaps), links, _known_std(names, pairs))
+
+
+def _known_std(names: list[str], pairs: Mapping[Names, Pair]) -> Array:
+    """(4 N + 2 L,) what pairs know of their constants, in the order of a swarm's."""
+    robots = np.full((len(names), ROBOT), np.inf)
+    shared = np.full((len(pairs), SHARED), np.inf)
+    for number, (both, pair) in enumerate(pairs.items()):
+        if pair.known_std is None:
+            continue
+        for name, places in zip(both, OF_ROBOTS, strict=True):
+            mine = robots[names.index(name)]
+            mine[:] = np.minimum(mine, pair.known_std[places])
+        shared[number] = pair.known_std[[BIAS, SCALE]]
+    return np.concatenate([robots.ravel(), shared.ravel()])
 
 
 def _error(estimate: Estimate | None, at_s: Array) -> Array:

@@ -71,6 +71,9 @@ class Flight:
         (N, K - 1) seconds of each interval in which a robot's sensors were silent.
     links
         Ranges.
+    known_std
+        (4 N + 2 L,) standard deviations of the constants, in their order, where they are known from
+        other flights, infinite where not; None: nowhere.
     """
 
     names: list[str]
@@ -79,6 +82,7 @@ class Flight:
     paths: list[tuple[Array, Array]]
     gap_s: Array
     links: list[Link]
+    known_std: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +161,8 @@ def _damped(equations: Normal, damping: float) -> Normal:
 def _prior_std(flight: Flight, noise: Noise) -> Array:
     velocity = [noise.velocity_scale_std, *[noise.velocity_bias_std_mps] * 2]
     robots = [noise.gyro_std_radps, *velocity] * len(flight.names)
-    return np.array([*robots, *[noise.bias_std_m, noise.scale_std] * len(flight.links)])
+    usual = [*robots, *[noise.bias_std_m, noise.scale_std] * len(flight.links)]
+    return np.minimum(usual, np.inf if flight.known_std is None else flight.known_std)
 
 
 def _rows(flight: Flight, noise: Noise, state: Array, constants: Array) -> _Rows:

@@ -105,6 +105,21 @@ def test_a_swarm_is_cut_where_all_robots_were_measured() -> None:
         assert link.height_m == pytest.approx(other - one + 0.01 * at_s * (other - one))
 
 
+def test_a_swarm_knows_of_its_sensors_what_its_pairs_know() -> None:
+    assert np.isinf(FLIGHT.known_std).all()
+    known, usual = pairs(), np.full(len(GLOBALS), np.inf)
+    for number, names in enumerate(TIME_S):
+        # A robot's own constants are the same in each of its pairs; one pair knows nothing of them.
+        std = usual if number == 0 else 0.001 * (1 + np.arange(len(GLOBALS)))
+        known[names] = replace(known[names], known_std=std)
+    robots, links = np.split(flight_of(known, {}).known_std, [ROBOT * len(NAMES)])
+    # a is the observer of a, c; b that of b, c; c the peer of both.
+    own, peer = [0.003, 0.005, 0.007, 0.008], [0.004, 0.006, 0.009, 0.010]
+    assert robots.reshape(-1, ROBOT) == pytest.approx(np.array([own, own, peer]))
+    nothing, both = [np.inf, np.inf], [0.001, 0.002]
+    assert links.reshape(-1, SHARED) == pytest.approx(np.array([nothing, both, both]))
+
+
 def test_a_swarm_starts_where_its_surest_pairs_say() -> None:
     key_s = FLIGHT.key_s
     sigma_m = {("a", "b"): 0.1, ("b", "c"): 0.2, ("a", "c"): 0.9}

@@ -217,3 +217,24 @@ def test_a_solve_comes_back_to_what_was_flown(flight: Flight) -> None:
     assert np.abs(found.state[:, 0, :2] - state[:, 0, :2]).max() < 0.05
     exact = solved(made, NOISE, state)
     assert exact.cost < 1e-6 and np.abs(exact.state - state).max() < 1e-3
+
+
+def test_what_other_flights_know_is_held_as_closely_as_they_know_it(flight: Flight) -> None:
+    state, constants = anywhere()
+    rows = _rows(flight, NOISE, state, constants)
+    first = ROBOTS * ROBOT
+    known = np.full(len(constants), np.inf)
+    known[[0, first]] = 0.001, 0.01  # the first robot's yaw rate, and the first link's offset
+    known[1] = 10.0  # no better than is usual
+    closer = replace(flight, known_std=known)
+    loose, held = (
+        np.diag(_equations(f, NOISE, rows, constants, _weights(NOISE, rows)).corner)
+        for f in (flight, closer)
+    )
+    more = np.zeros(len(constants))
+    more[0] = 0.001**-2 - NOISE.gyro_std_radps**-2
+    more[first] = 0.01**-2 - NOISE.bias_std_m**-2
+    assert held - loose == pytest.approx(more, rel=1e-9, abs=1e-6)
+    more_cost = (constants**2 * more).sum() / 2
+    cost, closer_cost = (_cost(f, NOISE, rows, constants) for f in (flight, closer))
+    assert closer_cost - cost == pytest.approx(more_cost)
