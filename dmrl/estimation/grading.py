@@ -1,5 +1,6 @@
 """How good the sensors were: the noise under which a flight is likeliest."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,10 @@ deviation of the ranges' offset, metres: who calibrated one sensor will have mea
 The likeliest is a fifth too low and scatters by a tenth, so that the flights that look best
 would be believed too much: sensors are taken for the default's unless they are clearly better.
 A flight shows a scale once at most: real flow with little noise was seen to be 7 % off."""
+SHARP, DOUBT = 0.09, 2.0
+"""A flight of 100 s tells the logarithm of its grade to this standard deviation. One that tells it
+worse is taken for so many times the difference worse: flights of 20 s tell it to 0.2, and those
+that looked calibrated by luck were kept from end to end, and wrong."""
 
 FADING_M, FADING_S = (0.03, 0.06), 1.0
 """Errors of ranges that fade, as where reflections or antennas make them: 0.1 m, and gone after one
@@ -113,12 +118,26 @@ def _graded(
             break
         middle = min(max(best, 1), last)
     around = range(middle - 1, middle + 2)
-    # The top of a parabola through the best and its neighbours; where it bends up there is none.
-    bend, slope, _ = np.polyfit(np.log([GRADES[n] for n in around]), [tried[n] for n in around], 2)
-    peak = float(np.exp(-slope / (2 * bend))) if bend < 0 else GRADES[best]
-    velocity, scales, offset_m = (float(np.interp(peak, TAKEN[0], taken)) for taken in TAKEN[1:])
+    likely = _likely([GRADES[n] for n in around], [tried[n] for n in around]) or GRADES[best]
+    velocity, scales, offset_m = (float(np.interp(likely, TAKEN[0], taken)) for taken in TAKEN[1:])
     found = replace(noise.graded(velocity, scales), bias_std_m=offset_m)
     return found, best, tried[best], solved[best]
+
+
+def _likely(grades: Sequence[float], found: Sequence[float]) -> float | None:
+    """The likeliest grade, or a larger one where the flight tells it badly; None: it has no top.
+
+    Parameters
+    ----------
+    grades, found
+        Three grades around it, and the evidence for each.
+    """
+    # The top of a parabola. How sharp it is says how exactly the flight tells.
+    bend, slope, _ = np.polyfit(np.log(grades), found, 2)
+    if bend >= 0:
+        return None
+    blunter = max((-2 * bend) ** -0.5 - SHARP, 0.0)
+    return float(np.exp(min(-slope / (2 * bend) + DOUBT * blunter, np.log(TAKEN[0][-1]))))
 
 
 def with_range_noise(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:

@@ -9,7 +9,7 @@ from dmrl.estimation.batch import Solution
 from dmrl.estimation.estimate import estimate_pairs
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import OK
-from dmrl.estimation.grading import FADING_S, GRADES, ONE, TAKEN, UNMEASURED, excess
+from dmrl.estimation.grading import DOUBT, FADING_S, GRADES, ONE, TAKEN, UNMEASURED, excess
 from dmrl.estimation.pair import Pair
 from dmrl.estimation.problem import GLOBALS, Noise, Problem
 from dmrl.flight import NOISE, Fault, Scenario, simulate
@@ -30,24 +30,35 @@ def reflected(pair: Pair, std_m: float, fades_s: float, seed: int) -> Pair:
 
 
 @pytest.mark.parametrize("likeliest", [0.6, 1.2, 2.0])
+@pytest.mark.parametrize(("std", "doubted"), [(0.05, 0.0), (0.09, 0.0), (0.19, 0.1)])
 def test_a_grade_between_those_tried_is_where_the_evidence_peaks(
-    likeliest: float, monkeypatch: pytest.MonkeyPatch
+    likeliest: float, std: float, doubted: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Evidence is a parabola of the grade's logarithm: its top is found exactly."""
+    """Evidence is a parabola of the grade's logarithm: its top is found exactly.
+
+    A flight that tells it worse than one of 100 s does is taken for a worse one.
+    """
 
     def likely(_: Problem, noise: Noise, __: Solution) -> float:
         grade = noise.velocity_std_mps / Noise().velocity_std_mps
-        return float(-((np.log(grade) - np.log(likeliest)) ** 2))
+        return float(-((np.log(grade) - np.log(likeliest)) ** 2) / (2 * std**2))
 
     some = Solution(np.zeros((1, 6)), np.zeros(len(GLOBALS)), 0.0)
     monkeypatch.setattr(grading, "solve_batch", lambda *_, **__: some)
     monkeypatch.setattr(grading, "evidence", likely)
     found, nearest, _, _ = grading._graded(SimpleNamespace(), Noise(), some)  # type: ignore[arg-type]
     assert GRADES[nearest] == min(GRADES, key=lambda grade: abs(np.log(grade / likeliest)))
-    velocity, scales, offset_m = (np.interp(likeliest, TAKEN[0], taken) for taken in TAKEN[1:])
+    taken_for = likeliest * np.exp(DOUBT * doubted)
+    velocity, scales, offset_m = (np.interp(taken_for, TAKEN[0], taken) for taken in TAKEN[1:])
     assert found.velocity_std_mps == pytest.approx(velocity * Noise().velocity_std_mps)
     assert found.velocity_scale_std == pytest.approx(scales * Noise().velocity_scale_std)
     assert found.bias_std_m == pytest.approx(offset_m)
+
+
+def test_evidence_that_bends_up_or_hardly_at_all_tells_no_grade_that_is_better() -> None:
+    assert grading._likely((0.4, 0.55, 0.75), (3.0, 1.0, 2.0)) is None
+    flat = [-1e-9 * np.log(grade / 0.5) ** 2 for grade in (0.4, 0.55, 0.75)]
+    assert grading._likely((0.4, 0.55, 0.75), flat) == pytest.approx(TAKEN[0][-1])
 
 
 @pytest.mark.heavy
