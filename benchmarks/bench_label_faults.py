@@ -263,7 +263,8 @@ def draw(rows: list[Row], stem: Path) -> None:
     panels[0].set(xscale="log", yticks=range(len(faults)), yticklabels=faults, xlim=(0.05, 5.0))
     panels[0].set_xticks([0.1, 1.0], ["0.1", "1"])
     panels[0].invert_yaxis()
-    panels[1].legend(fontsize=8)
+    # Below the panels: within one it covers points.
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     figure.savefig(stem.with_suffix(".png"), dpi=130)
 
 

@@ -32,11 +32,12 @@ WINDOW_S = 10.0
 """Over which motion is held against its noise."""
 NOISE_FACTOR = 1.8
 """Motion must exceed its noise's energy by this: 10 s of noise reach it in a few per cent."""
-CONSTANT_RANGE, CONSTANT = 1.25, 1.7
-"""Sigmas that come from offset and scale of the ranges, and from what else is constant, are this
-much larger: no average over a flight makes such an error smaller, so where it is outside its
-ellipse, all of the flight is. Real velocities have larger scales and biases than their priors say,
-and scales that differ by axis."""
+NOISE, CONSTANT_RANGE, CONSTANT = 1.25, 1.15, 1.4
+"""Sigmas that come from noise, from offset and scale of the ranges, and from what else is constant,
+are this much larger. No noise of a sensor is quite what the solve believes; and no average over a
+flight makes an error smaller that is constant, so where it is outside its ellipse, all of the
+flight is. Real velocities have larger scales and biases than their priors say, and scales that
+differ by axis."""
 
 
 def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Array, Array]:
@@ -90,7 +91,7 @@ def _shared(equations: Normal, looks: Looks, found: Seen, weight: Array) -> Arra
 
 def _inverse(equations: Normal) -> tuple[Array, Array]:
     *_, response, constants = solve(equations)
-    keyframes = block_inverse(equations.diagonal, equations.above)
+    keyframes = NOISE**2 * block_inverse(equations.diagonal, equations.above)
     wider = np.full(len(constants), CONSTANT)
     wider[[BIAS, SCALE]] = CONSTANT_RANGE
     response = response * wider

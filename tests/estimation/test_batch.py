@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation import banded
+from dmrl.estimation import banded, confidence
 from dmrl.estimation.batch import (
     SAME_M,
     WEAK,
@@ -125,7 +125,8 @@ def test_what_is_constant_counts_for_more_in_a_keyframe_s_spread(constant: int) 
     equations = banded.Normal(blocks, np.zeros((1, 1, 1)), border, corner, *nothing)
     spread, constants = _inverse(equations)
     wider = CONSTANT_RANGE if constant == BIAS else CONSTANT
-    assert spread == pytest.approx(np.full((2, 1, 1), 0.1**2 + (wider * 0.5) ** 2))
+    wanted = (confidence.NOISE * 0.1) ** 2 + (wider * 0.5) ** 2
+    assert spread == pytest.approx(np.full((2, 1, 1), wanted))
     assert constants[constant, constant] == pytest.approx(0.5**2)
 
 

@@ -187,7 +187,7 @@ def test_a_bearing_that_was_seen_is_the_solution_s_and_its_error_its_sigma() -> 
     across = np.array([-np.sin(0.4), np.cos(0.4)])
     sigma_rad = np.sqrt(across @ spread @ across) / 2
     # All images may share an error of one, so eighteen tell hardly more than one does.
-    assert STD[0] < sigma_rad < 1.3 * STD[0]
+    assert STD[0] < sigma_rad < 1.4 * STD[0]
     blind = problem(pair)
     alone = covariance(blind, NOISE, solve_batch(blind, NOISE, start))[0][50, :2, :2]
     assert across @ alone @ across > 100 * across @ spread @ across
