@@ -14,6 +14,7 @@ from dmrl import topics
 from dmrl.errors import RecordingError
 from dmrl.estimation.score import (
     DEFINITIONS,
+    GOOD_M,
     ErrorTrace,
     Figures,
     Judged,
@@ -247,11 +248,15 @@ COLUMNS = (
 )
 
 
-NOTE = (
-    "covered: share of the truth that has an estimate; "
-    "horizontal errors; kept: status OK, over the whole flight; good: within 0.3 m; "
-    "RMSE, 95 %, NEES, ellipse: settled"
-)
+def note(made: Mapping[str, Any]) -> str:
+    """What the words above the table of a ``document`` mean."""
+    return (
+        "errors are horizontal; covered: share of the truth that has an estimate; kept: status "
+        f"OK; good: off by {GOOD_M:g} m at most; these are of the whole flight. "
+        f"From {made['settle_s']:g} s on: RMSE; 95 %: of errors, so many are smaller; wrong: pairs "
+        "that are off by half their distance; NEES: squared error over covariance, honest at 2; "
+        "in 95 %: share of the truth inside the 95 % ellipse"
+    )
 
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:

@@ -57,6 +57,7 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
     for name, document in judged.items():
         headers = [words for _, words, _ in positions.COLUMNS]
         print_table(name, ["pair", *headers], positions.rows(document))
+        print_line(positions.note(document))
     rows = [(name, *_row(document)) for name, document in evaluations.items()]
     headers = [words for words, _ in COLUMNS.values()]
     if rows:

@@ -212,10 +212,15 @@ COLUMNS = (
     ("false_tracks_per_min", "false/min", ".1f"),
     ("named_right", "named right", ".0%"),
 )
-NOTE = (
-    "3D errors of the peers in view; of images: of the detections in single images; followed, "
-    f"detected: a track, a detection within {NEAR_M:g} m; false: tracks of nobody"
-)
+
+
+def note(made: Mapping[str, Any]) -> str:
+    """What the words above the table of a ``document`` mean."""
+    return (
+        "3D errors of the peers in view; of images: of the detections in single images; followed, "
+        f"detected: a track, a detection within {NEAR_M:g} m; false: tracks of nobody; "
+        f"all but false from {made['settle_s']:g} s on"
+    )
 
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:

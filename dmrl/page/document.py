@@ -82,8 +82,9 @@ def chart(svg: str, caption: str, *, least_rem: int = 0) -> str:
 
 
 def row(figures: Iterable[str]) -> str:
-    """Figures beside each other, or below where there is no room."""
-    return f'<div class="row">{"".join(figures)}</div>'
+    """Figures beside each other, or below where there is no room. Nothing, if there are none."""
+    inside = "".join(figures)
+    return f'<div class="row">{inside}</div>' if inside else ""
 
 
 @dataclass(slots=True)

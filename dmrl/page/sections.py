@@ -22,6 +22,8 @@ from dmrl.page.story import story
 from dmrl.plots import charts
 from dmrl.topics import robots
 
+FIGURES_OF_CARDS = ("position", "depth", "peers")
+"""Names of the pictures that `dmrl card` draws."""
 MOST_SHOWN = 12
 """Evaluations, models or pairs that are drawn; tables have them all."""
 FIGURES = {
@@ -192,7 +194,7 @@ def _positions(found: Found, pictures: Pictures) -> str:
         ran = f"dmrl evaluate {said['recording']['name']} --what positions --plots {name}"
         drawn = sorted((found.folder / name).glob("position-error-*.png"))[:2]
         figures = row(_if_there(path, f"{path.stem}, 3-sigma bands", pictures) for path in drawn)
-        judged = table(heads, positions.rows(dict(said)))
+        judged = table(heads, positions.rows(dict(said))) + f"<p>{text(positions.note(said))}.</p>"
         return f"<h3>{text(name)}</h3><p><code>{text(ran)}</code></p>{judged}{figures}"
 
     return row(_from_above(found)) + _each(found.of("positions"), show)
@@ -222,7 +224,8 @@ def _tracks(found: Found, pictures: Pictures) -> str:
         heads = ["robot", *(words for _, words, _ in tracks.COLUMNS)]
         drawn = sorted((found.folder / name).glob("*.png"))[:2]
         figures = row(_if_there(path, path.stem, pictures) for path in drawn)
-        return f"<h3>{text(name)}</h3>{table(heads, tracks.rows(dict(said)))}{figures}"
+        judged = table(heads, tracks.rows(dict(said))) + f"<p>{text(tracks.note(said))}.</p>"
+        return f"<h3>{text(name)}</h3>{judged}{figures}"
 
     return _each(found.of("tracks"), show)
 
@@ -275,14 +278,11 @@ def _datasets(found: Found, pictures: Pictures) -> str:
         made = found.made.get(name)
         sources = ", ".join(source.name for source in made.inputs) if made else ""
         rows.append((name, len(made.inputs) if made else None, sources))
-        for stem in ("positions", "depth", "peers"):
-            drawn += [_if_there(p, f"{name}: {p.stem}", pictures) for p in _figures(folder, stem)]
-    shown = row(drawn[:MOST_SHOWN])
+        for stem in FIGURES_OF_CARDS:
+            path = folder / "figures" / f"{stem}.png"
+            drawn.append(_if_there(path, f"{name}: {stem}", pictures))
+    shown = row([figure for figure in drawn if figure][:MOST_SHOWN])
     return table(("dataset", "inputs", "of"), rows) + shown if rows else ""
-
-
-def _figures(folder: Path, word: str) -> list[Path]:
-    return [p for p in sorted((folder / "figures").glob("*.png")) if word in p.stem]
 
 
 def _recordings(found: Found) -> str:

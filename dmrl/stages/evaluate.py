@@ -300,7 +300,7 @@ def print_document(recording: Path, made: Document) -> None:
     kind = tracks if "robots" in made else positions
     headers = [words for _, words, _ in kind.COLUMNS]
     print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
-    print_line(f"{kind.NOTE}; settled after {made['settle_s']:g} s")
+    print_line(kind.note(made))
 
 
 DEFAULTS = Settings()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import dmrl
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.page import gather, page, write
@@ -55,6 +56,20 @@ def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None
     assert html.count("<svg") >= 6 and html.count("data:image/png") == 2
     assert "0.5 (0.5, 0.6)" in html and "24778" in html and "flight.mcap" in html
     assert "seen from cf1; 95 % ellipses" in html
+
+
+@pytest.mark.heavy
+def test_pictures_have_every_figure_of_the_card_and_no_heading_for_positions(
+    tmp_path: Path,
+) -> None:
+    dmrl.sketch(tmp_path / "pictures", images=8, seed=1)
+    dmrl.convert(tmp_path / "pictures", tmp_path / "pictures.mcap")
+    dmrl.make_dataset(tmp_path / "pictures.mcap", tmp_path / "dataset")
+    drawn = {path.stem for path in (tmp_path / "dataset/figures").glob("*.png")}
+    assert drawn
+    html = page(gather(tmp_path))
+    assert all(f"dataset: {name}<" in html for name in drawn)
+    assert "Positions" not in _Seen(html).headings
 
 
 @pytest.mark.heavy

@@ -73,6 +73,8 @@ def test_the_table_has_a_row_per_pair_and_one_for_all(
 ) -> None:
     command([labelled])
     text = capsys.readouterr().out
+    explained = ("covered:", "95 %:", "wrong:", "NEES:", "in 95 %:", "kept:", "good:", "From 20 s")
+    assert all(word in text for word in explained)
     assert [row in text for row in ("cf1 sees cf2", "cf2 sees cf1", "all")] == [True] * 3
     command([labelled], as_json=True)
     assert json.loads(capsys.readouterr().out)["settle_s"] == 20.0
