@@ -90,7 +90,11 @@ def exact(kind: Any, tokens: Sequence[Token] | Sequence[str]) -> Any:
     ------
     ValueError
         If one is given: cyclopts would round it.
+    DmrlError
+        If a path is refused. Of ``Path | None`` cyclopts would say only that it is neither.
     """
+    if type(None) in (members := get_args(kind)) and len(members) == 2:
+        kind = next(member for member in members if member is not type(None))
     words = [token if isinstance(token, str) else token.value for token in tokens]
     whole = int in (kind, *get_args(kind)) and float not in get_args(kind)
     if whole and any("." in word for word in words):

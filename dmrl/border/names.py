@@ -23,10 +23,12 @@ _SPLIT = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
 _MARKUP = re.compile(r"([\\`\[\]<>|]|(?<=:)/|(?<=www)\.)", re.IGNORECASE)
 """What is markup, and what makes a link of ``https://x`` or ``www.x``."""
 _TAKEN = (
-    *("data", "figures", "parts", "README.md", "croissant.json", "facts.json"),
+    *("data", "figures", "parts", "readme.md", "croissant.json", "facts.json"),
     *("manifest.json", "provenance.json", "dataset_dict.json"),
 )
-"""What a dataset's folder holds beside its splits."""
+"""What a dataset's folder holds beside its splits; many disks take ``Data`` for ``data``."""
+_DEVICE = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
+"""Names that Windows keeps for devices: no folder of a dataset that is copied there has one."""
 
 
 def inside(folder: Path, name: str, what: str, *, suffix: str = "") -> Path:
@@ -81,14 +83,16 @@ def split_name(name: str, what: str) -> str:
     Raises
     ------
     UnsafeName
-        If it cannot, or a part of every dataset is called so.
+        If it cannot on every disk, or a part of every dataset is called so.
     """
     if not isinstance(name, str) or not _SPLIT.fullmatch(name) or len(name) > MOST_BYTES:
         raise UnsafeName(
             f"{what} is called {shortened(str(name))!r}. Give it up to {MOST_BYTES} letters, "
             "digits, _ and -"
         )
-    if name in _TAKEN:
+    if _DEVICE.fullmatch(name):
+        raise UnsafeName(f"{what} is called {name}, as devices of Windows are. Rename it")
+    if name.casefold() in _TAKEN:
         raise UnsafeName(f"{what} is called {name}, as a part of every dataset is. Rename it")
     return name
 

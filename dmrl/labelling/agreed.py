@@ -80,7 +80,8 @@ def agreed(sources: Sequence[Path], solved: Iterator[dict[Names, Estimate]]) -> 
     Raises
     ------
     RecordingError
-        If fewer than two flights of a pair tell where its robots were.
+        If fewer than two flights of a pair tell where its robots were, or nothing is worth
+        keeping: a file without a constant would change no label.
     """
     found = [one for flight in solved for one in flight.items()]
     usable = [(names, one) for names, one in found if one.refused not in BLIND]
@@ -96,7 +97,13 @@ def agreed(sources: Sequence[Path], solved: Iterator[dict[Names, Estimate]]) -> 
     number = {subject: k for k, subject in enumerate(place)}
     flights = [told(one, _column(names, number)) for names, one in twice]
     kinds = np.array(list(place.values()))
-    return _agreed(list(place), pooled(flights, kinds), Noise().prior_std()[kinds])
+    out = _agreed(list(place), pooled(flights, kinds), Noise().prior_std()[kinds])
+    if not out.sensors.names:
+        raise RecordingError(
+            f"{sources[0]}: {len(sources)} recordings agree on nothing of their sensors that is "
+            "known better than of any others. Give more flights, or longer ones"
+        )
+    return out
 
 
 def solutions(source: Path) -> dict[Names, Estimate]:

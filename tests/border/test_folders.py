@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl import recipe
+from dmrl import cli, recipe
 from dmrl.border.folders import refuse_no_text, refuse_pipe, refuse_pipes
 from dmrl.datasets import open_dataset
 from dmrl.deploy import store
@@ -93,6 +93,20 @@ def test_what_is_no_file_is_refused_under_its_own_name_too(
             one.bind("a.toml")
     with pytest.raises(UnsafeName, match=r"^a.toml is a pipe or a device, no file"):
         reads("a.toml")
+
+
+def test_every_path_of_a_command_line_is_refused_so() -> None:
+    """Those that may be left out too, of which the command line's library says what it likes."""
+    of_paths = [
+        (name, one.hint)
+        for name in cli.COMMANDS
+        for one in cli.app[name].assemble_argument_collection()
+        if one.hint in (Path, Path | None)
+    ]
+    assert {name for name, hint in of_paths if hint != Path} >= {"label", "render", "train", "view"}
+    for _, hint in of_paths:
+        with pytest.raises(UnsafeName, match=r"^/dev/zero is a pipe or a device, no file"):
+            cli.exact(hint, ["/dev/zero"])
 
 
 def test_what_may_be_named_is_a_file_a_folder_or_nothing(tmp_path: Path) -> None:

@@ -41,6 +41,13 @@ def test_a_split_is_called_by_a_word(name: str) -> None:
         split_name(name, "it")
 
 
+@pytest.mark.parametrize("name", ["Data", "readme.MD", "con", "AUX", "nul.x", "Com1", "lpt9"])
+def test_a_split_has_a_folder_of_its_own_on_every_disk(name: str) -> None:
+    with pytest.raises(UnsafeName, match="Rename it"):
+        split_name(name, "it")
+    assert split_name(f"x-{name}", "it") == f"x-{name}"
+
+
 def test_every_topic_has_a_file_of_its_own() -> None:
     known = [
         *("/cf1/height", "/cf1.height", "cf1/height", "cf1.height", "/cf1%2Eheight", "/=cf1"),
