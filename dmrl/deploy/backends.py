@@ -1,6 +1,6 @@
 """Backends: the ways to compute a network's output without torch, all with one interface."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +12,8 @@ from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.quantise import HEAD_OF
 from dmrl.learn.decode import Grids
 
+Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
+"""(N, height, width, 3) RGB, or N images of one size."""
 Outputs = dict[str, Float32]
 """(N, rows, cols) by the names that the network's class gives its ``channels``."""
 Levels = dict[str, NDArray[np.int8]]
@@ -21,7 +23,7 @@ Levels = dict[str, NDArray[np.int8]]
 class Backend(Protocol):
     """What computes."""
 
-    def outputs(self, images: NDArray[np.uint8]) -> Outputs:
+    def outputs(self, images: Images) -> Outputs:
         """Output for (N, height, width, 3) RGB images of the network's size."""
 
 
@@ -51,9 +53,10 @@ class Float:
         self.graph = graph
         self.channels = channels
 
-    def outputs(self, images: NDArray[np.uint8]) -> Outputs:
+    def outputs(self, images: Images) -> Outputs:
         """Output for (N, height, width, 3) RGB images."""
-        seen = grey_of(images) if self.graph.channels == 1 else images
+        stacked = np.asarray(images)
+        seen = grey_of(stacked) if self.graph.channels == 1 else stacked
         output = outputs_of(self.graph, tensors_of(self.graph, to_input(seen)))
         return dict(zip(self.channels, output.swapaxes(0, 1), strict=True))
 
@@ -73,7 +76,7 @@ class OnLevels:
         self.network = network
         self.run = run
 
-    def outputs(self, images: NDArray[np.uint8]) -> Outputs:
+    def outputs(self, images: Images) -> Outputs:
         """Output for (N, height, width, 3) RGB images: real values of the heads."""
         seen = [seen_by(self.network, image) for image in images]
         return real_outputs(self.network, [self.run(image) for image in seen])

@@ -12,11 +12,10 @@ from types import ModuleType
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dmrl.border.documents import parse_json
 from dmrl.border.folders import refuse_no_text, refuse_pipes
-from dmrl.deploy.backends import Backend, OnLevels, grids_of, integer
+from dmrl.deploy.backends import Backend, Images, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
 from dmrl.deploy.compiled import Compiled
 from dmrl.deploy.emulated import RISCV32, Emulated
@@ -26,7 +25,6 @@ from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 
-Images = NDArray[np.uint8]
 BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"]
 
 FLOAT_ONNX_NAME = "model.onnx"
@@ -54,7 +52,7 @@ class Detector:
     name
         Of the model.
     grids
-        What the model says of (N, height, width, 3) RGB images.
+        What the model says of (N, height, width, 3) RGB images, or of a list of N.
     stride_px
         Side of a grid cell.
     threshold
@@ -155,8 +153,13 @@ def _torch(model: Path, _backend: BackendName) -> Detector:
         )
     learned = _room("dmrl.learn.model", "train", "--backend torch").load_model(model)
     file = model / WEIGHTS_NAME if model.is_dir() else None
-    stride_px = learned.network.stride_px
-    return Detector(model.name, learned.grids, stride_px, learned.threshold, None, file)
+    stride_px, threshold = learned.network.stride_px, learned.threshold
+
+    def grids(images: Images) -> Grids:
+        said: Grids = learned.grids(np.asarray(images))
+        return said
+
+    return Detector(model.name, grids, stride_px, threshold, None, file)
 
 
 def _onnx(model: Path, _backend: BackendName) -> Detector:

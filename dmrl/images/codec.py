@@ -7,6 +7,7 @@ calibration belongs to the pixels as they were stored.
 import re
 import struct
 import warnings
+from dataclasses import dataclass
 from io import BytesIO
 
 import numpy as np
@@ -75,6 +76,62 @@ def _decodable(image: Image.Image, data: bytes, what: object, most: int) -> None
             )
 
 
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """A PNG, JPEG, PPM or BMP whose header was read, and no pixel.
+
+    Parameters
+    ----------
+    width_px, height_px
+        Its size.
+    kind
+        png, jpeg, ppm or bmp.
+    """
+
+    width_px: int
+    height_px: int
+    kind: str
+    _image: Image.Image
+    _data: bytes
+    _what: object
+
+    def decode(self, most: int) -> Rgb:
+        """Its pixels, once, of which it may have ``most``: see `decode`."""
+        with self._image as image:
+            _decodable(image, self._data, self._what, most)
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    if image.mode == "P" and image.palette is None:  # Pillow only asserts it
+                        raise ValueError("its palette is missing")
+                    # Converting what is RGB already would copy it.
+                    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+            except BROKEN as e:
+                why = " ".join(str(e).split())
+                raise SourceError(
+                    f"{self._what} cannot be decoded: {why}. Remove it or save it again"
+                ) from None
+
+
+def opened(data: bytes, what: object = "the image") -> Opened:
+    """A picture's header: its size before it is decoded.
+
+    Parameters
+    ----------
+    data
+        The encoded picture.
+    what
+        Name of the picture in errors.
+
+    Raises
+    ------
+    SourceError
+        If the bytes do not start like such a picture.
+    """
+    image = _open(data, what)
+    return Opened(image.width, image.height, str(image.format).lower(), image, data, what)
+
+
 def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIXELS) -> Rgb:
     """Pixels of a PNG, JPEG, PPM or BMP.
 
@@ -97,19 +154,7 @@ def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIX
     SourceError
         If the bytes are no such picture, end too soon, or ask for more pixels than a picture may.
     """
-    with _open(data, what) as image:
-        _decodable(image, data, what, most)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                if image.mode == "P" and image.palette is None:  # Pillow only asserts it
-                    raise ValueError("its palette is missing")
-                return np.asarray(image.convert("RGB"))
-        except BROKEN as e:
-            why = " ".join(str(e).split())
-            raise SourceError(
-                f"{what} cannot be decoded: {why}. Remove it or save it again"
-            ) from None
+    return opened(data, what).decode(most)
 
 
 def size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
@@ -120,8 +165,8 @@ def size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
     SourceError
         If the bytes do not start like such a picture.
     """
-    with _open(data, what) as image:
-        return image.width, image.height, str(image.format).lower()
+    picture = opened(data, what)
+    return picture.width_px, picture.height_px, picture.kind
 
 
 def encode_png(rgb: Rgb | NDArray[np.uint16]) -> bytes:

@@ -17,7 +17,7 @@ from dmrl.border import limits
 from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, fastest, open_detector
 from dmrl.errors import MissingTopic
 from dmrl.images.ahead import ahead
-from dmrl.images.codec import Rgb, decode, size
+from dmrl.images.codec import Opened, Rgb, opened, size
 from dmrl.learn.decode import PER_DETECTION, Found, Grids
 from dmrl.learn.decode import decode as find
 from dmrl.learn.pretrained import resolved
@@ -175,32 +175,38 @@ def _messages(
     pictured = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
     total = sum(held.topics[t].count for t in pictured)
     raws = track(read_raw(recording, *pictured), "Predicting", total)
-    batches = _batches(raws, settings.batch_size, recording)
-    decoded = partial(_pictures, detector, recording)
-    for batch, pictures in ahead(decoded, batches, threads=1, held=1):
-        seen = _seen(pictures, detector, settings)
+    batches = _batches(raws, settings.batch_size, detector, recording)
+    for batch in ahead(_decoded, batches, threads=1, held=1):
+        seen = _seen([rgb for _, rgb in batch], detector, settings)
         tally["images"] += len(seen)
-        for raw, (made, grid) in zip(batch, seen, strict=True):
+        for (raw, _), (made, grid) in zip(batch, seen, strict=True):
             tally["believed"] += sum(d.confidence >= detector.threshold for d in made.detections)
             robot = _robot(raw)
             yield Timed(raw.time_ns, topics.detections(robot), made, raw.publish_ns)
             yield Timed(raw.time_ns, topics.grid(robot), grid, raw.publish_ns)
 
 
-def _batches(raws: Iterable[RawMessage], most: int, recording: Path) -> Iterator[list[RawMessage]]:
+def _batches(
+    raws: Iterable[RawMessage], most: int, detector: Detector, recording: Path
+) -> Iterator[list[tuple[RawMessage, Opened]]]:
     """So many images at a time; fewer where they are large, one at least."""
-    batch: list[RawMessage] = []
+    batch: list[tuple[RawMessage, Opened]] = []
     pixels = 0
     for raw in raws:
-        data = parsed(raw, message("CompressedImage"), recording).data
-        width_px, height_px, _ = size(data, _named(recording, raw))
-        pixels += width_px * height_px
+        what = _named(recording, raw)
+        picture = opened(parsed(raw, message("CompressedImage"), recording).data, what)
+        detector.require_size(picture.width_px, picture.height_px, what)
+        pixels += picture.width_px * picture.height_px
         if len(batch) == most or (batch and pixels > limits.FRAME_PIXELS):
             yield batch
-            batch, pixels = [], width_px * height_px
-        batch.append(raw)
+            batch, pixels = [], picture.width_px * picture.height_px
+        batch.append((raw, picture))
     if batch:
         yield batch
+
+
+def _decoded(batch: list[tuple[RawMessage, Opened]]) -> list[tuple[RawMessage, Rgb]]:
+    return [(raw, picture.decode(limits.FRAME_PIXELS)) for raw, picture in batch]
 
 
 def _robot(raw: RawMessage) -> str:
@@ -209,20 +215,6 @@ def _robot(raw: RawMessage) -> str:
 
 def _named(recording: Path, image: RawMessage | Stamped) -> str:
     return f"{recording}: the image of {image.topic} at {image.time_ns} ns"
-
-
-def _pictures(
-    detector: Detector, recording: Path, batch: list[RawMessage]
-) -> tuple[list[RawMessage], list[Rgb]]:
-    """Messages, and the pictures in them."""
-    return batch, [_decode(raw, detector, recording) for raw in batch]
-
-
-def _decode(raw: RawMessage, detector: Detector, recording: Path) -> Rgb:
-    what = _named(recording, raw)
-    rgb = decode(parsed(raw, message("CompressedImage"), recording).data, what)
-    detector.require_size(rgb.shape[1], rgb.shape[0], what)
-    return rgb
 
 
 class _Seen(NamedTuple):
@@ -236,7 +228,7 @@ def _seen(pictures: list[Rgb], detector: Detector, settings: Settings) -> list[_
     """What the network finds in each picture."""
     out = []
     for _, same_size in groupby(pictures, key=np.shape):
-        images = np.stack(list(same_size))
+        images = list(same_size)
         grids = detector.grids(images)
         found = _found(images, grids, detector, settings)
         for k in range(len(found.count)):
@@ -245,15 +237,15 @@ def _seen(pictures: list[Rgb], detector: Detector, settings: Settings) -> list[_
     return out
 
 
-def _found(images: Rgb, grids: Grids, detector: Detector, settings: Settings) -> Found:
+def _found(images: list[Rgb], grids: Grids, detector: Detector, settings: Settings) -> Found:
     """Detections in these images, whose grids are known, over all views."""
-    stride_px, size_px = detector.stride_px, images.shape[1:3]
+    stride_px, (height_px, width_px, _) = detector.stride_px, images[0].shape
     most, least = settings.most, settings.min_confidence
     decoded = partial(find, stride_px=stride_px, most=most, min_confidence=least)
     found = [decoded(*grids)]
     for view in VIEWS[1 : settings.views]:
-        again = decoded(*detector.grids(shown(images, view, stride_px)))
-        found.append(returned(again, view, stride_px, size_px))
+        again = decoded(*detector.grids(shown(np.stack(images), view, stride_px)))
+        found.append(returned(again, view, stride_px, (height_px, width_px)))
     return agreed(found, most=most, min_confidence=least) if len(found) > 1 else found[0]
 
 

@@ -12,7 +12,7 @@ import torch
 from dmrl.deploy import onnx_run
 from dmrl.deploy.detector import fastest
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
-from dmrl.images.codec import decode, encode_png
+from dmrl.images.codec import Opened, decode, encode_png
 from dmrl.learn.model import Model, load_model, save_model
 from dmrl.learn.network import build
 from dmrl.messages import message
@@ -238,10 +238,11 @@ def test_pictures_are_decoded_in_another_thread(
 ) -> None:
     threads: set[threading.Thread] = set()
 
-    def noted(data: bytes, what: str) -> Any:
+    def noted(picture: Opened, most: int) -> Any:
         threads.add(threading.current_thread())
-        return decode(data, what)
+        return decoded(picture, most)
 
-    monkeypatch.setattr(predict, "decode", noted)
+    decoded = Opened.decode
+    monkeypatch.setattr(Opened, "decode", noted)
     run(model, dots, tmp_path / "out.mcap", Settings(batch_size=3))
     assert threads and threading.main_thread() not in threads
