@@ -118,7 +118,11 @@ def _end(text: str, status: int = 1) -> int:
 
 
 def _stopped() -> str:
-    if whole := output.standing():
+    try:
+        whole = output.standing()
+    except (DmrlError, OSError) as e:  # outputs may lie where nobody answers any more
+        return f"stopped. What has its final name is not known: {e}"
+    if whole:
         return f"stopped. Whole: {', '.join(map(str, whole))}; nothing else has its final name"
     return "stopped. Nothing stands under its final name"
 

@@ -153,13 +153,14 @@ def _torch(model: Path, _backend: BackendName) -> Detector:
         )
     learned = _room("dmrl.learn.model", "train", "--backend torch").load_model(model)
     file = model / WEIGHTS_NAME if model.is_dir() else None
-    stride_px, threshold = learned.network.stride_px, learned.threshold
-
-    def grids(images: Images) -> Grids:
-        said: Grids = learned.grids(np.asarray(images))
-        return said
-
-    return Detector(model.name, grids, stride_px, threshold, None, file)
+    return Detector(
+        model.name,
+        lambda images: learned.grids(np.asarray(images)),
+        learned.network.stride_px,
+        learned.threshold,
+        size_px=None,
+        file=file,
+    )
 
 
 def _onnx(model: Path, _backend: BackendName) -> Detector:

@@ -28,6 +28,8 @@ RANGE_ERROR = 5
 METRIC = [0, 1, 3, 4]
 """Residuals of a step that the velocity scales divide."""
 OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
+OF_OBSERVER = [OWN_GYRO, OWN_SCALE, 6, 7]
+"""Places among ``GLOBALS`` of what is the observer's alone; ``pair.SWAPPED`` of them the peer's."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,28 +14,14 @@ from dmrl.estimation.estimate import unmoved, with_status
 from dmrl.estimation.estimated import Estimate
 from dmrl.estimation.gate import GATE_M
 from dmrl.estimation.keyframe_filter import QUARTER
-from dmrl.estimation.linear import (
-    BIAS,
-    OWN_GYRO,
-    OWN_SCALE,
-    OWN_VELOCITY,
-    PEER_GYRO,
-    PEER_SCALE,
-    PEER_VELOCITY,
-    SCALE,
-)
+from dmrl.estimation.linear import BIAS, OF_OBSERVER, OWN_GYRO, PEER_GYRO, SCALE
 from dmrl.estimation.motion import odometry, rotation
-from dmrl.estimation.pair import Array, Pair, Track
+from dmrl.estimation.pair import SWAPPED, Array, Pair, Track
 from dmrl.estimation.problem import GLOBALS, KEY_HZ, silence, unheard
 from dmrl.estimation.stretches import contradicts
 from dmrl.estimation.swarm_solve import OWN, ROBOT, SHARED, Flight, Link, Swarm, inverse, solved
 
 Names = tuple[str, str]
-OF_ROBOTS = (
-    [OWN_GYRO, OWN_SCALE, *range(OWN_VELOCITY.start, OWN_VELOCITY.stop)],
-    [PEER_GYRO, PEER_SCALE, *range(PEER_VELOCITY.start, PEER_VELOCITY.stop)],
-)
-"""Places among ``GLOBALS`` of what a swarm has of either robot, in its order."""
 LEAST_S = 5.0
 """Shortest time that all robots share and that is worth a solve."""
 
@@ -146,9 +132,9 @@ def _known_std(names: list[str], pairs: Mapping[Names, Pair]) -> Array:
     for number, (both, pair) in enumerate(pairs.items()):
         if pair.known_std is None:
             continue
-        for name, places in zip(both, OF_ROBOTS, strict=True):
+        for name, known in zip(both, (pair.known_std, pair.known_std[SWAPPED]), strict=True):
             mine = robots[names.index(name)]
-            mine[:] = np.minimum(mine, pair.known_std[places])
+            mine[:] = np.minimum(mine, known[OF_OBSERVER])
         shared[number] = pair.known_std[[BIAS, SCALE]]
     return np.concatenate([robots.ravel(), shared.ravel()])
 

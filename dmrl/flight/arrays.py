@@ -13,15 +13,13 @@ from dmrl.geometry.frames import Array
 
 RATE_HZ = 100.0
 """Samples per second of logs and truth."""
-STRETCH = 4096
 
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
 def numbers(values: NDArray[Any]) -> Iterator[Any]:
-    """Python's numbers of an array, few at a time: as such they take five times the memory."""
-    for first in range(0, len(values), STRETCH):
-        yield from values[first : first + STRETCH].tolist()
+    """Python's numbers of an array, one at a time: as such they take five times the memory."""
+    return map(values.item, range(len(values)))
 
 
 def scanned(step: Callable[[Any, Any], Any], values: Signal) -> Signal:

@@ -15,17 +15,8 @@ import tomli_w
 from dmrl.border.documents import parse_toml
 from dmrl.border.folders import refuse_pipe
 from dmrl.errors import SourceError
-from dmrl.estimation.linear import (
-    BIAS,
-    OWN_GYRO,
-    OWN_SCALE,
-    OWN_VELOCITY,
-    PEER_GYRO,
-    PEER_SCALE,
-    PEER_VELOCITY,
-    SCALE,
-)
-from dmrl.estimation.pair import Array
+from dmrl.estimation.linear import BIAS, OF_OBSERVER, SCALE
+from dmrl.estimation.pair import SWAPPED, Array
 from dmrl.estimation.problem import GLOBALS
 
 Names = tuple[str, str]
@@ -33,12 +24,8 @@ Value = tuple[float, float]
 """A mean, and the standard deviation of the next flight about it."""
 Values = Mapping[str, Value]
 
-OF_ROBOT = {
-    "yaw_rate_bias_radps": (OWN_GYRO, PEER_GYRO),
-    "velocity_scale": (OWN_SCALE, PEER_SCALE),
-    "vx_bias_mps": (OWN_VELOCITY.start, PEER_VELOCITY.start),
-    "vy_bias_mps": (OWN_VELOCITY.start + 1, PEER_VELOCITY.start + 1),
-}
+_KEYS = ("yaw_rate_bias_radps", "velocity_scale", "vx_bias_mps", "vy_bias_mps")
+OF_ROBOT = {key: (place, SWAPPED[place]) for key, place in zip(_KEYS, OF_OBSERVER, strict=True)}
 """Of one robot: places among ``GLOBALS`` where it is the observer, and where it is the peer."""
 OF_PAIR = {"range_offset_m": BIAS, "range_scale": SCALE}
 """Of the ranges between two, in the order of their names. Clocks are another every time."""
