@@ -5,7 +5,11 @@
 
 from importlib import import_module
 
+from dmrl.border.telemetry import disable_telemetry
+
 __version__ = "0.1.0"
+
+disable_telemetry()  # dependencies read their switches when they are imported
 
 # Where each public name lives. `__init__.pyi` says the same to type checkers, a test holds them
 # together; imports here would be a circle, since every room asks for the version.

@@ -1,0 +1,48 @@
+"""No dependency reports on its users, and none leaves an identifier behind."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dmrl.border.telemetry import OPT_OUT
+
+CI = ("CI", "TF_BUILD", "GITHUB_ACTIONS", "JENKINS_URL", "BUILD_ID")
+"""Variables that tell onnxruntime that nobody is to be counted."""
+
+
+def users_environment(home: Path) -> dict[str, str]:
+    """Return the environment of a user who has switched nothing off."""
+    dropped = {*OPT_OUT, *CI}
+    kept = {name: value for name, value in os.environ.items() if name not in dropped}
+    places = ("HOME", "TMPDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
+    return kept | dict.fromkeys(places, str(home))
+
+
+def test_import_switches_every_dependency_off() -> None:
+    code = "import os, dmrl; print({k: os.environ[k] for k in %r})" % (sorted(OPT_OUT),)
+    environment = {**os.environ, **dict.fromkeys(OPT_OUT, "")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == str(dict(sorted(OPT_OUT.items())))
+
+
+@pytest.mark.heavy
+def test_onnxruntime_leaves_no_identifier(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    home = tmp_path / "home"
+    home.mkdir()
+    code = (
+        "import numpy as np\n"
+        "import dmrl\n"
+        "from dmrl.deploy.detector import open_detector\n"
+        "from dmrl.learn.pretrained import resolved\n"
+        "from pathlib import Path\n"
+        "detector = open_detector(resolved(Path('dmrl-nano')), 'onnx')\n"
+        "detector.grids([np.zeros((224, 320, 3), np.uint8)])\n"
+    )
+    subprocess.run([sys.executable, "-c", code], env=users_environment(home), check=True)
+    assert [str(p.relative_to(home)) for p in home.rglob("*")] == []
