@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help bench demo test test-heavy test-all test-faults mutants check format lint types imports spell schemas docs site examples wheels layout clean
+.PHONY: help bench demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas docs site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -40,6 +40,9 @@ mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. A
 
 test-faults: $(VENV)/.dev ## Break disks, processes and files in every way; prints what came of it.
 	$(PYTEST) -m "slow or not slow" --timeout 3600 tests/faults tests/recording/test_flips.py tests/recording/test_renames.py tests/recording/test_budgets.py tests/formats/test_fuzz.py $(ARGS)
+
+golden: $(VENV)/.dev ## Compare the decoded outputs of the main commands with tests/golden.json.
+	$(BIN)/python tests/golden.py $(ARGS)
 
 check: format lint types imports spell ## Check format, lint, types, imports and spelling.
 

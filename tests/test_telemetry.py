@@ -22,7 +22,7 @@ def users_environment(home: Path) -> dict[str, str]:
 
 
 def test_import_switches_every_dependency_off() -> None:
-    code = "import os, dmrl; print({k: os.environ[k] for k in %r})" % (sorted(OPT_OUT),)
+    code = f"import os, dmrl; print({{k: os.environ[k] for k in {sorted(OPT_OUT)}}})"
     environment = {**os.environ, **dict.fromkeys(OPT_OUT, "")}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
