@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl import output
+from dmrl import atomic_output
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
@@ -29,8 +29,8 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 def write_recordings(folder: Path, count: int) -> None:
     """Write recordings, a thousand to a folder."""
-    output.sync = lambda path: None  # ten thousand are not worth a disk's time each
-    output._sync_one = lambda path: None
+    atomic_output.sync = lambda path: None  # ten thousand are not worth a disk's time each
+    atomic_output._sync_one = lambda path: None
     rng = np.random.default_rng(0)
     for number in range(count):
         place = folder / f"{number // 1000:03d}" / f"{number:06d}.mcap"

@@ -5,7 +5,7 @@
 
 from importlib import import_module
 
-from dmrl.border.telemetry import disable_telemetry
+from dmrl.guards.telemetry import disable_telemetry
 
 __version__ = "0.1.0"
 

@@ -26,9 +26,9 @@ from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
-from dmrl import output
-from dmrl.border.names import without_middle
+from dmrl import atomic_output
 from dmrl.errors import DmrlError, SettingError, one_line, words_of
+from dmrl.guards.safe_names import without_middle
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -119,7 +119,7 @@ def _end(text: str, status: int = 1) -> int:
 
 def _stopped() -> str:
     try:
-        whole = output.standing()
+        whole = atomic_output.standing()
     except (DmrlError, OSError) as e:  # outputs may lie where nobody answers any more
         return f"stopped. What has its final name is not known: {e}"
     if whole:

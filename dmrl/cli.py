@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
-from dmrl.border.names import without_middle
+from dmrl.guards.safe_names import without_middle
 from dmrl.storage import path_of
 from dmrl.terminal import standins
 

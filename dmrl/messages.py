@@ -19,8 +19,8 @@ from google.protobuf.descriptor_pb2 import (
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from dmrl.border import limits
 from dmrl.errors import SourceError
+from dmrl.guards import limits
 
 PACKAGES = ("dmrl.v1", "foxglove")
 

@@ -17,10 +17,10 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 
-from dmrl.border import limits
-from dmrl.border.documents import parse_toml
-from dmrl.border.folders import refuse_pipe
 from dmrl.errors import RecipeError
+from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_toml
+from dmrl.guards.paths import refuse_pipe
 
 Settings = TypeVar("Settings")
 MOST_BYTES = 4 * limits.TOML_CHARACTERS

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
-from dmrl.border.names import topic_part
+from dmrl.guards.safe_names import topic_part
 
 
 @dataclass(frozen=True, slots=True)

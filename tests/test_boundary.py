@@ -110,7 +110,7 @@ def test_a_signal_says_that_nothing_has_its_final_name(
 def test_what_is_whole_when_a_signal_comes_is_said(tmp_path: Path) -> None:
     code = (
         "import os, sys, signal; from pathlib import Path\n"
-        "from dmrl import boundary; from dmrl.output import partial_file\n"
+        "from dmrl import boundary; from dmrl.atomic_output import partial_file\n"
         "def work():\n"
         "    for name in 'ab':\n"
         "        with partial_file(Path(name)) as partial:\n"

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from dmrl import __version__, cli, output
-from dmrl.border.names import without_middle
+from dmrl import __version__, atomic_output, cli
 from dmrl.cli import COMMANDS, app
 from dmrl.errors import DmrlError, StorageError
+from dmrl.guards.safe_names import without_middle
 
 HEAVY = {
     *("bpy", "datasets", "h5py", "matplotlib", "mcap", "numpy", "pandas", "PIL", "pyarrow"),
@@ -238,7 +238,7 @@ def _end_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:
 def test_ctrl_c_ends_with_one_line_and_status_130(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(output, "_begun", [])
+    monkeypatch.setattr(atomic_output, "_begun", [])
     assert _end_with(KeyboardInterrupt(), monkeypatch) == 130
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -249,7 +249,7 @@ def test_ctrl_c_ends_so_where_an_output_s_storage_does_not_answer(
     def standing() -> list[Path]:
         raise StorageError("s3://lab/out: nobody answers")
 
-    monkeypatch.setattr(output, "standing", standing)
+    monkeypatch.setattr(atomic_output, "standing", standing)
     assert _end_with(KeyboardInterrupt(), monkeypatch) == 130
     said = "dmrl: stopped. What has its final name is not known: s3://lab/out: nobody answers\n"
     assert capsys.readouterr().err == said

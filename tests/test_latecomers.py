@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from dmrl import output
+from dmrl import atomic_output
+from dmrl.atomic_output import partial_file, partial_folder, partial_of
 from dmrl.errors import OutputError
-from dmrl.output import partial_file, partial_folder, partial_of
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
@@ -16,14 +16,14 @@ def test_who_comes_just_after_another_leaves_nothing(
     kind: str, keep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Six times `dmrl train` or `render` into one name left a NAME.partial beside it."""
-    out, take = tmp_path / "out", getattr(output, f"take_{kind}")
+    out, take = tmp_path / "out", getattr(atomic_output, f"take_{kind}")
 
     def taken_late(partial: Path) -> int:
         out.touch()  # between the look at the name and the lock
         held: int = take(partial)
         return held
 
-    monkeypatch.setattr(output, f"take_{kind}", taken_late)
+    monkeypatch.setattr(atomic_output, f"take_{kind}", taken_late)
     write: Callable[..., object] = partial_file if kind == "file" else partial_folder
     with pytest.raises(OutputError, match="exists"), write(out, keep_on_error=keep):  # type: ignore[attr-defined]
         raise AssertionError
@@ -33,10 +33,12 @@ def test_who_comes_just_after_another_leaves_nothing(
 def test_work_that_can_be_resumed_is_not_taken_away_by_who_comes_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, take = tmp_path / "out", output.take_folder
+    out, take = tmp_path / "out", atomic_output.take_folder
     partial_of(out).mkdir()
     (partial_of(out) / "epochs").write_text("a night")
-    monkeypatch.setattr(output, "take_folder", lambda partial: (out.touch(), take(partial))[1])
+    monkeypatch.setattr(
+        atomic_output, "take_folder", lambda partial: (out.touch(), take(partial))[1]
+    )
     with (
         pytest.raises(OutputError, match="exists"),
         partial_folder(out, keep_on_error=True, resume=True),

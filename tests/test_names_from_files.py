@@ -1,8 +1,8 @@
-"""Held by the source itself: what comes from a file becomes a path in `dmrl.border.names` alone.
+"""Held by the source itself: what comes from a file becomes a path in `dmrl.guards.safe_names` alone.
 
 A path may be joined with a text that stands in the source. What else it is joined with goes
-through a function of `dmrl.border.names`, or stands below with the reason why it needs none.
-Documents of strangers are parsed in `dmrl.border.documents` alone, which knows their budgets.
+through a function of `dmrl.guards.safe_names`, or stands below with the reason why it needs none.
+Documents of strangers are parsed in `dmrl.guards.bounded_parsing` alone, which knows their budgets.
 """
 
 import ast
@@ -23,7 +23,7 @@ GIVEN = "a path of the user's, with an ending of ours"
 READ = "only read: names of files beside each other"
 REASONS = {
     "api/stages.py: f'{stage}.mcap'": OURS,
-    "border/names.py: file_name(name, what) + suffix": CHECKED_BEFORE,
+    "guards/safe_names.py: file_name(name, what) + suffix": CHECKED_BEFORE,
     "datasets/layout.py: f'data-{number}.arrow'": OURS,
     "datasets/layout.py: f'{split}-{number}.parquet'": CHECKED_BEFORE,
     "datasets/layout.py: split": CHECKED_BEFORE,
@@ -50,9 +50,9 @@ REASONS = {
     "output.py: file": "what we wrote ourselves just now",
     "output.py: last": OURS,
     "output.py: path.name + SUFFIX": GIVEN,
-    "page/gather.py: name": LISTED,
-    "page/sections.py: name": LISTED,
-    "page/story.py: name": "only read, and nothing outside the folder",
+    "html_report/collect.py: name": LISTED,
+    "html_report/sections.py: name": LISTED,
+    "html_report/figures.py: name": "only read, and nothing outside the folder",
     "pipeline/folders.py: n": LISTED,
     "pipeline/folders.py: name": LISTED,
     "pipeline/memory.py: name": LISTED,
@@ -77,7 +77,7 @@ REASONS = {
 }
 PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
 MAY_PARSE = {
-    "border/documents.py": "the home",
+    "guards/bounded_parsing.py": "the home",
     "rendering/blender/protocol.py": "what our own processes say to each other",
     "pipeline/crew.py": "what our own processes say to each other",
     "pipeline/work.py": "what our own processes say to each other",
@@ -205,7 +205,7 @@ def joins() -> set[str]:
 
 def test_a_path_is_joined_with_checked_names_alone() -> None:
     found = joins()
-    assert found - REASONS.keys() == set(), "use dmrl.border.names, or add the reason"
+    assert found - REASONS.keys() == set(), "use dmrl.guards.safe_names, or add the reason"
     assert REASONS.keys() - found == set(), "these are no more"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.border.telemetry import OPT_OUT
+from dmrl.guards.telemetry import OPT_OUT
 
 CI = ("CI", "TF_BUILD", "GITHUB_ACTIONS", "JENKINS_URL", "BUILD_ID")
 """Variables that tell onnxruntime that nobody is to be counted."""

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.atomic_output import partial_file
 from dmrl.colours import RGB
 from dmrl.datasets import layout
 from dmrl.datasets.flags import NEEDED
 from dmrl.errors import one_line
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
-from dmrl.output import partial_file
 from dmrl.terminal.progress import track
 from dmrl.viewer.browse import Ranked, image_size, ranked_of
 from dmrl.viewer.selection import Settings

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import rerun as rr
 
-from dmrl.output import partial_file
+from dmrl.atomic_output import partial_file
 from dmrl.viewer.layouts import TIMELINE
 from dmrl.viewer.scene import Scene, logged
 from dmrl.viewer.selection import Settings, at_time, moment_ns, select

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from rerun.experimental import ViewerClient
 
+from dmrl.atomic_output import partial_file
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode, encode_png
-from dmrl.output import partial_file
 from dmrl.terminal.ending import ended_by_signal
 from dmrl.viewer.process import (
     LOOPBACK,

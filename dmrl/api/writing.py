@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from dmrl import topics
 from dmrl.api.recordings import PathLike, Recording
-from dmrl.border import limits
-from dmrl.border.names import topic_part
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
+from dmrl.guards import limits
+from dmrl.guards.safe_names import topic_part
 from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
-from dmrl.border.documents import parse_json
+from dmrl.atomic_output import rewritten_file
 from dmrl.card import sections
 from dmrl.card.counts import Counts, count, sigmas_of
 from dmrl.card.croissant import NAME as CROISSANT
@@ -20,7 +20,7 @@ from dmrl.card.leaks import leaks
 from dmrl.datasets import Split, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX
-from dmrl.output import rewritten_file
+from dmrl.guards.bounded_parsing import parse_json
 from dmrl.recording import Provenance
 from dmrl.recording.provenance import FILE_NAME
 from dmrl.terminal.progress import say

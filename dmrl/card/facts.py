@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.documents import parse_json
-from dmrl.border.names import code, markdown
 from dmrl.datasets.seen import NEAR_BITS
 from dmrl.errors import DatasetError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.safe_names import code, markdown
 
 FILE = "facts.json"
 LISTED = 20

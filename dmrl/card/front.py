@@ -8,9 +8,9 @@ from typing import Any
 import pyarrow as pa
 from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
-from dmrl.border.documents import parse_json
 from dmrl.datasets import Split, layout
 from dmrl.errors import SettingError
+from dmrl.guards.bounded_parsing import parse_json
 
 HUB_LICENSES = ("unknown", "other", "odc-by", "odbl", "pddl", "c-uda")
 """Words of the Hub's for licences of data that are no SPDX identifiers."""

@@ -8,8 +8,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from dmrl.border.names import code, markdown
 from dmrl.datasets import Split
+from dmrl.guards.safe_names import code, markdown
 
 NEAR_S = 1.0
 """Images of one camera that are closer than this look alike."""

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from dmrl.border import limits
-from dmrl.border.names import inside
 from dmrl.catalogue.table import NAME, Catalogue, open_catalogue, stamp
 from dmrl.errors import MissingExtra, RecordingError, SettingError
+from dmrl.guards import limits
+from dmrl.guards.safe_names import inside
 
 try:
     import duckdb

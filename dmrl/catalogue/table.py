@@ -12,10 +12,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dmrl.border.memory import Bounded
+from dmrl.atomic_output import rewritten_file
 from dmrl.catalogue.describe import Row
 from dmrl.errors import RecordingError
-from dmrl.output import rewritten_file
+from dmrl.guards.memory import Bounded
 
 NAME = "catalogue.parquet"
 MARK = {b"dmrl.catalogue": b"1"}

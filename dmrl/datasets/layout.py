@@ -21,8 +21,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from dmrl.border.names import split_name
 from dmrl.geometry.frames import STRIDE_PX
+from dmrl.guards.safe_names import split_name
 
 PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.documents import parse_json
-from dmrl.border.names import file_name, inside, split_name
 from dmrl.datasets import layout
 from dmrl.errors import DatasetError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.safe_names import file_name, inside, split_name
 
 PARTS = "parts"
 

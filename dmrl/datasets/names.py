@@ -7,11 +7,11 @@ from typing import Any
 
 import pyarrow as pa
 
-from dmrl.border.names import inside
+from dmrl.atomic_output import rewritten_file
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest
 from dmrl.datasets.shards import schema_of
-from dmrl.output import rewritten_file
+from dmrl.guards.safe_names import inside
 
 
 def write_names(

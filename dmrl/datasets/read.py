@@ -14,15 +14,15 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from dmrl.border import limits
-from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_no_text, refuse_pipes
-from dmrl.border.names import inside, split_name
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, read_manifest
 from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
+from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.paths import refuse_no_text, refuse_pipes
+from dmrl.guards.safe_names import inside, split_name
 from dmrl.images.codec import decode
 
 PARQUET_NAME = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")

@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dmrl.border import limits
-from dmrl.border.memory import Bounded
 from dmrl.datasets import layout
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
+from dmrl.guards import limits
+from dmrl.guards.memory import Bounded
 
 AGAIN = "Make the dataset again, or copy it whole"
 

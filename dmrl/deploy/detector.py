@@ -13,8 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_no_text, refuse_pipes
 from dmrl.deploy.backends import Backend, Images, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
 from dmrl.deploy.compiled import Compiled
@@ -22,6 +20,8 @@ from dmrl.deploy.emulated import RISCV32, Emulated
 from dmrl.deploy.integer import IntegerNetwork
 from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError, SettingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.paths import refuse_no_text, refuse_pipes
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 

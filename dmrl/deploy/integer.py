@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmrl.border.names import shortened
 from dmrl.deploy.integer_layers import (
     PIXEL_ZERO,
     Add,
@@ -27,6 +26,7 @@ from dmrl.deploy.integer_layers import (
     unsound,
 )
 from dmrl.errors import ModelError
+from dmrl.guards.safe_names import shortened
 
 __all__ = [
     "CONFIDENCE_ONE",

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.border.documents import load_npz
 from dmrl.errors import ModelError
+from dmrl.guards.bounded_parsing import load_npz
 
 SAMPLES_NAME = "samples.npz"
 SAMPLES = 4

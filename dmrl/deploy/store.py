@@ -11,10 +11,10 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.border.documents import load_npz, parse_json
-from dmrl.border.folders import refuse_pipes
 from dmrl.deploy.integer import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
 from dmrl.errors import ModelError
+from dmrl.guards.bounded_parsing import load_npz, parse_json
+from dmrl.guards.paths import refuse_pipes
 
 INTEGER_NAME = "integer.npz"
 """Name of the file in a quantised model and in an export folder."""

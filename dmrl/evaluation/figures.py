@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
-from dmrl.border.names import inside
 from dmrl.estimation.score import ErrorTrace
 from dmrl.evaluation.detections import At, Pairs
+from dmrl.guards.safe_names import inside
 from dmrl.images.codec import decode
 from dmrl.learn.matching import Points
 from dmrl.learn.metrics import Scored

@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.documents import parse_json
 from dmrl.evaluation import positions
+from dmrl.guards.bounded_parsing import parse_json
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 

@@ -1,6 +1,6 @@
 """What a recipe wants its page to begin with: figures and numbers, beside published ones.
 
-``[[figure]]`` tables of a pipeline recipe. They name outputs of steps; `dmrl.page` draws them.
+``[[figure]]`` tables of a pipeline recipe. They name outputs of steps; `dmrl.html_report` draws them.
 """
 
 import re

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
+from dmrl.atomic_output import partial_folder
 from dmrl.errors import MissingExtra, RecordingError
 from dmrl.formats.ros_messages import HALF_PX, OWN
-from dmrl.output import partial_folder
 from dmrl.recording import Stamped, read, summary
 from dmrl.terminal.progress import track
 

@@ -21,9 +21,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dmrl.border.names import file_of_topic, inside
+from dmrl.atomic_output import partial_folder
 from dmrl.errors import MissingExtra, UnsafeName
-from dmrl.output import partial_folder
+from dmrl.guards.safe_names import file_of_topic, inside
 from dmrl.recording import columns, read_table, summary
 from dmrl.terminal.progress import track
 

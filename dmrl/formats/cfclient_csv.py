@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.border import limits
 from dmrl.errors import SourceError
 from dmrl.formats import crazyflie_log
 from dmrl.formats.counters import unwrap
 from dmrl.formats.format import Content, Format, Options, content_of
 from dmrl.formats.log_block import Block
 from dmrl.geometry.frames import Array
+from dmrl.guards import limits
 from dmrl.terminal.progress import say
 
 TIME = "Timestamp"

@@ -26,8 +26,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.documents import parse_toml
 from dmrl.errors import SourceError
+from dmrl.guards.bounded_parsing import parse_toml
 
 ANGLE = {"rad": 1.0, "deg": 0.017453292519943295}
 RATE = {"rad/s": 1.0, "deg/s": 0.017453292519943295}

@@ -25,8 +25,6 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-from dmrl.border import limits
-from dmrl.border.folders import refuse_pipes
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats import aideck
 from dmrl.formats.chip_maps import chip_maps
@@ -35,6 +33,8 @@ from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.label_table import LabelRow, read_labels
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX, Camera
+from dmrl.guards import limits
+from dmrl.guards.paths import refuse_pipes
 from dmrl.images import codec
 from dmrl.images.bayer import rgb_of
 from dmrl.samples.sample import Sample, calibration, image, intervals, labels

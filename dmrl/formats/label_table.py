@@ -8,9 +8,9 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TextIO
 
-from dmrl.border import limits
-from dmrl.border.names import split_name
 from dmrl.errors import SourceError
+from dmrl.guards import limits
+from dmrl.guards.safe_names import split_name
 
 POINT = ("u_px", "v_px", "depth_m")
 BOX = ("left_px", "top_px", "right_px", "bottom_px")

@@ -25,10 +25,10 @@ from typing import Any
 from urllib.parse import quote
 
 from dmrl import topics
-from dmrl.border.memory import Bounded, size_of
 from dmrl.errors import DmrlError, MissingExtra, SourceError
 from dmrl.formats.format import Content, Format, Options
 from dmrl.formats.ros_messages import HANDLERS, OWN, Placed, own
+from dmrl.guards.memory import Bounded, size_of
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.border.documents import load_npz
 from dmrl.errors import SourceError
 from dmrl.formats.format import Content, Format, Options
 from dmrl.geometry.frames import Array
+from dmrl.guards.bounded_parsing import load_npz
 from dmrl.samples import flight
 from dmrl.samples.flight import from_poses, in_order, nanoseconds
 from dmrl.samples.sample import Sample

@@ -3,10 +3,10 @@
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
-from dmrl.border.documents import parse_toml
-from dmrl.border.folders import refuse_pipe
 from dmrl.errors import SourceError
 from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
+from dmrl.guards.bounded_parsing import parse_toml
+from dmrl.guards.paths import refuse_pipe
 
 KNOWN = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
 """Cameras that have a name."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dmrl.border import limits
 from dmrl.errors import SourceError
+from dmrl.guards import limits
 
 Rgb = NDArray[np.uint8]
 Grey = NDArray[np.uint8]

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from dmrl.border.documents import parse_toml
-from dmrl.border.folders import refuse_pipe
 from dmrl.errors import SourceError
 from dmrl.estimation.linear import BIAS, OF_OBSERVER, SCALE
 from dmrl.estimation.pair import SWAPPED, Array
 from dmrl.estimation.problem import GLOBALS
+from dmrl.guards.bounded_parsing import parse_toml
+from dmrl.guards.paths import refuse_pipe
 
 Names = tuple[str, str]
 Value = tuple[float, float]

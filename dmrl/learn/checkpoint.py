@@ -16,9 +16,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.optim import Optimizer
 
-from dmrl.border.documents import parse_json
-from dmrl.border.names import inside
 from dmrl.errors import ModelError, SettingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.safe_names import inside
 from dmrl.learn.model import set_weights, weights_of, write_tensors
 from dmrl.learn.network import Network
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dmrl.border.memory import Bounded
 from dmrl.errors import MissingExtra, ModelError
+from dmrl.guards.memory import Bounded
 from dmrl.learn.network import LocaNet
 
 try:

@@ -16,10 +16,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from dmrl.border import limits
-from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_no_text, refuse_pipes
 from dmrl.errors import ModelError, SettingError
+from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.paths import refuse_no_text, refuse_pipes
 from dmrl.learn import pretrained
 from dmrl.learn.decode import Grids
 from dmrl.learn.keras import read_h5

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
+from dmrl.atomic_output import rewritten_file
 from dmrl.errors import OutputError, SettingError, one_line
-from dmrl.output import rewritten_file
 from dmrl.pipeline.crew import ONE_THREAD
 from dmrl.pipeline.job import failed
 from dmrl.pipeline.work import perform

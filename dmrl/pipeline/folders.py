@@ -13,9 +13,9 @@ from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.folders import refuse_no_text
+from dmrl.atomic_output import note
 from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
-from dmrl.output import note
+from dmrl.guards.paths import refuse_no_text
 from dmrl.pipeline.array import array_job
 from dmrl.pipeline.executors import SLURM, Executor, executor
 from dmrl.pipeline.job import Answer, failed, job

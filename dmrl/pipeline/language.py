@@ -13,7 +13,7 @@ from itertools import product
 from math import prod
 from typing import Any
 
-from dmrl.border import limits
+from dmrl.guards import limits
 
 NAME = re.compile(r"\{([A-Za-z_]\w*)(?:\.([A-Za-z_]\w*))?\}")
 RANGE = re.compile(r"(0|[1-9]\d{0,8})-(0|[1-9]\d{0,8})")

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import __version__
-from dmrl.border.documents import parse_json
+from dmrl.atomic_output import rewritten_file
 from dmrl.errors import OutputError
-from dmrl.output import rewritten_file
+from dmrl.guards.bounded_parsing import parse_json
 from dmrl.recording.inputs import sha256_of_file, sha256_of_folder
 from dmrl.storage import Remote
 

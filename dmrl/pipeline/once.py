@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dmrl.atomic_output import note
 from dmrl.errors import DmrlError, SettingError
-from dmrl.output import note
 from dmrl.pipeline.executors import SLURM, executor
 from dmrl.pipeline.folders import Task, differing, words_of
 from dmrl.pipeline.interface import interface_of

@@ -12,10 +12,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.border.names import file_name
 from dmrl.errors import RecipeError, UnsafeName
 from dmrl.evaluation import story
 from dmrl.geometry.camera_file import KNOWN
+from dmrl.guards.safe_names import file_name
 from dmrl.learn import pretrained
 from dmrl.pipeline.interface import Interface, interface_of
 from dmrl.pipeline.language import expanded

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dmrl.border.folders import refuse_no_text
+from dmrl.atomic_output import as_output_error, partial_of, rewritten_file
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.report import Done
-from dmrl.output import as_output_error, partial_of, rewritten_file
+from dmrl.guards.paths import refuse_no_text
 from dmrl.pipeline.executors import executor
 from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located

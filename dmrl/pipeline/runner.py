@@ -9,9 +9,9 @@ from time import perf_counter
 from typing import Any
 
 from dmrl import recipe as recipes
+from dmrl.atomic_output import note, partial_of
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.report import Done
-from dmrl.output import note, partial_of
 from dmrl.pipeline.executors import Executor
 from dmrl.pipeline.interface import NO_CONTENT
 from dmrl.pipeline.job import Answer, job

@@ -8,8 +8,8 @@ import numpy as np
 from mcap.records import Channel as McapChannel
 from mcap.records import Chunk
 
+from dmrl.atomic_output import as_output_error
 from dmrl.errors import RecordingError
-from dmrl.output import as_output_error
 from dmrl.recording.block import Block, Bytes, Ints
 from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import set_heads

@@ -14,7 +14,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
 
-from dmrl.border import limits
+from dmrl.guards import limits
 from dmrl.recording.block import HEAD_BYTES, Block, Bytes, Ints, put_at, taken
 from dmrl.recording.container import laid_out
 from dmrl.recording.opening import DEFINITIONS, RECORD, damaged, too_large

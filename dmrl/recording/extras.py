@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from dmrl.border.documents import parse_json
-from dmrl.border.names import split_name
 from dmrl.errors import RecordingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.safe_names import split_name
 from dmrl.recording import sums
 from dmrl.recording.index import SPLIT_METADATA, Summary
 from dmrl.recording.provenance import METADATA_NAME

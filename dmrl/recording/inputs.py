@@ -7,9 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_pipe
 from dmrl.errors import RecordingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.paths import refuse_pipe
 from dmrl.recording.index import summary
 from dmrl.recording.opening import expect_unchanged
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance

@@ -12,8 +12,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from mcap.stream_reader import CRCValidationError
 
+from dmrl.atomic_output import outputs_done
 from dmrl.errors import RecordingError
-from dmrl.output import outputs_done
 from dmrl.storage import Remote
 from dmrl.storage.ranges import LEAST_BYTES
 

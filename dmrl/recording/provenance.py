@@ -14,8 +14,8 @@ from typing import Any, Self
 import tomli_w
 
 from dmrl import __version__
-from dmrl.border import limits
-from dmrl.border.documents import parse_json
+from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_json
 
 FILE_NAME = "provenance.json"
 METADATA_NAME = "dmrl.provenance"

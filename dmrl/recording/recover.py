@@ -26,8 +26,8 @@ from mcap.records import (
 from mcap.records import Channel as McapChannel
 from mcap.summary import Summary as McapSummary
 
-from dmrl.border import limits
 from dmrl.errors import RecordingError
+from dmrl.guards import limits
 from dmrl.recording import sums
 from dmrl.recording.block import Block
 from dmrl.recording.blocks import tally

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
+from dmrl.atomic_output import partial_of
 from dmrl.errors import OutputError, RecordingError
-from dmrl.output import partial_of
 from dmrl.recording.channel import RawMessage, holds_pictures
 from dmrl.recording.index import summary
 from dmrl.recording.provenance import Provenance

@@ -25,7 +25,7 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
-from dmrl.border import limits
+from dmrl.guards import limits
 from dmrl.recording.block import EVER_NS
 from dmrl.recording.opening import DEFINITIONS, MAGIC, RECORD, Bounded, damaged, too_large
 

@@ -10,7 +10,7 @@ from mcap.records import Attachment, Chunk, McapRecord, Message, Metadata, Schem
 from mcap.records import Channel as McapChannel
 from mcap.stream_reader import StreamReader
 
-from dmrl.border import limits
+from dmrl.guards import limits
 from dmrl.recording.block import Block
 from dmrl.recording.channel import Channel
 from dmrl.recording.chunks import loose, of_channels, scanned, unpacked

@@ -11,9 +11,9 @@ from typing import Any, Self
 
 from google.protobuf.descriptor import Descriptor
 
+from dmrl.atomic_output import as_output_error, partial_file
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
-from dmrl.output import as_output_error, partial_file
 from dmrl.recording.assembly import OLDEST, Assembly
 from dmrl.recording.block import HEAD_BYTES, Ints
 from dmrl.recording.channel import Channel, RawMessage

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.border import limits
-from dmrl.border.folders import refuse_pipes
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Array, Camera
 from dmrl.geometry.lens import undistort
+from dmrl.guards import limits
+from dmrl.guards.paths import refuse_pipes
 from dmrl.images.codec import Rgb, crop_and_scale, decode, size
 from dmrl.rendering.lens import Picture, between
 from dmrl.rendering.sensor import LUMINANCE

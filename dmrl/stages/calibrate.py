@@ -10,13 +10,13 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.border import limits
-from dmrl.border.folders import refuse_pipes
+from dmrl.atomic_output import partial_file, refuse_existing
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError, SourceError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
+from dmrl.guards import limits
+from dmrl.guards.paths import refuse_pipes
 from dmrl.images.codec import decode
-from dmrl.output import partial_file, refuse_existing
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.spread import spread
 from dmrl.recording import Contents, read, summary

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from dmrl.atomic_output import partial_folder
 from dmrl.card import write_card
-from dmrl.output import partial_folder
 from dmrl.terminal.arguments import Flat
 from dmrl.terminal.tables import print_line
 

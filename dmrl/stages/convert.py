@@ -13,15 +13,15 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl.border.folders import refuse_pipes
+from dmrl.atomic_output import refuse_existing
 from dmrl.errors import SettingError, SourceError
 from dmrl.export.ros2 import write_bag
 from dmrl.export.tables import write_tables
 from dmrl.formats.format import Content, Options
 from dmrl.formats.known import format_of
 from dmrl.geometry.camera_file import camera_named
+from dmrl.guards.paths import refuse_pipes
 from dmrl.messages import message
-from dmrl.output import refuse_existing
 from dmrl.pipeline.folders import over_folder, recordings_in
 from dmrl.recording import (
     LICENCES_METADATA,

@@ -8,6 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl import recipe as recipes
+from dmrl.atomic_output import grown_folder, note, partial_folder
 from dmrl.card import write_card
 from dmrl.card.about import About, facts_of, read_about
 from dmrl.card.facts import FILE as FACTS
@@ -27,7 +28,6 @@ from dmrl.datasets.settings import Settings
 from dmrl.datasets.splits import SplitOf
 from dmrl.datasets.write import write_shards
 from dmrl.errors import SettingError
-from dmrl.output import grown_folder, note, partial_folder
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import all_recordings, differing
 from dmrl.pipeline.once import done_on

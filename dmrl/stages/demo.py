@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from dmrl.evaluation.report import report
-from dmrl.page import write
+from dmrl.html_report import write
 from dmrl.pipeline import run as pipeline
 from dmrl.terminal.arguments import AsJson
 

@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter, validators
 
 from dmrl import topics
+from dmrl.atomic_output import partial_folder, refuse_existing
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
 from dmrl.evaluation.tables import band_values, by_band_table, curve_values, finite
 from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, score
 from dmrl.learn.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
-from dmrl.output import partial_folder, refuse_existing
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import all_recordings
 from dmrl.pipeline.once import done_on

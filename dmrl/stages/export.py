@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
+from dmrl.atomic_output import partial_folder, refuse_existing
 from dmrl.deploy.backends import seen_by
 from dmrl.deploy.c import L1_FOR_STATE, STACKS_BYTES, write_c
 from dmrl.deploy.detector import (
@@ -23,7 +24,6 @@ from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.learn.pretrained import resolved
-from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import provenance
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say

@@ -13,12 +13,12 @@ from cyclopts import Parameter, validators
 
 from dmrl import recipe as recipes
 from dmrl import topics
+from dmrl.atomic_output import refuse_existing
 from dmrl.errors import SettingError
 from dmrl.flight import NOISE, Clock, Fault, Flight, Scenario, Trajectory, Truth, simulate
 from dmrl.geometry.frames import AIDECK_PINHOLE, Array
 from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
-from dmrl.output import refuse_existing
 from dmrl.pipeline.once import done_on
 from dmrl.recording import Provenance, RecordingWriter, provenance
 from dmrl.rendering import aloft, renderer

@@ -11,9 +11,9 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.atomic_output import refuse_existing
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.messages import message
-from dmrl.output import refuse_existing
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.pipeline.spread import spread

@@ -13,11 +13,11 @@ from cyclopts import Parameter, validators
 
 from dmrl import recipe as recipes
 from dmrl import topics
+from dmrl.atomic_output import partial_file, partial_of, refuse_existing
 from dmrl.datasets.backgrounds import photos_of
 from dmrl.errors import RecordingError, SettingError
 from dmrl.formats.image_folder import list_pictures
 from dmrl.images.codec import Rgb, decode, size
-from dmrl.output import partial_file, partial_of, refuse_existing
 from dmrl.recording import read, summary
 from dmrl.rendering import settings as looks
 from dmrl.rendering.contact_sheet import evenly, sheet

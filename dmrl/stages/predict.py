@@ -13,9 +13,9 @@ from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.border import limits
 from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, fastest, open_detector
 from dmrl.errors import MissingTopic
+from dmrl.guards import limits
 from dmrl.images.ahead import ahead
 from dmrl.images.codec import Opened, Rgb, opened, size
 from dmrl.learn.decode import PER_DETECTION, Found, Grids

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter, validators
 
+from dmrl.atomic_output import partial_folder, refuse_existing
 from dmrl.datasets import Dataset, Split, open_dataset
 from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
 from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
@@ -26,7 +27,6 @@ from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation.detections import labels_of_split
 from dmrl.learn.metrics import DEFINITIONS
 from dmrl.learn.pretrained import resolved
-from dmrl.output import partial_folder, refuse_existing
 from dmrl.recording import provenance
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say, track

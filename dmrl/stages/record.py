@@ -11,6 +11,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
+from dmrl.atomic_output import partial_of, refuse_existing
 from dmrl.errors import OutputError, RecordingError
 from dmrl.images.bayer import load_opencv
 from dmrl.live.camera import CameraClient
@@ -23,7 +24,6 @@ from dmrl.live.pictures import Colours, Stored
 from dmrl.live.robots import Robot, robot_of
 from dmrl.live.table import LiveTable
 from dmrl.messages import message
-from dmrl.output import partial_of, refuse_existing
 from dmrl.recording import RecordingWriter, provenance
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.ending import ended_by_signal

@@ -13,12 +13,12 @@ from cyclopts import Parameter, validators
 
 from dmrl import recipe as recipes
 from dmrl import topics
+from dmrl.atomic_output import partial_file, refuse_existing
 from dmrl.datasets.backgrounds import photos_of
 from dmrl.errors import OutputError, RecipeError, SettingError
 from dmrl.geometry.camera_file import KNOWN, camera_named
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
-from dmrl.output import partial_file, refuse_existing
 from dmrl.pipeline.once import done_on
 from dmrl.recording import (
     LICENCES_METADATA,

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from dmrl.page import write
+from dmrl.html_report import write
 from dmrl.terminal.arguments import AsJson
 from dmrl.terminal.tables import print_json, print_line
 
 
 def run(folder: Path, out: Path | None = None) -> Path:
-    """Write the page of a folder, and say where; see `dmrl.page.write`."""
+    """Write the page of a folder, and say where; see `dmrl.html_report.write`."""
     return write(folder, out)
 
 

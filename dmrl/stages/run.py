@@ -15,7 +15,7 @@ from dmrl.terminal.tables import print_line
 
 pages: ModuleType | None
 try:
-    from dmrl import page as pages
+    from dmrl import html_report as pages
 except MissingExtra:
     pages = None
 

@@ -15,13 +15,13 @@ import numpy as np
 from cyclopts import Parameter, validators
 from numpy.random import Generator
 
+from dmrl.atomic_output import partial_folder
 from dmrl.errors import SettingError
 from dmrl.formats.image_folder import CALIBRATION, LABELS
 from dmrl.formats.label_table import LabelRow, write_labels
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 from dmrl.images.codec import encode_png
-from dmrl.output import partial_folder
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.spread import spread
 from dmrl.recording import provenance

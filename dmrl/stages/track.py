@@ -8,11 +8,11 @@ import numpy as np
 from cyclopts import Parameter, validators
 
 from dmrl import topics
+from dmrl.atomic_output import refuse_existing
 from dmrl.errors import MissingExtra, MissingTopic, SettingError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
-from dmrl.output import refuse_existing
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite, summary
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers

@@ -11,10 +11,10 @@ import pyarrow.compute as pc
 from cyclopts import Parameter
 
 from dmrl import recipe as recipes
+from dmrl.atomic_output import partial_folder, partial_of, refuse_existing
 from dmrl.datasets import Split, open_dataset
 from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
 from dmrl.learn.pretrained import resolved
-from dmrl.output import partial_folder, partial_of, refuse_existing
 from dmrl.recording import provenance
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import track

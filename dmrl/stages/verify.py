@@ -10,6 +10,7 @@ import numpy as np
 from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
+from dmrl.atomic_output import partial_file
 from dmrl.datasets import open_dataset
 from dmrl.deploy.backends import seen_by
 from dmrl.deploy.c import L1_FOR_STATE
@@ -21,7 +22,6 @@ from dmrl.deploy.store import load
 from dmrl.deploy.targets import targets
 from dmrl.deploy.verification import TargetResult, expected, prove
 from dmrl.errors import DatasetError, SettingError, ToolError
-from dmrl.output import partial_file
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table

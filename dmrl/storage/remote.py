@@ -15,9 +15,9 @@ from functools import cache
 from pathlib import Path, PosixPath
 from typing import Any
 
-from dmrl.border.folders import refuse_pipe
-from dmrl.border.names import inside
 from dmrl.errors import StorageError
+from dmrl.guards.paths import refuse_pipe
+from dmrl.guards.safe_names import inside
 from dmrl.storage.ranges import STEP_BYTES, Ranged
 from dmrl.storage.system import system, told
 

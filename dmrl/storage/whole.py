@@ -11,8 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from dmrl.border.names import inside
 from dmrl.errors import StorageError
+from dmrl.guards.safe_names import inside
 from dmrl.storage.remote import METADATA, UNFINISHED, Remote
 from dmrl.storage.system import system, told
 

@@ -12,15 +12,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from dmrl import boundary, topics
-from dmrl.border import limits
 from dmrl.catalogue import NAME, open_catalogue
 from dmrl.catalogue.query import find
 from dmrl.catalogue.table import COLUMNS, Catalogue, rows_table
 from dmrl.cli import app
 from dmrl.errors import RecordingError, SettingError
+from dmrl.guards import limits
+from dmrl.html_report import gather, page
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.page import gather, page
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.recording.provenance import Input
 from dmrl.stages import index
@@ -248,7 +248,7 @@ def test_the_page_tells_of_a_catalogue_and_opens_no_thousand_recordings(
     shown = page(gather(flights))
     assert "<h2>Catalogue</h2>" in shown and "4 recordings, 0.0 h" in shown
     assert "estimate" in shown and "cut short" in shown and "<h2>Recordings</h2>" in shown
-    module = import_module("dmrl.page.gather")
+    module = import_module("dmrl.html_report.collect")
     monkeypatch.setattr(module, "MANY", 3)
     monkeypatch.setattr(module, "summary", None)
     assert "<h2>Recordings</h2>" not in page(gather(flights))

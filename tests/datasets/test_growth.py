@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from datasets import load_dataset, load_from_disk
 
-from dmrl.border.locking import take_folder
 from dmrl.datasets import open_dataset
 from dmrl.errors import BusyOutput, DatasetError, RecordingError, SettingError
+from dmrl.guards.locks import take_folder
 from dmrl.stages.dataset import Settings, add, run
 from dmrl.stages.trim import Settings as Cut
 from dmrl.stages.trim import run as trim

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.output import partial_of
+from dmrl.atomic_output import partial_of
 from dmrl.recording import check, read_table, recover, summary
 from dmrl.stages import fake_drone, fly
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from dmrl.atomic_output import partial_of
 from dmrl.datasets import open_dataset
-from dmrl.output import partial_of
 
 from .inputs import Inputs, cli, flights
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.border import limits
 from dmrl.errors import SourceError
 from dmrl.formats.label_table import COLUMNS, LabelRow, read_labels, write_labels
+from dmrl.guards import limits
 
 HEADER = "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px,visible_share\n"
 FULL = LabelRow(

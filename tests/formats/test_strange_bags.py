@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from dmrl.border import limits
 from dmrl.errors import SourceError
 from dmrl.formats.format import Options
 from dmrl.formats.ros import content
+from dmrl.guards import limits
 
 TOPICS = (
     "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, "

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dmrl.border import limits
 from dmrl.errors import SourceError
+from dmrl.guards import limits
 from dmrl.images import codec
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from dmrl.border import limits
+from dmrl.guards import limits
 from dmrl.pipeline.language import expanded
 
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from dmrl.atomic_output import partial_of
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.report import Done
-from dmrl.output import partial_of
 from dmrl.pipeline.crew import Crew
 from dmrl.pipeline.job import Answer
 from dmrl.pipeline.memory import Memory

@@ -14,8 +14,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Schema
 from mcap.writer import Writer
 
-from dmrl.border import limits
 from dmrl.errors import RecordingError
+from dmrl.guards import limits
 from dmrl.messages import schema_bytes
 from dmrl.recording.chunks import unpacked
 

@@ -12,8 +12,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Message
 
-from dmrl.border import limits
 from dmrl.errors import RecordingError
+from dmrl.guards import limits
 from dmrl.recording.block import Block
 from dmrl.recording.chunks import loose, messages_at, of_channels, scanned, unpacked
 

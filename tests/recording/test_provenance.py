@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.border import limits
+from dmrl.guards import limits
 from dmrl.recording import Provenance
 from dmrl.recording.provenance import Input
 from dmrl.stages.info import ancestry_lines

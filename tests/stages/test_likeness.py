@@ -182,7 +182,9 @@ def test_a_picture_that_a_killed_run_left_is_no_obstacle(
         raise OSError(errno.ENOSPC, "No space left on device", str(out))
 
     # The first name that is given is the picture's.
-    monkeypatch.setattr("dmrl.output.sync", lambda path: full() if "toml" in path.name else None)
+    monkeypatch.setattr(
+        "dmrl.atomic_output.sync", lambda path: full() if "toml" in path.name else None
+    )
     with pytest.raises(FullDisk):
         run(dots, out, Settings())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dots.mcap"]

@@ -146,7 +146,7 @@ def test_of_large_images_few_are_in_memory(
     seen = predict._seen
     monkeypatch.setattr(predict, "_seen", lambda p, *more: sizes.append(len(p)) or seen(p, *more))
     run(model, dots, tmp_path / "a.mcap", Settings())
-    monkeypatch.setattr("dmrl.border.limits.FRAME_PIXELS", 4 * 64 * 48)
+    monkeypatch.setattr("dmrl.guards.limits.FRAME_PIXELS", 4 * 64 * 48)
     run(model, dots, tmp_path / "b.mcap", Settings())
     assert sizes == [16, 14, *[4] * 7, 2]
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from dmrl import boundary, topics
+from dmrl.atomic_output import partial_file, partial_folder, rewritten_file
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.errors import OutputError, StorageError, UnsafeName
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.output import partial_file, partial_folder, rewritten_file
 from dmrl.pipeline.folders import recordings_in, tasks_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
 from dmrl.recording.inputs import input_of, sha256_of_file

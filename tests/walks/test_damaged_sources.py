@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.border.names import LINE_MAX
 from dmrl.errors import DmrlError
 from dmrl.formats.known import format_of
+from dmrl.guards.safe_names import LINE_MAX
 from dmrl.stages import convert
 
 from . import sources

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import __version__
-from dmrl.border.names import plain
 from dmrl.deploy.integer import IntegerNetwork
+from dmrl.guards.safe_names import plain
 
 OTHER_FILES = ("main", "harness", "count")
 """C files that stand beside the network's at one time or another."""
@@ -25,7 +25,7 @@ def fill(template: str, **values: object) -> str:
     KeyError
         If a name has no value.
 
-    What comes from a file must be a number, or have gone through `dmrl.border.names.plain`: a value
+    What comes from a file must be a number, or have gone through `dmrl.guards.safe_names.plain`: a value
     becomes code or ends a comment.
     """
     text = files("dmrl.deploy.c").joinpath("templates", template).read_text(encoding="utf-8")

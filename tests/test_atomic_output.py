@@ -12,8 +12,7 @@ from typing import Any
 
 import pytest
 
-from dmrl.errors import OutputError
-from dmrl.output import (
+from dmrl.atomic_output import (
     as_output_error,
     partial_file,
     partial_folder,
@@ -21,6 +20,7 @@ from dmrl.output import (
     refuse_existing,
     rewritten_file,
 )
+from dmrl.errors import OutputError
 
 PATIENCE_S = 120.0
 """How long a process may take on a machine that is busy."""
@@ -128,7 +128,7 @@ def test_errors_that_are_not_about_the_output_pass_unchanged(tmp_path: Path) -> 
 def test_a_killed_process_leaves_only_the_partial_file(tmp_path: Path) -> None:
     code = (
         "import os, pathlib, signal, sys\n"
-        "from dmrl.output import partial_file\n"
+        "from dmrl.atomic_output import partial_file\n"
         "with partial_file(pathlib.Path(sys.argv[1])) as partial:\n"
         "    partial.write_text('half')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
-from dmrl.border.documents import parse_json
 from dmrl.evaluation.story import Number, Shown, value_at
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.html_report.collect import MOST_BYTES, Found
+from dmrl.html_report.html import WRONG, Pictures, chart, row, table, text
 from dmrl.images.codec import decode
-from dmrl.page.document import WRONG, Pictures, chart, row, table, text
-from dmrl.page.gather import MOST_BYTES, Found
 from dmrl.plots import charts
 from dmrl.recording import Contents, read, summary
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.border.documents import load_npz, parse_json, parse_toml
+from dmrl.guards.bounded_parsing import load_npz, parse_json, parse_toml
 
 
 def test_documents_are_read() -> None:

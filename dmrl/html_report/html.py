@@ -7,8 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from dmrl.border import limits
 from dmrl.errors import DmrlError, one_line
+from dmrl.guards import limits
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 
 MARK = "<!-- written by dmrl report -->"

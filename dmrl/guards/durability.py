@@ -4,7 +4,7 @@ import os
 import shutil
 from pathlib import Path
 
-from dmrl.border.locking import UNSUPPORTED
+from dmrl.guards.locks import UNSUPPORTED
 
 
 def sync(path: Path) -> None:

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from dmrl import cli, recipe
-from dmrl.border.folders import refuse_no_text, refuse_pipe, refuse_pipes
 from dmrl.datasets import open_dataset
 from dmrl.deploy import store
 from dmrl.deploy.detector import open_detector
 from dmrl.errors import UnsafeName
 from dmrl.formats.image_folder import list_pictures
 from dmrl.geometry.camera_file import read_camera
+from dmrl.guards.paths import refuse_no_text, refuse_pipe, refuse_pipes
+from dmrl.html_report import gather
 from dmrl.learn.model import load_model
-from dmrl.page import gather
 from dmrl.recording.inputs import input_of
 from dmrl.rendering.backdrops import photos_in
 from dmrl.stages import calibrate, convert

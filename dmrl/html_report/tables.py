@@ -6,7 +6,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from dmrl.page.document import table, text
+from dmrl.html_report.html import table, text
 
 MOST_WRONG = 12
 """Recordings that are named with what is wrong with them."""

@@ -3,11 +3,11 @@
 import os
 from pathlib import Path
 
+from dmrl.atomic_output import partial_file, rewritten_file
 from dmrl.errors import OutputError
-from dmrl.output import partial_file, rewritten_file
-from dmrl.page.document import MARK
-from dmrl.page.gather import gather
-from dmrl.page.sections import page
+from dmrl.html_report.collect import gather
+from dmrl.html_report.html import MARK
+from dmrl.html_report.sections import page
 
 NAME = "report.html"
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmrl.html_report import gather, page
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.page import gather, page
 from dmrl.recording import Provenance, RecordingWriter
 
 RECIPE = """

@@ -12,8 +12,8 @@ import pytest
 
 import dmrl
 from dmrl.errors import OutputError, SettingError
+from dmrl.html_report import gather, page, write
 from dmrl.images.codec import encode_png
-from dmrl.page import gather, page, write
 from dmrl.plots import charts
 from dmrl.plots.pictures import _text_places
 

@@ -9,14 +9,14 @@ from typing import Any
 import pyarrow as pa
 
 from dmrl import recipe as recipes
-from dmrl.border.documents import parse_json
-from dmrl.border.folders import refuse_pipes
 from dmrl.catalogue import NAME as CATALOGUE
 from dmrl.catalogue import open_catalogue
 from dmrl.datasets import is_dataset
 from dmrl.errors import DmrlError, SettingError
 from dmrl.evaluation import story
 from dmrl.evaluation.story import Shown
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.paths import refuse_pipes
 from dmrl.recording import Provenance, Summary, summary
 from dmrl.recording.inputs import provenance_of
 

@@ -1,6 +1,6 @@
 """The graph of a provenance: one box a stage and round, arrows from what it was made from."""
 
-from dmrl.page.ancestry import ancestry
+from dmrl.html_report.lineage import ancestry
 from dmrl.recording import Input, Provenance
 
 

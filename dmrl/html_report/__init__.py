@@ -4,8 +4,8 @@
 `document` makes HTML of it that needs nothing else, and `write` one file.
 """
 
-from dmrl.page.gather import Found, gather
-from dmrl.page.sections import page
-from dmrl.page.write import write
+from dmrl.html_report.collect import Found, gather
+from dmrl.html_report.sections import page
+from dmrl.html_report.write import write
 
 __all__ = ["Found", "gather", "page", "write"]

@@ -9,7 +9,7 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
-from dmrl.border import limits
+from dmrl.guards import limits
 
 _HELD = re.compile(r"VmData:\s*(\d+) kB")
 

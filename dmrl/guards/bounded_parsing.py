@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.border import limits
+from dmrl.guards import limits
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from dmrl import topics
-from dmrl.border.names import (
+from dmrl.errors import RecordingError, UnsafeName, one_line
+from dmrl.guards.safe_names import (
     MOST_BYTES,
     code,
     file_of_topic,
@@ -14,7 +15,6 @@ from dmrl.border.names import (
     plain,
     split_name,
 )
-from dmrl.errors import RecordingError, UnsafeName, one_line
 
 HOSTILE = (
     *("", ".", "..", "../x", "../../victim", "/etc/passwd", "a/b", "a\\b", ".hidden", "a/../b"),

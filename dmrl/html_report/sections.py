@@ -13,12 +13,12 @@ import numpy as np
 from dmrl import __version__
 from dmrl.errors import DmrlError
 from dmrl.evaluation import positions, tracks
-from dmrl.page import document as html
-from dmrl.page.ancestry import ancestry
-from dmrl.page.document import WRONG, Pictures, chart, row, table, text
-from dmrl.page.gather import Found
-from dmrl.page.listed import listed
-from dmrl.page.story import story
+from dmrl.html_report import html
+from dmrl.html_report.collect import Found
+from dmrl.html_report.figures import story
+from dmrl.html_report.html import WRONG, Pictures, chart, row, table, text
+from dmrl.html_report.lineage import ancestry
+from dmrl.html_report.tables import listed
 from dmrl.plots import charts
 from dmrl.topics import robots
 

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dmrl.border.disk import empty, sync, sync_one
-from dmrl.border.folders import refuse_no_text
-from dmrl.border.locking import is_held, refuse_locked, take_file, take_folder
 from dmrl.errors import FullDisk, OutputError
+from dmrl.guards.durability import empty, sync, sync_one
+from dmrl.guards.locks import is_held, refuse_locked, take_file, take_folder
+from dmrl.guards.paths import refuse_no_text
 from dmrl.storage import Remote, added_files, uploaded_file, uploaded_folder
 from dmrl.storage.whole import require_bucket
 

@@ -15,7 +15,7 @@ UNPACKED_TIMES = 100
 dmrl's own topics reach is about 20; pictures reach 1."""
 
 MEMORY_BYTES = 500 * MB
-"""What a library may take to read a file as a whole (see `dmrl.border.memory`)."""
+"""What a library may take to read a file as a whole (see `dmrl.guards.memory`)."""
 
 MEMORY_TIMES = 10
 """It may take `MEMORY_BYTES`, and this many times the file's own size."""
