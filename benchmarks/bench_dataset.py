@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from dmrl.datasets import Split, open_dataset
-from dmrl.datasets.for_training import examples_of
+from dmrl.datasets.training_examples import examples_of
 from dmrl.images.codec import encode_jpeg
 from dmrl.learn.batches import gathered, order
 from dmrl.messages import message

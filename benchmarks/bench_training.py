@@ -19,7 +19,7 @@ import torch
 
 from dmrl import recipe
 from dmrl.datasets import open_dataset
-from dmrl.datasets.for_training import examples_of
+from dmrl.datasets.training_examples import examples_of
 from dmrl.images.codec import encode_png
 from dmrl.learn.augment import Augmenter
 from dmrl.learn.batches import Batch, Examples, gathered, order

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dmrl.atomic_output import partial_file
 from dmrl.colours import RGB
 from dmrl.datasets import layout
-from dmrl.datasets.flags import NEEDED
+from dmrl.datasets.writing.exclusions import NEEDED
 from dmrl.errors import one_line
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 from dmrl.terminal.progress import track

@@ -11,12 +11,12 @@ import numpy as np
 
 from dmrl.atomic_output import rewritten_file
 from dmrl.card import sections
-from dmrl.card.counts import Counts, count, sigmas_of
 from dmrl.card.croissant import NAME as CROISSANT
 from dmrl.card.croissant import croissant
 from dmrl.card.facts import cautions, equipment, read_facts
-from dmrl.card.front import check_license, front_matter, read_front
-from dmrl.card.leaks import leaks
+from dmrl.card.front_matter import check_license, front_matter, read_front
+from dmrl.card.leakage import leaks
+from dmrl.card.statistics import Counts, count, sigmas_of
 from dmrl.datasets import Split, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX

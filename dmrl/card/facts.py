@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from dmrl.datasets.seen import NEAR_BITS
+from dmrl.datasets.writing.near_duplicates import NEAR_BITS
 from dmrl.errors import DatasetError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.safe_names import code, markdown

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pyarrow as pa
 
-from dmrl.card.counts import Counts
+from dmrl.card.statistics import Counts
 from dmrl.datasets import Split, layout
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards.safe_names import code, markdown

@@ -1,7 +1,7 @@
 """Labels and detections of recordings, joined by robot and log time.
 
 The images are those that a dataset would take: with labels from the source that is asked
-for, all of them OK, or without any, if it looked. See ``dmrl.datasets.rows``.
+for, all of them OK, or without any, if it looked. See ``dmrl.datasets.writing.rows``.
 """
 
 from collections import Counter

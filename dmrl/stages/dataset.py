@@ -10,23 +10,23 @@ from cyclopts import Parameter
 from dmrl import recipe as recipes
 from dmrl.atomic_output import grown_folder, note, partial_folder
 from dmrl.card import write_card
-from dmrl.card.about import About, facts_of, read_about
 from dmrl.card.facts import FILE as FACTS
 from dmrl.card.facts import merged, read_facts
-from dmrl.card.front import check_license
-from dmrl.datasets.build import Wanted, explain, has_masks, rows, unused, warn_of_others
-from dmrl.datasets.flags import read_flags
-from dmrl.datasets.growth import Before, made_of, opened
-from dmrl.datasets.inputs import warn_of_lenses
+from dmrl.card.front_matter import check_license
+from dmrl.card.recording_facts import About, facts_of, read_about
 from dmrl.datasets.layout import MANIFEST
 from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
 from dmrl.datasets.names import fingerprint_of, rewrite, write_names
-from dmrl.datasets.parts import splits_of
-from dmrl.datasets.rows import Tally
-from dmrl.datasets.seen import Seen
 from dmrl.datasets.settings import Settings
-from dmrl.datasets.splits import SplitOf
-from dmrl.datasets.write import write_shards
+from dmrl.datasets.writing.append import Before, made_of, opened
+from dmrl.datasets.writing.builder import Wanted, explain, has_masks, rows, unused, warn_of_others
+from dmrl.datasets.writing.exclusions import read_flags
+from dmrl.datasets.writing.inputs import warn_of_lenses
+from dmrl.datasets.writing.near_duplicates import Seen
+from dmrl.datasets.writing.parts import splits_of
+from dmrl.datasets.writing.rows import Tally
+from dmrl.datasets.writing.splits import SplitOf
+from dmrl.datasets.writing.writer import write_shards
 from dmrl.errors import SettingError
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import all_recordings, differing

@@ -21,7 +21,7 @@ from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.datasets.for_training import material
+    from dmrl.datasets.training_examples import material
     from dmrl.learn.batches import Examples
     from dmrl.learn.calibrate import Calibration, calibrate, calibration
     from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageFilter
 
-from dmrl.card.leaks import near_in_time, same_poses
+from dmrl.card.leakage import near_in_time, same_poses
 from dmrl.datasets import open_dataset
-from dmrl.datasets.seen import NEAR_BITS, perceptual_hash
+from dmrl.datasets.writing.near_duplicates import NEAR_BITS, perceptual_hash
 from dmrl.stages.dataset import Settings, run
 
 from .conftest import Record, peer

@@ -15,7 +15,7 @@ import pytest
 from dmrl import recipe
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
-from dmrl.datasets.for_training import examples_of, material
+from dmrl.datasets.training_examples import examples_of, material
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.learn import fit

@@ -9,7 +9,7 @@ import rerun as rr
 
 from dmrl import topics
 from dmrl.colours import RGB, SECOND_DETECTION
-from dmrl.datasets.rows import label_source
+from dmrl.datasets.writing.rows import label_source
 from dmrl.errors import DmrlError, RecordingError, SettingError
 from dmrl.evaluation import detections
 from dmrl.geometry.frames import Array

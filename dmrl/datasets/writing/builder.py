@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dmrl import topics
-from dmrl.datasets.flags import Flag, read_flags
 from dmrl.datasets.manifest import Manifest
-from dmrl.datasets.rows import Tally, rows_of
 from dmrl.datasets.settings import Settings
-from dmrl.datasets.splits import SplitOf
-from dmrl.datasets.write import Row
+from dmrl.datasets.writing.exclusions import Flag, read_flags
+from dmrl.datasets.writing.rows import Tally, rows_of
+from dmrl.datasets.writing.splits import SplitOf
+from dmrl.datasets.writing.writer import Row
 from dmrl.errors import RecordingError
 from dmrl.images.ahead import ahead
 from dmrl.recording import Contents, summary

@@ -18,7 +18,7 @@ from dmrl.stages.dataset import Settings, add, run
 from dmrl.stages.trim import Settings as Cut
 from dmrl.stages.trim import run as trim
 
-from .conftest import Record, peer, pixels_of
+from ..conftest import Record, peer, pixels_of
 
 PLAIN = Settings(split="none", shard_images=4)
 SHARDS = ((0, 2), (1, 2), (2, 4), (3, 4))

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from dmrl.datasets.inputs import refuse_twins
-from dmrl.datasets.splits import SplitOf, held_out, held_out_alone, of_source
+from dmrl.datasets.writing.inputs import refuse_twins
+from dmrl.datasets.writing.splits import SplitOf, held_out, held_out_alone, of_source
 from dmrl.errors import SettingError
 from dmrl.recording import Input, Provenance, splits, summary
 

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl.datasets import open_dataset, write
+from dmrl.datasets import open_dataset
+from dmrl.datasets.writing import writer
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message, schema_bytes
@@ -15,7 +16,7 @@ from dmrl.stages import dataset as stage
 from dmrl.stages.dataset import Settings, run
 from dmrl.topics import camera_image, labels
 
-from .conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
+from ..conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
 
 PLAIN = Settings()
 
@@ -221,17 +222,17 @@ def test_of_large_images_few_are_in_memory(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
-    batch = write._record_batch
+    batch = writer._record_batch
     monkeypatch.setattr(
-        write, "_record_batch", lambda rows, *more: made.append(len(rows)) or batch(rows, *more)
+        writer, "_record_batch", lambda rows, *more: made.append(len(rows)) or batch(rows, *more)
     )
     flight = record(peers=[[peer()]] * 5)
     for name, pixels, wanted in (("a", 10**9, [5]), ("b", 2 * WIDTH_PX * HEIGHT_PX, [2, 2, 1])):
-        monkeypatch.setattr(write, "BATCH_PIXELS", pixels)
+        monkeypatch.setattr(writer, "BATCH_PIXELS", pixels)
         made.clear()
         run([flight], tmp_path / name, Settings())
         assert made == wanted
-    monkeypatch.setattr(write, "BATCH_PIXELS", 1)
+    monkeypatch.setattr(writer, "BATCH_PIXELS", 1)
     made.clear()
     run([flight], tmp_path / "c", Settings())
     assert made == [1] * 5
@@ -286,7 +287,7 @@ def test_a_run_that_dies_in_the_middle_leaves_no_dataset(
         raise KeyboardInterrupt
 
     flight = record(peers=[[peer()]] * 100)
-    monkeypatch.setattr("dmrl.datasets.build.one_size", die)
+    monkeypatch.setattr("dmrl.datasets.writing.builder.one_size", die)
     with pytest.raises(KeyboardInterrupt):
         run([flight], tmp_path / "out", PLAIN)
     assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]

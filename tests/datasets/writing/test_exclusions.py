@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.datasets.flags import read_flags
+from dmrl.datasets.writing.exclusions import read_flags
 from dmrl.errors import DmrlError, SettingError
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import Record
+from ..conftest import Record
 
 HEAD = "source,robot,log_time\n"
 

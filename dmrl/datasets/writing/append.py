@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import PARTS, Manifest, part_folder, read_manifest
-from dmrl.datasets.seen import read_seen
 from dmrl.datasets.shards import schema_of
+from dmrl.datasets.writing.near_duplicates import read_seen
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.recording import Input, Provenance

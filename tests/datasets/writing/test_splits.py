@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.datasets import open_dataset
-from dmrl.datasets.splits import held_out, of_source
+from dmrl.datasets.writing.splits import held_out, of_source
 from dmrl.errors import RecordingError, SettingError
 from dmrl.recording import (
     SPLIT_METADATA,
@@ -20,7 +20,7 @@ from dmrl.recording import (
 )
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import STEP_NS, Record
+from ..conftest import STEP_NS, Record
 
 
 def test_the_split_of_the_source_wins(record: Record, tmp_path: Path) -> None:

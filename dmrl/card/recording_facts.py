@@ -7,9 +7,9 @@ from pathlib import Path
 from dmrl import topics
 from dmrl.card.facts import Facts
 from dmrl.card.sensors import cameras_of, sensors_of
-from dmrl.datasets.inputs import focal_lengths
-from dmrl.datasets.rows import Tally, count_images, label_source, sources_of
-from dmrl.datasets.seen import Seen
+from dmrl.datasets.writing.inputs import focal_lengths
+from dmrl.datasets.writing.near_duplicates import Seen
+from dmrl.datasets.writing.rows import Tally, count_images, label_source, sources_of
 from dmrl.recording import Contents, label_findings, licences
 
 

@@ -1,0 +1,1 @@
+"""Build Arrow datasets: rows from recordings, splits, near duplicates, exclusions and shards."""
