@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from dmrl import plots
 from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
-from dmrl.deploy.equalise import equalise
-from dmrl.deploy.graph import graph_of
-from dmrl.deploy.quantise import About, quantise
-from dmrl.deploy.ranges import calibrate
-from dmrl.deploy.rounding import moments_of
+from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.equalisation import equalise
+from dmrl.deploy.int8.graph import graph_of
+from dmrl.deploy.int8.quantise import About, quantise
+from dmrl.deploy.int8.rounding import moments_of
 from dmrl.images.codec import decode
 from dmrl.learn.model import load_model
 from dmrl.learn.trace import operations

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.deploy.backends import seen_by
-from dmrl.deploy.compiled import Compiled
-from dmrl.deploy.onnx_run import OnnxRun
+from dmrl.deploy.c.run.compiled import Compiled
+from dmrl.deploy.int8.store import load
+from dmrl.deploy.onnx.run import OnnxRun
 from dmrl.deploy.samples import load_samples
-from dmrl.deploy.store import load
 
 PEER = "onnxruntime int8"
 

@@ -24,7 +24,7 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 import numpy as np  # after the number of its threads
 import onnxruntime
 
-from dmrl.deploy.float_onnx import float_onnx_of
+from dmrl.deploy.onnx.float_model import float_onnx_of
 from dmrl.images.codec import decode
 from dmrl.learn.model import load_model
 from dmrl.learn.pretrained import resolved

@@ -6,10 +6,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy import reference
-from dmrl.deploy.graph import Float32, Graph, grey_of, outputs_of, tensors_of, to_input
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.quantise import HEAD_OF
+from dmrl.deploy.int8 import reference
+from dmrl.deploy.int8.graph import Float32, Graph, grey_of, outputs_of, tensors_of, to_input
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.quantise import HEAD_OF
 from dmrl.learn.decode import Grids
 
 Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]

@@ -15,10 +15,10 @@ import numpy as np
 
 from dmrl.deploy.backends import Backend, Images, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
-from dmrl.deploy.compiled import Compiled
-from dmrl.deploy.emulated import RISCV32, Emulated
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.store import INTEGER_NAME, load
+from dmrl.deploy.c.run.compiled import Compiled
+from dmrl.deploy.c.run.emulated import RISCV32, Emulated
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_no_text, refuse_pipes
@@ -134,10 +134,10 @@ def fastest(model: Path, size_px: tuple[int, int]) -> BackendName:
         Width and height of the images.
     """
     try:
-        import_module("dmrl.deploy.onnx_run")
+        import_module("dmrl.deploy.onnx.run")
         if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
             return "onnx"
-        written = import_module("dmrl.deploy.onnx_write").OUTPUT_OF
+        written = import_module("dmrl.deploy.onnx.write").OUTPUT_OF
         learned = import_module("dmrl.learn.model").load_model(model)
     except (MissingExtra, ModuleNotFoundError, ModelError):
         return "torch"  # which says what is wrong
@@ -164,7 +164,7 @@ def _torch(model: Path, _backend: BackendName) -> Detector:
 
 
 def _onnx(model: Path, _backend: BackendName) -> Detector:
-    room = _room("dmrl.deploy.onnx_run", "deploy", "--backend onnx")
+    room = _room("dmrl.deploy.onnx.run", "deploy", "--backend onnx")
     file = model / FLOAT_ONNX_NAME
     if file.is_file():
         runs = room.OnnxRun(file, file)
@@ -172,7 +172,7 @@ def _onnx(model: Path, _backend: BackendName) -> Detector:
     else:
         learned = _room("dmrl.learn.model", "train", "a model to ONNX").load_model(model)
         grey = (model / INTEGER_NAME).is_file() and load(model).channels == 1
-        export = _room("dmrl.deploy.float_onnx", "deploy", "--backend onnx")
+        export = _room("dmrl.deploy.onnx.float_model", "deploy", "--backend onnx")
         runs = room.OnnxRun(export.float_onnx_of(learned, grey=grey), model)
         stride_px, threshold = learned.network.stride_px, learned.threshold
         file = model / WEIGHTS_NAME
@@ -182,12 +182,12 @@ def _onnx(model: Path, _backend: BackendName) -> Detector:
 
 
 def _onnx_int8(model: Path, backend: BackendName) -> Detector:
-    room = _room("dmrl.deploy.onnx_run", "deploy", "--backend onnx-int8")
+    room = _room("dmrl.deploy.onnx.run", "deploy", "--backend onnx-int8")
     network = _network(model, backend)
     file = model / INT8_ONNX_NAME
     if file.is_file():
         return _of_network(model, network, room.OnnxRun(file, file), file)
-    written = _room("dmrl.deploy.onnx_write", "deploy", "--backend onnx-int8").int8_onnx(network)
+    written = _room("dmrl.deploy.onnx.write", "deploy", "--backend onnx-int8").int8_onnx(network)
     return _of_network(model, network, room.OnnxRun(written, model), _integer_file(model))
 
 

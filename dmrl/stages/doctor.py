@@ -16,7 +16,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from dmrl.deploy import toolchain
+from dmrl.deploy.c.run import toolchain
 from dmrl.errors import SettingError, ToolError
 from dmrl.rendering import environment
 from dmrl.terminal.arguments import AsJson

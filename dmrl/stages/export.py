@@ -12,16 +12,16 @@ from cyclopts import Parameter, validators
 from dmrl.atomic_output import partial_folder, refuse_existing
 from dmrl.deploy.backends import seen_by
 from dmrl.deploy.c import L1_FOR_STATE, STACKS_BYTES, write_c
+from dmrl.deploy.c.run.measure import Memory, memory_of
 from dmrl.deploy.detector import (
     DESCRIPTION_NAME,
     FLOAT_ONNX_NAME,
     INT8_ONNX_NAME,
     WEIGHTS_NAME,
 )
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.measure import Memory, memory_of
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.store import INTEGER_NAME, load
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
-from dmrl.deploy.store import INTEGER_NAME, load
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.learn.pretrained import resolved
 from dmrl.recording import provenance
@@ -103,7 +103,7 @@ def run(model: Path, out: Path, settings: Settings) -> list[Written]:
         raise ModelError(f"{model} is an export folder already. Give the model it was made from")
     try:
         learned = import_module("dmrl.learn.model")
-        written = import_module("dmrl.deploy.float_onnx")
+        written = import_module("dmrl.deploy.onnx.float_model")
     except ModuleNotFoundError as e:
         raise MissingExtra(str(e.name), "train", "dmrl export") from None
     trained = learned.load_model(model)
@@ -125,7 +125,7 @@ def run(model: Path, out: Path, settings: Settings) -> list[Written]:
 
 
 def _write_int8(network: IntegerNetwork, model: Path, folder: Path, settings: Settings) -> None:
-    int8_onnx = import_module("dmrl.deploy.onnx_write").int8_onnx
+    int8_onnx = import_module("dmrl.deploy.onnx.write").int8_onnx
     (folder / INT8_ONNX_NAME).write_bytes(int8_onnx(network))
     for name in (INTEGER_NAME, SAMPLES_NAME):
         shutil.copyfile(model / name, folder / name)

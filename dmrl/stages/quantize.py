@@ -14,15 +14,15 @@ from dmrl.atomic_output import partial_folder, refuse_existing
 from dmrl.datasets import Dataset, Split, open_dataset
 from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
 from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
-from dmrl.deploy.equalise import equalise
-from dmrl.deploy.graph import Graph, graph_of
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.layers import LayerFigures, layer_figures
-from dmrl.deploy.quantise import About, quantise
-from dmrl.deploy.ranges import calibrate
-from dmrl.deploy.rounding import moments_of
+from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.equalisation import equalise
+from dmrl.deploy.int8.folding import LayerFigures, layer_figures
+from dmrl.deploy.int8.graph import Graph, graph_of
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.quantise import About, quantise
+from dmrl.deploy.int8.rounding import moments_of
+from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.samples import SAMPLES, save_samples
-from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation.detections import labels_of_split
 from dmrl.learn.metrics import DEFINITIONS

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dmrl.deploy.equalise import equalise
-from dmrl.deploy.graph import (
+from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.equalisation import equalise
+from dmrl.deploy.int8.graph import (
     FloatAdd,
     FloatConv,
     FloatLayer,
@@ -18,10 +19,9 @@ from dmrl.deploy.graph import (
     tensors_of,
     to_input,
 )
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.quantise import About, quantise
-from dmrl.deploy.ranges import calibrate
-from dmrl.deploy.rounding import moments_of
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.quantise import About, quantise
+from dmrl.deploy.int8.rounding import moments_of
 from dmrl.learn.network import build
 from dmrl.learn.trace import operations
 

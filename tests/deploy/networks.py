@@ -4,7 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from dmrl.deploy.integer import (
+from dmrl.deploy.int8.layers import SIGNED_OFFSET
+from dmrl.deploy.int8.network import (
     CONFIDENCE_ONE,
     PIXEL_ZERO,
     Add,
@@ -15,8 +16,7 @@ from dmrl.deploy.integer import (
     MaxPool,
     Shape,
 )
-from dmrl.deploy.integer_layers import SIGNED_OFFSET
-from dmrl.deploy.reference import accumulate, compute
+from dmrl.deploy.int8.reference import accumulate, compute
 
 Rng = np.random.Generator
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from dmrl.deploy.backends import grids_of, integer, seen_by
+from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, missing
 from dmrl.deploy.detector import Detector, open_detector
-from dmrl.deploy.float_onnx import float_onnx_of
-from dmrl.deploy.graph import grey_of
-from dmrl.deploy.store import INTEGER_NAME, save
-from dmrl.deploy.toolchain import EMULATOR, RISCV, missing
+from dmrl.deploy.int8.graph import grey_of
+from dmrl.deploy.int8.store import INTEGER_NAME, save
+from dmrl.deploy.onnx.float_model import float_onnx_of
 from dmrl.errors import ModelError, SettingError, ToolError
 from dmrl.learn.model import Model, load_model, save_model
 from dmrl.learn.network import build

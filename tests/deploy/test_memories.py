@@ -11,10 +11,10 @@ import pytest
 from dmrl.deploy.c import L1_FOR_STATE, write_c
 from dmrl.deploy.c.memories import split, traffic_bytes
 from dmrl.deploy.c.plan import Plan, plan
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.measure import Memory, memory_of
-from dmrl.deploy.targets import SANITIZERS, Build, Target
-from dmrl.deploy.verification import TargetResult, expected, prove
+from dmrl.deploy.c.run.measure import Memory, memory_of
+from dmrl.deploy.c.run.targets import SANITIZERS, Build, Target
+from dmrl.deploy.c.run.verify import TargetResult, expected, prove
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import SettingError
 
 from .graphs import quantised_network, untrained

@@ -4,7 +4,7 @@ import pytest
 
 from dmrl.deploy.c.plan import plan
 from dmrl.deploy.c.rings import Step, play, rows_held, shared_ring
-from dmrl.deploy.integer import Conv
+from dmrl.deploy.int8.network import Conv
 
 from .graphs import quantised_network, untrained
 from .networks import random_network

@@ -9,8 +9,8 @@ import pytest
 
 from dmrl import cli, recipe
 from dmrl.datasets import open_dataset
-from dmrl.deploy import store
 from dmrl.deploy.detector import open_detector
+from dmrl.deploy.int8 import store
 from dmrl.errors import UnsafeName
 from dmrl.formats.image_folder import list_pictures
 from dmrl.geometry.camera_file import read_camera

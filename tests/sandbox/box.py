@@ -14,9 +14,9 @@ import pytest
 
 from dmrl import boundary
 from dmrl.cli import app
-from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.samples import save_samples
-from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.images.codec import encode_png
 from dmrl.learn.pretrained import resolved
 from dmrl.messages import message

@@ -11,7 +11,7 @@ import pytest
 
 from dmrl import boundary
 from dmrl.cli import app
-from dmrl.deploy.store import INTEGER_NAME
+from dmrl.deploy.int8.store import INTEGER_NAME
 from dmrl.images.codec import encode_png
 
 from ..deploy.networks import random_network

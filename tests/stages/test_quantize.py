@@ -7,8 +7,8 @@ import pytest
 
 from dmrl import card
 from dmrl.cli import app
-from dmrl.deploy.integer import Conv
-from dmrl.deploy.store import load
+from dmrl.deploy.int8.network import Conv
+from dmrl.deploy.int8.store import load
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode, encode_png
 from dmrl.learn.model import load_model

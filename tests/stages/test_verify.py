@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from dmrl.cli import app
-from dmrl.deploy import targets
 from dmrl.deploy.c import write_c
+from dmrl.deploy.c.run import targets
 from dmrl.deploy.c.source import STACK_BYTES
-from dmrl.deploy.integer import Conv, IntegerNetwork
+from dmrl.deploy.int8.network import Conv, IntegerNetwork
+from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.samples import save_samples
-from dmrl.deploy.store import INTEGER_NAME, save
 from dmrl.errors import DatasetError, ModelError, SettingError, ToolError
 from dmrl.stages import verify
 from dmrl.stages.verify import Settings, document, run

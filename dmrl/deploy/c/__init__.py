@@ -10,7 +10,7 @@ from dmrl.deploy.c.refinement import refinement
 from dmrl.deploy.c.source import Source, source
 from dmrl.deploy.c.text import c_name, fill, names_of
 from dmrl.deploy.c.vectors import MOST, vectors
-from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.int8.network import IntegerNetwork
 
 __all__ = ["c_name", "write_c"]
 

@@ -8,7 +8,7 @@ from dmrl.deploy.c.places import RANGES, TYPES, Desk, body, plus, suffixes
 from dmrl.deploy.c.plan import Plan, along, taps_of
 from dmrl.deploy.c.rings import Step
 from dmrl.deploy.c.text import wrapped
-from dmrl.deploy.integer import Conv
+from dmrl.deploy.int8.network import Conv
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c.text import fill, names_of
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.reference import Detection
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.reference import Detection
 
 MOST = 20
 """Detections that the program asks for."""

@@ -15,7 +15,7 @@ from dmrl.deploy.c.places import (
 from dmrl.deploy.c.plan import Plan
 from dmrl.deploy.c.rings import Step
 from dmrl.deploy.c.text import array, fill
-from dmrl.deploy.integer import Add, Conv, MaxPool
+from dmrl.deploy.int8.network import Add, Conv, MaxPool
 from dmrl.errors import ModelError
 
 

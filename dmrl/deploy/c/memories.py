@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from dmrl.deploy.c.plan import SHARED, Plan, taps_of, up
 from dmrl.deploy.c.rings import Step
-from dmrl.deploy.integer import Conv, MaxPool
+from dmrl.deploy.int8.network import Conv, MaxPool
 from dmrl.errors import SettingError
 
 MOST_CHOICES = 12

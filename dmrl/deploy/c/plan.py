@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass, replace
 
 from dmrl.deploy.c.rings import Step, Write, needed_together, play, rows_held, shared_ring
-from dmrl.deploy.integer import Conv, IntegerNetwork, MaxPool, Shape
+from dmrl.deploy.int8.network import Conv, IntegerNetwork, MaxPool, Shape
 from dmrl.errors import ModelError
 
 LONGEST_SIDE = 4096

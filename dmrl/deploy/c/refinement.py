@@ -1,11 +1,11 @@
-"""C that learns on in the last layer, beside the network's own; see `dmrl.deploy.refine`."""
+"""C that learns on in the last layer, beside the network's own; see `dmrl.deploy.int8.refinement`."""
 
 import numpy as np
 
 from dmrl.deploy.c.plan import plan
 from dmrl.deploy.c.text import fill, wrapped
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.refine import gains, last_layer
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.refinement import gains, last_layer
 
 
 def refinement(network: IntegerNetwork, names: dict[str, str]) -> dict[str, str]:

@@ -7,7 +7,7 @@ none has. `play` plays this through, and what is counted in it is exact.
 import itertools
 from dataclasses import dataclass
 
-from dmrl.deploy.integer import AnyLayer, Conv, MaxPool
+from dmrl.deploy.int8.network import AnyLayer, Conv, MaxPool
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from dmrl.deploy.c.places import marked_unused, one_row, slot, state_names
 from dmrl.deploy.c.plan import Buffer, Plan, plan
 from dmrl.deploy.c.state import members, rings
 from dmrl.deploy.c.text import array, fill
-from dmrl.deploy.integer import SUBPIXEL, Head, IntegerNetwork
-from dmrl.deploy.integer_layers import GAIN_SHIFT
+from dmrl.deploy.int8.layers import GAIN_SHIFT
+from dmrl.deploy.int8.network import SUBPIXEL, Head, IntegerNetwork
 from dmrl.learn.decode import SAME_PX
 
 STACK_BYTES = 640

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import __version__
-from dmrl.deploy.integer import IntegerNetwork
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.guards.safe_names import plain
 
 OTHER_FILES = ("main", "harness", "count")

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.bayer import demosaic, mosaic
 from dmrl.deploy.c.text import array, fill
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.reference import decode, run
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.reference import decode, run
 
 Image = NDArray[np.uint8]
 MOST = 5

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.graph import FloatConv, Graph
-from dmrl.deploy.ranges import Ranges
+from dmrl.deploy.int8.calibration import Ranges
+from dmrl.deploy.int8.graph import FloatConv, Graph
 
 Array = NDArray[np.float64]
 

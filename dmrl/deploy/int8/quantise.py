@@ -11,13 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.graph import (
+from dmrl.deploy.int8.calibration import Ranges
+from dmrl.deploy.int8.graph import (
     FloatAdd,
     FloatConv,
     FloatPool,
     Graph,
 )
-from dmrl.deploy.integer import (
+from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
+from dmrl.deploy.int8.network import (
     CONFIDENCE_ONE,
     PIXEL_ZERO,
     SUBPIXEL,
@@ -29,9 +31,7 @@ from dmrl.deploy.integer import (
     IntegerNetwork,
     MaxPool,
 )
-from dmrl.deploy.integer_layers import GAIN_SHIFT, SIGNED_OFFSET
-from dmrl.deploy.ranges import Ranges
-from dmrl.deploy.rounding import Moments, rounded
+from dmrl.deploy.int8.rounding import Moments, rounded
 from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]

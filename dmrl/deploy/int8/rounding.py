@@ -10,8 +10,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.graph import FloatConv, Graph, grey_of, tensors_of, to_input
-from dmrl.deploy.windows import taps_of
+from dmrl.deploy.int8.graph import FloatConv, Graph, grey_of, tensors_of, to_input
+from dmrl.deploy.int8.windows import taps_of
 
 Array = NDArray[np.float64]
 Moments = dict[int, Array]

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.c import write_c
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.reference import Quantised, convolve, tensors_of
-from dmrl.deploy.refine import POINT, Seen, last_layer, learn, start, with_learned
-from dmrl.deploy.targets import SANITIZERS, Build, Target
-from dmrl.deploy.verification import expected, prove
+from dmrl.deploy.c.run.targets import SANITIZERS, Build, Target
+from dmrl.deploy.c.run.verify import expected, prove
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.reference import Quantised, convolve, tensors_of
+from dmrl.deploy.int8.refinement import POINT, Seen, last_layer, learn, start, with_learned
 from dmrl.errors import ModelError
 
-from .graphs import quantised_network
+from ..graphs import quantised_network
 
 RATE = POINT // 50
 

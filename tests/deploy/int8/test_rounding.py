@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.backends import Float, integer
-from dmrl.deploy.equalise import equalise
-from dmrl.deploy.graph import FloatConv, Graph, tensors_of, to_input
-from dmrl.deploy.quantise import About, quantise
-from dmrl.deploy.ranges import calibrate
-from dmrl.deploy.rounding import LARGEST, _rounded, moments_of, rounded
+from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.equalisation import equalise
+from dmrl.deploy.int8.graph import FloatConv, Graph, tensors_of, to_input
+from dmrl.deploy.int8.quantise import About, quantise
+from dmrl.deploy.int8.rounding import LARGEST, _rounded, moments_of, rounded
 
-from .graphs import random_graph
+from ..graphs import random_graph
 
 STEPS = np.random.default_rng(3).integers(0, 9, (4, 24, 32, 3))
 SMOOTH = np.cumsum(STEPS, axis=2).astype(np.uint8)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.integer import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
-from dmrl.deploy.integer_layers import GAIN_SHIFT, SIGNED_OFFSET
-from dmrl.deploy.windows import largest_of_blocks, taps_of
+from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
+from dmrl.deploy.int8.network import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
+from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
 from dmrl.learn.decode import SAME_PX
 
 Quantised = NDArray[np.int16]

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.bayer import demosaic, mosaic
 from dmrl.deploy.c.harness import MOST, Answer, answers
+from dmrl.deploy.c.run.targets import Build, Target
+from dmrl.deploy.c.run.toolchain import run
 from dmrl.deploy.c.source import STACK_BYTES
 from dmrl.deploy.c.text import c_name
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.reference import decode, tensors_of
-from dmrl.deploy.reference import run as reference_run
-from dmrl.deploy.refine import Seen, learn, start
-from dmrl.deploy.targets import Build, Target
-from dmrl.deploy.toolchain import run
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.reference import decode, tensors_of
+from dmrl.deploy.int8.reference import run as reference_run
+from dmrl.deploy.int8.refinement import Seen, learn, start
 from dmrl.errors import ToolError
 
 Image = NDArray[np.uint8]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.deploy.backends import Images, Outputs
-from dmrl.deploy.graph import grey_of
+from dmrl.deploy.int8.graph import grey_of
 from dmrl.errors import MissingExtra, ModelError
 
 try:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmrl.deploy.integer_layers import (
+from dmrl.deploy.int8.layers import (
     PIXEL_ZERO,
     Add,
     AnyLayer,

@@ -12,8 +12,8 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.integer import PIXEL_ZERO
-from dmrl.deploy.windows import largest_of_blocks, taps_of
+from dmrl.deploy.int8.network import PIXEL_ZERO
+from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
 from dmrl.errors import ModelError
 from dmrl.learn.operations import Op
 

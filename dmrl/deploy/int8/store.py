@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.integer import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
+from dmrl.deploy.int8.network import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
 from dmrl.errors import ModelError
 from dmrl.guards.bounded_parsing import load_npz, parse_json
 from dmrl.guards.paths import refuse_pipes

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.graph import Graph, grey_of, tensors_of, to_input
+from dmrl.deploy.int8.graph import Graph, grey_of, tensors_of, to_input
 from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmrl.deploy.windows import largest_of_blocks, taps_of
+from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
 
 RNG = np.random.default_rng(0)
 

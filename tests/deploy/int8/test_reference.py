@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.backends import grids_of, integer
-from dmrl.deploy.integer import Add, Conv, IntegerNetwork, MaxPool
-from dmrl.deploy.reference import Detection, compute, decode, run
+from dmrl.deploy.int8.network import Add, Conv, IntegerNetwork, MaxPool
+from dmrl.deploy.int8.reference import Detection, compute, decode, run
 from dmrl.learn.decode import decode as float_decode
 
-from .graphs import quantised_network
-from .networks import random_network
+from ..graphs import quantised_network
+from ..networks import random_network
 
 
 def by_hand(layer: Conv, x: np.ndarray, *shortcut: np.ndarray) -> np.ndarray:

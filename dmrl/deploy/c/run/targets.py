@@ -5,8 +5,8 @@ from pathlib import Path
 
 from dmrl.deploy.c import c_name
 from dmrl.deploy.c.harness import harness
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.toolchain import EMULATOR, RISCV, missing, run
+from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, missing, run
+from dmrl.deploy.int8.network import IntegerNetwork
 
 RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding",
                "-Wl,--no-relax")  # fmt: skip

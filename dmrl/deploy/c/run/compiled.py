@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.c import c_name, write_c
 from dmrl.deploy.c.harness import DETECTION, MOST, Answer, detections_of, harness
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.toolchain import host_compiler, run
+from dmrl.deploy.c.run.toolchain import host_compiler, run
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError
 
 FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.integer import SUBPIXEL, Conv, IntegerNetwork
-from dmrl.deploy.reference import Quantised, convolve
+from dmrl.deploy.int8.network import SUBPIXEL, Conv, IntegerNetwork
+from dmrl.deploy.int8.reference import Quantised, convolve
 from dmrl.errors import ModelError
 
 Int64 = NDArray[np.int64]

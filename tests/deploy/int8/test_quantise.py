@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.deploy import reference
 from dmrl.deploy.backends import Float, integer
-from dmrl.deploy.equalise import equalise
-from dmrl.deploy.graph import FloatConv, Graph, grey_of, outputs_of, tensors_of, to_input
-from dmrl.deploy.integer import Conv
-from dmrl.deploy.layers import layer_figures
-from dmrl.deploy.quantise import MEANINGS, About, _fixed_point, _odd, _shortened, quantise
-from dmrl.deploy.ranges import calibrate
+from dmrl.deploy.int8 import reference
+from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.equalisation import equalise
+from dmrl.deploy.int8.folding import layer_figures
+from dmrl.deploy.int8.graph import FloatConv, Graph, grey_of, outputs_of, tensors_of, to_input
+from dmrl.deploy.int8.network import Conv
+from dmrl.deploy.int8.quantise import MEANINGS, About, _fixed_point, _odd, _shortened, quantise
 from dmrl.errors import ModelError, SettingError
 
-from .graphs import quantised_network, random_graph
+from ..graphs import quantised_network, random_graph
 
 ABOUT = About("small", "small", 8, ("log_depth", "confidence"), 0.3)
 NOISE = np.random.default_rng(1).integers(0, 256, (3, 16, 24, 3)).astype(np.uint8)

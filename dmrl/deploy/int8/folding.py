@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy import graph as floats
-from dmrl.deploy import reference
-from dmrl.deploy.graph import Float32, Graph, grey_of
-from dmrl.deploy.integer import Conv, IntegerNetwork
-from dmrl.deploy.reference import Quantised
+from dmrl.deploy.int8 import graph as floats
+from dmrl.deploy.int8 import reference
+from dmrl.deploy.int8.graph import Float32, Graph, grey_of
+from dmrl.deploy.int8.network import Conv, IntegerNetwork
+from dmrl.deploy.int8.reference import Quantised
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.graph import FloatAdd, FloatConv, Graph
-from dmrl.deploy.integer import PIXEL_ZERO, Add, Conv, Head, IntegerNetwork
-from dmrl.deploy.integer_layers import GAIN_SHIFT, SIGNED_OFFSET
-from dmrl.deploy.quantise import HEAD_OF
+from dmrl.deploy.int8.graph import FloatAdd, FloatConv, Graph
+from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
+from dmrl.deploy.int8.network import PIXEL_ZERO, Add, Conv, Head, IntegerNetwork
+from dmrl.deploy.int8.quantise import HEAD_OF
 from dmrl.errors import MissingExtra
 
 try:

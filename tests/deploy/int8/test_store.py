@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.deploy import reference
+from dmrl.deploy.int8 import reference
+from dmrl.deploy.int8.store import INTEGER_NAME, load, save
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples, save_samples
-from dmrl.deploy.store import INTEGER_NAME, load, save
 from dmrl.errors import ModelError
 
-from .graphs import quantised_network
-from .networks import random_network
+from ..graphs import quantised_network
+from ..networks import random_network
 
 
 @pytest.mark.parametrize("seed", [0, 3, 8])

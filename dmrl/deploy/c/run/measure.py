@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c import L1_FOR_STATE, c_name
-from dmrl.deploy.c.text import fill
-from dmrl.deploy.integer import IntegerNetwork
-from dmrl.deploy.targets import RISCV_FLAGS, Build
-from dmrl.deploy.toolchain import (
+from dmrl.deploy.c.run.targets import RISCV_FLAGS, Build
+from dmrl.deploy.c.run.toolchain import (
     EMULATOR,
     RISCV,
     emulator_version,
@@ -21,6 +19,8 @@ from dmrl.deploy.toolchain import (
     run,
     run_both,
 )
+from dmrl.deploy.c.text import fill
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError, ToolError
 
 CLUSTER_HZ = 175e6

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dmrl.deploy.graph import (
+from dmrl.deploy.int8.graph import (
     FloatAdd,
     Graph,
     graph_of,

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl.deploy.integer import Head, IntegerNetwork
-from dmrl.deploy.integer_layers import Add, Conv, MaxPool
+from dmrl.deploy.int8.layers import Add, Conv, MaxPool
+from dmrl.deploy.int8.network import Head, IntegerNetwork
 from dmrl.errors import ModelError
 
 SHAPE = (3, 8, 10)

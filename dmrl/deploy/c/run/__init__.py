@@ -1,0 +1,1 @@
+"""Compile, emulate and verify the generated C, and count its instructions."""
