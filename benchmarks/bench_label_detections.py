@@ -19,12 +19,12 @@ import numpy as np
 from bench_label_faults import pair_of, times
 from fault_cases import CASES as FAULTS
 
-from dmrl.estimation.contested import told_apart
-from dmrl.estimation.estimate import estimate_pairs
-from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.gate import OK
-from dmrl.estimation.pair import Pair
-from dmrl.estimation.score import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
+from dmrl.estimation.flight.data_association import told_apart
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.model.metrics import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
+from dmrl.estimation.model.pair import Pair
+from dmrl.estimation.model.status import OK
+from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
 from dmrl.geometry.frames import AIDECK, Array, pixels_from_horizontal
 from dmrl.labelling.sight import Sight

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
-from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.gate import AMBIGUOUS, OK, probability_beyond
-from dmrl.estimation.pair import Mask, Pair, Track, usable_ranges
-from dmrl.estimation.score import GOOD_M, Figures, Judged, figures, overall
-from dmrl.estimation.sensors import track as sensed
+from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
+from dmrl.estimation.model.metrics import GOOD_M, Figures, Judged, figures, overall
+from dmrl.estimation.model.pair import Mask, Pair, Track, usable_ranges
+from dmrl.estimation.model.status import AMBIGUOUS, OK, probability_beyond
+from dmrl.estimation.signals.sensor_tracks import track as sensed
+from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
 from dmrl.geometry.frames import Array
 

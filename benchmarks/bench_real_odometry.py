@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from bench_label_faults import times
 
-from dmrl.estimation.estimate import estimate_pairs
-from dmrl.estimation.gate import GATE_M, OK
-from dmrl.estimation.motion import rotation
-from dmrl.estimation.pair import RATE_HZ, Pair, usable_ranges
-from dmrl.estimation.score import CHI2_95_OF_2, Judged, squared_distances
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.model.metrics import CHI2_95_OF_2, Judged, squared_distances
+from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.pair import RATE_HZ, Pair, usable_ranges
+from dmrl.estimation.model.status import GATE_M, OK
 from dmrl.flight import NOISE
 from dmrl.flight.sensors import pair_errors
 from dmrl.formats import mapped_csv

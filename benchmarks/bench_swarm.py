@@ -11,10 +11,10 @@ from itertools import combinations
 import numpy as np
 from bench_label_faults import judged, pair_of, times
 
-from dmrl.estimation.estimate import estimate_pairs
-from dmrl.estimation.gate import OK
-from dmrl.estimation.score import figures, overall
-from dmrl.estimation.swarm import estimate_swarm
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.flight.swarm import estimate_swarm
+from dmrl.estimation.model.metrics import figures, overall
+from dmrl.estimation.model.status import OK
 from dmrl.flight import NOISE, TRAJECTORIES, Scenario, simulate
 
 SETTLE_S = 20.0

@@ -10,8 +10,8 @@ import gtsam
 import numpy as np
 from gtsam import noiseModel
 
-from dmrl.estimation.motion import Increments, odometry, rotation
-from dmrl.estimation.pair import Pair
+from dmrl.estimation.model.odometry import Increments, odometry, rotation
+from dmrl.estimation.model.pair import Pair
 from dmrl.geometry.frames import Array
 
 KEY_HZ = 10.0

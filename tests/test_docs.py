@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.cli import COMMANDS, app
-from dmrl.estimation.gate import EXPECTED_SHARE
+from dmrl.estimation.model.status import EXPECTED_SHARE
 from dmrl.stages.doctor import EXTRAS
 
 ROOT = Path(__file__).parents[1]

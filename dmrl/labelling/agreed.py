@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import RecordingError
-from dmrl.estimation.estimate import estimate_pairs
-from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.linear import CLOCK
-from dmrl.estimation.pair import Array
-from dmrl.estimation.pooling import Pooled, pooled, told
-from dmrl.estimation.problem import GLOBALS, Noise
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.flight.random_effects import Pooled, pooled, told
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.keyframes import GLOBALS, Noise
+from dmrl.estimation.solver.residuals import CLOCK
 from dmrl.labelling.known import OF_PAIR, OF_ROBOT, Names, Sensors, Value
 from dmrl.labelling.logs import SENSED, read_logs
 from dmrl.recording import Contents

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.estimation.clocks import Clock, estimate_clock
-from dmrl.estimation.exchanges import estimate_from_exchanges
-from dmrl.estimation.image_motion import rates, shift, small
+from dmrl.estimation.signals.clocks import Clock, estimate_clock
+from dmrl.estimation.signals.image_motion import rates, shift, small
+from dmrl.estimation.signals.ranging_clocks import estimate_from_exchanges
 from dmrl.geometry.frames import Array
 from dmrl.geometry.turns import euler_zyx
 from dmrl.images import codec

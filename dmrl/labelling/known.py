@@ -13,9 +13,9 @@ import numpy as np
 import tomli_w
 
 from dmrl.errors import SourceError
-from dmrl.estimation.linear import BIAS, OF_OBSERVER, SCALE
-from dmrl.estimation.pair import SWAPPED, Array
-from dmrl.estimation.problem import GLOBALS
+from dmrl.estimation.model.pair import SWAPPED, Array
+from dmrl.estimation.solver.keyframes import GLOBALS
+from dmrl.estimation.solver.residuals import BIAS, OF_OBSERVER, SCALE
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
 

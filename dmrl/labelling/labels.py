@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.pair import Array
+from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED
 

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from dmrl.estimation.estimated import Estimate, Refused
-from dmrl.estimation.gate import OK
-from dmrl.estimation.linear import (
+from dmrl.estimation.model.metrics import inside_truth
+from dmrl.estimation.model.status import OK
+from dmrl.estimation.solver.estimate import Estimate, Refused
+from dmrl.estimation.solver.residuals import (
     BIAS,
     CLOCK,
     OWN_GYRO,
@@ -16,7 +17,6 @@ from dmrl.estimation.linear import (
     PEER_GYRO,
     PEER_SCALE,
 )
-from dmrl.estimation.score import inside_truth
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.truth import true_pairs, true_path
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from dmrl.estimation.fading import faded
-from dmrl.estimation.pair import Pair, Sightings
-from dmrl.estimation.sightings import claim, polar_of
+from dmrl.estimation.filters.ou_smoother import faded
+from dmrl.estimation.model.bearings import claim, polar_of
+from dmrl.estimation.model.pair import Pair, Sightings
 from dmrl.geometry.frames import horizontal_from_pixels
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.sight import Sight

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.estimation.pair import Array
+from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.camera import camera_of
 from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import RecordingError, SettingError
-from dmrl.estimation.clocks import Clock, connected
+from dmrl.estimation.signals.clocks import Clock, connected
 from dmrl.formats.counters import dejitter
 from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.labelling.corrected import MOCAP, Corrected

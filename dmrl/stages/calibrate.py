@@ -26,9 +26,9 @@ from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.estimation import board
-    from dmrl.estimation.camera_pose import LEAST, Calibration, calibrate
-    from dmrl.estimation.camera_views import Noise
+    from dmrl.estimation.calibration import intrinsics as board
+    from dmrl.estimation.calibration.extrinsics import LEAST, Calibration, calibrate
+    from dmrl.estimation.calibration.observations import Noise
     from dmrl.labelling.agreed import Constant, agreed, solutions
     from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.known import Sensors, write_sensors

@@ -23,12 +23,12 @@ from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.estimation.contested import told_apart
-    from dmrl.estimation.estimate import estimate_ekf, estimate_pairs
-    from dmrl.estimation.estimated import Estimate
-    from dmrl.estimation.gate import GATE_M
-    from dmrl.estimation.pair import Pair, Sightings
-    from dmrl.estimation.swarm import estimate_swarm
+    from dmrl.estimation.flight.data_association import told_apart
+    from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
+    from dmrl.estimation.flight.swarm import estimate_swarm
+    from dmrl.estimation.model.pair import Pair, Sightings
+    from dmrl.estimation.model.status import GATE_M
+    from dmrl.estimation.solver.estimate import Estimate
     from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.known import Sensors, read_sensors
     from dmrl.labelling.labels import SOURCE, Look, Positions

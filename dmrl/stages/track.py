@@ -20,8 +20,8 @@ from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.estimation.identity import Identity
-    from dmrl.estimation.tracker import Track, Tracker, Tuning
+    from dmrl.estimation.tracking.identity import Identity
+    from dmrl.estimation.tracking.tracker import Track, Tracker, Tuning
     from dmrl.evaluation.tracks import CAMERAS_METADATA
     from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.sight import SEEN, Sight, read_sight

@@ -4,8 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from dmrl.estimation.pair import Array, Pair, Track, usable_ranges
-from dmrl.estimation.sensors import track as sensed
+from dmrl.estimation.model.pair import Array, Pair, Track, usable_ranges
+from dmrl.estimation.signals.sensor_tracks import track as sensed
 from dmrl.flight import NOISE, Flight, RobotLog, Scenario, Trajectory, simulate
 
 

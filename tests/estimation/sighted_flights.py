@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dmrl.estimation.pair import Array, Pair, Sightings, Track
-from dmrl.estimation.sightings import polar_of
+from dmrl.estimation.model.bearings import polar_of
+from dmrl.estimation.model.pair import Array, Pair, Sightings, Track
 from dmrl.flight import Flight
 
 STD: Array = np.array([0.02, 0.03, 0.1])

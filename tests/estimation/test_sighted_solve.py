@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.contested import told_apart
-from dmrl.estimation.estimate import estimate_pairs
-from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.gate import AMBIGUOUS, OK
-from dmrl.estimation.pair import Pair
+from dmrl.estimation.flight.data_association import told_apart
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.model.pair import Pair
+from dmrl.estimation.model.status import AMBIGUOUS, OK
+from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
 
 from .flights import flown, pair_of, truth_at

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.pair import SWAPPED
-from dmrl.estimation.problem import GLOBALS, Noise
+from dmrl.estimation.model.pair import SWAPPED
+from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.keyframes import GLOBALS, Noise
 from dmrl.labelling.report import doubts, reasons, refusal
 
 

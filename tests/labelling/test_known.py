@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.estimation.estimate import estimate_pairs
-from dmrl.estimation.linear import BIAS, CLOCK, OWN_GYRO, PEER_GYRO, PEER_SCALE
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.solver.residuals import BIAS, CLOCK, OWN_GYRO, PEER_GYRO, PEER_SCALE
 from dmrl.labelling.known import Sensors, read_sensors, write_sensors
 from dmrl.labelling.logs import read_logs
 from dmrl.recording import Contents

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.linear import BIAS, OWN_GYRO, PEER_GYRO
+from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.residuals import BIAS, OWN_GYRO, PEER_GYRO
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.report import PairReport, pair_report
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message

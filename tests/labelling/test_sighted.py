@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.pair import Array
-from dmrl.estimation.sightings import polar_of
+from dmrl.estimation.model.bearings import polar_of
+from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.labelling.labels import Positions
 from dmrl.labelling.sight import Sight

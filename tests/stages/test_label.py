@@ -6,9 +6,9 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, OutputError, SettingError
-from dmrl.estimation.estimated import Estimate
-from dmrl.estimation.pair import Pair, Track
-from dmrl.estimation.problem import Noise
+from dmrl.estimation.model.pair import Pair, Track
+from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.keyframes import Noise
 from dmrl.flight import NOISE
 from dmrl.geometry.frames import AIDECK_PINHOLE, pixels_from_horizontal
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message

@@ -1,0 +1,1 @@
+"""Recursive estimators: the published EKF, its keyframe form and smoothers."""

@@ -1,0 +1,229 @@
+"""A robust EKF over keyframes for many starts and pairs at once, and its RTS smoother."""
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.estimation.filters.camera_update import NOTHING, Glances, glanced
+from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.keyframes import Noise, Problem
+
+# d rotation / d angle = QUARTER @ rotation
+QUARTER: Array = np.array([[0.0, -1.0], [1.0, 0.0]])
+SIZE = 5
+SHADOWED_M = 0.3
+"""Standard deviation of a range once its level is taken off."""
+INNOVATION_LIMIT = 2.0
+"""Standard deviations beyond which an innovation is weighted down."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What B filters are fed at K keyframes.
+
+    There is one range per keyframe: the median, which an outlier does not move.
+
+    Parameters
+    ----------
+    step_s
+        (K, B) seconds to the next keyframe; the last is zero.
+    own_turn_rad, peer_turn_rad
+        (K, B) turn from this keyframe to the next; the last is zero.
+    own_shift_m, peer_shift_m
+        (K, B, 2) the same of the position.
+    step_var
+        (K, B, 5) variance that the step adds to the state.
+    range_m, range_var
+        (K, B) range, metres, NaN where there was none, and its variance, m^2.
+    own_to_range_m, peer_to_range_m
+        (K, B, 2) motions from the keyframe to the mean time of its ranges.
+    height_m
+        (K, B) peer's height less the observer's.
+    """
+
+    step_s: Array
+    own_turn_rad: Array
+    peer_turn_rad: Array
+    own_shift_m: Array
+    peer_shift_m: Array
+    step_var: Array
+    range_m: Array
+    range_var: Array
+    own_to_range_m: Array
+    peer_to_range_m: Array
+    height_m: Array
+
+    def repeated(self, copies: int, keyframes: int) -> Self:
+        """The first keyframes, every pair ``copies`` times side by side."""
+        columns = (getattr(self, field.name)[:keyframes] for field in fields(self))
+        return type(self)(*(np.repeat(column, copies, axis=1) for column in columns))
+
+
+def inputs_of(problems: list[Problem], noise: Noise) -> Inputs:
+    """Inputs of one filter per problem. All need the same number of keyframes."""
+    rows = [_inputs(problem, noise) for problem in problems]
+    return Inputs(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
+
+
+def _inputs(problem: Problem, noise: Noise) -> tuple[Array, ...]:
+    count = len(problem.key_s)
+    per_key = np.bincount(problem.range_key, minlength=count)
+    many = np.maximum(per_key, 1)
+
+    def mean(values: Array) -> Array:
+        return np.bincount(problem.range_key, values, minlength=count) / many
+
+    def means(values: Array) -> Array:
+        return np.column_stack([mean(column) for column in values.T])
+
+    # pi/2 / n is the variance of a median; half the bias is what the first guess cannot know.
+    variance = 1.5 * noise.range_std_m**2 / many + 0.05**2
+    steps_s = np.append(problem.steps_s, 0.0)
+    shifts = (problem.own.shift_m, problem.peer.shift_m, step_variance(problem, noise))
+    shadowed = problem.range_level_m
+    level = mean(shadowed)
+    return (
+        steps_s,
+        *(np.append(turn, 0.0) for turn in (problem.own.turn_rad, problem.peer.turn_rad)),
+        *(np.vstack([shift, 0.0 * shift[:1]]) for shift in shifts),
+        _medians(problem.range_key, problem.range_m - shadowed, per_key),
+        np.where(level != 0, SHADOWED_M**2, variance),
+        means(problem.own_to_range.shift_m),
+        means(problem.peer_to_range.shift_m),
+        mean(problem.height_m),
+    )
+
+
+def _medians(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) -> Array:
+    """(K,) median of the values of each key, NaN where there are none."""
+    ordered = np.append(values[np.lexsort((values, key))], np.nan)
+    first = np.cumsum(per_key) - per_key
+    middle = np.stack([first + (per_key - 1) // 2, first + per_key // 2])
+    return np.where(per_key > 0, ordered[middle * (per_key > 0)].mean(axis=0), np.nan)
+
+
+def step_variance(problem: Problem, noise: Noise) -> Array:
+    """(K - 1, 5) variance that each step adds to x, y (m^2), psi (rad^2) and the biases."""
+    steps_s, gap_s = problem.steps_s, problem.gap_s
+    shift = 2 * noise.velocity_psd * steps_s + noise.gap_speed_mps**2 * gap_s
+    turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * gap_s
+    return np.column_stack([shift, shift, turn, np.zeros((len(turn), 2))])
+
+
+@dataclass(frozen=True, slots=True)
+class Filtered:
+    """B filters over K keyframes.
+
+    Parameters
+    ----------
+    state, covariance
+        (K, B, 5), (K, B, 5, 5) of x, y, psi and the biases of the observer's and the peer's yaw
+        rate, after the keyframe's range.
+    prior, prior_covariance
+        The same before it.
+    step
+        (K, B, 5, 5) Jacobian of the step to the next keyframe.
+    log_likelihood
+        (B,) of the innovations, robust.
+    """
+
+    state: Array
+    covariance: Array
+    prior: Array
+    prior_covariance: Array
+    step: Array
+    log_likelihood: Array
+
+
+def run(inputs: Inputs, start: Array, start_std: Array, glances: Glances = NOTHING) -> Filtered:
+    """Filter from B starts.
+
+    Parameters
+    ----------
+    inputs
+        Of B filters.
+    start
+        (B, 3) x, y (m), psi (rad) at the first keyframe.
+    start_std
+        (5,) standard deviations of these and of the biases, rad/s.
+    glances
+        What cameras saw, by keyframe.
+    """
+    count, filters = inputs.range_m.shape
+    states = (np.empty((count, filters, SIZE)) for _ in range(2))
+    matrices = (np.empty((count, filters, SIZE, SIZE)) for _ in range(3))
+    (state, prior), (covariance, prior_covariance, step) = states, matrices
+    out = Filtered(state, covariance, prior, prior_covariance, step, np.zeros(filters))
+    state = np.concatenate([start, np.zeros((filters, SIZE - 3))], axis=1)
+    covariance = np.broadcast_to(np.diag(start_std**2), (filters, SIZE, SIZE)).copy()
+    for k in range(count):
+        out.prior[k], out.prior_covariance[k] = state, covariance
+        _update(state, covariance, inputs, k, out.log_likelihood)
+        for glance in glances.get(k, ()):
+            mine = slice(glance.first, glance.first + glance.copies)
+            given = state[mine], covariance[mine], inputs.height_m[k, mine]
+            glanced(*given, glance, out.log_likelihood[mine])
+        out.state[k], out.covariance[k] = state, covariance
+        state, step = _moved(state, inputs, k)
+        out.step[k] = step
+        covariance = step @ covariance @ step.swapaxes(1, 2)
+        covariance += inputs.step_var[k][:, :, None] * np.eye(SIZE)
+    return out
+
+
+def _moved(state: Array, inputs: Inputs, k: int) -> tuple[Array, Array]:
+    """(B, 5) states at the next keyframe, and the (B, 5, 5) Jacobian."""
+    seconds = inputs.step_s[k]
+    own_turn = inputs.own_turn_rad[k] - seconds * state[:, 3]
+    peer_turn = inputs.peer_turn_rad[k] - seconds * state[:, 4]
+    turned = _apply(rotation(state[:, 2]), inputs.peer_shift_m[k])
+    back = rotation(-own_turn)
+    after = state.copy()
+    after[:, :2] = _apply(back, state[:, :2] + turned - inputs.own_shift_m[k])
+    after[:, 2] += peer_turn - own_turn
+    step = np.zeros((len(state), SIZE, SIZE))
+    step[:, :2, :2] = back
+    step[:, :2, 2] = _apply(back, turned @ QUARTER.T)
+    step[:, :2, 3] = seconds[:, None] * (after[:, :2] @ QUARTER.T)
+    step[:, [2, 3, 4], [2, 3, 4]] = 1.0
+    step[:, 2, 3], step[:, 2, 4] = seconds, -seconds
+    return after, step
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelihood: Array) -> None:
+    """Put keyframe k's ranges in, in place; far innovations count less."""
+    seen = np.isfinite(inputs.range_m[k])
+    peer = _apply(rotation(state[:, 2]), inputs.peer_to_range_m[k])
+    offset = state[:, :2] + peer - inputs.own_to_range_m[k]
+    expected = np.sqrt((offset**2).sum(axis=1) + inputs.height_m[k] ** 2) + 1e-6
+    towards = offset / expected[:, None]
+    row = np.column_stack([towards, np.einsum("bi,bi->b", towards, peer @ QUARTER.T)])
+    cross = _apply(covariance[..., :3], row)
+    spread = np.einsum("bi,bi->b", row, cross[:, :3]) + inputs.range_var[k]
+    innovation = np.where(seen, inputs.range_m[k] - expected, 0.0)
+    size = np.abs(innovation) / np.sqrt(spread)
+    softer = inputs.range_var[k] * np.maximum(1.0, size / INNOVATION_LIMIT) ** 2
+    log_likelihood -= seen * (0.5 * np.log(spread) + np.log1p(0.5 * size**2))
+    spread += softer - inputs.range_var[k]
+    gain = np.where(seen, 1 / spread, 0.0)[:, None] * cross
+    state += gain * innovation[:, None]
+    covariance -= gain[:, :, None] * cross[:, None, :]
+
+
+def smoothed(filtered: Filtered) -> tuple[Array, Array]:
+    """States (K, B, 5) and covariances (K, B, 5, 5) given the whole flight (RTS)."""
+    state, covariance = filtered.state.copy(), filtered.covariance.copy()
+    for k in range(len(state) - 2, -1, -1):
+        ahead = np.linalg.inv(filtered.prior_covariance[k + 1])
+        gain = filtered.covariance[k] @ filtered.step[k].swapaxes(1, 2) @ ahead
+        state[k] += _apply(gain, state[k + 1] - filtered.prior[k + 1])
+        change = covariance[k + 1] - filtered.prior_covariance[k + 1]
+        covariance[k] += gain @ change @ gain.swapaxes(1, 2)
+    return state, covariance

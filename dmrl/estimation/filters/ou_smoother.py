@@ -1,0 +1,52 @@
+"""An error that fades (Ornstein and Uhlenbeck 1930), found by a Kalman filter and RTS smoother."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.estimation.model.pair import Array
+
+
+def faded(
+    time_s: Array, std: Array, fade_s: float, rows: NDArray[np.intp], off: Array, noise: Array
+) -> tuple[Array, Array]:
+    """An error at all times, from measurements of it at some.
+
+    Parameters
+    ----------
+    time_s
+        (N,) ascending, seconds.
+    std
+        (N,) standard deviation of the error.
+    fade_s
+        Time in which it fades to 1/e, seconds.
+    rows
+        (M,) times that are measured, each once.
+    off, noise
+        (M,) measurements and their standard deviations.
+
+    Returns
+    -------
+    error, variance : Array
+        (N,) each. Measurements may share an error, so they never tell more than one of them would
+        alone; nor does the variance grow.
+    """
+    fade = np.exp(-np.diff(time_s) / fade_s)
+    measured, spread = np.full(len(std), np.nan), np.ones(len(std))
+    measured[rows], spread[rows] = off, noise**2
+    mean, var, ahead = np.zeros(len(std)), np.ones(len(std)), np.ones(len(std))
+    ahead_mean = mean.copy()
+    for k in range(len(std)):  # in units of ``std``
+        if k:
+            ahead_mean[k] = fade[k - 1] * mean[k - 1]
+            ahead[k] = fade[k - 1] ** 2 * var[k - 1] + 1 - fade[k - 1] ** 2
+        mean[k], var[k] = ahead_mean[k], ahead[k]
+        if np.isfinite(measured[k]):
+            gain = ahead[k] * std[k] / (std[k] ** 2 * ahead[k] + spread[k])
+            mean[k] += gain * (measured[k] - std[k] * ahead_mean[k])
+            var[k] *= 1 - gain * std[k]
+    for k in range(len(std) - 2, -1, -1):
+        gain = fade[k] * var[k] / ahead[k + 1]
+        mean[k] += gain * (mean[k + 1] - ahead_mean[k + 1])
+        var[k] += gain**2 * (var[k + 1] - ahead[k + 1])
+    least = np.median(noise) ** 2 if len(noise) else np.inf
+    return std * mean, np.minimum(std**2 * var + least, std**2)

@@ -1,0 +1,1 @@
+"""Estimate every pair of a flight: initial guesses, multi-start, data association."""

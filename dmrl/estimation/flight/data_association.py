@@ -1,0 +1,76 @@
+"""Candidates that two peers of one camera both took for theirs.
+
+Every pair is solved by itself, and takes what fits. Where two solutions took the same candidates,
+one of them is wrong, or does not see its own peer: they stay with the one whom they fit better over
+the whole flight, and the other is to be solved again without them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from dmrl.estimation.model.bearings import Claim, claim, without
+from dmrl.estimation.model.pair import Pair, Sightings
+from dmrl.estimation.solver.estimate import Estimate
+
+Names = tuple[str, str]
+CONTESTED = 0.1
+"""A pair is solved again where another has a better claim to so large a share of what it saw."""
+
+
+def told_apart(
+    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]
+) -> dict[Names, Pair]:
+    """The pairs that are to be solved again, without what is another peer's.
+
+    Parameters
+    ----------
+    pairs
+        By names, with what their cameras showed; each pair of robots once.
+    estimates
+        Of every ordered pair.
+    """
+    out: dict[Names, Pair] = {}
+    for robot in sorted({name for names in pairs for name in names}):
+        mine = {names: pair for names, pair in pairs.items() if robot in names}
+        claims = {names: _claim(robot, names, pair, estimates) for names, pair in mine.items()}
+        for one, other in combinations(mine, 2):
+            a, b = claims[one], claims[other]
+            if a is None or b is None:
+                continue
+            both = a.agrees & b.agrees & (a.nearest == b.nearest)
+            first = a.log_likelihood[both].sum() < b.log_likelihood[both].sum()
+            loser, lost = (one, a) if first else (other, b)
+            if both.sum() > CONTESTED * lost.agrees.sum():
+                before = out.get(loser, mine[loser])
+                sees = _sees(robot, loser, mine[loser])
+                assert sees is not None
+                left = without(sees, both, lost.nearest)
+                out[loser] = (
+                    replace(before, own_sees=left)
+                    if loser[0] == robot
+                    else replace(before, peer_sees=left)
+                )
+    return out
+
+
+def _sees(robot: str, names: Names, pair: Pair) -> Sightings | None:
+    return pair.own_sees if names[0] == robot else pair.peer_sees
+
+
+def _claim(
+    robot: str, names: Names, pair: Pair, estimates: Mapping[Names, Estimate]
+) -> Claim | None:
+    """What a robot's camera showed of a peer; None where it showed nothing."""
+    sees = _sees(robot, names, pair)
+    if sees is None or not len(sees.time_s):
+        return None
+    own, peer = (pair.own, pair.peer) if names[0] == robot else (pair.peer, pair.own)
+    found = estimates[names if names[0] == robot else names[::-1]]
+    xy, spread, _ = found.at(sees.time_s)
+    z = np.interp(sees.time_s, pair.time_s, peer.height_m - own.height_m)
+    covariance = np.zeros((len(z), 3, 3))
+    covariance[:, :2, :2], covariance[:, 2, 2] = spread, found.noise.height_std_m**2
+    return claim(sees, np.column_stack([xy, z]), covariance)

@@ -1,0 +1,229 @@
+"""More than pairs: all robots of a flight in one frame, by all their ranges at once.
+
+Solutions of the pairs say where to start. What a pair cannot tell, a third robot often can: its
+ranges cross theirs, and everybody's odometry is used once instead of once in each pair.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from dmrl.estimation.filters.keyframe_ekf import QUARTER
+from dmrl.estimation.flight.pairs import unmoved, with_status
+from dmrl.estimation.flight.segments import contradicts
+from dmrl.estimation.model.odometry import odometry, rotation
+from dmrl.estimation.model.pair import SWAPPED, Array, Pair, Track
+from dmrl.estimation.model.status import GATE_M
+from dmrl.estimation.solver.covariance import RESTLESS_S, noise_energy, shrunk
+from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.keyframes import GLOBALS, KEY_HZ, silence, unheard
+from dmrl.estimation.solver.multi_robot import (
+    OWN,
+    ROBOT,
+    SHARED,
+    Flight,
+    Link,
+    Swarm,
+    inverse,
+    solved,
+)
+from dmrl.estimation.solver.residuals import BIAS, OF_OBSERVER, OWN_GYRO, PEER_GYRO, SCALE
+
+Names = tuple[str, str]
+LEAST_S = 5.0
+"""Shortest time that all robots share and that is worth a solve."""
+
+
+def estimate_swarm(
+    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], *, gate_m: float = GATE_M
+) -> dict[Names, Estimate]:
+    """Estimates of every ordered pair; those of robots in no group of three stay as they are.
+
+    Parameters
+    ----------
+    pairs
+        What robots measured, each pair once; a robot's log is the same in all of them.
+    estimates
+        Of every ordered pair, by pairs.
+    gate_m
+        A position that is off by more than this is a bad one, metres.
+    """
+    out = dict(estimates)
+    for group in _groups(pairs):
+        mine = {names: pair for names, pair in pairs.items() if names[0] in group}
+        shared_s = min(p.time_s[-1] for p in mine.values()) - max(
+            p.time_s[0] for p in mine.values()
+        )
+        if len(group) > 2 and shared_s >= LEAST_S:
+            theirs = {names: e for names, e in estimates.items() if names[0] in group}
+            together = _estimates(mine, theirs, gate_m)
+            # What the solve over all has no model of bends it: then it stands against the pairs.
+            bent = any(contradicts(together[names], found) for names, found in theirs.items())
+            out |= {} if bent else together
+    return out
+
+
+def _groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
+    """Robots that ranges connect."""
+    groups: list[set[str]] = []
+    for names in pairs:
+        touched = [group for group in groups if group & set(names)]
+        groups = [group for group in groups if group not in touched]
+        groups.append(set(names).union(*touched))
+    return groups
+
+
+def _estimates(
+    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], gate_m: float
+) -> dict[Names, Estimate]:
+    flight = flight_of(pairs, estimates)
+    # How good the sensors are: as the pair in the middle found them.
+    ordered = sorted(estimates.values(), key=lambda estimate: estimate.noise.velocity_std_mps)
+    noise = ordered[len(ordered) // 2].noise
+    found = solved(flight, noise, _start(flight, estimates))
+    spread = inverse(flight, noise, found, _calmed(flight, found.state, noise_energy(noise)))
+    place = {name: number for number, name in enumerate(flight.names)}
+    out = {}
+    for one, other in estimates:
+        state, covariance = _relative(found.state, spread, place[one], place[other])
+        constants = _constants(flight, found, place[one], place[other])
+        none = np.zeros(len(state), np.int8)
+        seen = Estimate(flight.key_s, state, covariance, none, constants, noise)
+        pair = pairs[one, other] if (one, other) in pairs else pairs[other, one]
+        # Two that fly alike are told apart by a third.
+        why = unmoved(_moved(flight, place[one]), np.inf)
+        silent = silence(pair, flight.key_s) | unheard(pair, flight.key_s)
+        out[one, other] = with_status(seen, silent, why, gate_m)
+    return out
+
+
+def flight_of(pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]) -> Flight:
+    """Keyframes of the time that all robots share.
+
+    Parameters
+    ----------
+    pairs, estimates
+        As in `estimate_swarm`.
+    """
+    start_s = max(pair.time_s[0] for pair in pairs.values())
+    end_s = min(pair.time_s[-1] for pair in pairs.values())
+    key_s = start_s + np.arange(int((end_s - start_s) * KEY_HZ + 1e-6) + 1) / KEY_HZ
+    logs: dict[str, tuple[Array, Track]] = {}
+    for (one, other), pair in pairs.items():
+        logs |= {one: (pair.time_s, pair.own), other: (pair.time_s, pair.peer)}
+    names = sorted(logs)
+    ways = {name: odometry(track, time_s) for name, (time_s, track) in logs.items()}
+    gaps = [
+        np.diff(np.interp(key_s, time_s, np.cumsum(track.gap) * (time_s[1] - time_s[0])))
+        for time_s, track in (logs[name] for name in names)
+    ]
+    links = []
+    for (one, other), pair in pairs.items():
+        inside = (pair.range_time_s >= key_s[0]) & (pair.range_time_s <= key_s[-1])
+        at_s = pair.range_time_s[inside]
+        key = np.clip(np.searchsorted(key_s, at_s, "right") - 1, 0, len(key_s) - 1)
+        shifts = [ways[name].increments(key_s[key], at_s).shift_m for name in (one, other)]
+        height_m = np.interp(at_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
+        both = names.index(one), names.index(other)
+        # Behind something, ranges are too long for seconds: the pair's solve tells by how much.
+        range_m = pair.range_m[inside] - _error(estimates.get((one, other)), at_s)
+        links.append(Link(both, key, range_m, shifts[0], shifts[1], height_m))
+    moves = [ways[name].increments(key_s[:-1], key_s[1:]) for name in names]
+    paths = [ways[name].at(key_s)[:2] for name in names]
+    return Flight(names, key_s, moves, paths, np.array(gaps), links, _known_std(names, pairs))
+
+
+def _known_std(names: list[str], pairs: Mapping[Names, Pair]) -> Array:
+    """(4 N + 2 L,) what pairs know of their constants, in the order of a swarm's."""
+    robots = np.full((len(names), ROBOT), np.inf)
+    shared = np.full((len(pairs), SHARED), np.inf)
+    for number, (both, pair) in enumerate(pairs.items()):
+        if pair.known_std is None:
+            continue
+        for name, known in zip(both, (pair.known_std, pair.known_std[SWAPPED]), strict=True):
+            mine = robots[names.index(name)]
+            mine[:] = np.minimum(mine, known[OF_OBSERVER])
+        shared[number] = pair.known_std[[BIAS, SCALE]]
+    return np.concatenate([robots.ravel(), shared.ravel()])
+
+
+def _error(estimate: Estimate | None, at_s: Array) -> Array:
+    """(R,) by how much ranges are too long, as the pair's own solve found, metres."""
+    if estimate is None or estimate.range_error_m is None:
+        return np.zeros(len(at_s))
+    return np.interp(at_s, estimate.time_s, estimate.range_error_m)
+
+
+def _start(flight: Flight, estimates: Mapping[Names, Estimate]) -> Array:
+    """(K, N, 5) states from the pairs' solutions, along the tree of the surest."""
+    sigma_m = {
+        names: float(np.median(np.linalg.eigvalsh(e.covariance[:, :2, :2])[:, -1]))
+        for names, e in estimates.items()
+    }
+    state = np.zeros((len(flight.key_s), len(flight.names), OWN))
+    heading, position = flight.paths[0]
+    state[:, 0, :2], state[:, 0, 2] = position, heading
+    done = {flight.names[0]}
+    while len(done) < len(flight.names):
+        open_ends = [names for names in estimates if names[0] in done and names[1] not in done]
+        one, other = min(open_ends, key=lambda names: sigma_m[names])
+        here = state[:, flight.names.index(one)]
+        found = estimates[one, other]
+        columns = np.column_stack([found.state[:, :2], np.unwrap(found.state[:, 2])])
+        x, y, psi = (np.interp(flight.key_s, found.time_s, column) for column in columns.T)
+        away = _apply(rotation(here[:, 2]), np.column_stack([x, y]))
+        there = flight.names.index(other)
+        state[:, there, :2], state[:, there, 2] = here[:, :2] + away, here[:, 2] + psi
+        done.add(other)
+    return state
+
+
+def _calmed(flight: Flight, state: Array, energy: float) -> Array:
+    """The states on paths without what may be noise: each robot's own, and against all others'."""
+    step_s = float(np.median(np.diff(flight.key_s)))
+    velocity = np.diff(state[:, :, :2], axis=0) / step_s
+    robots = range(len(flight.names))
+    own = np.stack([shrunk(velocity[:, k], energy, step_s) for k in robots], axis=1)
+    mean = own.mean(axis=1, keepdims=True)
+    apart = np.stack([shrunk((own - mean)[:, k], energy, step_s) for k in robots], axis=1)
+    path = np.concatenate([np.zeros((1, *own.shape[1:])), np.cumsum(mean + apart, axis=0)])
+    path *= step_s
+    calm = state.copy()
+    calm[:, :, :2] = path + state[:, :, :2].mean(axis=0) - path.mean(axis=0)
+    return calm
+
+
+def _relative(state: Array, spread: Array, one: int, other: int) -> tuple[Array, Array]:
+    """(K, 3) where a robot is in another's horizontal frame, and the covariance (K, 3, 3)."""
+    here, there = state[:, one], state[:, other]
+    back = rotation(-here[:, 2])
+    xy = _apply(back, there[:, :2] - here[:, :2])
+    by_both = np.zeros((len(state), 3, 6))
+    by_both[:, :2, :2], by_both[:, :2, 3:5], by_both[:, :2, 2] = -back, back, -xy @ QUARTER.T
+    by_both[:, 2, 2], by_both[:, 2, 5] = -1.0, 1.0
+    at = np.concatenate([one * OWN + np.arange(3), other * OWN + np.arange(3)])
+    covariance = by_both @ spread[:, at[:, None], at] @ by_both.swapaxes(1, 2)
+    return np.column_stack([xy, there[:, 2] - here[:, 2]]), covariance
+
+
+def _moved(flight: Flight, robot: int) -> float:
+    """Mean square of a robot's averaged velocity, (m/s)^2."""
+    step_s = float(np.median(np.diff(flight.key_s)))
+    velocity = np.diff(flight.paths[robot][1], axis=0) / step_s
+    slow = uniform_filter1d(velocity, round(RESTLESS_S / step_s), axis=0, mode="nearest")
+    return float((slow**2).sum(axis=1).mean())
+
+
+def _constants(flight: Flight, found: Swarm, one: int, other: int) -> Array:
+    """(G,) what the solve says of a pair, in the order of ``GLOBALS``; zeros where it does not."""
+    out = np.zeros(len(GLOBALS))
+    out[OWN_GYRO], out[PEER_GYRO] = found.constants[[one * ROBOT, other * ROBOT]]
+    for number, link in enumerate(flight.links):
+        if set(link.robots) == {one, other}:
+            out[BIAS] = found.constants[len(flight.names) * ROBOT + number * SHARED]
+    return out
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

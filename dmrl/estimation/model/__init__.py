@@ -1,0 +1,1 @@
+"""Measurement models: odometry, bearings, the pair and its status."""

@@ -1,0 +1,108 @@
+"""Motion between keyframes, integrated once at 100 Hz, so that estimators step at 10 Hz.
+
+Odometry of a robot runs in a frame fixed at its start. The increment from a keyframe k to a
+time t, seen from the robot at k, is then exact for any t.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmrl.estimation.model.pair import Array, Track
+
+
+def rotation(angle_rad: Array) -> Array:
+    """(..., 2, 2) rotations by angles, counter-clockwise."""
+    out = np.empty((*np.shape(angle_rad), 2, 2))
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(angle_rad)
+    out[..., 1, 0] = np.sin(angle_rad)
+    out[..., 0, 1] = -out[..., 1, 0]
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Dead reckoning of one robot over a flight.
+
+    Parameters
+    ----------
+    time_s
+        (K,) uniform grid, seconds.
+    heading_rad
+        (K,) integral of the yaw rate, radians.
+    position_m
+        (K, 2) integral of the velocity in the frame of the start, metres.
+    drift_s
+        (K, 2, 2) what the position gains per m/s of velocity bias, seconds.
+    """
+
+    time_s: Array
+    heading_rad: Array
+    position_m: Array
+    drift_s: Array
+
+    def at(self, time_s: Array) -> tuple[Array, Array, Array]:
+        """Heading (N,), position (N, 2) and drift (N, 2, 2) at times in the grid."""
+        step = (time_s - self.time_s[0]) / (self.time_s[1] - self.time_s[0])
+        low = np.clip(step.astype(int), 0, len(self.time_s) - 2)
+        share = step - low
+
+        def between(values: Array) -> Array:
+            part = share.reshape(-1, *[1] * (values.ndim - 1))
+            return np.asarray(values[low] * (1 - part) + values[low + 1] * part)
+
+        return between(self.heading_rad), between(self.position_m), between(self.drift_s)
+
+    def increments(self, from_s: Array, to_s: Array) -> "Increments":
+        """Motion from some times to others, seen from the robot at the first."""
+        heading, position, drift = self.at(from_s)
+        later_heading, later, later_drift = self.at(to_s)
+        back = rotation(-heading)
+        return Increments(
+            turn_rad=later_heading - heading,
+            shift_m=np.einsum("nij,nj->ni", back, later - position),
+            drift_s=back @ (later_drift - drift),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Increments:
+    """Motions of one robot.
+
+    Parameters
+    ----------
+    turn_rad
+        (N,) change of heading, radians.
+    shift_m
+        (N, 2) change of position, in the robot's frame at the start of each, metres.
+    drift_s
+        (N, 2, 2) change of the shift per m/s of velocity bias, seconds.
+    """
+
+    turn_rad: Array
+    shift_m: Array
+    drift_s: Array
+
+
+def odometry(track: Track, time_s: Array) -> Odometry:
+    """Dead reckoning of a robot, by the trapezium rule.
+
+    Parameters
+    ----------
+    track
+        What it measured.
+    time_s
+        (K,) its uniform time grid, seconds.
+    """
+    dt_s = np.diff(time_s)
+
+    def integral(rate: Array) -> Array:
+        steps = 0.5 * (rate[1:] + rate[:-1]) * dt_s.reshape(-1, *[1] * (rate.ndim - 1))
+        return np.concatenate([np.zeros((1, *rate.shape[1:])), np.cumsum(steps, axis=0)])
+
+    heading = integral(track.yaw_rate_radps)
+    turned = rotation(heading)
+    velocity = np.column_stack([track.vx_mps, track.vy_mps])
+    return Odometry(
+        time_s, heading, integral(np.einsum("kij,kj->ki", turned, velocity)), integral(turned)
+    )

@@ -1,0 +1,1 @@
+"""Prepare sensor signals: clocks, image motion, step detection."""

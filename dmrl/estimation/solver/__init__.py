@@ -1,0 +1,1 @@
+"""Batch least squares: residuals, robust loss, linear algebra and covariance."""

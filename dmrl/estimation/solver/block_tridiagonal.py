@@ -1,0 +1,190 @@
+"""Block-tridiagonal normal equations with a border of globals: solve, and invert in part."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.camera_residuals import Looks, Seen
+from dmrl.estimation.solver.residuals import RANGED, Linear
+from dmrl.estimation.solver.robust_loss import Weights
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """J^T J of a flight, and J^T e.
+
+    Parameters
+    ----------
+    diagonal
+        (K, n, n) blocks of the keyframes.
+    above
+        (K - 1, n, n) blocks between a keyframe and the next.
+    border
+        (K, n, G) blocks between keyframes and globals.
+    corner
+        (G, G).
+    gradient, corner_gradient
+        (K, n), (G,).
+    """
+
+    diagonal: Array
+    above: Array
+    border: Array
+    corner: Array
+    gradient: Array
+    corner_gradient: Array
+
+
+def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior: Array) -> Normal:
+    """Normal equations without the globals' prior.
+
+    Parameters
+    ----------
+    linear
+        Residuals and Jacobians.
+    range_key
+        (R,) keyframe of each range.
+    weights
+        Of the squared residuals.
+    prior
+        (n,) information on every keyframe; tiny, so that there is always a solution.
+    """
+    steps, ranges, width = linear.steps, linear.ranges, len(prior)
+    size = steps.shape[2] - 2 * width - 1
+    diagonal = np.zeros((len(steps) + 1, width, width)) + np.diag(prior)
+    border, gradient = np.zeros((*diagonal.shape[:2], size)), np.zeros(diagonal.shape[:2])
+    rooted = steps * np.sqrt(weights.step)[..., None]
+    products = rooted[..., : 2 * width].swapaxes(1, 2) @ rooted
+    for keyframes, rows in ((slice(-1), slice(width)), (slice(1, None), slice(width, 2 * width))):
+        diagonal[keyframes] += products[:, rows, rows]
+        border[keyframes] += products[:, rows, 2 * width : -1]
+        gradient[keyframes] += products[:, rows, -1]
+
+    weighted = ranges * weights.range[:, None]
+    keys, sums = _summed(range_key, weighted[:, :4, None] * ranges[:, None, :])
+    states = np.array(RANGED)
+    diagonal[np.ix_(keys, states, states)] += sums[..., :4]
+    border[np.ix_(keys, states, np.arange(2))] += sums[..., 4:6]
+    gradient[np.ix_(keys, states)] += sums[..., 6]
+    flat = rooted.reshape(-1, steps.shape[2])[:, 2 * width :]
+    rest = flat.T @ flat
+    shared = [0, 1, -1]  # bias and scale of the ranges, and the residual
+    rest[np.ix_(shared, shared)] += weighted[:, 4:].T @ ranges[:, 4:]
+    above = products[:, :width, width : 2 * width]
+    return Normal(diagonal, above, border, rest[:-1, :-1], gradient, rest[:-1, -1])
+
+
+def add_looks(equations: Normal, looks: Looks, found: Seen, weight: Array) -> None:
+    """Put what was seen into normal equations, in place.
+
+    Parameters
+    ----------
+    equations
+        Of a flight's ranges and motions.
+    looks
+        Of I images, each between two keyframes.
+    found
+        The images' rows.
+    weight
+        (I,) of their squares.
+    """
+    products = found.rows[..., :3].swapaxes(1, 2) @ (found.rows * weight[:, None, None])
+    after = looks.part[:, None, None]
+    for key, part in ((looks.key, 1 - after), (looks.key + 1, after)):
+        np.add.at(equations.diagonal[:, :3, :3], key, part**2 * products[..., :3])
+        np.add.at(equations.gradient[:, :3], key, part[..., 0] * products[..., 3])
+    np.add.at(equations.above[:, :3, :3], looks.key, (1 - after) * after * products[..., :3])
+
+
+def _summed(key: NDArray[np.intp], parts: Array) -> tuple[NDArray[np.intp], Array]:
+    """The keys that occur, and the sum of the parts of each. Keys never go back."""
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    return key[first], np.add.reduceat(parts, first, axis=0) if len(key) else parts
+
+
+def bands(diagonal: Array, above: Array) -> Array:
+    """(2n, K n) upper bands of a matrix of (K, n, n) blocks, as SciPy wants them."""
+    size = diagonal.shape[1]
+    width = 2 * size - 1
+    out = np.zeros((width + 1, len(diagonal), size))
+    for row in range(size):
+        for column in range(row, size):
+            out[width + row - column, :, column] = diagonal[:, row, column]
+        for column in range(size):
+            out[width + row - column - size, 1:, column] = above[:, row, column]
+    return out.reshape(width + 1, -1)
+
+
+def log_determinant(equations: Normal) -> float:
+    """Logarithm of the determinant of the whole matrix, border and corner included.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the equations are not positive definite.
+    """
+    size = len(equations.corner)
+    factor = cholesky_banded(bands(equations.diagonal, equations.above))
+    border = equations.border.reshape(-1, size)
+    solved = cho_solve_banded((factor, False), border)
+    rest = np.linalg.slogdet(equations.corner - border.T @ solved)[1]
+    return float(2 * np.log(factor[-1]).sum() + rest)
+
+
+def solve(equations: Normal) -> tuple[Array, Array, Array, Array]:
+    """The Gauss-Newton step, and what the covariance needs.
+
+    Returns
+    -------
+    state : Array
+        (K, n) change of the keyframes.
+    constants : Array
+        (G,) change of the globals.
+    response : Array
+        (K, n, G) change of the keyframes per change of the globals, negated.
+    covariance : Array
+        (G, G) of the globals.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the equations are not positive definite.
+    """
+    size, width = len(equations.corner), equations.diagonal.shape[1]
+    factor = cholesky_banded(bands(equations.diagonal, equations.above))
+    right = np.concatenate([equations.gradient[..., None], equations.border], axis=2)
+    solved = cho_solve_banded((factor, False), right.reshape(-1, size + 1))
+    border = equations.border.reshape(-1, size)
+    covariance = np.linalg.inv(equations.corner - border.T @ solved[:, 1:])
+    constants = -covariance @ (equations.corner_gradient - border.T @ solved[:, 0])
+    state = -solved[:, 0] - solved[:, 1:] @ constants
+    return (
+        state.reshape(-1, width),
+        constants,
+        solved[:, 1:].reshape(-1, width, size),
+        covariance,
+    )
+
+
+def block_inverse(diagonal: Array, above: Array) -> Array:
+    """(K, ..., n, n) diagonal blocks of the inverse of a block-tridiagonal matrix.
+
+    By elimination from both ends, for many matrices at once.
+
+    Parameters
+    ----------
+    diagonal
+        (K, ..., n, n).
+    above
+        (K - 1, ..., n, n).
+    """
+    # Backwards is forwards in a mirror.
+    left = np.stack([diagonal, diagonal[::-1]], axis=1)
+    right = np.stack([above, above[::-1].swapaxes(-1, -2)], axis=1)
+    under = right.swapaxes(-1, -2)
+    for k in range(len(above)):
+        left[k + 1] -= under[k] @ np.linalg.inv(left[k]) @ right[k]
+    return np.asarray(np.linalg.inv(left[:, 0] + left[::-1, 1] - diagonal))

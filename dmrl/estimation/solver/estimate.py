@@ -1,0 +1,102 @@
+"""What an estimator says of a flight, seen from one robot or from the other."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from dmrl.estimation.filters.keyframe_ekf import QUARTER
+from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.pair import SWAPPED, Array
+from dmrl.estimation.model.status import UNCONVERGED, Statuses
+from dmrl.estimation.solver.keyframes import Noise
+from dmrl.estimation.solver.residuals import CLOCK
+
+Refused = Literal["still", "alike", "silent", "open", "imprecise"]
+"""Why nothing is OK: the observer hardly moves; one moves as the other; sensors were silent for
+most of it; the motion leaves the bearing open, or other solutions fit; nothing is exact enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where a peer was, over a flight. K keyframes or steps.
+
+    Parameters
+    ----------
+    time_s
+        (K,) times, seconds.
+    state
+        (K, 3) x, y (m) in the observer's horizontal frame, heading psi (rad).
+    covariance
+        (K, 3, 3) of the state.
+    status
+        (K,) OK, UNCONVERGED (not precise enough to label) or AMBIGUOUS (more than one
+        solution).
+    constants
+        (G,) what was constant, as in ``GLOBALS``; zeros where the method estimates none.
+    noise
+        What the sensors turned out to be like.
+    range_error_m
+        (K,) by how much the ranges were too long for a while, as behind something; None where the
+        method does not say.
+    refused
+        Why nothing is OK; None where something is.
+    constants_covariance
+        (G, G) of what was constant; None where the method does not say.
+    """
+
+    time_s: Array
+    state: Array
+    covariance: Array
+    status: Statuses
+    constants: Array
+    noise: Noise
+    range_error_m: Array | None = None
+    refused: Refused | None = None
+    constants_covariance: Array | None = None
+
+    def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
+        """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
+
+        Outside the flight the ends are held, and the status is UNCONVERGED at best.
+        """
+        place = np.interp(time_s, self.time_s, np.arange(len(self.time_s)))
+        low = np.clip(place.astype(int), 0, len(self.time_s) - 2)
+        share = (place - low)[:, None]
+        xy = self.state[low, :2] * (1 - share) + self.state[low + 1, :2] * share
+        part = share[..., None]
+        spread = self.covariance[low, :2, :2] * (1 - part) + self.covariance[low + 1, :2, :2] * part
+        status = np.maximum(self.status[low], self.status[low + 1])
+        outside = (time_s < self.time_s[0]) | (time_s > self.time_s[-1])
+        return xy, spread, np.where(outside, np.maximum(status, UNCONVERGED), status)
+
+
+def from_peer(state: Array) -> Array:
+    """(K, 3) the same states seen from the peer."""
+    out = -state
+    out[:, :2] = _apply(rotation(-state[:, 2]), out[:, :2])
+    return out
+
+
+def swapped(estimate: Estimate) -> Estimate:
+    """The same flight seen from the peer. The status stays that of the observer."""
+    state = from_peer(estimate.state)
+    # Seen from the peer p' = -R(-psi) p and psi' = -psi; the derivative of p' by psi is -Q p', with
+    # Q a quarter turn. First order: the covariance of the swapped state is J C J^T.
+    by_state = np.zeros((len(state), 3, 3))
+    by_state[:, :2, :2], by_state[:, 2, 2] = -rotation(-estimate.state[:, 2]), -1.0
+    by_state[:, :2, 2] = -state[:, :2] @ QUARTER.T
+    covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
+    constants = estimate.constants[SWAPPED]
+    constants[CLOCK] *= -1  # an offset between two clocks has the other sign from the other side
+    return replace(
+        estimate,
+        state=state,
+        covariance=covariance,
+        constants=constants,
+        constants_covariance=None,
+    )
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

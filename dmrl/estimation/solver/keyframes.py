@@ -1,0 +1,273 @@
+"""A pair cut into keyframes: what the filter, the smoother and the batch solve work on."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.estimation.model.odometry import Increments, odometry
+from dmrl.estimation.model.pair import LONGEST_GAP_S, Array, Mask, Pair
+from dmrl.estimation.signals.jump_detection import levels
+from dmrl.estimation.solver.camera_residuals import Looks, looks_of
+
+KEY_HZ = 10.0
+"""Keyframes per second."""
+BLOCK_S, REACH = 0.1, 3
+"""Ranges jump between medians of so many blocks of this length."""
+JUMP_M = 0.45
+"""Smaller ones are left to the solve."""
+SHIFT_S = 0.02
+"""Half the time difference behind the derivative by the peer's clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What the estimators believe about the sensors; one standard deviation each.
+
+    Parameters
+    ----------
+    velocity_std_mps, velocity_tau_s
+        Coloured noise of either robot's velocity, per axis, and its correlation time.
+    velocity_white_psd
+        White noise of either velocity: variance per second of integration, m^2/s.
+    yaw_rate_psd
+        White noise of either yaw rate, rad^2/s.
+    range_std_m
+        White noise of a range.
+    cauchy_m
+        Residual at which a range counts half.
+    range_error_std_m, range_tau_s
+        Coloured noise of the ranges, and its correlation time.
+    jump
+        A change of that noise this many standard deviations large counts half: it may jump.
+    free_m, free_weight
+        It may jump by anything, but mostly goes back to none: at every keyframe it is held against
+        zero with this weight, and counts half where it is so large.
+    bias_std_m, scale_std
+        Offset and scale of a pair's ranges.
+    gyro_std_radps
+        Bias of either yaw rate.
+    velocity_scale_std, velocity_bias_std_mps
+        Scale and bias of either velocity.
+    clock_std_s
+        Offset of the peer's clock.
+    height_std_m
+        Height difference.
+    gap_speed_mps, gap_turn_radps
+        How a robot may move while its sensors are silent, per square root of a second.
+    known_std
+        Of what is constant, in the order of ``GLOBALS``, where it is known from other flights;
+        empty where nothing is.
+    """
+
+    velocity_std_mps: float = 0.08
+    velocity_tau_s: float = 0.3
+    velocity_white_psd: float = 2e-4
+    yaw_rate_psd: float = 1e-5
+    range_std_m: float = 0.12
+    cauchy_m: float = 0.15
+    range_error_std_m: float = 0.02
+    range_tau_s: float = 200.0
+    jump: float = 1.0
+    free_m: float = 0.05
+    free_weight: float = 0.02
+    bias_std_m: float = 0.15
+    scale_std: float = 0.02
+    gyro_std_radps: float = 0.003
+    velocity_scale_std: float = 0.05
+    velocity_bias_std_mps: float = 0.02
+    clock_std_s: float = 0.02
+    height_std_m: float = 0.04
+    gap_speed_mps: float = 0.5
+    gap_turn_radps: float = 0.5
+    known_std: tuple[float, ...] = ()
+
+    @property
+    def velocity_psd(self) -> float:
+        """Either velocity's noise at low frequency: variance per second, m^2/s."""
+        return 2 * self.velocity_tau_s * self.velocity_std_mps**2 + self.velocity_white_psd
+
+    def graded(self, grade: float, constants: float | None = None) -> "Noise":
+        """The same with velocities this many times as noisy, and constants, as much if None."""
+        worse = grade if constants is None else constants
+        return replace(
+            self,
+            velocity_std_mps=self.velocity_std_mps * grade,
+            velocity_white_psd=self.velocity_white_psd * grade**2,
+            scale_std=self.scale_std * worse,
+            velocity_scale_std=self.velocity_scale_std * worse,
+        )
+
+    def with_range_noise(self, times: float) -> "Noise":
+        """The same with ranges this many times as noisy."""
+        return replace(self, range_std_m=self.range_std_m * times, cauchy_m=self.cauchy_m * times)
+
+    def prior_std(self) -> Array:
+        """(11,) of the globals, in the order of ``GLOBALS``."""
+        pairwise = [self.gyro_std_radps] * 2 + [self.velocity_scale_std] * 2
+        velocity = [self.velocity_bias_std_mps] * 4
+        usual = [self.bias_std_m, self.scale_std, *pairwise, *velocity, self.clock_std_s]
+        return np.minimum(usual, self.known_std or np.inf)
+
+
+GLOBALS = (
+    "range_bias_m",
+    "range_scale",
+    "own_gyro_bias_radps",
+    "peer_gyro_bias_radps",
+    "own_velocity_scale",
+    "peer_velocity_scale",
+    "own_vx_bias_mps",
+    "own_vy_bias_mps",
+    "peer_vx_bias_mps",
+    "peer_vy_bias_mps",
+    "peer_clock_s",
+)
+"""What is constant over a flight, in this order in every vector of globals."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A pair cut into K keyframes, with R ranges.
+
+    Parameters
+    ----------
+    key_s
+        (K,) times of the keyframes, seconds.
+    own, peer
+        K - 1 motions from a keyframe to the next.
+    peer_by_clock
+        (K - 1, 2) change of the peer's shift per second of clock offset, m/s.
+    gap_s
+        (K - 1,) share of the interval, in seconds, in which a robot's sensors were silent.
+    silent
+        (K,) whether any sensor of a robot, heights too, was silent for over half a second.
+    unheard
+        (K,) whether the ranges were.
+    range_key
+        (R,) keyframe at or before each range.
+    range_m
+        (R,) measured ranges, metres.
+    own_to_range, peer_to_range
+        R motions from that keyframe to the range.
+    range_level_m
+        (R,) by how much ranges seem to have jumped, metres: a first guess.
+    height_m
+        (R,) peer's height less the observer's, metres.
+    looks
+        What cameras saw; None: nothing.
+    known_std
+        As of the pair.
+    """
+
+    key_s: Array
+    own: Increments
+    peer: Increments
+    peer_by_clock: Array
+    gap_s: Array
+    silent: Mask
+    unheard: Mask
+    range_key: NDArray[np.intp]
+    range_m: Array
+    own_to_range: Increments
+    peer_to_range: Increments
+    range_level_m: Array
+    height_m: Array
+    looks: Looks | None = None
+    known_std: Array | None = None
+
+    @property
+    def steps_s(self) -> Array:
+        """(K - 1,) seconds between keyframes."""
+        return np.diff(self.key_s)
+
+
+def problem(pair: Pair, rate_hz: float = KEY_HZ) -> Problem:
+    """Keyframes of a pair.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    rate_hz
+        Keyframes per second.
+    """
+    grid = pair.time_s
+    count = max(2, int((grid[-1] - grid[0]) * rate_hz) + 1)
+    key_s = grid[0] + np.arange(count) / rate_hz
+    key_s = np.minimum(key_s, grid[-1])
+    own, peer = odometry(pair.own, grid), odometry(pair.peer, grid)
+    start, end = key_s[:-1], key_s[1:]
+    range_key = np.clip(np.searchsorted(key_s, pair.range_time_s, "right") - 1, 0, count - 1)
+    early, late = (np.clip(edge - SHIFT_S, grid[0], grid[-1]) for edge in (start, end))
+    early_2, late_2 = (np.clip(edge + SHIFT_S, grid[0], grid[-1]) for edge in (start, end))
+    before, after = peer.increments(early, late), peer.increments(early_2, late_2)
+    gap = np.interp(end, grid, np.cumsum((pair.own.gap | pair.peer.gap) * pair.dt_s))
+    height = pair.peer.height_m - pair.own.height_m
+    return Problem(
+        key_s=key_s,
+        own=own.increments(start, end),
+        peer=peer.increments(start, end),
+        peer_by_clock=(after.shift_m - before.shift_m) / (2 * SHIFT_S),
+        gap_s=np.diff(gap, prepend=0.0),
+        silent=silence(pair, key_s),
+        unheard=unheard(pair, key_s),
+        range_key=range_key,
+        range_m=pair.range_m,
+        own_to_range=own.increments(key_s[range_key], pair.range_time_s),
+        peer_to_range=peer.increments(key_s[range_key], pair.range_time_s),
+        range_level_m=range_levels(pair),
+        height_m=np.interp(pair.range_time_s, grid, height),
+        looks=looks_of(pair, key_s, Noise().height_std_m),
+        known_std=pair.known_std,
+    )
+
+
+def silence(pair: Pair, time_s: Array) -> Mask:
+    """(K,) whether a sensor of either robot was silent for over half a second.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    time_s
+        (K,) times asked for, seconds.
+    """
+    gap = pair.own.gap | pair.peer.gap
+    for track in (pair.own, pair.peer):
+        if track.height_gap is not None:
+            gap = gap | track.height_gap
+    low = np.clip(np.searchsorted(pair.time_s, time_s, "right") - 1, 0, len(gap) - 2)
+    return np.asarray(gap[low] | gap[low + 1])
+
+
+def unheard(pair: Pair, time_s: Array) -> Mask:
+    """(K,) whether the ranges were silent for over half a second.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    time_s
+        (K,) times asked for, seconds.
+    """
+    edges = np.concatenate([[-np.inf], pair.range_time_s, [np.inf]])
+    after = np.clip(np.searchsorted(edges, time_s), 1, len(edges) - 1)
+    return np.asarray(edges[after] - edges[after - 1] > LONGEST_GAP_S)
+
+
+def range_levels(pair: Pair) -> Array:
+    """(R,) by how much ranges jumped, metres.
+
+    Parameters
+    ----------
+    pair
+        What both measured.
+    """
+    if not len(pair.range_m):
+        return pair.range_m
+    block = ((pair.range_time_s - pair.time_s[0]) / BLOCK_S).astype(int)
+    blocks, inverse = np.unique(block, return_inverse=True)
+    ends = np.cumsum(np.bincount(inverse, minlength=len(blocks)))
+    middle = np.array([np.median(part) for part in np.split(pair.range_m, ends[:-1])])
+    return levels(middle, BLOCK_S, JUMP_M, REACH)[inverse]

@@ -1,0 +1,223 @@
+"""Residuals of a flight and their analytic Jacobians, by keyframe state and by global.
+
+A keyframe is (x, y, psi, wx, wy, b): w is the error of the measured relative velocity, in the
+observer's frame, which fades with its correlation time. White noise in its place would cost
+half of what the ranges tell. b is by how much ranges are too long at the time: what shadows a
+range shadows it for seconds.
+
+With s the velocity scales, the process residual is divided by 1 / (1 + s): without that, a
+scale that shrinks the path shrinks the noise with it and is always welcome.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmrl.estimation.filters.keyframe_ekf import QUARTER
+from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.camera_residuals import Seen, seen
+from dmrl.estimation.solver.keyframes import GLOBALS, Noise, Problem
+
+BIAS, SCALE, OWN_GYRO, PEER_GYRO, OWN_SCALE, PEER_SCALE = range(6)
+SIZE = 6
+RANGED = [0, 1, 2, 5]
+"""States that a range depends on."""
+RANGE_ERROR = 5
+"""Of states and of the residuals of a step."""
+METRIC = [0, 1, 3, 4]
+"""Residuals of a step that the velocity scales divide."""
+OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
+OF_OBSERVER = [OWN_GYRO, OWN_SCALE, 6, 7]
+"""Places among ``GLOBALS`` of what is the observer's alone; ``pair.SWAPPED`` of them the peer's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """Whitened residuals and Jacobians at one solution. K keyframes, R ranges, G globals.
+
+    Each Jacobian stands beside its residuals in one array, so that all products of a row come
+    from one multiplication.
+
+    Parameters
+    ----------
+    steps
+        (K - 1, 6, 6 + 6 + G + 1) of x, y, psi, wx, wy, b between neighbouring keyframes: by the
+        keyframe before, by the one after, by the globals; the residual.
+    ranges
+        (R, 4 + 2 + 1) by x, y, psi, b; by bias and scale of the ranges; the residual.
+    error_m
+        (K,) b, metres.
+    seen
+        What cameras saw; None: nothing.
+    """
+
+    steps: Array
+    ranges: Array
+    error_m: Array
+    seen: Seen | None = None
+
+    @property
+    def step(self) -> Array:
+        """(K - 1, 6) residuals of the steps."""
+        return self.steps[..., -1]
+
+    @property
+    def range(self) -> Array:
+        """(R,) residuals of the ranges."""
+        return self.ranges[:, -1]
+
+
+def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) -> Linear:
+    """Residuals and Jacobians.
+
+    Parameters
+    ----------
+    problem, noise
+        The flight, and what is believed about its sensors.
+    state
+        (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m).
+    constants
+        (G,) as in ``GLOBALS``.
+    """
+    steps = _steps(problem, noise, state, constants)
+    ranges = _ranges(problem, noise, state, constants)
+    looked = None if problem.looks is None else seen(problem.looks, state)
+    return Linear(steps, ranges, state[:, RANGE_ERROR], looked)
+
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """What the steps between keyframes do under a solution. S = K - 1 steps.
+
+    ``own_gain`` and ``peer_gain`` are 1 / (1 + scale) of either velocity; ``own`` and ``peer``
+    (S, 2) the corrected shifts and ``own_turn``, ``peer_turn`` (S,) turns; ``heading`` and
+    ``turned`` (S, 2, 2) rotate by the peer's heading and by the observer's turn; ``ahead`` and
+    ``error_ahead`` (S, 2) are the next keyframe's position and velocity error seen from this one;
+    ``half_s``, ``kept`` and ``range_kept`` (S, 1) half the step's time and what it leaves of a
+    velocity error and of a range's.
+    """
+
+    own_gain: float
+    peer_gain: float
+    own: Array
+    peer: Array
+    own_turn: Array
+    peer_turn: Array
+    heading: Array
+    turned: Array
+    ahead: Array
+    error_ahead: Array
+    half_s: Array
+    kept: Array
+    range_kept: Array
+
+
+def _moves(problem: Problem, noise: Noise, state: Array, constants: Array) -> _Steps:
+    steps_s = problem.steps_s
+    own_gain, peer_gain = 1 / (1 + constants[[OWN_SCALE, PEER_SCALE]])
+    clock = problem.peer_by_clock * constants[CLOCK]
+    biased = problem.peer.drift_s @ constants[PEER_VELOCITY]
+    heading = rotation(state[:-1, 2])
+    own_turn = problem.own.turn_rad - constants[OWN_GYRO] * steps_s
+    turned = rotation(own_turn)
+    return _Steps(
+        own_gain,
+        peer_gain,
+        own=own_gain * (problem.own.shift_m - problem.own.drift_s @ constants[OWN_VELOCITY]),
+        peer=_apply(heading, peer_gain * (problem.peer.shift_m + clock - biased)),
+        own_turn=own_turn,
+        peer_turn=problem.peer.turn_rad - constants[PEER_GYRO] * steps_s,
+        heading=heading,
+        turned=turned,
+        ahead=_apply(turned, state[1:, :2]),
+        error_ahead=_apply(turned, state[1:, 3:5]),
+        half_s=steps_s[:, None] / 2,
+        kept=np.exp(-steps_s / noise.velocity_tau_s)[:, None],
+        range_kept=np.exp(-steps_s / noise.range_tau_s)[:, None],
+    )
+
+
+def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> Array:
+    moves = _moves(problem, noise, state, constants)
+    share = np.sqrt((moves.own_gain**2 + moves.peer_gain**2) / 2)
+    weight = 1 / np.sqrt(step_variance(problem, noise))
+    weight[:, METRIC] /= share
+    out = np.zeros((len(moves.own), SIZE, 2 * SIZE + len(GLOBALS) + 1))
+    by_start, by_end, by_globals = np.split(out[..., :-1], [SIZE, 2 * SIZE], axis=2)
+    out[..., -1] = _residual(moves, state)
+    _by_states(moves, by_start, by_end)
+    _by_globals(moves, problem, by_globals)
+    out *= weight[:, :, None]
+    # The division by the share depends on the scales too.
+    for column, gain in ((OWN_SCALE, moves.own_gain), (PEER_SCALE, moves.peer_gain)):
+        by_globals[:, METRIC, column] += out[:, METRIC, -1] * gain**3 / (2 * share**2)
+    return out
+
+
+def _residual(moves: _Steps, state: Array) -> Array:
+    error = state[:-1, 3:5]
+    # Relative motion in the observer's frame: p' = p + peer's way - own way + half_s (w + w'), the
+    # velocity's error by the trapezium rule. psi is the peer's heading less the observer's.
+    shift = moves.ahead - state[:-1, :2] - moves.peer + moves.own
+    shift = shift - moves.half_s * (error + moves.error_ahead)
+    turn = state[1:, 2] - state[:-1, 2] - moves.peer_turn + moves.own_turn
+    # Gauss-Markov: what is left of an error after a step, and new noise, which is the residual.
+    longer = state[1:, RANGE_ERROR:] - moves.range_kept * state[:-1, RANGE_ERROR:]
+    return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error, longer])
+
+
+def _by_states(moves: _Steps, by_start: Array, by_end: Array) -> None:
+    """Fill in (S, 6, 6) zeros each."""
+    by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
+    by_start[:, :2, 2] = -moves.peer @ QUARTER.T
+    by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -moves.half_s, -moves.kept
+    by_start[:, RANGE_ERROR, RANGE_ERROR] = -moves.range_kept[:, 0]
+    by_end[:, :2, :2] = by_end[:, 3:5, 3:5] = moves.turned
+    by_end[:, :2, 3:5] = -moves.half_s[:, None] * moves.turned
+    by_end[:, 2, 2] = by_end[:, RANGE_ERROR, RANGE_ERROR] = 1.0
+
+
+def _by_globals(moves: _Steps, problem: Problem, out: Array) -> None:
+    """Fill in (S, 6, G) zeros."""
+    steps_s, heading = problem.steps_s, moves.heading
+    moved = moves.ahead - moves.half_s * moves.error_ahead
+    out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER.T)
+    out[:, 3:5, OWN_GYRO] = -steps_s[:, None] * (moves.error_ahead @ QUARTER.T)
+    out[:, 2, OWN_GYRO], out[:, 2, PEER_GYRO] = -steps_s, steps_s
+    out[:, :2, OWN_SCALE] = -moves.own_gain * moves.own
+    out[:, :2, PEER_SCALE] = moves.peer_gain * moves.peer
+    out[:, :2, OWN_VELOCITY] = -moves.own_gain * problem.own.drift_s
+    out[:, :2, PEER_VELOCITY] = moves.peer_gain * (heading @ problem.peer.drift_s)
+    out[:, :2, CLOCK] = -moves.peer_gain * _apply(heading, problem.peer_by_clock)
+
+
+def step_variance(problem: Problem, noise: Noise) -> Array:
+    """(K - 1, 6) variance of each step's residuals, before whitening."""
+    steps_s = problem.steps_s
+    shift = 2 * noise.velocity_white_psd * steps_s + noise.gap_speed_mps**2 * problem.gap_s
+    turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * problem.gap_s
+    faded = 1 - np.exp(-2 * steps_s / noise.velocity_tau_s)
+    error = 2 * noise.velocity_std_mps**2 * faded
+    longer = noise.range_error_std_m**2 * (1 - np.exp(-2 * steps_s / noise.range_tau_s))
+    return np.column_stack([shift, shift, turn, error, error, longer])
+
+
+def _ranges(problem: Problem, noise: Noise, state: Array, constants: Array) -> Array:
+    at = state[problem.range_key]
+    peer = _apply(rotation(state[:, 2])[problem.range_key], problem.peer_to_range.shift_m)
+    offset = at[:, :2] + peer - problem.own_to_range.shift_m
+    distance = np.sqrt((offset**2).sum(axis=1) + problem.height_m**2) + 1e-6
+    towards = offset / distance[:, None]
+    gain = 1 + constants[SCALE]
+    out = np.empty((len(at), 7))
+    out[:, :2] = -gain * towards
+    out[:, 2] = gain * (towards[:, 0] * peer[:, 1] - towards[:, 1] * peer[:, 0])
+    out[:, 3] = -1.0
+    out[:, 4 + BIAS], out[:, 4 + SCALE] = -1.0, -distance
+    out[:, -1] = problem.range_m - gain * distance - constants[BIAS] - at[:, RANGE_ERROR]
+    return out / noise.range_std_m
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return matrices[..., 0] * vectors[:, :1] + matrices[..., 1] * vectors[:, 1:]

@@ -1,0 +1,1 @@
+"""Track detected peers over time."""

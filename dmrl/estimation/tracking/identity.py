@@ -1,0 +1,70 @@
+"""Which robot a track is: the one whose measured distance keeps fitting."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from dmrl.estimation.tracking.tracker import Track
+
+RANGE_STD_M = 0.2
+"""Error of a UWB range, its bias included."""
+MEMORY_S = 2.0
+WORST = 9.0
+"""Misfit of a range, in variances, beyond which it counts no more: a detour."""
+FITS, CLEARER = 4.0, 1.5
+"""Mean misfit of a name that can be right; how much worse every other name must fit."""
+
+
+class Identity:
+    """Names of one observer's tracks, from the ranges to its peers."""
+
+    def __init__(self) -> None:
+        self._misfit: dict[tuple[int, str], float] = {}
+
+    def names(
+        self, tracks: Iterable[Track], range_m: Mapping[str, float], dt_s: float
+    ) -> dict[int, str]:
+        """Name by number of those tracks whose robot is clear.
+
+        Parameters
+        ----------
+        tracks
+            All that are confirmed.
+        range_m
+            Measured distance by peer; peers that were not heard are missing.
+        dt_s
+            Seconds since the last call.
+        """
+        tracks = list(tracks)
+        fresh = 1 - np.exp(-dt_s / MEMORY_S)
+        for track in tracks:
+            for peer, measured_m in range_m.items():
+                key = track.number, peer
+                before = self._misfit.get(key)
+                now = _misfit(track, measured_m)
+                self._misfit[key] = now if before is None else before + fresh * (now - before)
+        alive = {track.number for track in tracks}
+        self._misfit = {key: value for key, value in self._misfit.items() if key[0] in alive}
+        return self._assigned(tracks)
+
+    def _assigned(self, tracks: list[Track]) -> dict[int, str]:
+        peers = sorted({peer for _, peer in self._misfit})
+        cost = np.full((len(tracks), len(peers)), WORST)
+        for k, track in enumerate(tracks):
+            for j, peer in enumerate(peers):
+                cost[k, j] = self._misfit.get((track.number, peer), WORST)
+        out = {}
+        for k, j in zip(*linear_sum_assignment(cost), strict=True):
+            others = np.delete(cost[k], j)
+            if cost[k, j] < FITS and (others > cost[k, j] + CLEARER).all():
+                out[tracks[k].number] = peers[j]
+        return out
+
+
+def _misfit(track: Track, measured_m: float) -> float:
+    """Squared difference of a range from the track's distance, over its variance."""
+    distance_m = max(float(np.linalg.norm(track.position_m)), 1e-3)
+    along = track.position_m / distance_m
+    variance = RANGE_STD_M**2 + float(along @ track.covariance @ along)
+    return min((measured_m - distance_m) ** 2 / variance, WORST)

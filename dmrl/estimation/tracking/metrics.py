@@ -1,0 +1,141 @@
+"""Errors of tracks against the ground truth, beside those of single images."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from dmrl.estimation.model.metrics import ErrorTrace
+from dmrl.geometry.frames import Array
+
+NEAR_M = 1.0
+"""A track further from every peer than this is nobody's."""
+CHI2_95_OF_3 = 7.815
+
+DEFINITIONS = {
+    "in_view": "true positions of peers inside the image, one for each peer and image",
+    "rmse_m": "root of the mean squared 3D error of the tracks; N peers in view are matched one "
+    "to one to tracks, least total distance",
+    "single_rmse_m": "the same of detections, each put into 3D by its own image alone: the N most "
+    "confident of the image, matched in the same way; over the peers that also have a track",
+    "reduction": "by how much less the tracks' is, over that of the detections",
+    "median_m, single_median_m": "medians of those errors",
+    "coverage_95": "share of those peers inside their track's 95 % ellipsoid",
+    "nees": "mean of the squared error over its covariance; 3 if that is honest",
+    "followed, detected": "share of the peers in view with a track, a detection within "
+    f"{NEAR_M:g} m",
+    "false_tracks_per_min": f"tracks more than {NEAR_M:g} m from every peer, in view or not, for "
+    "more than half of their life, a minute",
+    "named_right": "share of the named tracks of peers in view that bear the right name",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What one observer's tracks are worth, one row for each peer in view of an image.
+
+    Parameters
+    ----------
+    robot
+        The observer.
+    time_s
+        (N,) from the first image.
+    peer, named
+        (N,) which peer it is, and the name of its track; empty where it has none.
+    error_m, single_error_m
+        (N, 3) of the track and of the detection matched to it; NaN where there is none.
+    covariance
+        (N, 3, 3) of the track, m^2.
+    false_tracks
+        How many were nobody's.
+    length_s
+        Time between the first and the last image.
+    """
+
+    robot: str
+    time_s: Array
+    peer: list[str]
+    named: list[str]
+    error_m: Array
+    single_error_m: Array
+    covariance: Array
+    false_tracks: int
+    length_s: float
+
+    @property
+    def trace(self) -> ErrorTrace:
+        """Errors over time, the tracks' apart from those of single images."""
+        errors = {"single images": self.single_error_m, "tracks": self.error_m}
+        sigma_m = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        title, name = f"{self.robot}: tracks minus truth", f"track-error-{self.robot}"
+        return ErrorTrace(title, name, self.time_s, sigma_m, errors)
+
+
+def assigned(truth_m: Array, found_m: Array, radius_m: float = math.inf) -> NDArray[np.int64]:
+    """(J,) which of (D, 3) positions belongs to each of (J, 3) true ones, -1 for none.
+
+    Parameters
+    ----------
+    truth_m, found_m
+        Positions, metres; NaN: not known, and matched to nothing.
+    radius_m
+        Largest distance of the two.
+    """
+    out = np.full(len(truth_m), -1, np.int64)
+    distance_m = np.linalg.norm(truth_m[:, None] - found_m, axis=-1)
+    distance_m = np.where(distance_m <= radius_m, distance_m, 1e6)
+    rows, columns = linear_sum_assignment(distance_m)
+    near = distance_m[rows, columns] < 1e6
+    out[rows[near]] = columns[near]
+    return out
+
+
+def figures(judged: Judged, settle_s: float) -> dict[str, float | None]:
+    """What ``DEFINITIONS`` explains; None where there is nothing to measure.
+
+    Parameters
+    ----------
+    judged
+        Tracks beside the truth.
+    settle_s
+        Images before this time do not count, but for false tracks.
+    """
+    late = judged.time_s >= settle_s
+    error_m, single_m = judged.error_m[late], judged.single_error_m[late]
+    size_m, single_size_m = (np.linalg.norm(e, axis=1) for e in (error_m, single_m))
+    both = np.isfinite(size_m) & np.isfinite(single_size_m)
+    tracked = np.isfinite(size_m)
+    inverse = np.linalg.inv(judged.covariance[late][tracked])
+    squared = np.einsum("ni,nij,nj->n", error_m[tracked], inverse, error_m[tracked])
+    rmse_m, single_rmse_m = _root(size_m[both]), _root(single_size_m[both])
+    names = zip(judged.named, judged.peer, late, strict=True)
+    values = {
+        "in_view": float(late.sum()),
+        "rmse_m": rmse_m,
+        "single_rmse_m": single_rmse_m,
+        "reduction": 1 - rmse_m / single_rmse_m if single_rmse_m else math.nan,
+        "median_m": _median(size_m[both]),
+        "single_median_m": _median(single_size_m[both]),
+        "coverage_95": _mean(squared <= CHI2_95_OF_3),
+        "nees": _mean(squared),
+        "followed": _mean(size_m <= NEAR_M),
+        "detected": _mean(single_size_m <= NEAR_M),
+        "false_tracks_per_min": judged.false_tracks / (judged.length_s / 60 or math.nan),
+        "named_right": _mean(np.array([name == peer for name, peer, ok in names if name and ok])),
+    }
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def _root(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else math.nan
+
+
+def _mean(values: NDArray[Any]) -> float:
+    return float(np.mean(values)) if len(values) else math.nan

@@ -1,0 +1,290 @@
+"""Peers followed over time: detections in, tracks with covariance out. Arrays only.
+
+One extended Kalman filter (filterpy's) per track. State: position of the peer and its velocity
+over ground, both along the axes of the observer's horizontal frame, and the share by which the
+network misjudges this peer's depth at the moment. That error stays for seconds, since the
+picture hardly changes; taken for white noise it would make every track too sure of itself.
+
+Birth, confirmation and death follow the score of a track: the log of how much more likely its
+detections are if it is a peer than if they are false alarms (Blackman and Popoli 1999, 6.2).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from dmrl.estimation.tracking.detections import Motion, View
+from dmrl.geometry.frames import (
+    Array,
+    Camera,
+    horizontal_from_pixels,
+    inside,
+    pixels_from_horizontal,
+)
+
+P, V, BIAS = slice(0, 3), slice(3, 6), 6
+DEPTH_SPAN = np.log(20.0)
+"""False alarms have any depth from near to twenty times that, evenly in its logarithm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """What the tracker expects of detector, robots and sensors.
+
+    Parameters
+    ----------
+    pixel_std_px
+        Error of a detection in u and in v.
+    depth_std_ratio, depth_bias_ratio, depth_bias_s
+        Error of a detection's depth over the depth: what is new in every image, where the
+        detection does not say; what stays; for how long it stays.
+    speed_std_mps, acceleration_std_mps2
+        How fast a peer is when first seen, and how it changes its velocity (in a second).
+    own_velocity_std_mps, yaw_rate_std_radps, attitude_std_rad
+        Errors of the observer's own sensors; those of roll and pitch last for one image.
+    detection_share
+        Share of the images with a peer in view that it is detected in, 0 to 1.
+    false_per_image
+        False alarms per image, on average.
+    gate
+        Share of a peer's own detections that are let through to it, 0 to 1.
+    confirm_odds, lost_odds
+        Odds that a track is a peer, from which it counts; and by which they may fall again.
+    lost_std_m
+        A track whose position is this uncertain is given up.
+    """
+
+    pixel_std_px: float = 4.0
+    depth_std_ratio: float = 0.12
+    depth_bias_ratio: float = 0.08
+    depth_bias_s: float = 2.0
+    speed_std_mps: float = 0.7
+    acceleration_std_mps2: float = 0.8
+    own_velocity_std_mps: float = 0.1
+    yaw_rate_std_radps: float = 0.05
+    attitude_std_rad: float = 0.015
+    detection_share: float = 0.7
+    false_per_image: float = 0.3
+    gate: float = 0.997
+    confirm_odds: float = 1e6
+    lost_odds: float = 1e4
+    lost_std_m: float = 1.0
+
+
+class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
+    """filterpy's EKF; its prediction is linear, with the observer's shift as the input."""
+
+    def __init__(self, state: Array, covariance: Array) -> None:
+        super().__init__(dim_x=7, dim_z=3)
+        self.x, self.P = state, covariance
+
+    def predict_x(self, u: Array) -> None:
+        """Move the state; filterpy's ``predict`` then moves the covariance by F and Q."""
+        self.x = self.F @ self.x + u
+
+
+@dataclass(slots=True)
+class Track:
+    """One peer, followed.
+
+    Parameters
+    ----------
+    number
+        Stays the same while the track lives.
+    filter
+        Its state and covariance.
+    score, best
+        Log odds that it is a peer, now and at their highest.
+    confirmed
+        Whether the odds were ever high enough.
+    """
+
+    number: int
+    filter: _Filter
+    score: float = 0.0
+    best: float = field(default=-np.inf)
+    confirmed: bool = False
+
+    @property
+    def position_m(self) -> Array:
+        """(3,) in the observer's horizontal frame."""
+        return np.asarray(self.filter.x[P])
+
+    @property
+    def velocity_mps(self) -> Array:
+        """(3,) over ground, along the axes of that frame."""
+        return np.asarray(self.filter.x[V])
+
+    @property
+    def covariance(self) -> Array:
+        """(3, 3) of the position, m^2."""
+        return np.asarray(self.filter.P[P, P])
+
+
+class Tracker:
+    """Tracks of one observer.
+
+    Parameters
+    ----------
+    camera
+        The observer's; ``distortion`` empty if the images have none any more.
+    tuning
+        See `Tuning`.
+    """
+
+    def __init__(self, camera: Camera, tuning: Tuning) -> None:
+        self.camera, self.tuning = camera, tuning
+        self.tracks: list[Track] = []
+        self._born = 0
+        area = camera.width_px * camera.height_px * DEPTH_SPAN
+        self._false_density = tuning.false_per_image / area
+        self._gate = float(chi2.ppf(tuning.gate, 3))
+
+    def step(self, motion: Motion, view: View) -> list[Track]:
+        """Confirmed tracks after the observer has moved and taken another image.
+
+        Parameters
+        ----------
+        motion
+            Since the last image.
+        view
+            What was detected in this one, and the attitude.
+        """
+        for track in self.tracks:
+            self._predict(track, motion)
+        free = self._associate(view)
+        self._bury()
+        self._bear(view, free)
+        return [track for track in self.tracks if track.confirmed]
+
+    def _predict(self, track: Track, motion: Motion) -> None:
+        """Constant velocity over ground, seen from a frame that moves and turns."""
+        t, dt = self.tuning, motion.dt_s
+        c, s = np.cos(motion.turn_rad), np.sin(motion.turn_rad)
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # new from old axes
+        # The depth error is a first-order Gauss-Markov process: it fades with ``depth_bias_s``,
+        # and its noise below makes up for that, so that its variance stays.
+        keep = np.exp(-dt / t.depth_bias_s)
+        ekf = track.filter
+        ekf.F = np.zeros((7, 7))
+        ekf.F[P, P], ekf.F[P, V], ekf.F[V, V], ekf.F[BIAS, BIAS] = turn, dt * turn, turn, keep
+        x, y, _ = ekf.x[P]
+        # A wrong yaw rate moves the peer sideways, the more the further away it is.
+        across = np.array([y, -x, 0.0]) * t.yaw_rate_std_radps * dt
+        own = (t.own_velocity_std_mps * dt) ** 2 * np.diag([1.0, 1.0, 0.0])
+        power = t.acceleration_std_mps2**2 * np.eye(3)
+        # White noise of acceleration, integrated over dt (Bar-Shalom et al. 2001, 6.2).
+        ekf.Q = np.zeros((7, 7))
+        ekf.Q[P, P] = power * dt**3 / 3 + own + np.outer(across, across)
+        ekf.Q[P, V] = ekf.Q[V, P] = power * dt**2 / 2
+        ekf.Q[V, V] = power * dt
+        ekf.Q[BIAS, BIAS] = t.depth_bias_ratio**2 * (1 - keep**2)
+        shift = np.zeros(7)
+        shift[P] = -turn @ motion.shift_m
+        ekf.predict(shift)
+
+    def _measured(self, track: Track, view: View) -> tuple[Array, Array, Array]:
+        """(3,) expected u, v, log depth; (3, 7) its Jacobian; (3, 3) noise but for the depth's."""
+        t = self.tuning
+        attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
+        uv, depth_m, by = pixels_from_horizontal(track.position_m[None], *attitude, self.camera)
+        # The logarithm, because the error of a depth grows with it. Its derivative is 1 / depth.
+        by = by[0] / np.array([[1.0], [1.0], [depth_m[0]]])
+        row = np.zeros((3, 7))
+        row[:, P], row[2, BIAS] = by[:, :3], 1.0
+        white = np.diag([t.pixel_std_px**2, t.pixel_std_px**2, 0.0])
+        noise = white + t.attitude_std_rad**2 * by[:, 3:] @ by[:, 3:].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.array([*uv[0], np.log(depth_m[0]) + track.filter.x[BIAS]]), row, noise
+
+    def _of_depth(self, view: View) -> Array:
+        """(N, 3, 3) noise of each detection's log depth."""
+        ratio = np.full(len(view.depth_m), self.tuning.depth_std_ratio)
+        if view.sigma_depth_m is not None:
+            known = view.sigma_depth_m > 0
+            ratio[known] = view.sigma_depth_m[known] / view.depth_m[known]
+        noise = np.zeros((len(ratio), 3, 3))
+        noise[:, 2, 2] = ratio**2
+        return noise
+
+    def _associate(self, view: View) -> list[int]:
+        """Give every track the detection that suits it best; return those nobody took."""
+        seen = np.column_stack([view.uv, np.log(view.depth_m)])
+        of_depth = self._of_depth(view)
+        expected = [self._measured(track, view) for track in self.tracks]
+        gain = np.full((len(self.tracks), len(seen)), -np.inf)
+        for k, (track, (mean, row, noise)) in enumerate(zip(self.tracks, expected, strict=True)):
+            if np.isfinite(mean).all():
+                spread = row @ track.filter.P @ row.T + noise + of_depth
+                gain[k] = self._likelihood(seen - mean, spread)
+        free = set(range(len(seen)))
+        # The solver refuses rows without any finite entry, so "never" is a large loss here.
+        rows, columns = linear_sum_assignment(np.maximum(gain, -1e6), maximize=True)
+        taken = {k: j for k, j in zip(rows, columns, strict=True) if np.isfinite(gain[k, j])}
+        for k, track in enumerate(self.tracks):
+            mean, row, noise = expected[k]
+            if k in taken:
+                free.discard(taken[k])
+                self._update(track, seen[taken[k]], mean, row, noise + of_depth[taken[k]])
+                track.score += gain[k, taken[k]]
+            # Unseen counts against a peer only where the camera looks.
+            elif np.isfinite(mean).all() and self._in_view(mean):
+                track.score += np.log1p(-self.tuning.detection_share)
+        return sorted(free)
+
+    def _likelihood(self, difference: Array, spread: Array) -> Array:
+        """(N,) log of how much likelier detections are from a track; -inf outside its gate."""
+        squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
+        density = -0.5 * (squared + np.linalg.slogdet(2 * np.pi * spread)[1])
+        ratio = np.log(self.tuning.detection_share / self._false_density) + density
+        return np.where(squared <= self._gate, ratio, -np.inf)
+
+    def _in_view(self, mean: Array) -> bool:
+        return bool(inside(mean[None, :2], self.camera.width_px, self.camera.height_px)[0])
+
+    def _update(self, track: Track, seen: Array, mean: Array, row: Array, noise: Array) -> None:
+        track.filter.update(seen, lambda _: row, lambda _: mean, R=noise)
+        assert track.filter.x.shape == (7,), "filterpy changed the state's shape"
+
+    def _bury(self) -> None:
+        """Forget tracks that their peers have left."""
+        allowed = np.log(self.tuning.lost_odds)
+        kept = []
+        for track in self.tracks:
+            track.best = max(track.best, track.score)
+            track.confirmed |= track.score >= np.log(self.tuning.confirm_odds)
+            spread_m = np.sqrt(np.linalg.eigvalsh(track.covariance)[-1])
+            # A newborn may lose no more than it was born with.
+            lost = track.best - track.score > (allowed if track.confirmed else track.best)
+            if not lost and spread_m < self.tuning.lost_std_m:
+                kept.append(track)
+        self.tracks = kept
+
+    def _bear(self, view: View, free: Sequence[int]) -> None:
+        """Start a track at every detection that no track explains."""
+        t = self.tuning
+        attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
+        of_depth = self._of_depth(view)
+        for k in free:
+            at = view.uv[k : k + 1], view.depth_m[k : k + 1]
+            xyz = horizontal_from_pixels(*at, *attitude, self.camera)[0]
+            if not np.isfinite(xyz).all():
+                continue
+            ekf = _Filter(np.array([*xyz, 0.0, 0.0, 0.0, 0.0]), np.zeros((7, 7)))
+            ekf.P[V, V] = t.speed_std_mps**2 * np.eye(3)
+            ekf.P[BIAS, BIAS] = t.depth_bias_ratio**2
+            track = Track(self._born, ekf)
+            _, row, noise = self._measured(track, view)
+            noise += of_depth[k]
+            noise[2, 2] += t.depth_bias_ratio**2
+            # The first position is the detection turned round: position = inverse of (seen - bias).
+            # So it carries the noise of the pixels, and its bias with the sign reversed.
+            by_pixel = np.linalg.inv(row[:, P])
+            ekf.P[P, P] = by_pixel @ noise @ by_pixel.T
+            ekf.P[P, BIAS] = ekf.P[BIAS, P] = -by_pixel[:, 2] * t.depth_bias_ratio**2
+            self._born += 1
+            self.tracks.append(track)

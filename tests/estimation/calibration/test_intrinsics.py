@@ -1,0 +1,122 @@
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from dmrl.estimation.calibration import intrinsics as board
+from dmrl.estimation.calibration.intrinsics import Intrinsics, corners, intrinsics
+from dmrl.geometry.frames import AIDECK, Array, Camera
+
+from ..boards import COLUMNS, ROWS, Look, corners_of, lens, picture, pose
+
+
+def shown(camera: Camera, rng: np.random.Generator, views: int) -> list[tuple[Array, Array]]:
+    """Found and true corners of some views."""
+    pairs = []
+    for _ in range(views):
+        at = pose(rng, camera)
+        look = Look(rng.uniform(0.3, 1.2), rng.uniform(0.5, 4.0), rng.uniform(15, 50))
+        found = corners(picture(*at, camera, look, rng), COLUMNS, ROWS)
+        true = corners_of(*at, camera)
+        if found is not None:
+            turned = np.abs(found[0] - true[0]).max() > np.abs(found[-1] - true[0]).max()
+            pairs.append((found[::-1] if turned else found, true))
+    return pairs
+
+
+def calibrated(camera: Camera, pairs: list[tuple[Array, Array]]) -> Intrinsics:
+    boards = [np.ascontiguousarray(found, np.float32) for found, _ in pairs]
+    return intrinsics(boards, (COLUMNS, ROWS), (camera.width_px, camera.height_px))
+
+
+def normalised(camera: Camera, made: Intrinsics) -> Array:
+    """(4,) errors of focal lengths and centre over the sigmas they are given with."""
+    found = made.camera
+    errors = np.subtract(
+        (found.fx_px, found.fy_px, found.cx_px, found.cy_px),
+        (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px),
+    )
+    return np.asarray(errors / (*made.focal_std_px, *made.centre_std_px))
+
+
+def test_the_same_boards_give_the_same_digits_each_time() -> None:
+    rng = np.random.default_rng(0)
+    seen = [corners_of(*pose(rng)) for _ in range(8)]
+    views = [(at + rng.normal(0, 0.1, at.shape)).astype(np.float32) for at in seen]
+    made = [intrinsics(views, (COLUMNS, ROWS), (320, 224)) for _ in range(50)]
+    assert len({one.camera for one in made}) == 1
+
+
+def test_exact_corners_give_the_exact_camera() -> None:
+    rng = np.random.default_rng(3)
+    seen = [(corners_of(*pose(rng)),) * 2 for _ in range(8)]
+    made = calibrated(AIDECK, seen)
+    for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
+        assert getattr(made.camera, name) == pytest.approx(getattr(AIDECK, name), abs=0.02)
+    assert made.rms_px < 1e-3
+
+
+@pytest.mark.heavy
+def test_a_drawn_board_gives_the_camera_that_drew_it() -> None:
+    pairs = shown(AIDECK, np.random.default_rng(0), 10)
+    assert len(pairs) >= 8
+    made = calibrated(AIDECK, pairs)
+    assert made.camera.fx_px == pytest.approx(AIDECK.fx_px, rel=0.005)
+    assert made.camera.fy_px == pytest.approx(AIDECK.fy_px, rel=0.005)
+    assert made.camera.cx_px == pytest.approx(AIDECK.cx_px, abs=0.7)
+    assert made.camera.cy_px == pytest.approx(AIDECK.cy_px, abs=0.7)
+    assert np.abs(normalised(AIDECK, made)).max() < 4
+    assert (made.camera.width_px, made.camera.height_px) == (320, 224)
+
+
+@pytest.mark.heavy
+def test_corners_are_found_to_a_twentieth_of_a_pixel() -> None:
+    pairs = shown(AIDECK, np.random.default_rng(1), 8)
+    errors = np.concatenate([found - true for found, true in pairs])
+    assert np.sqrt((errors**2).mean()) < 0.06
+    assert np.abs(errors).max() < 0.4
+
+
+def test_a_large_picture_is_looked_at_smaller_and_measured_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(1)
+    at = pose(rng)
+    grey = picture(*at)
+    whole = corners(grey, COLUMNS, ROWS)
+    monkeypatch.setattr(board, "LARGE_PIXELS", grey.size // 3)
+    monkeypatch.setattr(board.cv2, "findChessboardCornersSB", _only(grey.size // 4 + 1))
+    found = corners(grey, COLUMNS, ROWS)
+    assert whole is not None and found is not None
+    assert np.abs(found - whole).max() < 0.05
+    assert corners(grey[:1], COLUMNS, ROWS) is None
+
+
+def _only(pixels: int) -> Callable[..., Any]:
+    """OpenCV's detector, for small pictures."""
+    detect = board.cv2.findChessboardCornersSB
+
+    def detect_small(grey: Any, *given: Any, **named: Any) -> Any:
+        assert grey.size <= pixels
+        return detect(grey, *given, **named)
+
+    return detect_small
+
+
+@pytest.mark.slow
+def test_sigmas_of_thirty_lenses_hold() -> None:
+    squares = []
+    for seed in range(30):
+        rng = np.random.default_rng(100 + seed)
+        camera = lens(rng)
+        squares.append(normalised(camera, calibrated(camera, shown(camera, rng, 12))) ** 2)
+    low, high = chi2.ppf((0.025, 0.975), 30) / 30
+    for mean in np.mean(squares, axis=0):
+        assert low < mean < high
+
+
+def test_a_picture_without_a_board_has_no_corners() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (224, 320), np.uint8)
+    assert corners(noise, COLUMNS, ROWS) is None

@@ -1,0 +1,246 @@
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from dmrl import messages
+from dmrl.estimation.flight import pairs as entrance
+from dmrl.estimation.flight.initial_guesses import Starts
+from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
+from dmrl.estimation.model import status as room
+from dmrl.estimation.model.pair import Pair, Track
+from dmrl.estimation.solver.estimate import Estimate, from_peer, swapped
+from dmrl.estimation.solver.keyframes import GLOBALS, Noise
+from dmrl.estimation.solver.levenberg_marquardt import Solution
+from dmrl.estimation.solver.residuals import BIAS
+from dmrl.flight import Trajectory
+
+from ..flights import flown, pair_of, truth_at
+
+LONG_S = 60.0
+Both = tuple[Estimate, Estimate]
+Method = Literal["batch", "smoother"]
+
+
+@cache
+def solved(trajectory: Trajectory, noise: str, seed: int, method: Method = "batch") -> Both:
+    """What a minute's flight of one pair is estimated to be: once, for every test that asks."""
+    (found,) = estimate_pairs([pair_of(flown(trajectory, noise, seed, LONG_S))], method)
+    return found
+
+
+def rmse(
+    estimate: Estimate,
+    seed: int,
+    noise: str = "calibrated",
+    own: str = "cf1",
+    *,
+    duration_s: float = LONG_S,
+) -> float:
+    flight = flown("in_view", noise, seed, duration_s)
+    peer = "cf2" if own == "cf1" else "cf1"
+    error = estimate.state[:, :2] - truth_at(flight, estimate.time_s, own, peer)
+    settled = estimate.time_s - estimate.time_s[0] > 20
+    return float(np.sqrt((error[settled] ** 2).sum(axis=1).mean()))
+
+
+def test_spreads_grow_with_what_else_may_be(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two solutions of one cost, 1 m apart."""
+    ends = [Solution(np.zeros((3, 6)), np.zeros(len(GLOBALS)), 0.0) for _ in range(2)]
+    ends[1].state[:, 0] = 1.0
+    known = np.tile(np.eye(6), (3, 1, 1))
+    for name, given in (("solutions", ends), ("_weighed", ends), ("covariance", (known, None))):
+        monkeypatch.setattr(entrance, name, lambda *_, given=given: given)
+    flight = SimpleNamespace(key_s=np.arange(3.0), looks=None, known_std=None)
+    found = entrance._from_batch(flight, Noise(), Starts(*np.zeros((3, 1))), [])  # type: ignore[arg-type]
+    wanted = entrance.INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
+    assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
+
+
+def test_a_smoother_s_spread_is_its_own_and_that_between_its_tracks() -> None:
+    tracks = np.zeros((3, 2, 5))
+    tracks[:, 1, 0] = 1.0
+    known = np.tile(np.eye(5), (3, 2, 1, 1))
+    flight = SimpleNamespace(key_s=np.arange(3.0))
+    starts = Starts(np.zeros(2), tracks, known, offset_m=-0.4)
+    found = entrance._from_smoother(flight, Noise(), starts)  # type: ignore[arg-type]
+    assert found.constants[BIAS] == -0.4
+    wanted = entrance.SMOOTHER_INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
+    assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
+
+
+def test_the_gate_makes_no_allowance_for_sensors_worse_than_any_that_were_tried() -> None:
+    usual = Noise()
+    grades = [entrance.gate_sigma(usual.graded(grade)) for grade in (0.55, 1.0, 1.3, 1.5, 3.0)]
+    assert grades[:2] == [entrance.GATE_SIGMA] * 2
+    assert entrance.GATE_SIGMA < grades[2] < 1.0
+    assert grades[3:] == [1.0, 1.0]
+    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.06)) == entrance.GATE_SIGMA
+    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.12)) == 1.0
+
+
+def test_the_statuses_are_those_of_the_schema() -> None:
+    assert (room.OK, room.UNCONVERGED, room.AMBIGUOUS) == (
+        messages.STATUS_OK,
+        messages.STATUS_UNCONVERGED,
+        messages.STATUS_AMBIGUOUS,
+    )
+
+
+@pytest.mark.heavy
+def test_batch_beats_smoother_and_both_beat_the_published_filter() -> None:
+    seeds = (1000, 1001, 1002, 1003)
+    pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
+    published = [
+        rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)
+    ]
+    smoother, batch = (
+        [rmse(solved("in_view", "calibrated", s, method)[0], s) for s in seeds]
+        for method in ("smoother", "batch")
+    )
+    assert np.median(batch) < np.median(smoother) < np.median(published)
+    assert max(batch) < 0.35
+
+
+@pytest.mark.heavy
+def test_only_sensors_that_look_calibrated_are_taken_to_have_small_scales() -> None:
+    scales = []
+    for noise in ("calibrated", "realistic", "harsh"):
+        scales.append(solved("in_view", noise, 1001)[0].noise.scale_std)
+    assert scales[0] < 0.02 <= scales[1] < scales[2]
+
+
+@pytest.mark.heavy
+def test_both_directions_come_from_one_solve() -> None:
+    here, there = solved("in_view", "calibrated", 1001)
+    assert rmse(there, 1001, own="cf2") < 0.35
+    assert np.allclose(from_peer(there.state), here.state)
+    again = swapped(swapped(here))
+    assert np.allclose(again.covariance, here.covariance)
+    assert np.allclose(again.constants, here.constants)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(
+    ("trajectory", "noise"),
+    [
+        ("observer_static", "realistic"),
+        ("parallel", "harsh"),
+        ("both_static", "harsh"),
+        ("hover", "realistic"),
+    ],
+)
+def test_motion_that_leaves_the_bearing_open_is_never_ok(
+    trajectory: Trajectory, noise: str
+) -> None:
+    (estimate, _) = solved(trajectory, noise, 1000)
+    assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
+    assert estimate.refused == {"parallel": "alike"}.get(trajectory, "still")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1000, 1005))
+@pytest.mark.parametrize("trajectory", ["observer_static", "parallel", "both_static", "hover"])
+@pytest.mark.parametrize("noise", ["realistic", "harsh"])
+def test_nor_is_it_in_other_flights(trajectory: Trajectory, noise: str, seed: int) -> None:
+    (estimate, _) = solved(trajectory, noise, seed)
+    assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
+
+
+@pytest.mark.heavy
+def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
+    pair = pair_of(flown("random", "calibrated", 1001, LONG_S))
+    gap = (pair.time_s > 30) & (pair.time_s < 33)
+    held = Track(*(np.where(gap, 0.0, signal) for signal in pair.own.values()), gap)
+    ((estimate, _),) = estimate_pairs(
+        [Pair(pair.time_s, held, pair.peer, pair.range_time_s, pair.range_m)]
+    )
+    inside = (estimate.time_s > 30.05) & (estimate.time_s < 32.95)
+    assert (estimate.status[inside] != room.OK).all()
+    assert (estimate.status == room.OK).mean() > 0.2
+
+
+@pytest.mark.heavy
+def test_where_ranges_are_silent_nothing_is_ok_and_nothing_is_out_of_their_reach() -> None:
+    pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
+    kept = (pair.range_time_s < 30) | (pair.range_time_s > 33)
+    range_time_s, range_m = pair.range_time_s[kept], pair.range_m[kept]
+    ((estimate, _),) = estimate_pairs([replace(pair, range_time_s=range_time_s, range_m=range_m)])
+    inside = (estimate.time_s > 30.05) & (estimate.time_s < 32.95)
+    assert (estimate.status[inside] != room.OK).all()
+    assert (estimate.status == room.OK).mean() > 0.2
+    assert np.hypot(*estimate.state[:, :2].T).max() < range_m.max() + 0.5
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("fault", ["shadowed", "own bias", "peer bias", "offset"])
+def test_a_fault_does_not_move_the_flight(fault: str) -> None:
+    # A minute does not tell an offset of the ranges well enough to keep anything.
+    duration_s = 100.0 if fault == "offset" else LONG_S
+    pair = pair_of(flown("in_view", "calibrated", 1002, duration_s))
+    if fault in ("shadowed", "offset"):
+        burst = (pair.range_time_s > 30) & (pair.range_time_s < 33)
+        longer = 0.35 if fault == "offset" else 1.0 * burst
+        pair = replace(pair, range_m=pair.range_m + longer)
+    else:
+        side = "own" if fault == "own bias" else "peer"
+        log = getattr(pair, side)
+        biased = replace(log, yaw_rate_radps=log.yaw_rate_radps + 0.05)
+        pair = replace(pair, **{side: biased})
+    ((estimate, _),) = estimate_pairs([pair])
+    assert rmse(estimate, 1002, duration_s=duration_s) < 0.16
+    assert (estimate.status == room.OK).mean() > 0.5
+
+
+@pytest.mark.heavy
+def test_a_flight_without_ranges_is_ambiguous() -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    none = Pair(pair.time_s, pair.own, pair.peer, np.zeros(0), np.zeros(0))
+    ((estimate, _),) = estimate_pairs([none])
+    assert (estimate.status == room.AMBIGUOUS).all()
+
+
+def test_pairs_of_different_length_are_estimated_together_as_alone() -> None:
+    pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 20.0 + k)) for k in range(2)]
+    together = estimate_pairs(pairs, "smoother")
+    for pair, (estimate, _) in zip(pairs, together, strict=True):
+        ((alone, _),) = estimate_pairs([pair], "smoother")
+        assert np.allclose(alone.state, estimate.state)
+
+
+def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() -> None:
+    none = np.zeros(2, np.int8)
+    estimate = Estimate(
+        np.array([0.0, 1.0]),
+        np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]]),
+        np.stack([np.eye(3), 3 * np.eye(3)]),
+        none,
+        np.zeros(len(GLOBALS)),
+        Noise(),
+    )
+    xy, covariance, status = estimate.at(np.array([0.5, 2.0]))
+    assert xy.tolist() == [[0.5, 1.0], [1.0, 2.0]]
+    assert covariance[0].tolist() == (2 * np.eye(2)).tolist()
+    assert status.tolist() == [room.OK, room.UNCONVERGED]
+
+
+def test_between_two_statuses_the_worse_counts_and_turned_covariances_are_those_of_draws() -> None:
+    spread = np.array([[0.02, 0.01, 0.003], [0.01, 0.03, -0.002], [0.003, -0.002, 0.01]])
+    state = np.array([[1.0, 0.5, 0.4], [1.0, 0.5, 0.4]])
+    status = np.array([room.OK, room.AMBIGUOUS], np.int8)
+    constants = np.arange(11.0)
+    estimate = Estimate(np.arange(2.0), state, np.stack([spread] * 2), status, constants, Noise())
+    assert estimate.at(np.array([0.0, 0.5, 1.0, 1.5]))[2].tolist() == [room.AMBIGUOUS] * 4
+    back = swapped(estimate)
+    # Own and peer change places, and what a clock is late by the other is early by.
+    assert back.constants.tolist() == [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, -10]
+    drawn = np.random.default_rng(0).multivariate_normal(state[0], 1e-4 * spread, 100_000)
+    seen = np.cov(from_peer(drawn).T) * 1e4
+    assert back.covariance[0] == pytest.approx(seen, abs=3e-4)
+    # A peer 1 m ahead that faces left sees the observer 1 m to its left.
+    assert from_peer(np.array([[1.0, 0.0, np.pi / 2]]))[0] == pytest.approx([0, 1, -np.pi / 2])

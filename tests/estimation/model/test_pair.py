@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from dmrl.estimation.model.pair import Pair, Track, resample, usable_ranges
+
+GRID = np.arange(200) / 100
+STILL = Track(*np.zeros((4, 200)), np.zeros(200, bool))
+
+
+def test_ranges_that_no_radio_gives_are_not_usable() -> None:
+    time_s = np.arange(7.0)
+    range_m = np.array([1.0, 0.0, -1.0, 65535.0, np.nan, np.inf, 2.0])
+    assert usable_ranges(time_s, range_m).tolist() == [True, *[False] * 5, True]
+
+
+def test_a_range_from_before_the_last_one_is_not_usable() -> None:
+    assert usable_ranges(np.array([0.0, 2.0, 1.0, 2.0]), np.ones(4)).tolist() == [
+        True,
+        True,
+        False,
+        True,
+    ]
+
+
+def test_a_pair_takes_only_what_is_finite_and_forward() -> None:
+    Pair(GRID, STILL, STILL, np.array([0.5]), np.array([1.0]))
+    with pytest.raises(ValueError, match="time order"):
+        Pair(GRID, STILL, STILL, np.array([0.5]), np.array([-1.0]))
+    with pytest.raises(ValueError, match="outside the time grid"):
+        Pair(GRID, STILL, STILL, np.array([9.0]), np.array([1.0]))
+    with pytest.raises(ValueError, match="as many range times"):
+        Pair(GRID, STILL, STILL, np.array([0.5]), np.array([1.0, 2.0]))
+    with pytest.raises(ValueError, match="not uniform and forward"):
+        Pair(GRID[::-1], STILL, STILL, np.array([0.5]), np.array([1.0]))
+    for at in (0.105, 0.11):  # a step that is longer, and one that is none
+        with pytest.raises(ValueError, match="not uniform and forward"):
+            uneven = np.where(np.arange(200) == 10, at, GRID)
+            Pair(uneven, STILL, STILL, np.array([0.5]), np.array([1.0]))
+    broken = Track(np.full(200, np.nan), *np.zeros((3, 200)), np.zeros(200, bool))
+    short = Track(*np.zeros((4, 199)), np.zeros(199, bool))
+    for odd in (broken, short):
+        with pytest.raises(ValueError, match="peer signals are not 200 finite numbers"):
+            Pair(GRID, STILL, odd, np.array([0.5]), np.array([1.0]))
+
+
+def test_a_pair_seen_from_the_peer_has_the_same_ranges() -> None:
+    fast = Track(np.ones(200), *np.zeros((3, 200)), np.zeros(200, bool))
+    pair = Pair(GRID, STILL, fast, np.array([0.5]), np.array([1.0])).swapped()
+    assert pair.own is fast
+    assert pair.peer is STILL
+    assert pair.dt_s == pytest.approx(0.01)
+
+
+def test_resampling_leaves_out_what_is_not_finite_or_goes_back() -> None:
+    time_s = np.array([0.0, 0.1, 0.2, 0.15, 0.3])
+    values = np.array([[0.0], [1.0], [np.nan], [99.0], [3.0]])
+    # 0.15 comes after 0.2, so it is out, although 0.2 itself has no value.
+    signal, gap = resample(time_s, values, np.array([0.0, 0.2, 0.3]))
+    assert signal[:, 0].tolist() == pytest.approx([0.0, 2.0, 3.0])
+    assert not gap.any()
+
+
+def test_of_samples_of_one_time_the_first_counts() -> None:
+    values = np.array([[0.0], [1.0], [99.0], [2.0]])
+    signal, _ = resample(np.array([0.0, 0.1, 0.1, 0.2]), values, np.array([0.1, 0.15, 0.2]))
+    assert signal[:, 0].tolist() == pytest.approx([1.0, 1.5, 2.0])
+
+
+def test_resampling_marks_silence_of_half_a_second() -> None:
+    time_s = np.array([0.0, 0.4, 1.0, 1.1])
+    _, gap = resample(time_s, np.zeros((4, 1)), np.array([0.2, 0.4, 0.7, 1.0, 1.05]))
+    assert gap.tolist() == [False, False, True, False, False]
+
+
+def test_resampling_nothing_is_an_error() -> None:
+    with pytest.raises(ValueError, match="no sample is finite"):
+        resample(np.array([0.0]), np.array([[np.nan]]), GRID)

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.model.status import (
+    AMBIGUOUS,
+    OK,
+    UNCONVERGED,
+    probability_beyond,
+    within_budget,
+)
+from dmrl.estimation.model.status import statuses as statuses_of
+
+
+def spread(*sigmas_m: float) -> Array:
+    """(K, 3, 3) covariances that are alike in both directions."""
+    return np.stack([np.diag([sigma**2, sigma**2, 0.01]) for sigma in sigmas_m])
+
+
+def test_the_probability_of_a_round_error_is_rayleighs() -> None:
+    found = probability_beyond(spread(0.1, 0.3)[:, :2, :2], 0.3)
+    assert found == pytest.approx(np.exp([-4.5, -0.5]))
+
+
+def test_the_probability_of_a_long_error_is_that_of_samples() -> None:
+    covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
+    errors = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 200_000)
+    share = (np.hypot(*errors.T) > 0.3).mean()
+    assert probability_beyond(covariance[None], 0.3)[0] == pytest.approx(share, rel=0.02)
+
+
+def test_a_flight_keeps_its_best_until_the_budget_is_spent() -> None:
+    probability = np.array([0.1, 0.0, 0.06, 0.05, 0.0])
+    for share, count in ((0.01, 2), (0.02, 3)):
+        kept = within_budget(probability, share)
+        assert kept.sum() == count
+        assert probability[kept].mean() <= share
+        worse = np.sort(probability[~kept])[:1]
+        assert np.append(probability[kept], worse).mean() > share
+
+
+def test_no_budget_pays_for_a_position_that_may_be_anywhere() -> None:
+    probability = np.append(np.zeros(1000), 0.5)
+    assert within_budget(probability, 0.2).tolist() == [True] * 1000 + [False]
+    assert not within_budget(np.full(10, 0.5), 0.6).any()
+
+
+def test_a_bearing_that_is_open_is_ambiguous_and_a_blurred_one_unconverged() -> None:
+    far = np.tile([4.0, 0.0, 0.0], (5, 1))
+    assert (statuses_of(far, spread(*[0.08] * 5), 0.3) == OK).all()
+    assert (statuses_of(far, spread(*[0.5] * 5), 0.3) == UNCONVERGED).all()
+    assert (statuses_of(far / 4, spread(*[0.5] * 5), 0.3) == AMBIGUOUS).all()
+
+
+def test_where_most_of_a_flight_is_open_all_of_it_is() -> None:
+    near = np.tile([1.0, 0.0, 0.0], (5, 1))
+    vague = spread(0.3, 0.3, 0.3, 0.02, 0.02)  # 0.3 rad at the median: below what is open by itself
+    assert (statuses_of(near, vague, 0.3) == AMBIGUOUS).all()
+    mostly = spread(0.3, 0.3, 0.02, 0.02, 0.02)
+    assert (statuses_of(near, mostly, 0.3) != AMBIGUOUS).all()
+    assert (statuses_of(near, mostly, 0.3)[2:] == OK).all()
+
+
+def test_the_positions_of_a_flight_are_worth_what_is_stated() -> None:
+    """Of those that are OK 4.5 % are expected to be bad, and none by more than 12 %."""
+    std_m = np.linspace(0.02, 0.2, 400)
+    far = np.tile([4.0, 0.0, 0.0], (400, 1))
+    bad = probability_beyond(spread(*std_m)[:, :2, :2], 0.3)
+    ok = statuses_of(far, spread(*std_m), 0.3) == OK
+    assert bad[ok].max() <= 0.12 < bad[~ok].min()
+    worse = np.linspace(0.11, 0.14, 400)  # 2 to 10 % each, so that the mean decides
+    ok = statuses_of(far, spread(*worse), 0.3) == OK
+    bad = probability_beyond(spread(*worse)[:, :2, :2], 0.3)
+    assert bad[ok].mean() <= 0.045 < np.append(bad[ok], bad[~ok].min()).mean()
+
+
+def test_a_bearing_is_open_by_its_worst_direction_over_the_distance() -> None:
+    along = np.diag([0.5**2, 0.02**2, 0.01])
+    for distance_m, open_ in ((1.4, True), (1.5, False)):  # 0.5 m over 1.43 m is 0.35 rad
+        at = np.tile([distance_m, 0.0, 0.0], (5, 1))
+        covariance = np.stack([along, *[np.eye(3) * 1e-4] * 4])
+        assert (statuses_of(at, covariance, 0.3)[0] == AMBIGUOUS) == open_

@@ -1,0 +1,70 @@
+"""Clocks by single exchanges: offset, drift, and how well each is known."""
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.signals import ranging_clocks
+from dmrl.estimation.signals.clocks import Clock
+from dmrl.estimation.signals.ranging_clocks import (
+    POLLED_S,
+    SAME_M,
+    SAME_S,
+    _line,
+    _same_exchange,
+    estimate_from_exchanges,
+)
+
+
+def test_a_line_is_found_under_outliers_with_the_deviations_of_its_parts() -> None:
+    x = np.linspace(-100, 100, 2001)
+    off = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        y = 0.05 + 3e-4 * x + rng.normal(0, 0.02, len(x))
+        y[rng.random(len(x)) < 0.03] += 0.2
+        slope, middle, (slope_std, middle_std) = _line(x, y)
+        off.append(((slope - 3e-4) / slope_std, (middle - 0.05) / middle_std))
+    # The line's own: sigma / sqrt(n), and that over the spread of x.
+    assert middle_std == pytest.approx(0.02 / np.sqrt(len(x)), rel=0.4)
+    assert middle_std / slope_std == pytest.approx(x.std(), rel=0.05)
+    assert np.sqrt(np.mean(np.square(off), axis=0)[0]) == pytest.approx(1.0, abs=0.4)
+    assert POLLED_S < 0.02
+
+
+def test_what_both_logged_is_told_by_value_and_time() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    value = 1 + 0.01 * np.arange(100)
+    late = time_s + 0.05
+    late[[3, 40]] += [2 * SAME_S, 0.2]  # out of reach, and beside the others
+    seen = value.copy()
+    seen[[7, 8]] += [1.5 * SAME_M, 0.5 * SAME_M]
+    found, apart_s = _same_exchange(late, seen, time_s, value)
+    assert set(range(100)) - set(found.tolist()) == {3, 7, 40}
+    assert apart_s == pytest.approx(np.full(97, 0.05))
+
+
+def test_a_clock_s_deviations_are_of_its_offset_and_of_its_drift() -> None:
+    rng = np.random.default_rng(5)
+    time_s = np.arange(0, 200, 0.05)
+    range_m = np.round(3 + np.sin(time_s / 3) + np.sin(time_s / 1.7 + 1), 3)
+    range_m += np.round(rng.normal(0, 0.1, len(time_s)), 3)
+    late = time_s + rng.uniform(0, 0.01, len(time_s))
+    clock = estimate_from_exchanges(late, range_m, time_s + 0.04 + 2e-5 * time_s, range_m)
+    assert clock is not None
+    assert clock.sigma_s / clock.sigma_drift == pytest.approx(time_s.std(), rel=0.05)
+    assert clock.sigma_s == pytest.approx(0.01 / 12**0.5 / len(time_s) ** 0.5, rel=0.2)
+    assert clock.drift == pytest.approx(-2e-5, abs=4 * clock.sigma_drift)
+    middle = clock.at_s + clock.offset_s
+    assert middle + 0.04 + 2e-5 * middle - 0.005 == pytest.approx(clock.at_s, abs=1e-3)
+
+
+def test_what_a_rough_clock_is_off_by_single_exchanges_put_right(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A guess that is 50 ms late and 100 ppm slow, of a clock that is right."""
+    time_s = np.arange(0, 100, 0.05)
+    range_m = 3 + np.sin(time_s / 3) + 0.01 * np.arange(len(time_s)) % 0.5
+    monkeypatch.setattr(ranging_clocks, "estimate_clock", lambda *_: Clock(0.05, -1e-4, at_s=40.0))
+    clock = estimate_from_exchanges(time_s, range_m, time_s, range_m)
+    assert clock is not None
+    assert clock.corrected(time_s) == pytest.approx(time_s, abs=1e-6)

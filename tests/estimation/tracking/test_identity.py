@@ -1,0 +1,67 @@
+"""Names of tracks, by ranges: when one is clear, and when it is not."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.tracking.identity import MEMORY_S, RANGE_STD_M, Identity
+
+
+@dataclass
+class Track:
+    """What `Identity` asks of a track: straight ahead, at some distance."""
+
+    number: int
+    distance_m: float
+    std_m: float = 0.0
+    position_m: np.ndarray = field(init=False)
+    covariance: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.position_m = np.array([self.distance_m, 0.0, 0.0])
+        self.covariance = np.diag([self.std_m**2, 9.0, 9.0])  # across does not matter
+
+
+def names(tracks: list[Track], times: int = 1, **range_m: float) -> dict[int, str]:
+    identity = Identity()
+    for _ in range(times):
+        found = identity.names(tracks, range_m, 0.1)  # type: ignore[arg-type]
+    return found
+
+
+@pytest.mark.parametrize(("sigmas", "named"), [(1.9, True), (2.1, False)])
+def test_a_range_fits_within_two_sigmas_of_itself_and_the_track(sigmas: float, named: bool) -> None:
+    std_m = 0.3
+    apart = sigmas * np.hypot(RANGE_STD_M, std_m)
+    assert bool(names([Track(1, 2.0, std_m)], cf2=2.0 + apart)) == named
+    assert bool(names([Track(1, 2.0, std_m)], cf2=2.0 - apart)) == named
+
+
+@pytest.mark.parametrize(("misfit", "named"), [(1.4, False), (1.6, True)])
+def test_every_other_name_must_fit_clearly_worse(misfit: float, named: bool) -> None:
+    other = 2.0 + RANGE_STD_M * np.sqrt(misfit)
+    assert bool(names([Track(1, 2.0)], cf2=2.0, cf3=other)) == named
+
+
+def test_two_tracks_share_the_names_as_they_fit_together() -> None:
+    assert names([Track(1, 1.0), Track(2, 3.0)], cf2=3.0, cf3=1.0) == {1: "cf3", 2: "cf2"}
+
+
+def test_one_detour_is_forgotten_and_counts_no_more_than_the_worst() -> None:
+    identity = Identity()
+    track: list[Track] = [Track(1, 2.0)]
+    steps = round(3 * MEMORY_S / 0.1)
+    for k in range(steps):
+        ranges = {"cf2": 2.0 if k else 60.0, "cf3": 9.0}
+        found = identity.names(track, ranges, 0.1)  # type: ignore[arg-type]
+        if k == round(0.5 * MEMORY_S / 0.1):
+            assert not found  # 9 e^-0.5 is still more than 4
+    assert found == {1: "cf2"}
+
+
+def test_a_track_that_is_gone_and_one_that_no_one_ranged_have_no_name() -> None:
+    identity = Identity()
+    assert identity.names([Track(1, 2.0)], {"cf2": 2.0}, 0.1) == {1: "cf2"}  # type: ignore[list-item]
+    assert identity.names([], {}, 0.1) == {}
+    assert identity.names([Track(1, 9.0)], {}, 0.1) == {}  # type: ignore[list-item]
