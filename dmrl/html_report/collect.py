@@ -13,8 +13,8 @@ from dmrl.catalogue import NAME as CATALOGUE
 from dmrl.catalogue import open_catalogue
 from dmrl.datasets import is_dataset
 from dmrl.errors import DmrlError, SettingError
-from dmrl.evaluation import story
-from dmrl.evaluation.story import Shown
+from dmrl.evaluation import figure_specs as story
+from dmrl.evaluation.figure_specs import Shown
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes
 from dmrl.recording import Provenance, Summary, summary

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
-from dmrl.evaluation.story import Number, Shown, value_at
+from dmrl.evaluation.figure_specs import Number, Shown, value_at
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.html_report.collect import MOST_BYTES, Found
 from dmrl.html_report.html import WRONG, Pictures, chart, row, table, text

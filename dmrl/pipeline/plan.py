@@ -13,14 +13,14 @@ from typing import Any
 
 from dmrl import recipe as recipes
 from dmrl.errors import RecipeError, UnsafeName
-from dmrl.evaluation import story
+from dmrl.evaluation import figure_specs
 from dmrl.geometry.camera_file import KNOWN
 from dmrl.guards.safe_names import file_name
 from dmrl.learn import pretrained
 from dmrl.pipeline.interface import Interface, interface_of
 from dmrl.pipeline.language import expanded
 
-KEYS = ("kind", "each", "defaults", "step", story.TITLE, story.KEY)
+KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE, figure_specs.KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
@@ -139,7 +139,7 @@ def load(name: str | Path) -> Plan:
         If a package that a stage needs is not installed.
     """
     text, keys = recipes.text(name), recipes.read(name)
-    return Plan(tuple(_steps(name, keys)), text, story.KEY in keys)
+    return Plan(tuple(_steps(name, keys)), text, figure_specs.KEY in keys)
 
 
 def _steps(name: str | Path, recipe: Table) -> list[Step]:
@@ -152,7 +152,7 @@ def _steps(name: str | Path, recipe: Table) -> list[Step]:
         faults += [f"step.{number}.{fault}" for fault in wrong]
         found.append((number, step))
     faults += _name_faults(found)
-    faults += story.faults(recipe, {step.out for _, step in found})
+    faults += figure_specs.faults(recipe, {step.out for _, step in found})
     if faults:
         raise recipes.faulty(name, dict.fromkeys(faults))
     steps = [step for _, step in found]

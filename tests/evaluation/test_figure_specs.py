@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from dmrl.errors import RecipeError
-from dmrl.evaluation.story import faults, told, value_at
+from dmrl.evaluation.figure_specs import faults, told, value_at
 
 OUTS = {"model", "judged", "a.mcap"}
 GOOD = {"title": "Losses", "shows": "losses", "of": ["model"]}
