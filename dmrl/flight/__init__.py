@@ -5,7 +5,7 @@ the truth. A robot's own randomness depends on the seed and its number alone, so
 changes nothing for those already there.
 """
 
-from dmrl.flight.arrays import Clock, Flight, Ranges, RobotLog, Truth
+from dmrl.flight.data import Clock, Flight, Ranges, RobotLog, Truth
 from dmrl.flight.faults import Fault
 from dmrl.flight.motion import TRAJECTORIES, Trajectory
 from dmrl.flight.noise import NOISE, Noise

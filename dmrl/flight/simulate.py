@@ -8,8 +8,8 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.errors import SettingError
-from dmrl.flight import failing, motion, sensors
-from dmrl.flight.arrays import RATE_HZ, Clock, Flight
+from dmrl.flight import fault_effects, motion, sensors
+from dmrl.flight.data import RATE_HZ, Clock, Flight
 from dmrl.flight.faults import ENDS, Fault, Happened, check, happened
 from dmrl.flight.motion import TRAJECTORIES, Motion, Start, Trajectory
 from dmrl.flight.noise import Noise
@@ -77,7 +77,7 @@ def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault
         mine = [event for event in events if event.fault.robot == name]
         way, height = _flown(moves[k], _height(_rng(seed, "height", k), scenario), mine)
         truth[name] = motion.truth_of(way, height)
-        clocks[name] = failing.clock_with(_clock(_rng(seed, "clock", k), k, noise), mine)
+        clocks[name] = fault_effects.clock_with(_clock(_rng(seed, "clock", k), k, noise), mine)
         robots[name] = sensors.robot_log(
             _rng(seed, "log", k), truth[name], way.yaw_rate, clocks[name], noise
         )
@@ -94,16 +94,16 @@ def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault
     }
     for k, event in enumerate(events):
         robot, rng = event.fault.robot, _rng(seed, "fault", k, 1)
-        robots[robot] = failing.log_with(rng, robots[robot], truth[robot], event)
+        robots[robot] = fault_effects.log_with(rng, robots[robot], truth[robot], event)
         for link in (link for link in ranges if event.befalls(link)):
-            ranges[link] = failing.ranges_with(rng, ranges[link], clocks[link[0]], event)
+            ranges[link] = fault_effects.ranges_with(rng, ranges[link], clocks[link[0]], event)
     return Flight(robots, truth, ranges, clocks, tuple(events))
 
 
 def _flown(way: Motion, height_m: Array, events: Sequence[Happened]) -> tuple[Motion, Array]:
     """A robot's motion and height, to the landing or crash that ends them."""
     for event in (event for event in events if event.fault.kind in ENDS):
-        way, height_m = failing.brought_down(way, height_m, event)
+        way, height_m = fault_effects.brought_down(way, height_m, event)
     return way, height_m
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.flight.arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
+from dmrl.flight.data import RATE_HZ, Clock, Ranges, RobotLog, Truth
 from dmrl.flight.faults import Happened
 from dmrl.flight.motion import Motion
 from dmrl.geometry.frames import Array
