@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dmrl.formats.locanet import LocanetImage, read
+from dmrl.formats.published.locanet import LocanetImage, read
 from dmrl.geometry.frames import PUBLISHED_RENDER
 from dmrl.images.codec import Rgb, decode, encode_jpeg
 from dmrl.recording import read as read_messages

@@ -23,8 +23,8 @@ from dmrl.estimation.model.pair import RATE_HZ, Pair, usable_ranges
 from dmrl.estimation.model.status import GATE_M, OK
 from dmrl.flight import NOISE
 from dmrl.flight.sensors import pair_errors
-from dmrl.formats import mapped_csv
-from dmrl.formats.format import Options
+from dmrl.formats.base import Options
+from dmrl.formats.files import mapped_csv
 from dmrl.geometry.frames import Array
 from dmrl.labelling.logs import RobotLog
 from dmrl.samples.sample import Columns

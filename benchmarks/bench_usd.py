@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.formats.cfusdlog import decode
+from dmrl.formats.crazyflie.usd_log import decode
 
 ROUNDS = 40
 KEPT_BYTES = 1 << 24

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.formats.log_block import euler_zyx
+from dmrl.formats.crazyflie.log_block import euler_zyx
 from dmrl.recording import read_table
 
 COLOURS = ("#c0392b", "#1e8449", "#2471a3")

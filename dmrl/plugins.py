@@ -3,7 +3,7 @@
 In the package's pyproject.toml::
 
     [project.entry-points."dmrl.formats"]
-    blackbox = "their_package.blackbox:FORMAT"     # a dmrl.formats.format.Format
+    blackbox = "their_package.blackbox:FORMAT"     # a dmrl.formats.base.Format
     [project.entry-points."dmrl.networks"]
     their-nano = "their_package.network:TheirNano" # a subclass of dmrl.learn.network.Network
     [project.entry-points."dmrl.stages"]

@@ -11,7 +11,7 @@ import pytest
 
 from dmrl import plugins
 from dmrl.errors import PluginError, SettingError, SourceError
-from dmrl.formats.known import format_of
+from dmrl.formats.registry import format_of
 from dmrl.learn.model import Model, load_model, save_model
 from dmrl.learn.network import architecture_names, build
 from dmrl.recording import read_table, summary
@@ -21,7 +21,7 @@ Install = Callable[..., None]
 
 FORMAT = """
     from dmrl import topics
-    from dmrl.formats.format import Content, Format
+    from dmrl.formats.base import Content, Format
     from dmrl.samples.sample import Sample
 
     def recognises(source):
@@ -141,7 +141,7 @@ def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("import nothing_like_it", "cannot be loaded: ModuleNotFoundError: No module named"),
-        ("FORMAT = 1", "is not a dmrl.formats.format.Format: alt_logs:FORMAT"),
+        ("FORMAT = 1", "is not a dmrl.formats.base.Format: alt_logs:FORMAT"),
         (
             FORMAT.replace("source.suffix", "source.missing"),
             "fails to look at .*flight.alt: AttributeError",

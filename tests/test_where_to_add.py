@@ -122,7 +122,7 @@ FORMAT = '''
     from pathlib import Path
 
     from dmrl import topics
-    from dmrl.formats.format import Content, Format, Options
+    from dmrl.formats.base import Content, Format, Options
     from dmrl.samples.sample import Sample
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.formats.counters import SteadySender
-from dmrl.formats.cpx import PORT, Image, ImageReader
+from dmrl.formats.aideck.cpx import PORT, Image, ImageReader
+from dmrl.formats.timestamps import SteadySender
 from dmrl.geometry.frames import AIDECK, AIDECK_SENSOR_PX, Camera
 from dmrl.live.clocks import HostTime, SenderClock
 from dmrl.live.feed import Feed, Health, Received

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from dmrl.errors import SettingError
-from dmrl.formats.counters import Unwrapped
+from dmrl.formats.timestamps import Unwrapped
 from dmrl.live.cflib_session import Session
 from dmrl.live.clocks import HostTime, SenderClock
 from dmrl.live.feed import Feed, Health, Received

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from dmrl.errors import SettingError
-from dmrl.formats.cpx import Image
-from dmrl.formats.cpx_pack import pack_image
-from dmrl.formats.cpx_state import State
+from dmrl.formats.aideck.cpx import Image
+from dmrl.formats.aideck.cpx_encode import pack_image
+from dmrl.formats.aideck.cpx_state import State
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
 from dmrl.live.fake_flight import Faults, FlightClock, Pictures

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.cpx import Image
+from dmrl.formats.aideck.cpx import Image
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
 

@@ -14,7 +14,7 @@ from dmrl import topics
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import RecordingError, SettingError
 from dmrl.estimation.signals.clocks import Clock, connected
-from dmrl.formats.counters import dejitter
+from dmrl.formats.timestamps import dejitter
 from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.labelling.corrected import MOCAP, Corrected
 from dmrl.pipeline.folders import is_many, over_folder

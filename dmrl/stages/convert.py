@@ -1,6 +1,6 @@
 """``dmrl convert``: foreign files and folders to a recording, and recordings to files.
 
-A new format is one file in ``dmrl/formats`` and one row in ``dmrl.formats.known``.
+A new format is one file in ``dmrl/formats`` and one row in ``dmrl.formats.registry``.
 """
 
 import json
@@ -17,8 +17,8 @@ from dmrl.atomic_output import refuse_existing
 from dmrl.errors import SettingError, SourceError
 from dmrl.export.ros2 import write_bag
 from dmrl.export.tables import write_tables
-from dmrl.formats.format import Content, Options
-from dmrl.formats.known import format_of
+from dmrl.formats.base import Content, Options
+from dmrl.formats.registry import format_of
 from dmrl.geometry.camera_file import camera_named
 from dmrl.guards.paths import refuse_pipes
 from dmrl.messages import message

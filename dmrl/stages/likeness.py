@@ -16,7 +16,7 @@ from dmrl import topics
 from dmrl.atomic_output import partial_file, partial_of, refuse_existing
 from dmrl.datasets.backgrounds import photos_of
 from dmrl.errors import RecordingError, SettingError
-from dmrl.formats.image_folder import list_pictures
+from dmrl.formats.files.image_folder import list_pictures
 from dmrl.images.codec import Rgb, decode, size
 from dmrl.recording import read, summary
 from dmrl.rendering import settings as looks

@@ -17,8 +17,8 @@ from numpy.random import Generator
 
 from dmrl.atomic_output import partial_folder
 from dmrl.errors import SettingError
-from dmrl.formats.image_folder import CALIBRATION, LABELS
-from dmrl.formats.label_table import LabelRow, write_labels
+from dmrl.formats.files.image_folder import CALIBRATION, LABELS
+from dmrl.formats.files.label_csv import LabelRow, write_labels
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 from dmrl.images.codec import encode_png

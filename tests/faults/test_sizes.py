@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.formats.known import own
+from dmrl.formats.registry import own
 
 from ..formats.test_fuzz import SOURCES
 from .conftest import Count

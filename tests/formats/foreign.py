@@ -11,9 +11,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from dmrl.formats.cpx import Image
-from dmrl.formats.cpx_pack import pack_image
-from dmrl.formats.cpx_state import State
+from dmrl.formats.aideck.cpx import Image
+from dmrl.formats.aideck.cpx_encode import pack_image
+from dmrl.formats.aideck.cpx_state import State
 from dmrl.images.codec import encode_jpeg, encode_png
 
 from . import plain_usd

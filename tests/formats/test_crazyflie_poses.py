@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.formats.crazyflie_log import _pose
-from dmrl.formats.log_block import Series
+from dmrl.formats.crazyflie.log_block import Series
+from dmrl.formats.crazyflie.log_variables import _pose
 
 GROWING = st.lists(st.integers(0, 9), min_size=1, max_size=6).map(sorted)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.formats.format import Options
-from dmrl.formats.image_folder import SUFFIXES
-from dmrl.formats.known import own
-from dmrl.formats.label_table import COLUMNS
+from dmrl.formats.base import Options
+from dmrl.formats.files.image_folder import SUFFIXES
+from dmrl.formats.files.label_csv import COLUMNS
+from dmrl.formats.registry import own
 from dmrl.geometry.camera_file import KNOWN
 from dmrl.geometry.frames import Camera
 

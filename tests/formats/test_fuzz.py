@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from dmrl.errors import DmrlError
-from dmrl.formats.format import Options
-from dmrl.formats.known import own
+from dmrl.formats.base import Options
+from dmrl.formats.registry import own
 from dmrl.messages import message
 
 from ..faults.mutate import mutated

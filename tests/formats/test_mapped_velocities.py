@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
-from dmrl.formats import mapped_csv
-from dmrl.formats.log_block import Series
+from dmrl.formats.crazyflie.log_block import Series
+from dmrl.formats.files import mapped_csv
 from dmrl.geometry.frames import camera_from_horizontal
 
 ANGLE = st.floats(-1.4, 1.4)

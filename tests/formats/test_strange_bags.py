@@ -10,8 +10,8 @@ import pytest
 import zstandard
 
 from dmrl.errors import SourceError
-from dmrl.formats.format import Options
-from dmrl.formats.ros import content
+from dmrl.formats.base import Options
+from dmrl.formats.ros.bag import content
 from dmrl.guards import limits
 
 TOPICS = (

@@ -12,7 +12,7 @@ from dmrl.datasets import open_dataset
 from dmrl.deploy.detector import open_detector
 from dmrl.deploy.int8 import store
 from dmrl.errors import UnsafeName
-from dmrl.formats.image_folder import list_pictures
+from dmrl.formats.files.image_folder import list_pictures
 from dmrl.geometry.camera_file import read_camera
 from dmrl.guards.paths import refuse_no_text, refuse_pipe, refuse_pipes
 from dmrl.html_report import gather

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SettingError
-from dmrl.formats import cpx
-from dmrl.formats.cpx import Image
-from dmrl.formats.cpx_pack import pack_image
-from dmrl.formats.cpx_packets import APP, GAP8, HOST, Packet, pack_packet
-from dmrl.formats.cpx_state import State
+from dmrl.formats.aideck import cpx
+from dmrl.formats.aideck.cpx import Image
+from dmrl.formats.aideck.cpx_encode import pack_image
+from dmrl.formats.aideck.cpx_log import APP, GAP8, HOST, Packet, pack_packet
+from dmrl.formats.aideck.cpx_state import State
 from dmrl.live.camera import GARBAGE_BYTES, CameraClient, _Times, address
 from dmrl.live.clocks import HostTime
 from dmrl.live.feed import Feed, Received

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.formats.cpx import Image
+from dmrl.formats.aideck.cpx import Image
 from dmrl.images import bayer, codec
 from dmrl.live.fake_camera import whole_sensor
 from dmrl.live.pictures import encoded

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import DmrlError
-from dmrl.formats.known import format_of
+from dmrl.formats.registry import format_of
 from dmrl.guards.safe_names import LINE_MAX
 from dmrl.stages import convert
 

@@ -1,0 +1,234 @@
+"""The AI-deck's image stream: the images in CPX packets.
+
+Three layouts of images are known:
+
+* ``plain``     an 11-byte header (size, kind), then chunks: no time in it;
+* ``stamped``   25 bytes: the camera's time in ms and the robot's position besides;
+* ``streamer``  nanocockpit's: 148 bytes of metadata before the pixels, with the frame's number
+  (uint8), its time in us (uint32, wraps in 71.6 min) and the robot's last state.
+
+Nothing here opens a socket or a file: bytes go in, images come out.
+"""
+
+import binascii
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from dmrl.formats.aideck.cpx_log import APP, STREAMER, Packet, PacketReader
+from dmrl.formats.aideck.cpx_state import STATE_FORMAT, State, unpack_state
+from dmrl.formats.timestamps import Unwrapped
+
+Layout = Literal["plain", "stamped", "streamer"]
+Encoding = Literal["raw", "jpeg"]
+
+PORT = 5000
+
+HEADER = struct.Struct("<BHHBBI")
+STAMP = struct.Struct("<IhhhI")
+BEGIN = struct.Struct("<BBII2x")
+DATA = struct.Struct("<B3x")
+METADATA = struct.Struct(f"<BHHBBBII{STATE_FORMAT}IB3x64sIII4f")
+
+MAGIC = 0xBC
+ENCODINGS: tuple[Encoding, ...] = ("raw", "jpeg")
+CHUNK_BYTES = 1020  # Bitcraze's largest packet of 1022 bytes, without its routing
+STREAMER_CHUNK_BYTES = 4080
+STREAMER_BEGIN, STREAMER_DATA, STREAMER_IMAGE, STREAMER_VERSION = 0x10, 0x11, 1, 10
+SIDE_MAX_PX = 4096
+IMAGE_MAX_BYTES = 1 << 22
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """One image as the camera sent it.
+
+    Parameters
+    ----------
+    width_px, height_px
+        Its size.
+    encoding
+        "raw": one byte per pixel, row by row, behind red, green / green, blue filters on the
+        colour version of the camera; "jpeg".
+    data
+        The pixels, or the JPEG.
+    time_us
+        When it was taken on the camera's clock, microseconds, unwrapped; None: not told.
+    frame_id
+        Its number, unwrapped: a step of more than one is a loss; None: not told.
+    state
+        What the robot last told the camera; None: nothing.
+    """
+
+    width_px: int
+    height_px: int
+    encoding: Encoding
+    data: bytes
+    time_us: int | None = None
+    frame_id: int | None = None
+    state: State | None = None
+
+    @property
+    def robot_time_us(self) -> int | None:
+        """When it was taken on the robot's clock, as far as the state tells; or None."""
+        if self.time_us is None or self.state is None:
+            return None
+        return self.time_us - self.state.received_us + 1000 * self.state.robot_ms
+
+
+class ImageReader:
+    """Images out of a stream's bytes, whichever layout it has.
+
+    Attributes
+    ----------
+    broken
+        Images that were begun and never whole, or are not what their header says.
+    """
+
+    def __init__(self) -> None:
+        self.broken = 0
+        self._packets = PacketReader()
+        self._begun: _Begun | None = None
+        self._time_ms, self._time_us = Unwrapped(32), Unwrapped(32)
+        self._state_us, self._robot_ms = Unwrapped(32), Unwrapped(32)
+        self._frame_id = Unwrapped(8, forward=True)
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes that belonged to no packet."""
+        return self._packets.skipped_bytes
+
+    def feed(self, data: bytes) -> Iterator[Image]:
+        """The images that are whole with these bytes."""
+        for packet in self._packets.feed(data):
+            image = self.take(packet)
+            if image is not None:
+                yield image
+
+    def finish(self) -> None:
+        """Nothing more comes: an image that was begun counts as broken."""
+        amid = self._packets.finish()
+        self.broken += amid or self._begun is not None
+        self._begun = None
+
+    def take(self, packet: Packet) -> Image | None:
+        """The image that a packet completes, if it does."""
+        if packet.function == APP:
+            return self._take_app(packet.data)
+        if packet.function == STREAMER and packet.data:
+            return self._take_streamer(packet.data)
+        return None
+
+    def _take_app(self, data: bytes) -> Image | None:
+        begun = self._begun
+        if len(data) not in (HEADER.size, HEADER.size + STAMP.size) or data[0] != MAGIC:
+            return self._append(data)
+        header = self._app_header(data)
+        # Amid an image, pixels may look like a header; before one, they are a broken header.
+        if begun is not None and (header is None or len(data) == begun.missing):
+            return self._append(data)
+        self._begin(header)
+        return None
+
+    def _app_header(self, data: bytes) -> "_Begun | None":
+        _, width_px, height_px, _, kind, size = HEADER.unpack_from(data)
+        if kind >= len(ENCODINGS) or not _sane(width_px, height_px, size):
+            return None
+        if ENCODINGS[kind] == "raw" and size != width_px * height_px:
+            return None
+        time_us = None
+        if len(data) > HEADER.size:
+            time_us = 1000 * self._time_ms(STAMP.unpack_from(data, HEADER.size)[0])
+        return _Begun(size, Image(width_px, height_px, ENCODINGS[kind], b"", time_us))
+
+    def _take_streamer(self, data: bytes) -> Image | None:
+        command = data[0]
+        if command == STREAMER_BEGIN and len(data) >= BEGIN.size:
+            _, kind, size, checksum = BEGIN.unpack_from(data)
+            if kind != STREAMER_IMAGE:
+                self._drop()
+                return None
+            sane = METADATA.size < size <= IMAGE_MAX_BYTES
+            self._begin(_Begun(size, None, checksum) if sane else None)
+            return self._append(data[BEGIN.size :])
+        if command == STREAMER_DATA and len(data) >= DATA.size:
+            return self._append(data[DATA.size :])
+        self._drop()
+        return None
+
+    def _begin(self, begun: "_Begun | None") -> None:
+        self._drop()
+        self._begun = begun
+        self.broken += begun is None
+
+    def _drop(self) -> None:
+        self.broken += self._begun is not None
+        self._begun = None
+
+    def _append(self, data: bytes) -> Image | None:
+        begun = self._begun
+        if begun is None:
+            return None
+        # The streamer fills its last packet up to a multiple of four; nobody else may.
+        spare = 3 if begun.image is None else 0
+        if len(data) > begun.missing + spare:
+            self._drop()
+            return None
+        begun.data += data[: begun.missing]
+        if begun.missing:
+            return None
+        self._begun = None
+        image = self._finished(begun)
+        self.broken += image is None
+        return image
+
+    def _finished(self, begun: "_Begun") -> Image | None:
+        data = bytes(begun.data)
+        if begun.image is None:
+            return self._streamed(data) if begun.checksum in (0, checksum(data)) else None
+        image = begun.image
+        if image.encoding == "jpeg" and not data.startswith(b"\xff\xd8"):
+            return None
+        return replace(image, data=data)
+
+    def _streamed(self, data: bytes) -> Image | None:
+        version, width_px, height_px, _, _, frame_id, time_us, received_us, *rest = (
+            METADATA.unpack_from(data)
+        )
+        pixels = data[METADATA.size :]
+        if version != STREAMER_VERSION or len(pixels) != width_px * height_px or not pixels:
+            return None
+        time_ms = self._robot_ms(rest[0])
+        state = unpack_state(rest, time_ms, self._state_us(received_us)) if received_us else None
+        frame_id, time_us = self._frame_id(frame_id), self._time_us(time_us)
+        return Image(width_px, height_px, "raw", pixels, time_us, frame_id, state)
+
+
+@dataclass(slots=True)
+class _Begun:
+    """An image whose chunks are coming; ``image`` is None while metadata is among them."""
+
+    size: int
+    image: Image | None
+    checksum: int = 0
+    data: bytearray = field(default_factory=bytearray)
+
+    @property
+    def missing(self) -> int:
+        return self.size - len(self.data)
+
+
+def _sane(width_px: int, height_px: int, size: int) -> bool:
+    return (
+        0 < width_px <= SIDE_MAX_PX
+        and 0 < height_px <= SIDE_MAX_PX
+        and size > 0
+        and (size <= IMAGE_MAX_BYTES)
+    )
+
+
+def checksum(data: bytes) -> int:
+    """CRC-32 of an image, as the streamer sends it."""
+    # 0 says that there is none, so a checksum of 0 is sent as all ones.
+    return binascii.crc32(data) or 0xFFFFFFFF

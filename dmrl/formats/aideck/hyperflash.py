@@ -1,0 +1,112 @@
+"""Dumps of the HyperFlash that the published firmware fills.
+
+Records of 71,704 bytes: 224 x 320 pixels as the sensor gave them (rows 10 to 233 and columns
+2 to 321 of 244 x 324), then six little-endian float32, see ``aideck``. Erased flash is 0xFF: a
+record of nothing else ends the dump. There are no times: they are nominal.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from dmrl.errors import SourceError
+from dmrl.formats.aideck import calibration as aideck
+from dmrl.formats.base import Content, Format, Options
+from dmrl.geometry.frames import AIDECK
+from dmrl.images import codec
+from dmrl.images.bayer import rgb_of
+from dmrl.samples.sample import Sample, calibration, image
+from dmrl.terminal.progress import say
+
+HEIGHT_PX, WIDTH_PX = 224, 320
+PIXELS = HEIGHT_PX * WIDTH_PX
+RECORD = np.dtype([("raw", "u1", (HEIGHT_PX, WIDTH_PX)), ("values", "<f4", (6,))])
+ERASED = b"\xff" * RECORD.itemsize
+
+
+def recognises(source: Path) -> bool:
+    """Whether a file is whole records, or those and erased flash, the first of them plausible.
+
+    Six floats of anything may be plausible; of a dump that was cut short one has to say what
+    it is.
+    """
+    if not source.is_file() or source.stat().st_size < RECORD.itemsize:
+        return False
+    with source.open("rb") as stream:
+        stream.seek(PIXELS)
+        values = np.frombuffer(stream.read(RECORD.itemsize - PIXELS), "<f4").tolist()
+        stream.seek(source.stat().st_size // RECORD.itemsize * RECORD.itemsize)
+        rest = stream.read().strip(b"\xff")
+    return aideck.is_plausible(values) and any(values) and not rest
+
+
+def records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
+    """Whole records up to the end marker or the end; says what is left out.
+
+    Parameters
+    ----------
+    stream
+        The dump.
+    what
+        Its name, for the line on stderr; None: there is no such line.
+    """
+    while len(data := stream.read(RECORD.itemsize)) == RECORD.itemsize:
+        if data == ERASED:
+            return
+        yield np.frombuffer(data, RECORD)[0]
+    if what is not None and data.strip(b"\xff"):
+        say(f"{what}: its last {len(data)} bytes are no whole record; left out")
+
+
+def content(source: Path, options: Options) -> Content:
+    """Samples of a dump: pictures in RGB, attitude, and the peer as the firmware had it.
+
+    Parameters
+    ----------
+    source
+        The file.
+    options
+        ``robot``, ``rate_hz``, ``camera`` (without one: the AI-deck's) and ``names``, in which
+        0 names the peer; cf2 else.
+
+    Raises
+    ------
+    SourceError
+        If there is no whole record before the end marker, or most of them are no records.
+    MissingExtra
+        If OpenCV is not installed.
+    """
+    if not source.is_file():
+        raise SourceError(f"{source} is no file. Name the dump of a flash")
+    with source.open("rb") as stream:
+        plausible = [aideck.is_plausible(r["values"].tolist()) for r in records(stream)]
+    if not plausible:
+        raise SourceError(f"{source} holds no record of {RECORD.itemsize} bytes. Name another dump")
+    if 2 * sum(plausible) <= len(plausible):
+        raise SourceError(
+            f"{source}: {len(plausible) - sum(plausible)} of {len(plausible)} records have numbers "
+            "that no drone has, so it is no such dump, or its bytes are shifted. Name another"
+        )
+    rgb_of(np.zeros((4, 4), np.uint8))  # a missing extra is said before anything is written
+    return Content(_samples(source, options), source.stat().st_size // RECORD.itemsize)
+
+
+def _samples(source: Path, options: Options) -> Iterator[Sample]:
+    camera, peer = options.camera or AIDECK, options.names.get("0", "cf2")
+    odd = 0
+    yield calibration(0, options.robot, camera)
+    with source.open("rb") as stream:
+        for k, record in enumerate(records(stream, source)):
+            time_ns = round(k * 1e9 / options.rate_hz)
+            png = codec.encode_png(rgb_of(record["raw"]))
+            yield image(time_ns, options.robot, png, "png")
+            values = record["values"].tolist()
+            odd += not aideck.is_plausible(values)
+            yield from aideck.samples(time_ns, options.robot, peer, values, camera)
+    if odd:
+        say(f"{source}: {odd} pictures have impossible numbers; their labels are left out")
+
+
+FORMAT = Format("hyperflash", "a dump of the AI-deck's flash", recognises, content)

@@ -1,0 +1,147 @@
+"""Log blocks as the Crazyflie client writes them: CSV, ``Timestamp`` in milliseconds first.
+
+One file per log block, ``<block>-<date>T<time>.csv``. A column whose cells are all without a
+point is of integers, which tells millimetres from metres. A single file is a robot's log; so is a
+folder of such files. In a folder of folders, each of them is a robot, named after it.
+"""
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Content, Format, Options, content_of
+from dmrl.formats.crazyflie import log_variables
+from dmrl.formats.crazyflie.log_block import Block
+from dmrl.formats.timestamps import unwrap
+from dmrl.geometry.frames import Array
+from dmrl.guards import limits
+from dmrl.terminal.progress import say
+
+TIME = "Timestamp"
+NS_PER_MS = 1_000_000
+TIME_BITS = 24  # milliseconds in a log packet
+WHOLE = re.compile(r"\s*[+-]?\d+\s*")
+STAMP = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
+
+
+def recognises(source: Path) -> bool:
+    """Whether it is a CSV file that begins with ``Timestamp``, or holds one."""
+    return bool(_robots(source, "cf1"))
+
+
+def _robots(source: Path, robot: str) -> dict[str, list[Path]]:
+    """Files of each robot."""
+    if source.is_file():
+        return {robot: [source]} if _is_log(source) else {}
+    if own := sorted(path for path in source.glob("*.csv") if _is_log(path)):
+        return {robot: own}
+    folders = [path for path in sorted(source.iterdir()) if path.is_dir()]
+    below = {folder.name: sorted(filter(_is_log, folder.glob("*.csv"))) for folder in folders}
+    return {name: paths for name, paths in below.items() if paths}
+
+
+def _is_log(path: Path) -> bool:
+    if path.suffix != ".csv":
+        return False
+    with path.open("rb") as stream:
+        return stream.read(len(TIME) + 1) == f"{TIME},".encode()
+
+
+def content(source: Path, options: Options) -> Content:
+    """Samples of the log blocks.
+
+    Parameters
+    ----------
+    source
+        A file, a robot's folder, or a folder with one folder per robot.
+    options
+        ``robot`` and ``names``.
+
+    Raises
+    ------
+    SourceError
+        If there is no such file, or a line of one is not as its header: names the line.
+    """
+    robots = _robots(source, options.robot)
+    if not robots:
+        raise SourceError(f"no CSV file that begins with {TIME} in {source}. Name another source")
+    streams: list[log_variables.Stream] = []
+    for name, paths in robots.items():
+        robot = options.names.get(name, name)
+        blocks = _of_one_clock([read_block(path) for path in paths])
+        streams += log_variables.streams(robot, blocks, options.names, source)
+    return content_of(streams)
+
+
+def read_block(path: Path) -> Block:
+    """One file. A last line that was cut short is left out, with a line that says so.
+
+    Raises
+    ------
+    SourceError
+        If the file is no such CSV file, or has no row.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as e:
+        raise SourceError(f"{path} cannot be read as text: {e}. Name another file") from None
+    lines = text.splitlines()
+    try:
+        names = next(csv.reader(lines[:1]), [])
+    except csv.Error as e:
+        raise SourceError(f"{path}:1: {e}. Name another file") from None
+    if names[:1] != [TIME] or len(set(names)) < len(names) or not all(names):
+        raise SourceError(f"{path}:1: not {TIME} and names of variables. Name another file")
+    rows = [_row(line, len(names)) for line in lines[1:]]
+    if rows and rows[-1] is None and not text.endswith("\n"):
+        say(f"{path}: its last line is cut short; left out")
+        rows.pop()
+    if None in rows:
+        raise SourceError(f"{path}:{rows.index(None) + 2}: not {len(names)} numbers. Mend the line")
+    if not rows:
+        raise SourceError(f"{path} has no rows. Name another file")
+    values = np.array(rows, float).T
+    time_ns = unwrap(values[0], TIME_BITS) * NS_PER_MS
+    cells = zip(*(line.split(",")[1:] for line in lines[1 : len(rows) + 1]), strict=True)
+    columns = {
+        name: _in_its_type(text, column)
+        for name, text, column in zip(names[1:], cells, values[1:], strict=True)
+    }
+    return Block(STAMP.sub("", path.stem), time_ns, columns)
+
+
+def _in_its_type(cells: tuple[str, ...], values: Array) -> NDArray[Any]:
+    """A column as the firmware has it: integers are written without a point."""
+    whole = all(WHOLE.fullmatch(cell) for cell in cells)
+    if whole and np.abs(values).max() < 2**31:
+        return values.astype(np.int32)
+    return values
+
+
+def _of_one_clock(blocks: list[Block]) -> list[Block]:
+    """Blocks with the wraps added that one of them began before and another after."""
+    period_ns, start_ns = NS_PER_MS << TIME_BITS, blocks[0].time_ns[0]
+    wraps = [round((start_ns - block.time_ns[0]) / period_ns) for block in blocks]
+    return [  # the earliest stays: no time is before 0
+        replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
+        for block, count in zip(blocks, wraps, strict=True)
+    ]
+
+
+def _row(line: str, width: int) -> list[float] | None:
+    if len(line) > limits.LINE_CHARACTERS:
+        return None  # Python's own error would quote all of it
+    try:
+        row = [float(cell) for cell in line.split(",")]
+    except ValueError:
+        return None
+    return row if len(row) == width and np.isfinite(row[0]) else None
+
+
+FORMAT = Format("cfclient", "log blocks of the Crazyflie client", recognises, content)

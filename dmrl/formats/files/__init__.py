@@ -1,0 +1,1 @@
+"""Plain files: image folders, label tables and CSV flights."""

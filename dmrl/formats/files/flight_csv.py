@@ -1,0 +1,273 @@
+"""Flights as a folder of CSV files, one ``<robot>.csv`` per robot, on one clock.
+
+Columns, SI units, angles in radians:
+
+* ``time_s, roll_rad, pitch_rad, yaw_rate_radps, vx_mps, vy_mps, height_m`` must be there:
+  velocity in the robot's own horizontal frame (x forward, y left, turning with its yaw),
+  attitude Rz(yaw) Ry(pitch) Rx(roll), z up, so pitch is positive nose down;
+* ``range_<peer>_m`` may be: UWB distance, empty where there was none;
+* ``<peer>_x_m, <peer>_y_m, <peer>_z_m`` may be: true position of the peer in the robot's
+  horizontal frame, empty where it is not known;
+* columns of other sensors may be, as ``csv`` in dmrl/topics.py names them.
+
+Pictures of a robot lie in a folder ``<robot>/``, named by their time in nanoseconds, at least
+12 digits (zeros in front); ``calibration.toml`` there is its camera.
+"""
+
+import csv
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.errors import SourceError
+from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.files import image_folder
+from dmrl.geometry.frames import Array
+from dmrl.samples import flight
+from dmrl.samples.flight import LOG_COLUMNS, in_order, nanoseconds
+from dmrl.samples.sample import Sample
+from dmrl.terminal.progress import say
+from dmrl.topics import Topic
+
+TIME = "time_s"
+REQUIRED = (TIME, *LOG_COLUMNS)
+GAP_S = 1.0
+TIME_MAX_S = 9e9  # nanoseconds of it fill 64 bits; the year 2255 of those who count from 1970
+RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios that found nothing say 65535 mm
+OWN = {field for row in topics.OWN_SENSORS for field in row.csv}
+OTHERS = tuple(
+    row
+    for row in topics.SENSORS
+    if row.csv and row.pattern != topics.RANGE and not set(row.csv) <= set(LOG_COLUMNS)
+)
+"""Sensors whose columns need no rule of their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """One CSV file: its path, columns, (N,) each, NaN where a cell is empty, and line of a row."""
+
+    path: Path
+    columns: dict[str, Array]
+    lines: list[int]
+
+    @property
+    def robot(self) -> str:
+        """The robot it is of."""
+        return self.path.stem
+
+    @property
+    def time_s(self) -> Array:
+        """(N,) times."""
+        return self.columns[TIME]
+
+    @property
+    def ranged(self) -> list[str]:
+        """Peers that it has ranges to."""
+        return [
+            name[6:-2]
+            for name in self.columns
+            if name.startswith("range_") and name[-2:] == "_m" and name not in OWN
+        ]
+
+    @property
+    def seen(self) -> list[str]:
+        """Peers whose true position it has."""
+        return [
+            name[:-4]
+            for name in self.columns
+            if name.endswith("_x_m")
+            and all(f"{name[:-4]}_{axis}_m" in self.columns for axis in "yz")
+        ]
+
+
+def recognises(source: Path) -> bool:
+    """Whether a folder holds a CSV file whose first column is ``time_s``."""
+    return source.is_dir() and any(_header(path)[:1] == [TIME] for path in source.glob("*.csv"))
+
+
+def _header(path: Path) -> list[str]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            return [name.strip() for name in next(csv.reader(stream), [])]
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return []
+
+
+def content(source: Path, options: Options | None = None) -> Content:
+    """Samples of a flight, in time order. Says on stderr what is odd but can be used.
+
+    Parameters
+    ----------
+    source
+        The folder.
+    options
+        ``names`` of robots; ``camera`` and ``size_px`` of the pictures.
+
+    Raises
+    ------
+    SourceError
+        If a column is missing, a cell is no number, time does not increase, or two robots
+        share no time: names the file, and the line.
+    """
+    paths = sorted(source.glob("*.csv")) if source.is_dir() else []
+    if not paths:
+        raise SourceError(f"no <robot>.csv in {source}. Name a folder with a file per robot")
+    logs = [read_log(path) for path in paths]
+    _check_together(logs)
+    options = options or Options()
+    streams = [stream for log in logs for stream in _streams(log, options.names)]
+    streams += [stream for log in logs for stream in _pictures(source / log.robot, options)]
+    return Content(in_order(streams))
+
+
+def read_log(path: Path) -> Log:
+    """One robot's file, checked.
+
+    Raises
+    ------
+    SourceError
+        If a column is missing, a cell is no number, or time does not increase.
+    """
+    names = _header(path)
+    if missing := [name for name in REQUIRED if name not in names]:
+        raise SourceError(f"{path} has no column {', '.join(missing)}. Add it, in SI units")
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream)
+            next(reader)
+            rows = [(reader.line_num, row) for row in reader if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as e:
+        raise SourceError(f"{path} cannot be read as CSV: {e}. Save it as CSV in UTF-8") from None
+    lines = [line for line, _ in rows]
+    values = [_numbers(path, line, row, len(names)) for line, row in rows]
+    if len(rows) < 2:
+        raise SourceError(f"{path} has fewer than two rows. Give it a flight, or remove it")
+    log = Log(path, dict(zip(names, np.array(values).T, strict=True)), lines)
+    _check(log)
+    return log
+
+
+def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
+    if len(row) != width:
+        raise SourceError(f"{path}:{line} has {len(row)} cells, not {width}. Mend the line")
+    try:
+        return [float(cell) if cell.strip() else np.nan for cell in row]
+    except ValueError as e:
+        raise SourceError(f"{path}:{line}: {e}. Mend the line, or leave the cell empty") from None
+
+
+def _check(log: Log) -> None:
+    for name in REQUIRED:
+        if (bad := np.flatnonzero(~np.isfinite(log.columns[name]))).size:
+            raise SourceError(
+                f"{log.path}:{log.lines[bad[0]]}: {name} is no number. Fill it, or drop the line"
+            )
+    steps = np.diff(log.time_s)
+    if (back := np.flatnonzero(steps <= 0)).size:
+        raise SourceError(
+            f"{log.path}:{log.lines[back[0] + 1]}: time goes back or stands still "
+            f"({log.time_s[back[0] + 1]:.6f} s after {log.time_s[back[0]]:.6f} s). Sort the lines"
+        )
+    if log.time_s[-1] > TIME_MAX_S:
+        raise SourceError(
+            f"{log.path}: time_s reaches {log.time_s[-1]:.3g}, which is no time in seconds. Are "
+            "these ms, us or ns? Divide them"
+        )
+    if log.time_s[0] < 0:
+        raise SourceError(f"{log.path} begins before time 0. Add a constant to time_s everywhere")
+    if (gaps := np.flatnonzero(steps > GAP_S)).size:
+        at = log.time_s[gaps[0]]
+        say(f"{log.path}: {gaps.size} gaps, the first of {steps[gaps[0]]:.1f} s after {at:.3f} s")
+    _warn_of_units(log)
+
+
+def _warn_of_units(log: Log) -> None:
+    """Doubt columns a tenth of whose values is too large for any small robot."""
+    for doubt in (doubt for row in topics.OWN_SENSORS for doubt in row.doubts):
+        if doubt.field not in log.columns:
+            continue
+        often = float(np.nanquantile(np.abs(log.columns[doubt.field]), 0.9))
+        if often > doubt.over:
+            say(
+                f"{log.path}: {doubt.field}: a tenth is over {often:.3g}. "
+                f"Are these {doubt.perhaps}? {doubt.unit} is expected"
+            )
+
+
+def _check_together(logs: list[Log]) -> None:
+    for one, other in combinations(logs, 2):
+        apart = max(one.time_s[0], other.time_s[0]) - min(one.time_s[-1], other.time_s[-1])
+        if apart > 0:
+            raise SourceError(
+                f"{one.path} and {other.path} share no time: {apart:.0f} s lie between them. "
+                "Put both on one clock"
+            )
+    known = {log.robot for log in logs}
+    for log in logs:
+        for peer in log.ranged:
+            if peer not in known:
+                say(f"{log.path} has ranges to {peer}, but there is no {peer}.csv beside it")
+
+
+def _streams(log: Log, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
+    def name(robot: str) -> str:
+        return names.get(robot, robot)
+
+    own, time_ns = name(log.robot), nanoseconds(log.time_s)
+    yield flight.robot_log(own, time_ns, log.columns)
+    for peer in log.ranged:
+        range_m = log.columns[f"range_{peer}_m"]
+        given = ~np.isnan(range_m)
+        usable = given & (range_m > 0) & (range_m < RANGE_MAX_M)
+        if refused := int((given & ~usable).sum()):
+            say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
+        yield flight.ranges(own, name(peer), time_ns[usable], range_m[usable])
+    for peer in log.seen:
+        xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
+        known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+        yield flight.truth(own, name(peer), time_ns[known], xyz[known])
+    for row in OTHERS:
+        for peer, columns in _columns_of(row, log):
+            who = {"robot": own} | ({"peer": name(peer)} if peer else {})
+            topic = topics.filled(row.pattern, **who)
+            yield flight.sensor(topic, row.message, time_ns, columns)
+
+
+def _columns_of(row: Topic, log: Log) -> Iterator[tuple[str, dict[str, Array]]]:
+    """Columns of a sensor by the fields of its message, for each peer that it has them of."""
+    if not row.of_pairs:
+        peers = [""]
+    else:
+        before, _, unit = row.csv[0].rpartition("_")
+        found = re.compile(f"{before}_(.+)_{unit}")
+        peers = [m[1] for name in log.columns if name not in OWN and (m := found.fullmatch(name))]
+    for peer in peers:
+        named = {
+            field: f"_{peer}_".join(field.rsplit("_", 1)) if peer else field for field in row.csv
+        }
+        if all(name in log.columns for name in named.values()):
+            yield peer, {field: log.columns[name] for field, name in named.items()}
+
+
+def _pictures(folder: Path, options: Options) -> Iterator[Iterator[Sample]]:
+    if not folder.is_dir():
+        return
+    for path in sorted(folder.iterdir()):
+        named = path.stem.isdecimal() and len(path.stem) >= image_folder.TIME_DIGITS
+        if path.suffix.lower() in image_folder.SUFFIXES and not named:
+            raise SourceError(
+                f"{path} is not named by its time in nanoseconds, {image_folder.TIME_DIGITS} "
+                "digits or more. Rename it"
+            )
+    robot = options.names.get(folder.name, folder.name)
+    own = Options(robot=robot, camera=options.camera, size_px=options.size_px)
+    yield image_folder.content(folder, own).samples
+
+
+FORMAT = Format("csv", "a folder of flight logs", recognises, content)

@@ -1,0 +1,231 @@
+"""A folder of pictures, with labels in a CSV file where there are any.
+
+Pictures: ``.png .jpg .jpeg .ppm .pgm .bmp``, in the order of their names. When every name is a
+number of 12 digits or more, the numbers are times in nanoseconds; otherwise the pictures
+get nominal times, evenly spaced from 0.
+
+Labels: ``labels.csv`` in the folder, or another file. One row per peer and picture; a row
+with an empty peer says that no peer is in view. A picture without a row is not labelled.
+
+* ``file, peer, u_px, v_px, depth_m`` must be there;
+* ``left_px, top_px, right_px, bottom_px, visible_share, source, split, sigma_u_px,
+  sigma_v_px, sigma_depth_m`` may be. ``source`` is "hand" where it is empty.
+
+Or ``label.txt`` as the published firmware's tools write it, ``imgNNNNN.ppm roll pitch x y z d``
+a line: see ``aideck``. Labels of it need a camera. Maps of a chip: see ``chip_maps``.
+
+Pixels are those of the stored picture, pixel-edge coordinates. ``calibration.toml`` in the
+folder is the camera that took the pictures as they are stored (keys: see ``Camera``). Pictures of
+the AI-deck's whole sensor, 324x244, with a camera of 320x224 are cut to what that is of, unless
+324x244 is asked for.
+"""
+
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.aideck import calibration as aideck
+from dmrl.formats.aideck.chip_outputs import chip_maps
+from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.files.crop import Crop
+from dmrl.formats.files.label_csv import LabelRow, read_labels
+from dmrl.geometry.camera_file import read_camera
+from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX, Camera
+from dmrl.guards import limits
+from dmrl.guards.paths import refuse_pipes
+from dmrl.images import codec
+from dmrl.images.bayer import rgb_of
+from dmrl.samples.sample import Sample, calibration, image, intervals, labels
+from dmrl.terminal.progress import say
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
+LABELS = "labels.csv"
+AIDECK_LABELS = "label.txt"
+CALIBRATION = "calibration.toml"
+TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
+NS_PER_S = 1_000_000_000
+TIME_MAX_NS = 2**63 - 1
+
+
+def recognises(source: Path) -> bool:
+    """Whether a folder holds a picture."""
+    return source.is_dir() and any(_is_picture(path) for path in source.iterdir())
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def content(source: Path, options: Options) -> Content:
+    """Samples of a folder: pictures in time order, with the labels they have.
+
+    Parameters
+    ----------
+    source
+        The folder.
+    options
+        All but ``names`` count.
+
+    Raises
+    ------
+    SourceError
+        If there is no picture, one cannot be decoded, or the labels do not fit them: names
+        the file, and the line.
+    SettingError
+        If the camera is not of the pictures' size.
+    """
+    own = source / CALIBRATION
+    if options.camera is None and own.is_file():
+        options = replace(options, camera=read_camera(own))
+    pictures = list_pictures(source, options.rate_hz)
+    path = options.labels or source / LABELS
+    known = {picture.name for _, picture in pictures}
+    rows = read_labels(path, known) if options.labels or path.is_file() else {}
+    splits = {name: found[0].split for name, found in rows.items()}
+    states = _aideck_labels(source / AIDECK_LABELS, known)
+    if states.keys() - rows.keys() and options.camera is None:
+        say(f"{source / AIDECK_LABELS} gives no labels without a camera. Try: --camera aideck")
+    return Content(
+        samples=_samples(pictures, rows, states, options),
+        total=len(pictures) + len(rows) + (options.camera is not None),
+        split=intervals((time_ns, splits.get(p.name)) for time_ns, p in pictures),
+    )
+
+
+def list_pictures(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
+    """(time_ns, path) of every picture in a folder, in time order.
+
+    Raises
+    ------
+    SourceError
+        If there is none, only some are named by times, or two have the same time.
+    """
+    if not source.is_dir():
+        raise SourceError(f"no folder {source}. Name a folder of pictures")
+    refuse_pipes(source)
+    paths = sorted(path for path in source.iterdir() if _is_picture(path))
+    if not paths:
+        raise SourceError(f"no picture ({', '.join(SUFFIXES)}) in {source}. Name another folder")
+    timed = [path for path in paths if _time_ns(path) is not None]
+    if not timed:
+        return [(round(k * NS_PER_S / rate_hz), path) for k, path in enumerate(paths)]
+    if odd := sorted(set(paths) - set(timed)):
+        raise SourceError(
+            f"{odd[0]} is not named by its time in nanoseconds as {timed[0].name} is. "
+            "Rename it, or move it out of the folder"
+        )
+    moments = sorted((_time_ns(path) or 0, path) for path in paths)
+    for (time_ns, path), (next_ns, following) in pairwise(moments):
+        if time_ns == next_ns:
+            raise SourceError(f"{path} and {following.name} have the same time. Remove one")
+    return moments
+
+
+def _time_ns(path: Path) -> int | None:
+    if not (path.stem.isdecimal() and len(path.stem) >= TIME_DIGITS):
+        return None
+    if int(path.stem) > TIME_MAX_NS:
+        raise SourceError(f"{path}: time after the year 2262. Name it by nanoseconds since 1970")
+    return int(path.stem)
+
+
+def _aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[float]]:
+    """Six numbers by picture, from ``label.txt`` where there is one."""
+    found: dict[str, list[float]] = {}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    except (OSError, UnicodeDecodeError) as e:
+        raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None
+    for number, line in enumerate(lines, 1):
+        name, *words = line.replace(",", " ").split() or [""]
+        if not name:
+            continue
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != len(aideck.VARIABLES):
+            wanted = " ".join(aideck.VARIABLES)
+            raise SourceError(f"{path}:{number}: not a picture and {wanted}. Mend the line")
+        if (name := name.rsplit("/", 1)[-1]) not in files:
+            raise SourceError(f"{path}:{number}: no picture {name}. Add it, or delete the line")
+        found[name] = values
+    return found
+
+
+def _samples(
+    pictures: list[tuple[int, Path]],
+    rows: dict[str, list[LabelRow]],
+    states: dict[str, list[float]],
+    options: Options,
+) -> Iterator[Sample]:
+    """The calibration, then of each picture: itself, its labels, and what the firmware said."""
+    for k, (time_ns, path) in enumerate(pictures):
+        crop, data, kind = _stored(path, options)
+        if options.camera is not None and k == 0:
+            yield calibration(time_ns, options.robot, _camera_after(crop, options.camera))
+        yield image(time_ns, options.robot, data, kind)
+        if (maps := chip_maps(path, time_ns, options.robot)) is not None and not crop.changes:
+            yield maps
+        if path.name in rows:
+            peers = [crop.label(row) for row in rows[path.name] if row.peer]
+            sources = {row.source for row in rows[path.name]}
+            yield labels(time_ns, options.robot, [row.fields() for row in peers], sources)
+        if path.name in states:
+            known = options.camera if path.name not in rows else None
+            camera = _camera_after(crop, known) if known else None
+            peer = options.names.get("0", "cf2")
+            yield from aideck.samples(time_ns, options.robot, peer, states[path.name], camera)
+
+
+def _stored(path: Path, options: Options) -> tuple[Crop, bytes, str]:
+    """How a picture is cropped, and its bytes and format: as they are, where nothing changes."""
+    data = path.read_bytes()
+    rgb = _colours(data, path) if options.raw else codec.decode(data, path, limits.PIXELS)
+    crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
+    if crop.changes:
+        return crop, codec.encode_png(crop.pixels(rgb)), "png"
+    kind = "raw" if options.raw else codec.size(data)[2]
+    if kind in ("png", "jpeg"):
+        return crop, data, kind
+    return crop, codec.encode_png(rgb), "png"
+
+
+def _colours(data: bytes, path: Path) -> codec.Rgb:
+    rgb = codec.decode(data, path, limits.PIXELS)
+    if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
+        raise SourceError(f"{path} has colours already, so it is not raw. Leave out --raw")
+    return rgb_of(rgb[..., 0].copy())
+
+
+def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
+    camera, size = options.camera, (width_px, height_px)
+    if camera is None or size == _size(camera):
+        return Crop(*size, *(options.size_px or size))
+    if size == AIDECK_SENSOR_PX and _size(camera) == _size(AIDECK):
+        wanted = options.size_px or _size(AIDECK)
+        return Crop(*size, *wanted, (0, 0) if wanted == size else AIDECK_CORNER_PX)
+    raise SettingError(
+        f"{path} is {width_px}x{height_px} px, its camera {camera.width_px}x"
+        f"{camera.height_px}. Give the calibration of the pictures as they are stored"
+    )
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width_px, camera.height_px
+
+
+def _camera_after(crop: Crop, camera: Camera) -> Camera:
+    """The camera of the pictures as they are written, from one of them as they are stored.
+
+    A camera that is of less than is stored is of what lies in the middle.
+    """
+    left = (crop.from_width_px - camera.width_px) / 2
+    top = (crop.from_height_px - camera.height_px) / 2
+    stored = replace(camera, cx_px=camera.cx_px + left, cy_px=camera.cy_px + top)
+    return crop.camera(stored)
+
+
+FORMAT = Format("images", "a folder of pictures", recognises, content)

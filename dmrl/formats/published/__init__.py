@@ -1,0 +1,1 @@
+"""Published data sets: locanet and UWB TIERS."""

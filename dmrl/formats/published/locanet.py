@@ -1,0 +1,303 @@
+"""The synthetic set published with the network ``locanet``: text files and JPEGs.
+
+A folder holds ``synImgs/`` (one robot per picture) or ``synImgsMulti/``, with
+
+* ``posLabel.txt``: ``path roll,pitch`` of the camera, then ``x,y,z,roll,pitch,yaw`` per
+  robot; x, y, z in the camera frame, metres and radians.
+* ``boxLabel.txt``: ``path`` and per robot ``x0,y0,x1,y1,class``, first and last pixel that
+  the robot covers when drawn alone; x counts from 0, y from 1.
+* ``train.txt``, ``test.txt``: ``path roll,pitch`` and per robot ``u,v,depth_mm,class``.
+
+Only the file name of ``path`` counts. Attitudes: the camera stands in the horizontal frame
+as Rx(roll) Ry(pitch), and a robot as Rx(roll) Rz(yaw) Ry(pitch), x forward, y left, z up,
+not negated. The signs follow from the boxes: of all combinations only these fit the
+outlines (0.6 px median, the next best 1.1 px), and a test holds it. The order of the
+camera's two turns is that of the authors' rendering script; the boxes agree, weakly. The
+robots' attitudes are against the horizontal frame, unlike their positions.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.errors import SourceError
+from dmrl.formats.base import Content, Format, Options
+from dmrl.geometry.frames import PUBLISHED_RENDER, Array, camera_from_horizontal, project
+from dmrl.images import codec
+from dmrl.samples.sample import Sample, calibration, image, intervals, labels
+
+FOLDERS = ("synImgs", "synImgsMulti")
+STEP_NS = 1_000_000_000
+"""The pictures are unrelated; number n gets the nominal time n seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocanetImage:
+    """One picture of the set and what is published about it.
+
+    Parameters
+    ----------
+    path
+        The JPEG.
+    number
+        Number in its name.
+    roll_rad, pitch_rad
+        Attitude of the camera: horizontal_from_camera = Rx(roll) Ry(pitch).
+    xyz_camera
+        (N, 3) robot centres, camera frame, metres.
+    attitude_rad
+        (N, 3) roll, pitch, yaw of the robots: Rx(roll) Rz(yaw) Ry(pitch), horizontal frame.
+    box_px
+        (N, 4) left, top, right, bottom, pixel-edge coordinates, clipped to the image, as if
+        nothing hid the robot. (0, 4) without boxLabel.txt.
+    published
+        (N, 3) u_px, v_px, depth_m as printed in train.txt or test.txt; (0, 3) where absent.
+    split
+        "train", "test", or None.
+    """
+
+    path: Path
+    number: int
+    roll_rad: float
+    pitch_rad: float
+    xyz_camera: Array
+    attitude_rad: Array
+    box_px: Array
+    published: Array
+    split: str | None
+
+
+def recognises(source: Path) -> bool:
+    """Whether a folder holds the published set, by the names of its files."""
+    folders = (source, *(source / name for name in FOLDERS))
+    return any((folder / "posLabel.txt").is_file() for folder in folders) or any(
+        (source / name).is_dir() for name in FOLDERS
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    where: str
+    head: tuple[float, ...]
+    robots: Array
+
+
+Lines = Mapping[str, _Line]
+
+
+def read(source: Path) -> list[LocanetImage]:
+    """Pictures of the set in the order of their numbers.
+
+    Parameters
+    ----------
+    source
+        A folder with ``synImgs/`` or ``synImgsMulti/``, or that folder itself.
+
+    Raises
+    ------
+    SourceError
+        If posLabel.txt or a picture is missing, or a line is malformed: names file and line.
+    """
+    folder = _folder(source)
+    positions = _lines(folder / "posLabel.txt", head=2, width=6)
+    boxes = _lines(folder / "boxLabel.txt", head=0, width=5, optional=True)
+    train = _lines(folder / "train.txt", head=2, width=4, optional=True)
+    test = _lines(folder / "test.txt", head=2, width=4, optional=True)
+    if both := sorted(train.keys() & test.keys()):
+        raise SourceError(
+            f"{test[both[0]].where}: {both[0]} is in train.txt too. Delete one of the lines"
+        )
+    if not positions:
+        raise SourceError(f"{folder / 'posLabel.txt'} is empty. Restore the file")
+    found = [_image(folder, name, line, boxes, train, test) for name, line in positions.items()]
+    return sorted(found, key=lambda item: item.number)
+
+
+def _folder(source: Path) -> Path:
+    inner = [source / name for name in FOLDERS if (source / name).is_dir()]
+    if len(inner) > 1:
+        raise SourceError(f"{source} holds two sets. Name one: {inner[0]} or {inner[1]}")
+    folder = inner[0] if inner else source
+    if not (folder / "posLabel.txt").is_file():
+        raise SourceError(
+            f"no posLabel.txt in {folder}. Name the folder that holds synImgs/ or synImgsMulti/"
+        )
+    return folder
+
+
+def _lines(path: Path, *, head: int, width: int, optional: bool = False) -> Lines:
+    """Lines of a label file by the file name of the picture."""
+    if optional and not path.is_file():
+        return {}
+    found: dict[str, _Line] = {}
+    try:
+        texts = path.read_text(encoding="ascii").splitlines()
+    except (OSError, UnicodeDecodeError) as e:
+        raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None
+    for number, text in enumerate(texts, 1):
+        where = f"{path}:{number}"
+        name, *words = text.split() or [""]
+        name = name.rsplit("/", 1)[-1]
+        if name in found:
+            raise SourceError(f"{where}: {name} has a line already. Delete one of them")
+        found[name] = _Line(where, *_numbers(where, words, head, width))
+    return found
+
+
+def _numbers(
+    where: str, words: list[str], head: int, width: int
+) -> tuple[tuple[float, ...], Array]:
+    wanted = f"path {'roll,pitch ' if head else ''}and {width} numbers per robot"
+    try:
+        groups = [[float(number) for number in word.split(",")] for word in words]
+    except ValueError as e:
+        raise SourceError(f"{where}: {e}; wanted {wanted}. Restore the line") from None
+    first = tuple(groups.pop(0)) if head and groups else ()
+    robots = np.array(groups) if {len(g) for g in groups} == {width} else np.empty(0)
+    if len(first) != head or robots.ndim != 2 or not np.isfinite([*first, *robots.flat]).all():
+        raise SourceError(f"{where}: not {wanted}, all finite. Restore the line")
+    return first, robots
+
+
+def _image(
+    folder: Path, name: str, line: _Line, boxes: Lines, train: Lines, test: Lines
+) -> LocanetImage:
+    path = folder / name
+    if not path.is_file():
+        raise SourceError(f"{line.where}: no picture {path}. Restore it, or delete the line")
+    if not path.stem.isdecimal():
+        raise SourceError(f"{line.where}: {name} is not named by its number. Rename it: 0007.jpg")
+    if (line.robots[:, 0] <= 0).any():
+        raise SourceError(f"{line.where}: a robot behind the camera, x <= 0. Delete the line")
+    label = train.get(name) or test.get(name)
+    return LocanetImage(
+        path=path,
+        number=int(path.stem),
+        roll_rad=line.head[0],
+        pitch_rad=line.head[1],
+        xyz_camera=line.robots[:, :3],
+        attitude_rad=line.robots[:, 3:],
+        box_px=_box_px(_of_robots(name, line, boxes)) if boxes else np.empty((0, 4)),
+        published=_published(_of_robots(name, line, {name: label}) if label else np.empty((0, 4))),
+        split="train" if name in train else "test" if name in test else None,
+    )
+
+
+def _of_robots(name: str, line: _Line, other: Lines) -> Array:
+    """Rows of another file about the same robots, one each."""
+    if name not in other:
+        beside = next(iter(other.values())).where.rsplit(":", 1)[0]
+        raise SourceError(f"{line.where}: no line for {name} in {beside}. Restore it")
+    if len(other[name].robots) != len(line.robots):
+        raise SourceError(
+            f"{other[name].where}: {len(other[name].robots)} robots, but {len(line.robots)} "
+            f"at {line.where}. Restore the line"
+        )
+    return other[name].robots
+
+
+def _box_px(robots: Array) -> Array:
+    """Edges from first and last pixel; v is printed one too high."""
+    limit = (PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px) * 2
+    return np.clip(robots[:, :4] + (0.0, -1.0, 1.0, 0.0), 0.0, limit)
+
+
+def _published(robots: Array) -> Array:
+    return robots[:, :3] * (1.0, 1.0, 1e-3)
+
+
+def attitude_zyx(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
+    """Roll and pitch of Rz(yaw) Ry(pitch) Rx(roll) from those of the set, Rx(roll) Ry(pitch).
+
+    The yaw between the two, up to 7 degrees, is left out: the horizontal frame of dmrl has
+    its x axis under the camera's.
+    """
+    cr, sr, cp, sp = np.cos(roll_rad), np.sin(roll_rad), np.cos(pitch_rad), np.sin(pitch_rad)
+    return float(np.arctan2(sr, cr * cp)), float(np.arcsin(cr * sp))
+
+
+def content(source: Path, options: Options | None = None) -> Content:
+    """Samples of the set: every picture with its true and its published labels.
+
+    Parameters
+    ----------
+    source
+        A folder with ``synImgs/`` or ``synImgsMulti/``, or that folder itself.
+    options
+        ``robot`` carries the camera. It sees cf2, cf3, ..., without itself.
+
+    Raises
+    ------
+    SourceError
+        If a file is missing or malformed: names file and line.
+    """
+    robot = (options or Options()).robot
+    items = read(source)
+    return Content(
+        samples=_samples(items, robot),
+        total=1 + sum(3 + len(item.xyz_camera) for item in items),
+        split=intervals((item.number * STEP_NS, item.split) for item in items),
+    )
+
+
+def _samples(items: list[LocanetImage], robot: str) -> Iterator[Sample]:
+    yield calibration(items[0].number * STEP_NS, robot, PUBLISHED_RENDER)
+    for item in items:
+        time_ns = item.number * STEP_NS
+        names = _peer_names(robot, len(item.xyz_camera))
+        yield image(time_ns, robot, _jpeg(item.path), "jpeg")
+        sources = ["truth", *(["published"] if len(item.published) else [])]
+        yield labels(time_ns, robot, _peers(item, names), sources)
+        roll, pitch = attitude_zyx(item.roll_rad, item.pitch_rad)
+        fields = {"roll_rad": roll, "pitch_rad": pitch}
+        yield Sample(time_ns, topics.attitude(robot), "Attitude", fields)
+        xyz_horizontal = item.xyz_camera @ camera_from_horizontal(roll, pitch)
+        for peer, xyz in zip(names, xyz_horizontal.tolist(), strict=True):
+            yield _truth(time_ns, robot, peer, xyz)
+
+
+def _jpeg(path: Path) -> bytes:
+    """Bytes of a picture that decodes to the size of the published renders."""
+    data = path.read_bytes()
+    height_px, width_px, _ = codec.decode(data, path).shape
+    wanted = (PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px)
+    if (width_px, height_px) != wanted:
+        raise SourceError(
+            f"{path} is {width_px}x{height_px}, the set is {wanted[0]}x{wanted[1]}. Restore it"
+        )
+    return data
+
+
+def _peer_names(robot: str, count: int) -> list[str]:
+    names = [f"cf{k}" for k in range(2, count + 3)]
+    return [name for name in names if name != robot][:count]
+
+
+def _truth(time_ns: int, robot: str, peer: str, xyz: list[float]) -> Sample:
+    fields = dict(zip("xyz", xyz, strict=True)) | {
+        "frame_id": f"{robot}/horizontal",
+        "covariance": [0.0] * 9,
+    }
+    return Sample(time_ns, topics.truth(robot, peer), "PeerPosition", fields)
+
+
+def _peers(item: LocanetImage, names: list[str]) -> list[dict[str, Any]]:
+    """True label of every robot, each followed by the published one where there is one."""
+    uv, depth_m = project(item.xyz_camera, PUBLISHED_RENDER.image_from_optical)
+    true = np.column_stack([uv, depth_m])
+    found: list[dict[str, Any]] = []
+    for k, name in enumerate(names):
+        box = {"box_px": item.box_px[k].tolist()} if len(item.box_px) else {}
+        for source, rows in (("truth", true), ("published", item.published)):
+            if len(rows):
+                u, v, depth = rows[k].tolist()
+                value = {"u_px": u, "v_px": v, "depth_m": depth, "source": source}
+                found.append({"peer": name, **value, **box})
+    return found
+
+
+FORMAT = Format("locanet", "a folder of the published synthetic set", recognises, content)

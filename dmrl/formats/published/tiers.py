@@ -1,0 +1,133 @@
+"""Ranges between ground robots with motion capture: the TIERS group's ``.npz`` files.
+
+Arrays of equal length: ``uwb_range_<a>_<b>_np`` (metres, 0 where there was none),
+``optitrack_turtle0<n>_pose_np`` (N, 2) metres and ``..._orientation_np`` radians. The file has
+no times: 10 Hz fits the robots, whose steps then end at the top speeds of their makes,
+0.22 and 0.26 m/s. It has no odometry either, so velocity and yaw rate are derived from motion
+capture and are far better than a drone's. Ranges stand as measured, some 0.35 m too long.
+"""
+
+import re
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Content, Format, Options
+from dmrl.geometry.frames import Array
+from dmrl.guards.bounded_parsing import load_npz
+from dmrl.samples import flight
+from dmrl.samples.flight import from_poses, in_order, nanoseconds
+from dmrl.samples.sample import Sample
+
+RATE_HZ = 10.0
+# What zipfile, zlib and NumPy raise on damaged archives.
+BROKEN = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    EOFError,
+    SyntaxError,
+    RuntimeError,
+    MemoryError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+POSE = re.compile(r"optitrack_turtle(\d{1,3})_pose_np")
+RANGE = re.compile(r"uwb_range_(\d{1,3})_(\d{1,3})_np")
+ROBOTS = 64
+"""More would be told of too many pairs."""
+
+
+def recognises(source: Path) -> bool:
+    """Whether a file is an ``.npz`` with ranges and poses of these names."""
+    if source.suffix != ".npz" or not zipfile.is_zipfile(source):
+        return False
+    try:
+        with zipfile.ZipFile(source) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+    except BROKEN:
+        return False
+    return any(map(POSE.fullmatch, names)) and any(map(RANGE.fullmatch, names))
+
+
+def content(source: Path, _options: Options | None = None) -> Content:
+    """Samples of the file, robots named turtle1, turtle3, ...
+
+    Parameters
+    ----------
+    source
+        The ``.npz`` file.
+
+    Raises
+    ------
+    SourceError
+        If it is not such a file, or its arrays do not fit each other.
+    """
+    if not recognises(source):
+        raise SourceError(f"{source} has no uwb_range_*_np and optitrack_*_pose_np. Name another")
+    arrays = _arrays(source)
+    poses = {int(m[1]): _pose(arrays, m[1]) for m in map(POSE.fullmatch, arrays) if m}
+    streams: list[Iterator[Sample]] = []
+    for number, (time_s, xy_m, yaw) in sorted(poses.items()):
+        log = from_poses(time_s, xy_m, yaw)
+        streams.append(flight.robot_log(f"turtle{number}", nanoseconds(time_s), log))
+        streams += [
+            flight.truth(
+                f"turtle{number}",
+                f"turtle{peer}",
+                nanoseconds(time_s),
+                _seen_from(xy_m, yaw, other),
+            )
+            for peer, (_, other, _) in sorted(poses.items())
+            if peer != number
+        ]
+    for match in filter(None, map(RANGE.fullmatch, arrays)):
+        streams.append(_ranges(match[1], match[2], arrays[match[0]]))
+    return Content(in_order(streams))
+
+
+def _arrays(source: Path) -> dict[str, Array]:
+    try:
+        found = {n: np.asarray(v, float) for n, v in load_npz(source).items() if v.itemsize >= 4}
+    except BROKEN as e:
+        why = " ".join(str(e).split())
+        raise SourceError(f"{source} cannot be read: {why}. Fetch it again") from e
+    ranges = [values for name, values in found.items() if RANGE.fullmatch(name)]
+    if not all(v.ndim for v in found.values()) or any(v.ndim != 1 for v in ranges):
+        raise SourceError(f"{source} has arrays of other shapes than it should. Fetch it again")
+    if sum(bool(POSE.fullmatch(name)) for name in found) > ROBOTS:
+        raise SourceError(f"{source} has more than {ROBOTS} robots. Fetch it again")
+    return found
+
+
+def _pose(arrays: dict[str, Array], number: str) -> tuple[Array, Array, Array]:
+    xy_m = arrays[f"optitrack_turtle{number}_pose_np"]
+    yaw = arrays.get(f"optitrack_turtle{number}_orientation_np", np.zeros(0))
+    if xy_m.shape != (len(yaw), 2) or {len(a) for a in arrays.values()} != {len(yaw)}:
+        raise SourceError(f"the arrays of turtle{number} differ in length. Fetch the file again")
+    return np.arange(len(yaw)) / RATE_HZ, xy_m, yaw
+
+
+def _seen_from(here: Array, yaw: Array, peer: Array) -> Array:
+    """(N, 3) peer in the horizontal frame of a robot on the same floor."""
+    x, y = (peer - here).T
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([c * x + s * y, c * y - s * x, np.zeros(len(yaw))], axis=1)
+
+
+def _ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
+    time_ns = nanoseconds(np.arange(len(range_m)) / RATE_HZ)
+    kept = np.isfinite(range_m) & (range_m > 0)
+    return flight.ranges(f"turtle{int(one)}", f"turtle{int(other)}", time_ns[kept], range_m[kept])
+
+
+FORMAT = Format("uwb-tiers", "ranges with motion capture", recognises, content)

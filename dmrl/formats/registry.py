@@ -1,0 +1,134 @@
+"""The one table of formats, in the order in which a source is held against them.
+
+A new format is one file beside this one with a ``FORMAT``, or a plug-in of another package: see
+docs/add-a-format.md.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from difflib import get_close_matches
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from pkgutil import walk_packages
+
+from dmrl import formats, plugins
+from dmrl.errors import PluginError, SourceError
+from dmrl.formats.base import Content, Format, Options
+from dmrl.plugins import Plugin
+from dmrl.samples.sample import Sample
+from dmrl.terminal.progress import say
+
+FIRST = (
+    *("locanet", "csv", "uwb-tiers", "rosbag2", "nanocockpit", "cfclient"),
+    *("cfusdlog", "aideck-stream", "hyperflash"),
+)
+"""Their order matters: the sources of some hold files that others know."""
+
+
+@cache
+def own() -> dict[str, Format]:
+    """The ``FORMAT`` of every file here, by name: those of ``FIRST``, then the others in order.
+
+    Plain pictures come last, as any folder with pictures is a folder of pictures.
+    """
+    walked = walk_packages(formats.__path__, f"{formats.__name__}.")
+    modules = [import_module(m.name) for m in walked if m.name != __name__]
+    found = [m.FORMAT for m in modules if isinstance(getattr(m, "FORMAT", None), Format)]
+
+    def turn(form: Format) -> tuple[int, str]:
+        if form.name in FIRST:
+            return FIRST.index(form.name), ""
+        return len(FIRST) + (form.name == "images"), form.name
+
+    return {form.name: form for form in sorted(found, key=turn)}
+
+
+def format_of(source: Path, name: str | None = None) -> Format:
+    """The row of ``own`` or of a plug-in for a source.
+
+    Parameters
+    ----------
+    source
+        A file or folder.
+    name
+        Its format; None: guess.
+
+    Raises
+    ------
+    SourceError
+        If there is no such source or format, or none fits: lists the formats.
+    PluginError
+        If a plug-in that is asked for by name cannot be loaded.
+    """
+    added = {n: p for n, p in plugins.found(plugins.FORMATS).items() if n not in own()}
+    known = ", ".join([*own(), *added])
+    if not source.exists():
+        raise SourceError(f"no file or folder {source}. Name one to convert")
+    if not (source.is_file() or source.is_dir()):
+        raise SourceError(f"{source} is neither a file nor a folder. Save it to a file first")
+    if odd := next((p for p in _within(source) if _is_neither(p)), None):
+        raise SourceError(f"{odd} is neither a file nor a folder. Move it out of {source}")
+    if name in added:
+        return _plugged(added[name])
+    if name is not None and name not in own():
+        near = get_close_matches(name, [*own(), *added], n=1)
+        hint = f"Did you mean {near[0]}? " if near else ""
+        raise SourceError(f"--from {name}: no such kind. {hint}Kinds: {known}")
+    if name is not None:
+        return own()[name]
+    if source.is_file() and source.stat().st_size == 0:
+        raise SourceError(f"{source} is empty, 0 bytes. Name another file")
+    if source.is_dir() and not any(source.iterdir()):
+        raise SourceError(f"{source} is an empty folder. Name one with files in it")
+    if guess := _guess(source, added.values()):
+        return guess
+    if source.suffix == ".mcap":
+        raise SourceError(f"{source} is a recording already. Say --to: csv, parquet, ros2")
+    raise SourceError(f"{source} looks like no kind that is known. Say --from: {known}")
+
+
+def _within(source: Path) -> Iterator[Path]:
+    return source.rglob("*") if source.is_dir() else iter(())
+
+
+def _is_neither(path: Path) -> bool:
+    """Whether something there would keep who opens it waiting, such as a pipe."""
+    return path.exists() and not (path.is_file() or path.is_dir())
+
+
+def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:
+    """The first format that knows a source: plug-ins after dmrl's own, before plain pictures."""
+    *first, pictures = own().values()
+    if found := next((f for f in first if f.recognises(source)), None):
+        return found
+    for plugin in added:
+        try:
+            form = _plugged(plugin)
+            if form.recognises(source):
+                return form
+        except PluginError as e:
+            say(f"{e}. Not tried on {source}")
+    return pictures if pictures.recognises(source) else None
+
+
+def _plugged(plugin: Plugin) -> Format:
+    """A format of another package; what fails in it names the package."""
+    loaded = plugin.load()
+    form = getattr(loaded, "FORMAT", loaded)
+    plugin.require(isinstance(form, Format), "a dmrl.formats.base.Format")
+
+    def recognises(source: Path) -> bool:
+        with plugin.blamed(f"fails to look at {source}"):
+            return bool(form.recognises(source))
+
+    def content(source: Path, options: Options) -> Content:
+        with plugin.blamed(f"fails to read {source}"):
+            held: Content = form.content(source, options)
+            return replace(held, samples=samples(source, held.samples))
+
+    def samples(source: Path, given: Iterator[Sample]) -> Iterator[Sample]:
+        with plugin.blamed(f"fails to read {source}"):
+            yield from given
+
+    return Format(plugin.name, form.what, recognises, content)

@@ -1,0 +1,278 @@
+"""ROS bags: rosbag2 (folders, ``.db3``, ``.mcap``) and ROS 1 (``.bag``). The home of rosbags.
+
+What is taken, by the message's type; all else is left out, with a line that names it:
+
+* ``sensor_msgs/Image`` (8 bits), ``CompressedImage`` (PNG, JPEG) and ``CameraInfo``;
+* ``nav_msgs/Odometry``: attitude, velocity (in the body's frame), height, pose;
+* ``sensor_msgs/Imu`` and ``geometry_msgs/TwistStamped``, for a robot without odometry;
+* ``geometry_msgs/PoseStamped``: a true pose where the topic names motion capture, else a pose;
+* ``sensor_msgs/Range`` on a topic that names two robots, ``/<robot>/uwb/<peer>``: UWB;
+* ``dmrl_msgs/*``, as ``dmrl convert --to ros2`` writes them, on the topics of dmrl.
+
+Times are those of the headers. Where they are empty, the time at which the bag received a message
+stands for it, with a line that says so; that time is the publish time of every message.
+"""
+
+import errno
+import re
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from dmrl import topics
+from dmrl.errors import DmrlError, MissingExtra, SourceError
+from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.ros.messages import HANDLERS, OWN, Placed, own
+from dmrl.guards.memory import Bounded, size_of
+from dmrl.samples.sample import Sample
+from dmrl.terminal.progress import say
+
+SUFFIXES = (".db3", ".bag", ".mcap")
+BEGINNING = b"#ROSBAG V2.0\n"
+NO_PICTURES = (topics.MASKS, topics.DEPTHS)
+"""Images that are no pictures of a camera: of a render that was exported."""
+CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
+ODD_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
+# Parts of a topic that say what it is, not whose.
+GENERIC = re.compile(
+    r"odom\w*|odometry|pose\w*|imu\w*|data|raw|twist|velocity|image\w*|color|colour|camera\w*|rgb|"
+    r"compressed|info|camera_info|filtered|local|vrpn_client_node|mavros|state|truth|calibration|"
+    r"uwb\w*|rang(e|es|ing)|dist(ance|ances)?|peers?|to|from",
+    re.IGNORECASE,
+)
+
+
+def recognises(source: Path) -> bool:
+    """Whether it is a ROS 1 bag, a rosbag2 folder, or the storage of one."""
+    if source.is_dir():
+        return (source / "metadata.yaml").is_file()
+    if source.suffix not in SUFFIXES:
+        return False
+    with source.open("rb") as stream:
+        head = stream.read(64)
+    if source.suffix == ".mcap":
+        return b"ros2" in head
+    return head.startswith((b"SQLite format 3", b"#ROSBAG V2"))
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What becomes of one topic of a bag."""
+
+    topic: str
+    kind: str
+    count: int
+    robot: str
+    peer: str = ""
+
+
+def content(source: Path, options: Options) -> Content:
+    """Samples of a bag, in the bag's order.
+
+    Parameters
+    ----------
+    source
+        The bag.
+    options
+        ``names`` gives robots their names: those in topics are else kept. ``robot`` is the
+        one of topics that name none.
+
+    Raises
+    ------
+    SourceError
+        If the bag cannot be read, or holds nothing that is known.
+    MissingExtra
+        If rosbags is not installed.
+    """
+    lines, unknown = plan(_topics(source), options)
+    if not lines:
+        known = ", ".join(sorted({*HANDLERS}))
+        raise SourceError(f"{source} has no topic that is known: {known}. Name another bag")
+    if unknown:
+        say(f"{source}: left out: {', '.join(sorted(unknown))}")
+    return Content(_samples(source, lines), sum(line.count for line in lines.values()))
+
+
+def plan(
+    held: list[tuple[str, str, int]], options: Options
+) -> tuple[dict[tuple[str, str], Line], list[str]]:
+    """What becomes of each topic, and the topics that are left out.
+
+    Parameters
+    ----------
+    held
+        Topic, type and number of messages.
+    options
+        See ``content``.
+    """
+    lines: dict[tuple[str, str], Line] = {}
+    unknown = []
+    for topic, kind, count in held:
+        line = _line(topic, kind, count, options)
+        if line is None or not count:
+            unknown += [topic] if count else []
+        else:
+            lines[topic, kind] = line
+    # One source of a kind per robot: two, interleaved, would contradict each other.
+    best: dict[tuple[str, str, str, bool], Line] = {}
+    for line in lines.values():
+        key = (line.kind, line.robot, line.peer, bool(CAPTURE.search(line.topic)))
+        if not line.kind.startswith(OWN) and (key not in best or best[key].count < line.count):
+            best[key] = line
+    kept = {
+        key: line
+        for key, line in lines.items()
+        if line.kind.startswith(OWN) or line in best.values()
+    }
+    return kept, unknown + [line.topic for key, line in lines.items() if key not in kept]
+
+
+def _line(topic: str, kind: str, count: int, options: Options) -> Line | None:
+    def name(part: str) -> str:
+        part = options.names.get(part, part)
+        return re.sub(r"[^A-Za-z0-9_-]", "_", part)
+
+    if kind.startswith(OWN):
+        return Line(topic, kind, count, "")
+    if kind not in HANDLERS or any(topics.names(one, topic) for one in NO_PICTURES):
+        return None
+    own = [name(part) for part in topic.split("/") if part and not GENERIC.fullmatch(part)]
+    if kind != "sensor_msgs/msg/Range":
+        return Line(topic, kind, count, own[-1] if own else options.robot)
+    if len(own) < 2 or own[-2] == own[-1]:
+        return None
+    return Line(topic, kind, count, own[-2], own[-1])
+
+
+def _reader(source: Path) -> Any:
+    try:
+        from rosbags.highlevel import AnyReader  # noqa: PLC0415
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ModuleNotFoundError as e:
+        raise MissingExtra("rosbags", "ros", "a ROS bag") from e
+    return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+
+
+def _topics(source: Path) -> list[tuple[str, str, int]]:
+    """Topic, type and number of messages of all connections of a bag."""
+    found: Counter[tuple[str, str]] = Counter()
+    for connection in _guarded(source, lambda reader: iter(reader.connections)):
+        found[connection.topic, connection.msgtype] += connection.msgcount
+    return [(topic, kind, count) for (topic, kind), count in found.items()]
+
+
+def _refuse_odd(source: Path) -> None:
+    """Nothing, if the SQLite files of a bag hold tables alone: a view computes what it likes.
+
+    A ROS 1 bag has to begin as one: rosbags reads its first line, however long it is.
+
+    Raises
+    ------
+    SourceError
+        If it is not so.
+    """
+    for path in sorted(source.glob("*.db3")) if source.is_dir() else [source]:
+        with path.open("rb") as stream:
+            head = stream.read(16)
+        if path.suffix == ".bag" and not head.startswith(BEGINNING):
+            raise SourceError(f"{path} does not begin as a ROS 1 bag 2.0. Name another file")
+        if not head.startswith(b"SQLite format 3"):
+            continue
+        where = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(where, uri=True)) as database:
+            for kind, text in database.execute("SELECT type, sql FROM sqlite_master"):
+                if kind not in ("table", "index") or ODD_TABLE.search(text or ""):
+                    raise SourceError(f"{path} holds more than tables. Record the bag again")
+
+
+def _guarded(source: Path, of: Any) -> Iterator[Any]:
+    """What ``of(reader)`` gives, with any error of rosbags as one line.
+
+    rosbags lets through what sqlite, YAML, struct and its decompressors raise on damaged
+    bags, so there is no list of errors to name here.
+    """
+    try:
+        bound = Bounded(size_of(source))
+        reader = _reader(source)
+        _refuse_odd(source)
+        with bound:
+            reader.open()
+        with closing(reader):
+            found = of(reader)
+            while True:
+                with bound:
+                    one = next(found, None)
+                if one is None:
+                    return
+                yield one
+    except DmrlError:
+        raise
+    except Exception as e:
+        if isinstance(e, MemoryError) or getattr(e, "errno", None) == errno.EFBIG:
+            raise SourceError(
+                f"{source} unpacks to much more than its size explains. Record the bag again"
+            ) from e
+        why = " ".join(str(e).split())[:200] or type(e).__name__
+        raise SourceError(f"{source} cannot be read as a ROS bag: {why}. Restore it") from e
+
+
+def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sample]:
+    calibrated: set[str] = set()
+    unstamped: Counter[str] = Counter()
+    fixed: set[str] = set()
+    moving = {line.robot for line in lines.values() if line.kind == "nav_msgs/msg/Odometry"}
+
+    def messages(reader: Any) -> Iterator[Any]:
+        wanted = [c for c in reader.connections if (c.topic, c.msgtype) in lines]
+        for connection, bag_ns, data in reader.messages(connections=wanted):
+            line = lines[connection.topic, connection.msgtype]
+            yield line, bag_ns, reader.deserialize(data, connection.msgtype)
+
+    for line, bag_ns, decoded in _guarded(source, messages):
+        captured, odometry = bool(CAPTURE.search(line.topic)), line.robot in moving
+        where = Placed(source, line.robot, line.peer, captured, odometry, fixed)
+        # Where a header has no time, and where there is none, the bag's own is the best there is.
+        time_ns = _stamp_ns(decoded)
+        unstamped[line.topic] += time_ns == 0 < bag_ns
+        for sample in _of(line, decoded, time_ns or max(bag_ns, 0), where):
+            is_calibration = sample.message == "CameraCalibration"
+            # It comes with every image and is always the same: the first is enough.
+            if not (is_calibration and sample.topic in calibrated):
+                yield replace(sample, publish_ns=max(bag_ns, 0))
+            if is_calibration:
+                calibrated.add(sample.topic)
+    _say_what_is_odd(source, fixed, unstamped)
+
+
+def _say_what_is_odd(source: Path, fixed: set[str], unstamped: Mapping[str, int]) -> None:
+    """Lines on velocities that were left out, and on topics whose stamps are 0."""
+    if fixed:
+        say(
+            f"{source}: left out: velocities of {', '.join(sorted(fixed))}, which are in a frame "
+            "that does not turn with the robot. Record its odometry"
+        )
+    if told := [f"{count} on {topic}" for topic, count in unstamped.items() if count]:
+        say(f"{source}: a stamp of 0 have {', '.join(told)}; they are at the times of the bag")
+
+
+def _stamp_ns(message: Any) -> int | None:
+    """Time in the header; 0: it is empty, None: there is no header."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is None:
+        return None
+    return max(int(stamp.sec * 1_000_000_000 + stamp.nanosec), 0)
+
+
+def _of(line: Line, message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+    if not line.kind.startswith(OWN):
+        yield from HANDLERS[line.kind](message, time_ns, where)
+    elif (sample := own(message, line.topic, time_ns)) is not None:
+        yield sample
+
+
+FORMAT = Format("rosbag2", "a ROS bag", recognises, content)

@@ -1,0 +1,187 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.aideck import nanocockpit
+from dmrl.formats.base import Options
+from dmrl.formats.registry import format_of
+from dmrl.geometry.frames import AIDECK
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode, encode_jpeg, encode_png
+from dmrl.samples.sample import Sample
+
+from .. import foreign
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Six pictures; time and number wrap between the third and the fourth."""
+    return foreign.nanocockpit(tmp_path / "cockpit")
+
+
+def samples(folder: Path) -> dict[str, list[Sample]]:
+    """Samples by topic."""
+    found: dict[str, list[Sample]] = {}
+    for sample in nanocockpit.content(folder, Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+def test_pictures_have_the_camera_s_time_unwrapped(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = samples(folder)["/cf1/camera/image"]
+    assert np.diff([s.time_ns for s in found]).tolist() == [50_000_000] * 5
+    for sample, raw in zip(found, foreign.pictures(6), strict=True):
+        np.testing.assert_array_equal(decode(sample.fields["data"]), rgb_of(raw))
+    assert capsys.readouterr().err == ""
+
+
+def test_the_state_has_the_units_of_dmrl(folder: Path) -> None:
+    found = samples(folder)
+    attitude, velocity = found["/cf1/attitude"], found["/cf1/velocity"]
+    assert attitude[0].fields == pytest.approx(
+        {"roll_rad": 0, "pitch_rad": 0, "yaw_rad": 0, "yaw_rate_radps": 0.25}, abs=2e-3
+    )
+    assert velocity[0].fields == pytest.approx({"vx_mps": 0.5, "vy_mps": 0, "vz_mps": 0}, abs=1e-9)
+    assert [s.fields["height_m"] for s in found["/cf1/height"]] == pytest.approx([0.9] * 6)
+    assert found["/cf1/pose"][5].fields["pose"]["position"]["x"] == pytest.approx(0.5)
+    # The state came 5 ms before the picture.
+    assert found["/cf1/camera/image"][0].time_ns - attitude[0].time_ns == 5_000_000
+
+
+def test_lost_pictures_are_counted_by_their_numbers(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = (folder / "metadata.csv").read_text().splitlines()
+    del lines[3:5]
+    (folder / "metadata.csv").write_text("\n".join(lines) + "\n")
+    assert len(samples(folder)["/cf1/camera/image"]) == 4
+    assert "2 pictures were lost on the way" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("frame_id", "frame", r"metadata.csv:1: no column frame_id"),
+        ("00003.jpg", "00009.jpg", r"no picture 00009 in .*camera_raw"),
+        (",10,255,", ",10,x,", r"metadata.csv:4: not a file and whole numbers"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_one_line(folder: Path, old: str, new: str, text: str) -> None:
+    path = folder / "metadata.csv"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(SourceError, match=text):
+        samples(folder)
+
+
+def test_it_is_known_by_its_table(folder: Path) -> None:
+    assert format_of(folder).name == "nanocockpit"
+
+
+def test_differences_of_counts_that_wrap_are_the_short_way() -> None:
+    ticks = np.array([5, -5, 2**31 - 1, 2**31, -(2**31), 2**32 - 3, 3 - 2**32])
+    short = [5, -5, 2**31 - 1, -(2**31), -(2**31), -3, 3]
+    assert nanocockpit._nearest(ticks).tolist() == short
+
+
+def test_a_state_that_stands_counts_once_and_none_before_the_first(folder: Path) -> None:
+    path = folder / "metadata.csv"
+    head, *lines = path.read_text().splitlines()
+    at = head.split(",").index("state_gap8_timestamp")
+    rows = [line.split(",") for line in lines]
+    for row, stamp in zip(rows, ("0", "0", rows[2][at], rows[2][at], *"xx"), strict=True):
+        row[at] = row[at] if stamp == "x" else stamp
+    path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
+    found = samples(folder)
+    images = [s.time_ns for s in found["/cf1/camera/image"]]
+    assert [s.time_ns for s in found["/cf1/attitude"]] == [images[k] - 5_000_000 for k in (2, 4, 5)]
+    for row in rows:
+        row[at] = "0"
+    path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
+    assert samples(folder).keys() == {"/cf1/camera/image"}
+
+
+def test_a_camera_that_is_given_stands_before_the_pictures(folder: Path) -> None:
+    camera = replace(AIDECK, width_px=32, height_px=24)
+    first, *rest = nanocockpit.content(folder, Options(robot="me", camera=camera)).samples
+    while first.topic != "/me/camera/calibration":  # a state may have come before
+        first, *rest = rest
+    images = [s.time_ns for s in rest if s.topic == "/me/camera/image"]
+    assert first.time_ns == images[0] == (2**32 - 120_000) * 1000
+    assert len(images) == 6
+
+
+def test_colour_pictures_stand_in_for_raw_ones_as_they_are(folder: Path) -> None:
+    (folder / "camera_raw").rename(folder / "camera_rgb")
+    jpegs = []
+    for k, path in enumerate(sorted((folder / "camera_rgb").iterdir())):
+        path.unlink()
+        jpegs.append(encode_jpeg(np.full((24, 32, 3), 20 * k, np.uint8)))
+        path.with_suffix(".jpg").write_bytes(jpegs[-1])
+    found = samples(folder)["/cf1/camera/image"]
+    assert [s.fields["data"] for s in found] == jpegs
+    assert {s.fields["format"] for s in found} == {"jpeg"}
+    assert nanocockpit.recognises(folder)
+
+
+@pytest.mark.parametrize(("size", "fits"), [((4, 4), True), ((3, 8), False), ((8, 3), False)])
+def test_raw_pictures_are_of_four_by_four_pixels_at_least(
+    size: tuple[int, int], fits: bool, folder: Path
+) -> None:
+    for path in (folder / "camera_raw").iterdir():
+        path.write_bytes(encode_png(np.zeros(size, np.uint8)))
+    if fits:
+        assert len(samples(folder)["/cf1/camera/image"]) == 6
+    else:
+        with pytest.raises(SourceError, match="is smaller than 4 x 4 pixels"):
+            samples(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "metadata.csv:1: no column filename"),
+        ("{head}\n", "has no rows"),
+        ("{head}\n{row}\n{row}", ""),
+        ("{head}\n{row}\na,1", ""),
+        ("{head}\na,1", "has no rows"),
+        ("{head}\na,1\n{row}\n", "metadata.csv:2: not a file and whole numbers"),
+        ("{head}\n{large}\n", "a number beyond 64 bits"),
+    ],
+)
+def test_a_table_s_last_line_may_be_cut(
+    text: str, said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "metadata.csv"
+    head, row, *_ = path.read_text().splitlines()
+    large = row.replace(row.split(",")[3], str(2**64))
+    path.write_text(text.format(head=head, row=row, large=large))
+    if said:
+        with pytest.raises(SourceError, match=said.replace(".", r"\.")):
+            samples(folder)
+        return
+    cut = "a,1" in text
+    assert len(samples(folder)["/cf1/camera/image"]) == 2 - cut
+    assert ("its last line is cut short" in capsys.readouterr().err) == cut
+
+
+def test_every_number_of_a_state_is_in_its_place(folder: Path) -> None:
+    path = folder / "metadata.csv"
+    head, row, *_ = path.read_text().splitlines()
+    names, cells = head.split(","), row.split(",")
+    values = {"x": 1000, "y": -2000, "z": 3000, "vx": 400, "vy": -500, "vz": 600}
+    for name, value in values.items():
+        cells[names.index(f"state_{name}")] = str(value)
+    path.write_text(f"{head}\n{','.join(cells)}\n")
+    found = samples(folder)
+    velocity = found["/cf1/velocity"][0].fields  # it looks along x
+    assert velocity == pytest.approx({"vx_mps": 0.4, "vy_mps": -0.5, "vz_mps": 0.6})
+    place = found["/cf1/pose"][0].fields["pose"]["position"]
+    assert place == pytest.approx({"x": 1, "y": -2, "z": 3})
+    logged = found["/cf1/log/stateEstimateZ"][0].fields
+    assert logged["stateEstimateZ_x"] == 1000 and logged["stateEstimateZ_rateYaw"] == 250

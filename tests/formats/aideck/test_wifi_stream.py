@@ -1,0 +1,147 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.aideck import wifi_stream
+from dmrl.formats.aideck.cpx import Image, Layout
+from dmrl.formats.aideck.cpx_encode import pack_image
+from dmrl.formats.aideck.cpx_state import State
+from dmrl.formats.base import Options
+from dmrl.formats.registry import format_of
+from dmrl.geometry.frames import AIDECK
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode, encode_jpeg
+from dmrl.samples.sample import Sample
+
+from .. import foreign
+
+
+def samples(path: Path, data: bytes, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Samples by topic of a stream of these bytes."""
+    path.write_bytes(data)
+    found: dict[str, list[Sample]] = {}
+    for sample in wifi_stream.content(path, options or Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+def test_raw_pictures_get_their_colours_and_nominal_times(tmp_path: Path) -> None:
+    raw = foreign.pictures(3)
+    data = b"".join(pack_image(Image(32, 24, "raw", p.tobytes())) for p in raw)
+    found = samples(tmp_path / "a.cpx", data, Options(rate_hz=20))["/cf1/camera/image"]
+    assert [s.time_ns for s in found] == [0, 50_000_000, 100_000_000]
+    for sample, pixels in zip(found, raw, strict=True):
+        np.testing.assert_array_equal(decode(sample.fields["data"]), rgb_of(pixels))
+    assert format_of(tmp_path / "a.cpx").name == "aideck-stream"
+
+
+def test_a_camera_that_is_given_comes_once_before_the_pictures(tmp_path: Path) -> None:
+    raw = foreign.pictures(3)
+    data = b"".join(pack_image(Image(32, 24, "raw", p.tobytes())) for p in raw)
+    found = samples(tmp_path / "a.cpx", data, Options(rate_hz=20, camera=AIDECK))
+    (calibration,) = found["/cf1/camera/calibration"]
+    assert calibration.time_ns == 0
+    assert len(found["/cf1/camera/image"]) == 3
+
+
+def test_jpegs_keep_their_bytes(tmp_path: Path) -> None:
+    jpeg = encode_jpeg(np.full((24, 32, 3), 90, np.uint8))
+    found = samples(tmp_path / "a.cpx", pack_image(Image(32, 24, "jpeg", jpeg)))
+    (image,) = found["/cf1/camera/image"]
+    assert (image.fields["format"], image.fields["data"]) == ("jpeg", jpeg)
+
+
+def test_the_camera_s_clock_and_the_robot_s_state_are_used(tmp_path: Path) -> None:
+    start = 2**32 - 75_000  # wraps between the second picture and the third
+    data = b""
+    for k, raw in enumerate(foreign.pictures(4)):
+        time = start + 50_000 * k
+        state = State(1000 + 50 * k, time - 4_000, (0.1 * k, 0.0, 0.7), (0.0, 0.5, 0.0))
+        data += pack_image(Image(32, 24, "raw", raw.tobytes(), time, k, state), "streamer")
+    found = samples(tmp_path / "a.cpx", data)
+    assert np.diff([s.time_ns for s in found["/cf1/camera/image"]]).tolist() == [50_000_000] * 3
+    heights = found["/cf1/height"]
+    assert [s.fields["height_m"] for s in heights] == pytest.approx([0.7] * 4)
+    assert heights[0].time_ns == found["/cf1/camera/image"][0].time_ns - 4_000_000
+    assert found["/cf1/velocity"][0].fields["vy_mps"] == pytest.approx(0.5)
+    assert found["/cf1/log/cpx_state"][2].fields["stateEstimate_x"] == pytest.approx(0.2)
+
+
+def test_a_stream_that_was_cut_gives_what_is_whole_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
+    found = samples(tmp_path / "a.cpx", one * 2 + one[:12] + one * 2)
+    assert len(found["/cf1/camera/image"]) >= 3
+    assert "pictures are broken" in capsys.readouterr().err
+
+
+def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="holds no whole picture of a CPX stream"):
+        samples(tmp_path / "a.cpx", b"\0" * 1000)
+    assert not wifi_stream.recognises(tmp_path / "a.cpx")
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
+@pytest.mark.parametrize("layout", ["plain", "streamer"])
+def test_a_stream_that_was_cut_says_so(
+    layout: Layout, share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = [
+        Image(32, 24, "raw", raw.tobytes(), 1_000_000 + 50_000 * k, k)
+        for k, raw in enumerate(foreign.pictures(3))
+    ]
+    whole = b"".join(pack_image(image, layout) for image in images)
+    path = tmp_path / "flight.cpx"
+    path.write_bytes(whole[: int(len(whole) * share)])
+    found = wifi_stream.content(path, Options()).samples
+    assert len([s for s in found if s.message == "CompressedImage"]) == int(3 * share)
+    assert "1 pictures are broken or cut short" in capsys.readouterr().err
+    path.write_bytes(whole)
+    list(wifi_stream.content(path, Options()).samples)
+    assert not capsys.readouterr().err
+
+
+def test_times_of_a_camera_that_does_not_always_tell_are_nominal_and_none_goes_back() -> None:
+    of = wifi_stream._times_ns
+    assert of([5, 3, 9], 10.0) == [5000, 5000, 9000]
+    assert of([5, None, 9], 4.0) == [0, 250_000_000, 500_000_000]
+    assert of([0, 1], 4.0) == [0, 1000]
+
+
+@pytest.mark.parametrize(("garbage", "known"), [(1000, True), (65_000, True), (66_000, False)])
+def test_a_stream_is_known_by_a_whole_picture_near_its_start(
+    garbage: int, known: bool, tmp_path: Path
+) -> None:
+    image = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
+    path = tmp_path / "flight.cpx"
+    path.write_bytes(bytes(garbage) + image * 2)
+    assert wifi_stream.recognises(path) == known
+    path.rename(tmp_path / "flight.txt")
+    assert not wifi_stream.recognises(tmp_path / "flight.txt")
+
+
+def test_the_robot_s_turning_is_told_in_radians(tmp_path: Path) -> None:
+    state = State(1000, 5_000_000, (0.0, 0.0, 0.7), turning_radps=(0.1, 0.2, 0.5))
+    raw = foreign.pictures(1)[0].tobytes()
+    data = pack_image(Image(32, 24, "raw", raw, 5_004_000, 1, state), "streamer")
+    (attitude,) = samples(tmp_path / "a.cpx", data)["/cf1/attitude"]
+    assert attitude.fields["yaw_rate_radps"] == pytest.approx(0.5)
+    assert attitude.time_ns == 5_000_000_000
+
+
+def test_a_state_is_logged_in_the_order_of_its_names(tmp_path: Path) -> None:
+    state = State(
+        *(1000, 5_000_000, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+        turning_radps=tuple(np.radians((7.0, 8.0, 9.0)).tolist()),
+    )
+    raw = foreign.pictures(1)[0].tobytes()
+    data = pack_image(Image(32, 24, "raw", raw, 5_004_000, 1, state), "streamer")
+    (logged,) = samples(tmp_path / "a.cpx", data)["/cf1/log/cpx_state"]
+    values = [*(1, 2, 3), *(4, 5, 6), *(0, 0, 0, 1), *(7, 8, 9)]
+    assert list(logged.fields.values()) == pytest.approx(values, abs=0.03)
+    names = ("x", "y", "z", "vx", "vy", "vz", "qx", "qy", "qz", "qw")
+    turns = [f"gyro_{axis}" for axis in "xyz"]
+    assert list(logged.fields) == [*(f"stateEstimate_{name}" for name in names), *turns]

@@ -1,0 +1,246 @@
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.crazyflie import usd_log, usd_records
+
+from .. import foreign, plain_usd
+
+LOGS = ("log05", "jana00_brushed_flights", "eckart00_brushless_flights")
+# Records of each event, counted by an independent decoder.
+COUNTS = {
+    "log05": {
+        "estTDOA": 2044,
+        "estGyroscope": 11457,
+        "estAcceleration": 11457,
+        "estBarometer": 573,
+        "lhPosition": 1562,
+    },
+    "jana00_brushed_flights": {"fixedFrequency": 4643, "estPose": 511},
+    "eckart00_brushless_flights": {"fixedFrequency": 4634, "estPose": 926},
+}
+
+
+def same(log: usd_log.Log, data: bytes) -> None:
+    """The log holds what the value-by-value decoder finds, bit for bit."""
+    wanted = plain_usd.decode(data)
+    unit = {1: 1_000_000, 2: 1000}[log.version]
+    assert [b.name for b in log.blocks] == [name for name, v in wanted.items() if v["timestamp"]]
+    for block in log.blocks:
+        values = wanted[block.name]
+        assert (block.time_ns == np.array(values.pop("timestamp")) * unit).all()
+        assert list(block.columns) == list(values)
+        for name, column in block.columns.items():
+            np.testing.assert_array_equal(column, np.array(values[name], column.dtype))
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_real_logs_equal_an_independent_decode(data: Path, name: str) -> None:
+    raw = (data / "crazyflie-usd" / name).read_bytes()
+    assert zlib.crc32(raw[:-4]) == struct.unpack("<I", raw[-4:])[0]
+    log = usd_log.decode(raw)
+    assert log.warnings == ()
+    assert {b.name: len(b.time_ns) for b in log.blocks} == COUNTS[name]
+    same(log, raw)
+
+
+def test_rates_of_a_real_log_are_those_that_were_set(data: Path) -> None:
+    raw = (data / "crazyflie-usd" / "eckart00_brushless_flights").read_bytes()
+    rates = {
+        b.name: (len(b.time_ns) - 1) / ((b.time_ns[-1] - b.time_ns[0]) * 1e-9)
+        for b in usd_log.decode(raw).blocks
+    }
+    assert rates["fixedFrequency"] == pytest.approx(505, abs=1)
+    assert rates["estPose"] == pytest.approx(101, abs=1)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_both_versions_are_read(version: int) -> None:
+    raw = foreign.usd_log(version)
+    log = usd_log.decode(raw)
+    assert (log.version, log.warnings) == (version, ())
+    same(log, raw)
+
+
+def test_every_type_of_variable_is_read() -> None:
+    values = {"b": -5, "B": 250, "h": -300, "H": 60000, "i": -(2**31), "I": 2**32 - 1}
+    numbers = (*values.values(), 0.5, 1.25)
+    codes = [*values, "e", "f"]
+    raw = plain_usd.encode({1: ("all", [(f"v.{c}", c) for c in codes])}, [(1, 7, numbers)])
+    (block,) = usd_log.decode(raw).blocks
+    assert tuple(column[0] for column in block.columns.values()) == numbers
+
+
+@pytest.mark.parametrize("name", ["synthetic", *LOGS])
+def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    if name == "synthetic":
+        raw = foreign.usd_log()
+    else:
+        raw = (request.getfixturevalue("data") / "crazyflie-usd" / name).read_bytes()
+    body = usd_log._header(raw, name)[2]
+    whole = usd_log.decode(raw)
+    sizes = {b.name: 10 + sum(c.itemsize for c in b.columns.values()) for b in whole.blocks}
+    times = np.concatenate([b.time_ns for b in whole.blocks])
+    size = np.concatenate([np.full(len(b.time_ns), sizes[b.name]) for b in whole.blocks])
+    assert body + size.sum() + 4 == len(raw)
+    for length in np.random.default_rng(7).integers(body, len(raw) - 4, 50).tolist():
+        log = usd_log.decode(raw[:length], name)
+        assert "no valid CRC" in log.warnings[0]
+        got = sum(len(b.time_ns) * sizes[b.name] for b in log.blocks)
+        # What is left is less than one record.
+        assert 0 <= length - body - got < size.max()
+        for cut in log.blocks:
+            full = next(b for b in whole.blocks if b.name == cut.name)
+            assert (cut.time_ns == full.time_ns[: len(cut.time_ns)]).all()
+    assert len(times)
+
+
+def test_an_empty_log_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "log00").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"log00 is empty.* Name another log") as e:
+        usd_log.content(tmp_path / "log00", Options())
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "text"),
+    [
+        (lambda raw: b"\xbd" + raw[1:], "no micro-SD log of version 1 or 2"),
+        (lambda raw: raw[:1] + b"\3" + raw[2:], "no micro-SD log of version 1 or 2"),
+        (lambda raw: raw[:40], "damaged in its header, or ends there"),
+        (lambda raw: raw.replace(b"estDistance\0", b"fixedFrequency\0"), "the same name"),
+        (lambda raw: raw.replace(b"gyro.x(f)", b"gyro.x(q)"), "without name or known type"),
+    ],
+)
+def test_a_damaged_header_is_one_line(damage: object, text: str) -> None:
+    with pytest.raises(SourceError, match=text):
+        usd_log.decode(damage(foreign.usd_log()), "log07")  # type: ignore[operator]
+
+
+def test_an_id_that_is_unknown_ends_the_log_with_a_warning() -> None:
+    raw = foreign.usd_log()
+    log = usd_log.decode(raw[:-4] + b"\x55\x55" + b"\0" * 30)
+    assert [len(b.time_ns) for b in log.blocks] == [100, 20, 20]
+    assert "32 bytes from byte" in log.warnings[1]
+
+
+def test_bytes_that_look_like_ids_are_no_records() -> None:
+    events = {7: ("a", [("x", "H"), ("y", "H")]), 9: ("b", [("z", "I")])}
+    rows = [(7, 7 * 65536 + 9, (7, 9)) if k % 3 else (9, 7, (9 * 65536 + 7,)) for k in range(300)]
+    raw = plain_usd.encode(events, rows)
+    same(usd_log.decode(raw), raw)
+
+
+@pytest.mark.parametrize("code", ["H", "B"])
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "aabab" + 60 * "ab",
+        60 * "abc",
+        60 * "bca",
+        40 * "abca",
+        60 * "ab" + "b" + 60 * "ab",
+        60 * "ab" + "a",
+        60 * "ab" + "ac" + 60 * "ab",
+        60 * "ab" + 60 * "ba",
+    ],
+)
+def test_events_that_come_together_are_told_apart(
+    pattern: str, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = {ord(c) - 90: (c, [("x", "H"), ("y", code)]) for c in "abc"}
+    rows = [(ord(c) - 90, 1000 * k, (k, 7)) for k, c in enumerate(pattern)]
+    raw = plain_usd.encode(events, rows)
+    same(usd_log.decode(raw), raw)
+    monkeypatch.setattr(usd_records, "PIECE", 100)
+    same(usd_log.decode(raw), raw)
+
+
+def test_events_that_always_follow_one_another_are_gathered_as_one() -> None:
+    events = [usd_records.Event(k, "abc"[k], (("x", "H"),), "<u4") for k in range(3)]
+    order = [0, 1, 2] * usd_records.SAMPLE
+    data = b"header" + b"".join(struct.pack("<HIH", k, 0, 0) for k in order)
+    (group,) = usd_records._together(data, len(b"header"), events)
+    assert [event.number for event in group] == [0, 1, 2]
+
+
+def test_milliseconds_that_wrap_go_on() -> None:
+    rows = [(1, (2**32 - 2 + k) % 2**32, (k,)) for k in range(5)]
+    (block,) = usd_log.decode(plain_usd.encode({1: ("a", [("x", "H")])}, rows, 1)).blocks
+    assert np.diff(block.time_ns).tolist() == [1_000_000] * 4
+
+
+@pytest.mark.parametrize(
+    ("head", "known"),
+    [
+        (b"\xbc" + struct.pack("<HH", 1, 1), True),
+        (b"\xbc" + struct.pack("<HH", 2, 250), True),
+        (b"\xbc" + struct.pack("<HH", 2, 251), False),
+        (b"\xbc" + struct.pack("<HH", 2, 0), False),
+        (b"\xbc" + struct.pack("<HH", 0, 1), False),
+        (b"\xbc" + struct.pack("<HH", 3, 1), False),
+        (b"\xbd" + struct.pack("<HH", 1, 1), False),
+        (b"\xbc\1\0\1", False),
+    ],
+)
+def test_a_log_is_known_by_five_bytes(head: bytes, known: bool, tmp_path: Path) -> None:
+    (tmp_path / "log").write_bytes(head)
+    assert usd_log.recognises(tmp_path / "log") == known
+    assert usd_log.recognises(tmp_path) == known
+    if not known:
+        with pytest.raises(SourceError, match="no micro-SD log in"):
+            usd_log.content(tmp_path, Options())
+
+
+@pytest.mark.parametrize(
+    ("events", "words"),
+    [
+        ({1: ("a", [("x", "H"), ("x", "H")])}, "without name or known type"),
+        ({1: ("a", [("", "H")])}, "without name or known type"),
+        ({1: ("", [("x", "H")])}, "without name or known type"),
+        ({1: ("a", [("x", "d")])}, "without name or known type"),
+    ],
+)
+def test_variables_have_names_of_their_own_and_known_types(
+    events: dict[int, tuple[str, list[tuple[str, str]]]], words: str
+) -> None:
+    head = b"\xbc" + struct.pack("<HH", 2, len(events))
+    for number, (name, variables) in events.items():
+        head += (
+            struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
+        )
+        head += b"".join(f"{variable}({code})".encode() + b"\0" for variable, code in variables)
+    with pytest.raises(SourceError, match=words):
+        usd_log.decode(head + bytes(40))
+
+
+@pytest.mark.parametrize("numbers", [(1, 257), (0x0102, 0xFF02), (0xFFFF, 0x00FF)])
+def test_events_whose_numbers_end_alike_are_told_apart(numbers: tuple[int, int]) -> None:
+    events = {numbers[0]: ("a", [("x", "H")]), numbers[1]: ("b", [("y", "I"), ("z", "H")])}
+    rows = [
+        (numbers[k % 3 == 0], 1000 * k, (k,) if k % 3 else (70_000 + k, 257)) for k in range(200)
+    ]
+    raw = plain_usd.encode(events, rows)
+    same(usd_log.decode(raw), raw)
+
+
+def test_a_log_has_250_types_of_events_at_most_and_names_that_print() -> None:
+    events = {k: (f"e{k}", [("x", "H")]) for k in range(251)}
+    most = {k: events[k] for k in range(250)}
+    raw = plain_usd.encode(most, [(k, k, (k,)) for k in range(250)])
+    assert len(usd_log.decode(raw).blocks) == 250
+    with pytest.raises(SourceError, match="no micro-SD log of version 1 or 2"):
+        usd_log.decode(plain_usd.encode(events, []))
+    for name, variable in (("a\n", "x"), ("a", "x\n")):
+        with pytest.raises(SourceError, match="without name or known type"):
+            usd_log.decode(plain_usd.encode({1: (name, [(variable, "H")])}, []))
+    for head in (b"\xbc\2\0\0\0", b"\xbc\2\0"):
+        with pytest.raises(SourceError):
+            usd_log.decode(head + bytes(9))

@@ -1,0 +1,325 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.files import flight_csv
+from dmrl.geometry.frames import AIDECK
+from dmrl.images.codec import encode_png
+from dmrl.samples.flight import LOG_COLUMNS, from_poses
+
+HEADER = ["time_s", *LOG_COLUMNS]
+Rows = list[list[object]]
+
+
+def rows(start_s: float = 1.0, count: int = 20) -> Rows:
+    """Level flight forward, twenty samples at 100 Hz."""
+    return [[round(start_s + 0.01 * k, 3), 0.0, 0.01, 0.1, 0.5, 0.0, 1.0] for k in range(count)]
+
+
+def write(folder: Path, robot: str, data: Rows, header: list[str] = HEADER) -> None:
+    folder.mkdir(exist_ok=True)
+    lines = [",".join(map(str, row)) for row in [header, *data]]
+    (folder / f"{robot}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """Two robots; cf1 ranges to cf2 in every other row and knows where it truly is."""
+    folder = tmp_path / "flight"
+    extra = ["range_cf2_m", "cf2_x_m", "cf2_y_m", "cf2_z_m"]
+    mine: Rows = [
+        [*row, 2.5 if k % 2 else "", *(1, 2, 0.1)] if k < 10 else [*row, "", "", "", ""]
+        for k, row in enumerate(rows())
+    ]
+    write(folder, "cf1", mine, [*HEADER, *extra])
+    write(folder, "cf2", rows())
+    return folder
+
+
+def test_a_flight_becomes_samples_in_time_order(flight: Path) -> None:
+    assert flight_csv.recognises(flight)
+    samples = list(flight_csv.content(flight).samples)
+    times = [s.time_ns for s in samples]
+    assert times == sorted(times)
+    assert times[0] == 1_000_000_000
+    by_topic = {
+        topic: [s for s in samples if s.topic == topic] for topic in {s.topic for s in samples}
+    }
+    assert {topic: len(found) for topic, found in by_topic.items()} == {
+        "/cf1/attitude": 20,
+        "/cf1/velocity": 20,
+        "/cf1/height": 20,
+        "/cf1/range/cf2": 5,
+        "/cf1/peer/cf2/truth": 10,
+        "/cf2/attitude": 20,
+        "/cf2/velocity": 20,
+        "/cf2/height": 20,
+    }
+    assert by_topic["/cf1/velocity"][3].fields == {"vx_mps": 0.5, "vy_mps": 0.0}
+    assert by_topic["/cf1/range/cf2"][0].time_ns == 1_010_000_000
+    last = by_topic["/cf1/attitude"][-1].fields
+    assert last["yaw_rad"] == pytest.approx(0.019)
+    assert (last["pitch_rad"], last["yaw_rate_radps"]) == (0.01, 0.1)
+    where = by_topic["/cf1/peer/cf2/truth"][0].fields
+    assert (where["x"], where["y"], where["z"], where["frame_id"]) == (1, 2, 0.1, "cf1/horizontal")
+
+
+def test_pictures_beside_the_log_come_along(flight: Path) -> None:
+    (flight / "cf1").mkdir()
+    picture = encode_png(np.zeros((8, 8, 3), np.uint8))
+    (flight / "cf1" / "001005000000.png").write_bytes(picture)
+    images = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/camera/image"]
+    assert [(s.time_ns, s.fields["data"]) for s in images] == [(1_005_000_000, picture)]
+
+
+def test_robots_get_the_names_that_are_asked_for(flight: Path) -> None:
+    folder = flight / "cf1"
+    folder.mkdir()
+    (folder / "0000001050000000.png").write_bytes(encode_png(np.zeros((224, 320, 3), np.uint8)))
+    options = Options(names={"cf1": "left", "cf2": "right"}, camera=AIDECK)
+    found = {sample.topic for sample in flight_csv.content(flight, options).samples}
+    own = {"/left/range/right", "/left/peer/right/truth", "/left/camera/calibration"}
+    assert own | {"/left/camera/image", "/right/height"} < found
+    assert not [topic for topic in found if "cf" in topic]
+
+
+def test_pictures_that_are_not_named_by_time_are_refused(flight: Path) -> None:
+    (flight / "cf1").mkdir()
+    (flight / "cf1" / "7.png").write_bytes(encode_png(np.zeros((8, 8, 3), np.uint8)))
+    with pytest.raises(SourceError, match=r"7\.png is not named by its time"):
+        flight_csv.content(flight)
+
+
+def refused(folder: Path) -> str:
+    with pytest.raises(SourceError) as caught:
+        list(flight_csv.content(folder).samples)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_time_that_goes_back_or_stands_still_is_refused(flight: Path) -> None:
+    for change in (0.03, 0.02):
+        data = rows()
+        data[4][0] = 1.0 + change
+        write(flight, "cf2", data)
+        assert "cf2.csv:6: time goes back or stands still" in refused(flight)
+
+
+def test_what_is_no_number_is_refused_with_its_line(flight: Path) -> None:
+    for cell in ("nan", "", "inf"):
+        data = rows()
+        data[6][5] = cell
+        write(flight, "cf2", data)
+        assert "cf2.csv:8: vy_mps is no number" in refused(flight)
+    data[6][5] = "fast"
+    write(flight, "cf2", data)
+    assert "cf2.csv:8: could not convert" in refused(flight)
+    write(flight, "cf2", [*rows(), [2.0, 1]])
+    assert "cf2.csv:22 has 2 cells, not 7" in refused(flight)
+
+
+def test_a_missing_column_is_named(flight: Path) -> None:
+    write(flight, "cf2", [row[:-2] for row in rows()], HEADER[:-2])
+    assert "cf2.csv has no column vy_mps, height_m" in refused(flight)
+
+
+def test_too_little_is_refused(flight: Path, tmp_path: Path) -> None:
+    write(flight, "cf2", rows()[:1])
+    assert "fewer than two rows" in refused(flight)
+    assert "no <robot>.csv in" in refused(tmp_path)
+    write(flight, "cf2", rows(-0.5))
+    assert "begins before time 0" in refused(flight)
+
+
+def test_clocks_an_hour_apart_are_refused(flight: Path) -> None:
+    write(flight, "cf2", rows(3601.0))
+    assert "share no time: 3600 s lie between them. Put both on one clock" in refused(flight)
+
+
+def warned(folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    list(flight_csv.content(folder).samples)
+    return capsys.readouterr().err.splitlines()
+
+
+def test_degrees_are_warned_of(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert warned(flight, capsys) == []
+    data = rows()
+    for row in data[::5]:
+        row[1] = -8.0
+    write(flight, "cf2", data)
+    (line,) = warned(flight, capsys)
+    assert line.endswith("roll_rad: a tenth is over 8. Are these degrees? rad is expected")
+
+
+def test_times_that_no_clock_shows_in_seconds_are_refused(flight: Path) -> None:
+    data = rows()
+    for row in data:
+        row[0] *= 1e12
+    write(flight, "cf2", data)
+    assert "which is no time in seconds. Are these ms, us or ns? Divide them" in refused(flight)
+
+
+def test_gaps_are_warned_of(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(flight, "cf2", rows() + rows(4.0))
+    (line,) = warned(flight, capsys)
+    assert line.endswith("cf2.csv: 1 gaps, the first of 2.8 s after 1.190 s")
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 65.535, 65535.0])
+def test_ranges_that_cannot_be_are_left_out(
+    flight: Path, value: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data: Rows = [[*row, value if k == 3 else 1.5] for k, row in enumerate(rows())]
+    write(flight, "cf1", data, [*HEADER, "range_cf2_m"])
+    samples = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/range/cf2"]
+    assert [s.fields["range_m"] for s in samples] == [1.5] * 19
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "1 ranges to cf2 left out" in line
+
+
+def test_a_robot_without_its_file_is_warned_of(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (flight / "cf2.csv").unlink()
+    (line,) = warned(flight, capsys)
+    assert line.endswith("has ranges to cf2, but there is no cf2.csv beside it")
+
+
+def test_other_folders_are_not_taken_for_flights(tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text("file,peer\n")
+    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
+    assert not flight_csv.recognises(tmp_path)
+
+
+def test_odometry_from_poses_turns_with_the_robot() -> None:
+    time_s = np.arange(0, 20, 0.01)
+    yaw = 0.5 * time_s
+    xy = np.stack([2 * np.sin(yaw), -2 * np.cos(yaw)], axis=1)  # a circle, driven forward
+    log = from_poses(time_s, xy, np.angle(np.exp(1j * yaw)))
+    assert np.allclose(log["vx_mps"][5:-5], 1.0, atol=1e-4)
+    assert np.allclose(log["vy_mps"][5:-5], 0.0, atol=1e-4)
+    assert np.allclose(log["yaw_rate_radps"], 0.5)
+
+
+def test_logs_that_share_their_last_samples_are_taken(flight: Path) -> None:
+    write(flight, "cf2", rows(1.18))
+    assert list(flight_csv.content(flight).samples)
+
+
+def test_steps_of_a_second_are_no_gap_and_longer_ones_are(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(flight, "cf2", [*rows(), *rows(2.19)])
+    assert warned(flight, capsys) == []
+    write(flight, "cf2", [*rows(), *rows(2.21), *rows(4.0)])
+    (line,) = warned(flight, capsys)
+    assert line.endswith("cf2.csv: 2 gaps, the first of 1.0 s after 1.190 s")
+
+
+def test_clocks_that_touch_share_a_time_and_the_order_of_files_does_not_matter(
+    flight: Path,
+) -> None:
+    for robot in ("cf0", "cf2"):  # before and after cf1 by name
+        write(flight, robot, rows(1.20))
+        assert "share no time: 0 s lie between them" in refused(flight)
+        write(flight, robot, rows(1.19))
+        assert list(flight_csv.content(flight).samples)
+
+
+def test_a_range_under_60_m_is_one(flight: Path) -> None:
+    data: Rows = [[*row, 59.99 if k % 2 else 60.0] for k, row in enumerate(rows())]
+    write(flight, "cf1", data, [*HEADER, "range_cf2_m"])
+    samples = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/range/cf2"]
+    assert [s.fields["range_m"] for s in samples] == [59.99] * 10
+
+
+def test_where_a_peer_truly_is_needs_three_numbers(flight: Path) -> None:
+    cells = [["1", "2", ""], ["", "2", "3"], ["1", "2", "3"]]
+    data: Rows = [[*row, *cells[k % 3]] for k, row in enumerate(rows())]
+    write(flight, "cf1", data, [*HEADER, "cf2_x_m", "cf2_y_m", "cf2_z_m"])
+    found = [s for s in flight_csv.content(flight).samples if s.topic.endswith("truth")]
+    assert [s.time_ns for s in found] == [1_000_000_000 + 10_000_000 * k for k in range(2, 20, 3)]
+    write(flight, "cf1", [row[:-1] for row in data], [*HEADER, "cf2_x_m", "cf2_y_m"])
+    assert not [s for s in flight_csv.content(flight).samples if s.topic.endswith("truth")]
+
+
+def test_times_end_with_64_bits(flight: Path) -> None:
+    for robot in ("cf1", "cf2"):
+        write(flight, robot, [[9e9 - 19 + k, *row[1:]] for k, row in enumerate(rows())])
+    assert list(flight_csv.content(flight).samples)
+    write(flight, "cf2", [[9e9 - 18.9 + k, *row[1:]] for k, row in enumerate(rows())])
+    assert "time_s reaches 9e+09" in refused(flight)
+
+
+def test_two_rows_are_a_flight(flight: Path) -> None:
+    write(flight, "cf2", rows()[:2])
+    assert len([s for s in flight_csv.content(flight).samples if s.topic == "/cf2/height"]) == 2
+
+
+def test_the_first_and_the_last_time_are_looked_at(flight: Path) -> None:
+    write(flight, "cf2", rows(-0.005))
+    assert "begins before time 0" in refused(flight)
+    for robot in ("cf1", "cf2"):
+        write(flight, robot, rows(0.0))
+    assert next(flight_csv.content(flight).samples).time_ns == 0
+    write(flight, "cf2", [*rows(0.0), [9.1e9, *rows()[0][1:]]])
+    assert "time_s reaches 9.1e+09" in refused(flight)
+
+
+def test_columns_that_only_look_like_ranges_are_none(flight: Path) -> None:
+    data: Rows = [[*row, 1.5, 1.5, 1.5] for row in rows()]
+    write(flight, "cf1", data, [*HEADER, "range_cf2_s", "range_cf2", "my_range_cf2_m"])
+    assert not [s for s in flight_csv.content(flight).samples if "range" in s.topic]
+
+
+def test_values_as_large_as_may_be_are_not_doubted(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for value, said in ((0.8, 0), (-0.81, 1)):
+        write(flight, "cf2", [[row[0], value, *row[2:]] for row in rows()])
+        assert len(warned(flight, capsys)) == said
+
+
+def test_pictures_are_named_by_digits(flight: Path) -> None:
+    (flight / "cf1").mkdir()
+    picture = encode_png(np.zeros((8, 8, 3), np.uint8))
+    (flight / "cf1" / "notes-of-the-flight.txt").write_text("no picture")
+    (flight / "cf1" / "001005000000.png").write_bytes(picture)
+    assert list(flight_csv.content(flight).samples)
+    (flight / "cf1" / "a_dozen_and_one.png").write_bytes(picture)
+    with pytest.raises(SourceError, match=r"in nanoseconds, 12 digits or more\. Rename it"):
+        flight_csv.content(flight)
+
+
+def test_other_sensors_are_read_by_their_row_of_the_table(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def row(pattern: str, message: str, *csv: str) -> topics.Topic:
+        return topics.Topic(pattern, message, "-", "m", "10 Hz", "convert", sensor=True, csv=csv)
+
+    pressure = row("/{robot}/pressure", "Pressure", "pressure_pa", "air_c")
+    sonar = row("/{robot}/sonar/{peer}", "Sonar", "sonar_up_m", "echo_db")
+    monkeypatch.setattr(flight_csv, "OTHERS", (pressure, sonar))
+    names = ["pressure_pa", "air_c", "sonar_up_cf2_m", "echo_cf2_db", "sonar_up_cf3_m"]
+    data: Rows = [
+        [*one, 1e5 + k, 20.5, 1.5 + k if k % 2 else "", -3.5, 7.0] for k, one in enumerate(rows())
+    ]
+    write(flight, "cf1", data, [*HEADER, *names])
+    found = list(flight_csv.content(flight, Options(names={"cf1": "a", "cf2": "b"})).samples)
+    of_air = [s for s in found if s.topic == "/a/pressure"]
+    assert [s.fields for s in of_air] == [
+        {"pressure_pa": 1e5 + k, "air_c": 20.5} for k in range(20)
+    ]
+    heard = [s for s in found if "sonar" in s.topic]
+    assert {s.topic for s in heard} == {"/a/sonar/b"}  # of cf3 there is no echo
+    assert [(s.time_ns, s.message, s.fields) for s in heard] == [
+        (10**9 + 10**7 * k, "Sonar", {"sonar_up_m": 1.5 + k, "echo_db": -3.5})
+        for k in range(1, 20, 2)
+    ]
+    write(flight, "cf1", [line[:-4] for line in data], [*HEADER, names[0]])  # one of two
+    assert not [s for s in flight_csv.content(flight).samples if "pressure" in s.topic]

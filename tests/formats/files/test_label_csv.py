@@ -1,0 +1,152 @@
+"""Labels of pictures in a CSV file: what is written is read, and where a value ends to be one."""
+
+import io
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dmrl.errors import SourceError
+from dmrl.formats.files.label_csv import COLUMNS, LabelRow, read_labels, write_labels
+from dmrl.guards import limits
+
+HEADER = "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px,visible_share\n"
+FULL = LabelRow(
+    "a.png", "cf2", 1.5, -2.25, 0.75, (1, 2, 3, 4.5), 0.5, "truth", "train", (0.5, 1.5, 0.25)
+)
+
+
+def read(folder: Path, text: str) -> dict[str, list[LabelRow]]:
+    path = folder / "labels.csv"
+    path.write_text(text)
+    return read_labels(path, ["a.png", "b.png"])
+
+
+def written(*rows: LabelRow) -> str:
+    stream = io.StringIO()
+    write_labels(stream, rows)
+    return stream.getvalue()
+
+
+def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
+    bare = LabelRow("b.png", "cf3", 4.0, 5.0, 6.0)
+    nobody = LabelRow("a.png", "", source="truth", split="train")
+    assert read(tmp_path, written(FULL, bare)) == {"a.png": [FULL], "b.png": [bare]}
+    assert read(tmp_path, written(nobody)) == {"a.png": [nobody]}
+    assert (bare.box_px, bare.visible_share, bare.source, bare.split) == ((), 0.0, "hand", None)
+    assert bare.sigmas == (0.0, 0.0, 0.0)
+
+
+def test_cells_stand_under_their_names_and_what_is_not_known_is_empty() -> None:
+    head, full, bare, nobody = written(
+        FULL, LabelRow("b.png", "cf3", 4.0, 5.0, 6.0), LabelRow("b.png", "")
+    ).splitlines()
+    assert head == ",".join(COLUMNS)
+    assert full == "a.png,cf2,1.5000,-2.2500,0.75000,1,2,3,4.5,0.5000,truth,train,0.5,1.5,0.25"
+    assert bare == "b.png,cf3,4.0000,5.0000,6.00000,,,,,,hand,,,,"
+    assert nobody == "b.png,,,,,,,,,,hand,,,,"
+
+
+def test_fields_are_those_of_a_label() -> None:
+    assert FULL.fields() == {
+        **{"peer": "cf2", "u_px": 1.5, "v_px": -2.25, "depth_m": 0.75, "visible_share": 0.5},
+        **{"source": "truth", "sigma_u_px": 0.5, "sigma_v_px": 1.5, "sigma_depth_m": 0.25},
+        "box_px": [1, 2, 3, 4.5],
+    }
+
+
+@given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(0.01, 100))
+def test_a_point_is_kept_to_a_ten_thousandth_of_a_pixel(u: float, v: float, depth: float) -> None:
+    cells = LabelRow("a.png", "cf2", u, v, depth).cells()
+    assert [float(cell) for cell in cells[2:5]] == pytest.approx((u, v, depth), abs=5.1e-5)
+
+
+@pytest.mark.parametrize(
+    ("cells", "complaint"),
+    [
+        ("1,2,0.001,,,,,", ""),
+        ("1,2,0,,,,,", "depth_m is 0"),
+        ("1,2,3,1,2,3,4,0", ""),
+        ("1,2,3,1,2,3,4,1", ""),
+        ("1,2,3,1,2,3,4,1.01", "visible_share is 1.01"),
+        ("1,2,3,1,2,3,4,-0.01", "visible_share is -0.01"),
+        ("1,2,3,1,2,1,4,", "not a box"),
+        ("1,2,3,1,2,3,2,", "not a box"),
+        ("1,2,3,4,2,3,5,", "not a box"),
+        ("1,2,3,1,6,3,5,", "not a box"),
+        ("1,2,3,1,2,3,,", "not a box"),
+        ("1,2,,,,,,", "depth_m is '', not a number"),
+        ("1,2,inf,,,,,", "depth_m is 'inf', not a number"),
+    ],
+)
+def test_where_values_end(tmp_path: Path, cells: str, complaint: str) -> None:
+    text = f"{HEADER}a.png,cf2,{cells}\n"
+    if not complaint:
+        assert len(read(tmp_path, text)["a.png"]) == 1
+        return
+    with pytest.raises(SourceError, match=complaint):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize("cell", range(7))
+def test_who_sees_nobody_says_nothing_of_where(tmp_path: Path, cell: int) -> None:
+    cells = ["5" if k == cell else "" for k in range(8)]
+    with pytest.raises(SourceError, match="without a peer"):
+        read(tmp_path, f"{HEADER}a.png,,{','.join(cells)}\n")
+
+
+def test_one_peer_may_have_labels_of_several_sources(tmp_path: Path) -> None:
+    rows = [LabelRow("a.png", "cf2", 1, 2, 3, source=source) for source in ("truth", "hand")]
+    rows.append(LabelRow("a.png", "cf3", 1, 2, 3))
+    assert read(tmp_path, written(*rows)) == {"a.png": rows}
+    with pytest.raises(SourceError, match=r":5: a\.png has cf3 from hand already"):
+        read(tmp_path, written(*rows, rows[-1]))
+    with pytest.raises(SourceError, match=r":3: .*empty peer, so no other"):
+        read(tmp_path, written(LabelRow("a.png", ""), rows[0]))
+
+
+def test_a_picture_has_so_many_rows_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "PEERS", 3)
+    rows = [LabelRow("a.png", f"cf{k}", 1, 2, 3) for k in range(4)]
+    assert len(read(tmp_path, written(*rows[:3]))["a.png"]) == 3
+    with pytest.raises(SourceError, match=r":5: a\.png has more than 3 rows"):
+        read(tmp_path, written(*rows))
+
+
+def test_a_column_that_is_misspelled_is_told_the_near_one(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"unknown column 'sigma_u'\. Did you mean sigma_u_px\?"):
+        read(tmp_path, "file,peer,u_px,v_px,depth_m,sigma_u\n")
+    with pytest.raises(SourceError, match=r"unknown column 'zz'\. Known are file, peer"):
+        read(tmp_path, "file,peer,u_px,v_px,depth_m,zz\n")
+
+
+def test_who_looked_and_saw_nobody_is_told(tmp_path: Path) -> None:
+    head = "file,peer,u_px,v_px,depth_m,source\n"
+    found = read(tmp_path, f"{head}a.png,,,,,\nb.png,,,,,truth\n")
+    assert (found["a.png"][0].source, found["b.png"][0].source) == ("hand", "truth")
+    found = read(tmp_path, f"{head}a.png,cf2,1,2,3,\nb.png,cf2,1,2,3,truth\n")
+    assert (found["a.png"][0].source, found["b.png"][0].source) == ("hand", "truth")
+
+
+@given(
+    st.lists(st.floats(-500, 500).map(lambda x: round(x, 3)), min_size=4, max_size=4, unique=True),
+    st.lists(st.integers(0, 8), min_size=3, max_size=3),
+    st.integers(0, 100),
+)
+def test_whatever_a_row_holds_is_read_back(
+    tmp_path_factory: pytest.TempPathFactory, edges: list[float], sigmas: list[int], share: int
+) -> None:
+    (left, right), (top, bottom) = sorted(edges[:2]), sorted(edges[2:])
+    row = LabelRow(
+        "a.png",
+        "cf9",
+        *(left, top, 0.25),
+        box_px=tuple(float(f"{edge:g}") for edge in (left, top, right, bottom)),
+        visible_share=share / 100,
+        sigmas=(sigmas[0] / 4, sigmas[1] / 4, sigmas[2] / 4),
+    )
+    if row.box_px[0] < row.box_px[2] and row.box_px[1] < row.box_px[3]:
+        assert read(tmp_path_factory.getbasetemp(), written(row)) == {"a.png": [row]}

@@ -1,0 +1,316 @@
+"""CSV files of others, by tables that say what their columns are."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.files import mapped_csv
+from dmrl.formats.files.column_map import QUANTITIES
+from dmrl.formats.registry import format_of
+from dmrl.geometry.turns import euler_zyx, quaternion_zyx
+from dmrl.samples.sample import Sample
+
+TABLE = """
+[time]
+name = "t (ms)"
+unit = "ms"
+[roll]
+name = "phi"
+unit = "deg"
+[pitch]
+name = "theta"
+unit = "deg"
+sign = -1
+[yaw]
+name = "psi"
+unit = "rad"
+[yaw_rate]
+name = "r"
+unit = "deg/s"
+[vx]
+name = "vx"
+unit = "cm/s"
+frame = "world"
+[vy]
+name = "vy"
+unit = "cm/s"
+frame = "world"
+[height]
+name = "h"
+unit = "mm"
+[range.cf2]
+name = "d2"
+unit = "mm"
+"""
+HEADER = "t (ms);phi;theta;psi;r;vx;vy;h;d2;note"
+ROWS = ("1000;10;20;1.5707963;5;100;0;500;1500;ok", "1010.5;10;20;1.5707963;5;100;0;510;;ok")
+
+
+def samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Samples by topic."""
+    found: dict[str, list[Sample]] = {}
+    for sample in mapped_csv.content(source, options or Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """A table of columns, and beside it a log that it fits."""
+    (tmp_path / "log.csv").write_text("\n".join([HEADER, *ROWS]) + "\n")
+    (tmp_path / "map.toml").write_text(TABLE)
+    return tmp_path / "map.toml"
+
+
+def test_units_frames_and_signs_are_as_the_table_says(table: Path) -> None:
+    found = samples(table.with_name("log.csv"), Options(columns=table))
+    attitude = found["/cf1/attitude"][0].fields
+    assert (attitude["roll_rad"], attitude["pitch_rad"]) == pytest.approx(np.radians((10, -20)))
+    assert (attitude["yaw_rad"], attitude["yaw_rate_radps"]) == pytest.approx(
+        (np.pi / 2, np.radians(5)), abs=1e-6
+    )
+    # One metre a second along the world's x is to the right of a robot that looks along y.
+    velocity = found["/cf1/velocity"][0].fields
+    assert (velocity["vx_mps"], velocity["vy_mps"]) == pytest.approx((0, -1), abs=1e-6)
+    assert found["/cf1/height"][1].fields == {"height_m": pytest.approx(0.51)}
+    assert [(s.time_ns, s.fields["range_m"]) for s in found["/cf1/range/cf2"]] == [(10**9, 1.5)]
+    assert found["/cf1/height"][1].time_ns == 1_010_500_000
+    logged = found["/cf1/log/columns"][1].fields
+    assert logged["t__ms_"] == 1010.5 and np.isnan(logged["d2"]) and "note" not in logged
+
+
+@pytest.mark.parametrize("frame", ["horizontal", "body"])
+def test_velocities_of_other_frames_are_turned(frame: str, table: Path) -> None:
+    third = '[vz]\nname = "h"\nunit = "mm/s"\nframe = "body"\n' if frame == "body" else ""
+    table.write_text(TABLE.replace('frame = "world"', f'frame = "{frame}"') + third)
+    fields = samples(table.with_name("log.csv"), Options(columns=table))["/cf1/velocity"][0].fields
+    if frame == "horizontal":
+        assert (fields["vx_mps"], fields["vy_mps"]) == pytest.approx((1, 0), abs=1e-9)
+        return
+    (cr, cp), (sr, sp) = np.cos(np.radians((10, -20))), np.sin(np.radians((10, -20)))
+    level = [cp + sp * cr * 0.5, -sr * 0.5, -sp + cp * cr * 0.5]
+    assert [fields[f"v{axis}_mps"] for axis in "xyz"] == pytest.approx(level)
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("soon;1;2;3;4;5;6;7;8;x", r"log\.csv:4: 'soon' is no time"),
+        ("1020;much;2;3;4;5;6;7;8;x", r"log\.csv:4: phi is 'much', no number"),
+        ("1020;1;2;3\n1030;1;2;3;4;5;6;7;8;x", r"log\.csv:4: 4 cells, not 10"),
+        ("-5;1;2;3;4;5;6;7;8;x", r"log\.csv:4: time -5 is before 1970"),
+    ],
+)
+def test_a_wrong_line_is_named(line: str, text: str, table: Path) -> None:
+    log = table.with_name("log.csv")
+    log.write_text(log.read_text() + line + "\n")
+    with pytest.raises(SourceError, match=text):
+        samples(log, Options(columns=table))
+
+
+def test_a_column_that_is_not_there_is_named(table: Path) -> None:
+    table.write_text(TABLE.replace('"phi"', '"roll"'))
+    with pytest.raises(SourceError, match=r"log\.csv:1: no column roll\. Mend the table"):
+        samples(table.with_name("log.csv"), Options(columns=table))
+
+
+def test_ranges_that_cannot_be_are_counted_and_empty_cells_are_none(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = table.with_name("log.csv")
+    rows = [
+        f"{1020 + 10 * k};0;0;0;0;0;0;500;{range_mm};x" for k, range_mm in enumerate(["0", "9", ""])
+    ]
+    log.write_text(log.read_text() + "\n".join([*rows, "1050;0;0;0;0;0;0;500;70000;x"]) + "\n")
+    found = samples(log, Options(columns=table))["/cf1/range/cf2"]
+    assert [s.fields["range_m"] for s in found] == pytest.approx([1.5, 0.009])
+    assert "2 ranges to cf2 left out: not over 0 and under 60 m" in capsys.readouterr().err
+
+
+def test_units_that_cannot_be_are_doubted(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table.write_text(TABLE.replace('unit = "deg"', 'unit = "rad"'))
+    samples(table.with_name("log.csv"), Options(columns=table))
+    err = capsys.readouterr().err
+    assert "roll reaches 10 rad. Is its unit deg?" in err
+    log = table.with_name("log.csv")
+    rows = [f"{1000 + 10 * k};0;0;{0.02 * k};114.6;0;0;0;0;x" for k in range(50)]  # 2 rad/s
+    log.write_text("\n".join([HEADER, *rows]) + "\n")
+    table.write_text(TABLE.replace('unit = "deg/s"', 'unit = "rad/s"'))
+    samples(log, Options(columns=table))
+    assert "turning rates are 57 times the slope of yaw. Are they deg/s?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "B8_star_fast_rep2",
+        pytest.param("B7_oval_medium_rep3", marks=pytest.mark.slow),
+        pytest.param("B9_trefoil_fast_rep4", marks=pytest.mark.slow),
+    ],
+)
+def test_flights_of_nanobench_are_known_and_agree_with_vicon(
+    name: str, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = data / "nanobench" / f"{name}.csv"
+    assert format_of(source).name == "columns"
+    found = samples(source)
+    assert capsys.readouterr().err == ""
+    with source.open() as stream:
+        first = stream.readlines()[1].split(",")[0]
+    assert found["/cf1/attitude"][0].time_ns == int(first.replace(".", ""))
+
+    def rows(topic: str, *names: str) -> np.ndarray:
+        return np.array([[s.fields[n] for n in names] for s in found[topic]])
+
+    truth = [s.fields["pose"] for s in found["/cf1/pose/truth"]]
+    turned = np.array([[p["orientation"][axis] for axis in "xyzw"] for p in truth])
+    place = np.array([[p["position"][axis] for axis in "xyz"] for p in truth])
+    angles = rows("/cf1/attitude", "roll_rad", "pitch_rad", "yaw_rad")
+    off = angles - euler_zyx(turned)
+    off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    assert (np.median(np.abs(off), axis=0) < 0.06).all()
+    time_s = np.array([s.time_ns for s in found["/cf1/velocity"]]) * 1e-9
+    vx, vy = rows("/cf1/velocity", "vx_mps", "vy_mps").T
+    c, s = np.cos(angles[:, 2]), np.sin(angles[:, 2])
+    world = np.stack([c * vx - s * vy, s * vx + c * vy], axis=1)
+    true = np.gradient(place[:, :2], time_s - time_s[0], axis=0)
+    # The estimate lags: off by a tenth of the speed of the fast flights.
+    assert np.median(np.linalg.norm(world - true, axis=1)) < 0.12
+    assert min(np.corrcoef(world[:, k], true[:, k])[0, 1] for k in (0, 1)) > 0.97
+    assert np.ptp(place[:, 0]) > 1
+
+
+def turning(table: Path, told: float, slope: float, count: int = 50) -> None:
+    """A log whose gyroscope tells a turn, deg/s, and whose yaw turns, rad/s, at 100 Hz."""
+    rows = [f"{1000 + 10 * k};0;0;{slope * k / 100};{told};0;0;0;0;x" for k in range(count)]
+    table.with_name("log.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+    samples(table.with_name("log.csv"), Options(columns=table))
+
+
+@pytest.mark.parametrize(
+    ("told", "slope", "said"),
+    [
+        (9.9, 1.0, ""),
+        (10.1, 1.0, "turning rates are 10 times the slope of yaw. Are they deg/s?"),
+        (0.49, 0.01, ""),  # hardly any turn
+        (0.51, 0.01, "turning rates are 51 times"),
+        (1.0, 9.9, ""),
+        (1.0, 10.1, "turning rates are 1/10 of the slope of yaw. Are they rad/s?"),
+        (0.01, 0.49, ""),
+        (0.01, 0.51, "turning rates are 1/51"),
+    ],
+)
+def test_turning_rates_ten_times_off_are_doubted(
+    told: float, slope: float, said: str, table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turning(table, np.degrees(told), slope)
+    err = capsys.readouterr().err
+    assert said in err and bool(said) == ("turning rates" in err)
+    turning(table, np.degrees(told), slope, 2)
+    assert "turning rates" not in capsys.readouterr().err
+
+
+def test_a_tilt_of_half_a_turn_may_be(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table.write_text(TABLE.replace('name = "theta"\nunit = "deg"', 'name = "theta"\nunit = "rad"'))
+    for tilt, said in ((3.14, False), (3.15, True)):
+        rows = [f"{1000 + 10 * k};0;{-tilt};0;0;0;0;0;0;x" for k in range(3)]
+        table.with_name("log.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+        samples(table.with_name("log.csv"), Options(columns=table))
+        assert ("pitch reaches 3 rad" in capsys.readouterr().err) == said
+
+
+def test_lines_out_of_order_are_sorted_and_the_last_may_be_cut(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = table.with_name("log.csv")
+    log.write_text("\n".join([HEADER, ROWS[1], ROWS[0], "1020;1;2"]))
+    found = samples(log, Options(columns=table))["/cf1/height"]
+    assert [s.time_ns for s in found] == [1_000_000_000, 1_010_500_000]
+    assert [s.fields["height_m"] for s in found] == [0.5, 0.51]
+    err = capsys.readouterr().err
+    assert "its lines are not in order of time; sorted" in err
+    assert "its last line is cut short; left out" in err
+
+
+@pytest.mark.parametrize(
+    ("cell", "time_ns"),
+    [("0", 0), ("9223372036854.775807", 2**63 - 1), ("9223372036854.775808", None)],
+)
+def test_times_are_whole_nanoseconds_of_63_bits(
+    cell: str, time_ns: int | None, table: Path
+) -> None:
+    log = table.with_name("log.csv")
+    log.write_text(f"{HEADER}\n{ROWS[0].replace('1000', cell, 1)}\n")
+    if time_ns is None:
+        with pytest.raises(SourceError, match="before 1970 or after 2262"):
+            samples(log, Options(columns=table))
+    else:
+        assert samples(log, Options(columns=table))["/cf1/height"][0].time_ns == time_ns
+
+
+def test_a_folder_is_a_robot_per_file_by_its_name(table: Path) -> None:
+    folder = table.with_name("logs")
+    folder.mkdir()
+    for name in ("a.csv", "b.CSV"):
+        (folder / name).write_text(table.with_name("log.csv").read_text())
+    (folder / "notes.txt").write_text("x")
+    found = samples(folder, Options(columns=table, names={"a": "left"}))
+    assert {topic.split("/")[1] for topic in found} - {"tf"} == {"left", "b"}
+
+
+def test_a_column_that_stands_twice_is_refused(table: Path) -> None:
+    log = table.with_name("log.csv")
+    log.write_text(log.read_text().replace(";note", ";vx"))
+    with pytest.raises(SourceError, match="a column appears twice"):
+        samples(log, Options(columns=table))
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_columns_are_parted_by_what_stands_there_most(separator: str, table: Path) -> None:
+    log = table.with_name("log.csv")
+    other = "," if separator != "," else ";"
+    text = log.read_text().replace(";", separator).replace("note", f'"a{other}b"')
+    log.write_text("\ufeff" + text, encoding="utf-8")
+    assert mapped_csv._header(log)[1] == separator
+    assert len(samples(log, Options(columns=table))["/cf1/height"]) == 2
+
+
+def test_every_quantity_of_a_table_comes_where_it_belongs(tmp_path: Path) -> None:
+    """A log in which every column has a number of its own."""
+    frames = {f"v{axis}": 'frame = "world"\n' for axis in "xyz"}
+    first = {"rad": "rad", "rad/s": "rad/s", "m": "m", "m/s": "m/s", "1": "1", "s": "s"}
+    names = [n for n in QUANTITIES if n != "height"]
+    text = "".join(
+        f'[{n}]\nname = "{n}"\nunit = "{first[next(iter(QUANTITIES[n]))]}"\n{frames.get(n, "")}'
+        for n in names
+    )
+    (tmp_path / "map.toml").write_text(text)
+    row = dict(zip(names, (np.arange(len(names)) + 1) / 64, strict=True)) | {"time": 2.0}
+    (quaternion,) = quaternion_zyx(np.array([[0.4, -0.3, 1.2]]))
+    row |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.tolist(), strict=True))
+    row |= {"true_qx": 0.0, "true_qy": 0.6}
+    row |= {"true_qz": 0.0, "true_qw": 0.8}
+    (tmp_path / "log.csv").write_text(f"{','.join(row)}\n{','.join(map(str, row.values()))}\n")
+    found = samples(tmp_path / "log.csv", Options(columns=tmp_path / "map.toml"))
+    assert {s.time_ns for v in found.values() for s in v} == {2 * 10**9}
+    yaw, rate = 1.2, row["gyro_y"] * np.sin(0.4) + row["gyro_z"] * np.cos(0.4)
+    attitude = found["/cf1/attitude"][0].fields  # of the quaternion, and of both gyroscopes
+    wanted = {"roll_rad": 0.4, "pitch_rad": -0.3, "yaw_rad": yaw}
+    assert attitude == pytest.approx({**wanted, "yaw_rate_radps": rate / np.cos(0.3)})
+    c, s = np.cos(yaw), np.sin(yaw)
+    velocity = found["/cf1/velocity"][0].fields
+    assert velocity == pytest.approx(
+        {
+            "vx_mps": c * row["vx"] + s * row["vy"],
+            "vy_mps": c * row["vy"] - s * row["vx"],
+            "vz_mps": row["vz"],
+        }
+    )
+    assert found["/cf1/height"][0].fields == pytest.approx({"height_m": row["z"]})
+    for topic, before in (("/cf1/pose", ""), ("/cf1/pose/truth", "true_")):
+        pose = found[topic][0].fields["pose"]
+        assert pose["position"] == pytest.approx({n: row[f"{before}{n}"] for n in "xyz"})
+        assert pose["orientation"] == pytest.approx({n: row[f"{before}q{n}"] for n in "xyzw"})

@@ -1,0 +1,223 @@
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.registry import format_of
+from dmrl.formats.ros import bag as ros
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode
+from dmrl.samples.sample import Sample
+
+from .. import foreign
+
+
+def bag(kind: str, folder: Path) -> Path:
+    """One bag of each kind."""
+    if kind == "ros1":
+        return foreign.ros1_bag(folder / "flight.bag")
+    return foreign.ros2_bag(folder / "flight", kind)
+
+
+def samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Samples by topic."""
+    found: dict[str, list[Sample]] = {}
+    for sample in ros.content(source, options or Options()).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap", "ros1"])
+def test_bags_of_every_kind_give_the_same(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = bag(kind, tmp_path)
+    assert format_of(source).name == "rosbag2"
+    found = samples(source)
+    assert {topic: len(v) for topic, v in found.items()} == dict.fromkeys(
+        [
+            "/cf1/attitude",
+            "/cf1/camera/image",
+            "/cf1/height",
+            "/cf1/pose",
+            "/cf1/pose/truth",
+            "/cf1/range/cf2",
+            "/cf1/velocity",
+        ],
+        5,
+    )
+    assert [s.time_ns for s in found["/cf1/height"]] == [10**12 + k * 10**8 for k in range(5)]
+    assert [s.fields["range_m"] for s in found["/cf1/range/cf2"]] == [1.5, 2.5, 3.5, 4.5, 5.5]
+    assert found["/cf1/velocity"][0].fields["vx_mps"] == 1.0
+    assert found["/cf1/attitude"][0].fields["yaw_rate_radps"] == pytest.approx(0.2)
+    pixels = decode(found["/cf1/camera/image"][0].fields["data"])
+    np.testing.assert_array_equal(pixels, rgb_of(foreign.pictures(1)[0]))
+    assert "left out: /chatter" in capsys.readouterr().err
+
+
+def test_when_a_bag_received_its_messages_is_kept(tmp_path: Path) -> None:
+    found = samples(foreign.ros2_bag(tmp_path / "flight", late_ns=7_000_000))
+    for topic in ("/cf1/height", "/cf1/range/cf2", "/cf1/camera/image"):
+        assert [s.time_ns for s in found[topic]] == [10**12 + k * 10**8 for k in range(5)]
+        received = [s.publish_ns or 0 for s in found[topic]]
+        assert received == [10**12 + k * 10**8 + 7_000_000 for k in range(5)]
+
+
+def test_stamps_of_zero_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    late_ns = 48 * 86_400 * 10**9
+    source = foreign.ros2_bag(tmp_path / "flight", late_ns=late_ns, ranges_stamped=False)
+    found = samples(source)
+    assert found["/cf1/range/cf2"][0].time_ns == 10**12 + late_ns
+    assert "5 on /uwb/cf1/cf2/distance; they are at the times of the bag" in capsys.readouterr().err
+
+
+def test_robots_are_named_as_the_user_wants(tmp_path: Path) -> None:
+    found = samples(bag("sqlite3", tmp_path), Options(names={"cf1": "a", "cf2": "b"}))
+    assert "/a/range/b" in found and "/a/attitude" in found
+
+
+def test_a_bag_without_anything_known_is_one_line(tmp_path: Path) -> None:
+    lines, unknown = ros.plan([("/chatter", "std_msgs/msg/String", 3)], Options())
+    assert (lines, unknown) == ({}, ["/chatter"])
+    path = tmp_path / "a.db3"
+    path.write_bytes(b"SQLite format 3\0" + b"\0" * 100)
+    with pytest.raises(SourceError, match="cannot be read as a ROS bag") as e:
+        samples(path)
+    assert "\n" not in str(e.value)
+
+
+def test_of_two_odometries_of_a_robot_the_longer_counts() -> None:
+    kind = "nav_msgs/msg/Odometry"
+    lines, unknown = ros.plan([("/cf1/odom", kind, 5), ("/vio/cf1/odom", kind, 50)], Options())
+    assert [line.topic for line in lines.values()] == ["/vio/cf1/odom"]
+    assert unknown == ["/cf1/odom"]
+
+
+@pytest.mark.heavy
+def test_a_real_bag_of_ranges_odometry_and_motion_capture(data: Path) -> None:
+    counts = Counter(
+        sample.topic
+        for sample in ros.content(data / "uwb-tiers" / "shortbag.db3", Options()).samples
+    )
+    assert counts["/n_2/range/n_5"] == 252
+    assert counts["/turtlebot3_cap/pose/truth"] == 1032
+    assert counts["/turtle03/velocity"] == counts["/turtle03/attitude"] == 340
+    assert sum(counts.values()) == 16204
+
+
+RANGE, ODOMETRY, IMU = (
+    "sensor_msgs/msg/Range",
+    "nav_msgs/msg/Odometry",
+    "sensor_msgs/msg/Imu",
+)
+
+
+def planned(
+    *held: tuple[str, str, int], **names: str
+) -> tuple[dict[str, tuple[str, str]], list[str]]:
+    """Robot and peer of each topic that is taken, and what is left out."""
+    lines, unknown = ros.plan(list(held), Options(robot="me", names=names))
+    return {line.topic: (line.robot, line.peer) for line in lines.values()}, unknown
+
+
+def test_topics_tell_whose_they_are() -> None:
+    found, unknown = planned(
+        ("/cf1/uwb/cf2/range", RANGE, 5),
+        ("/imu/data", IMU, 5),
+        ("/drone 3/odom", ODOMETRY, 5),
+        ("/cf1/uwb", RANGE, 5),  # to whom?
+        ("/cf1/cf1/range", RANGE, 5),
+        ("/cf9/odom", ODOMETRY, 0),
+        (topics.MASKS.format(robot="cf1"), "sensor_msgs/msg/Image", 5),
+        ("/chatter", "std_msgs/msg/String", 1),
+        ("/quiet", "std_msgs/msg/String", 0),
+        cf2="anchor",
+    )
+    assert found == {
+        "/cf1/uwb/cf2/range": ("cf1", "anchor"),
+        "/imu/data": ("me", ""),
+        "/drone 3/odom": ("drone_3", ""),
+    }
+    assert {"/cf1/uwb", "/cf1/cf1/range", "/chatter"} <= set(unknown)
+    assert not {"/cf9/odom", "/quiet"} & set(unknown)
+
+
+def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
+    kind = "geometry_msgs/msg/PoseStamped"
+    found, unknown = planned(
+        ("/cf1/pose", kind, 5), ("/vrpn_client_node/cf1/pose", kind, 9), ("/vio/cf1/pose", kind, 5)
+    )
+    assert found.keys() == {"/cf1/pose", "/vrpn_client_node/cf1/pose"}
+    assert unknown == ["/vio/cf1/pose"]  # as long as the first, and after it
+
+
+def test_how_many_messages_there_will_be_is_told_before(tmp_path: Path) -> None:
+    content = ros.content(bag("sqlite3", tmp_path), Options())
+    with_odometry = 4  # of one message come attitude, velocity, height and pose
+    assert content.total == len(list(content.samples)) - 5 * (with_odometry - 1)
+
+
+def test_ranges_of_both_directions_and_our_own_messages_are_all_kept() -> None:
+    ours = "dmrl_msgs/msg/Height"
+    held = [
+        ("/cf1/uwb/cf2/range", RANGE, 5),
+        ("/cf2/uwb/cf1/range", RANGE, 9),
+        ("/far/cf1/uwb/cf2/range", RANGE, 5),  # no more than the first
+        ("/cf1/height", ours, 1),
+        ("/cf2/height", ours, 2),
+        ("/cf1/odom", ODOMETRY, 2),
+        ("/cf1/imu", IMU, 3),
+    ]
+    found, unknown = planned(*held)
+    assert found == {
+        "/cf1/uwb/cf2/range": ("cf1", "cf2"),
+        "/cf2/uwb/cf1/range": ("cf2", "cf1"),
+        "/cf1/height": ("", ""),
+        "/cf2/height": ("", ""),
+        "/cf1/odom": ("cf1", ""),
+        "/cf1/imu": ("cf1", ""),
+    }
+    assert unknown == ["/far/cf1/uwb/cf2/range"]
+    lines, _ = ros.plan(held, Options())
+    assert {line.topic: line.count for line in lines.values()} == {
+        topic: count for topic, _, count in held if topic in found
+    }
+
+
+@pytest.mark.parametrize(
+    ("stamp", "time_ns"), [((3, 5), 3_000_000_005), ((0, 0), 0), ((-1, 5), 0), (None, None)]
+)
+def test_a_header_s_stamp_is_whole_nanoseconds(
+    stamp: tuple[int, int] | None, time_ns: int | None
+) -> None:
+    held = stamp and SimpleNamespace(sec=stamp[0], nanosec=stamp[1])
+    message = SimpleNamespace(header=SimpleNamespace(stamp=held)) if held else SimpleNamespace()
+    assert ros._stamp_ns(message) == time_ns
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "known"),
+    [
+        ("a.db3", b"SQLite format 3\0", True),
+        ("a.bag", b"#ROSBAG V2.0\n", True),
+        ("a.bag", b"#ROSBAG V1.2\n", False),
+        ("a.mcap", b"\x89MCAP0\r\n" + b"\1" * 20 + b"ros2", True),
+        ("a.mcap", b"\x89MCAP0\r\n" + b"\1" * 20 + b"ros1", False),
+        ("a.mcap", b"\1" * 60 + b"ros2", True),
+        ("a.mcap", b"\1" * 61 + b"ros2", False),
+        ("a.txt", b"SQLite format 3\0", False),
+    ],
+)
+def test_a_bag_is_known_by_its_first_bytes(
+    name: str, head: bytes, known: bool, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(head)
+    assert ros.recognises(tmp_path / name) == known
+    assert not ros.recognises(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("")
+    assert ros.recognises(tmp_path)

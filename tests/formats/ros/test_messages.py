@@ -1,0 +1,303 @@
+"""Messages of ROS in dmrl's frames and units."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from dmrl.errors import SourceError
+from dmrl.formats.ros.messages import (
+    HANDLERS,
+    Placed,
+    _angles,
+    _is_fixed,
+    _levelled,
+    _rgb,
+    _turned_back,
+    _yaw_rate,
+)
+from dmrl.geometry.frames import camera_from_horizontal
+from dmrl.geometry.turns import quaternion_zyx
+from dmrl.images.bayer import rgb_of
+from dmrl.images.codec import decode, encode_jpeg, encode_png
+from dmrl.samples.sample import Sample
+
+QUARTER = np.pi / 2
+
+
+@pytest.mark.parametrize(
+    ("angles", "body", "level"),
+    [
+        ((QUARTER, 0, 0), (0, 1, 0), (0, 0, 1)),  # rolled to the right, its left is up
+        ((0, QUARTER, 0), (1, 0, 0), (0, 0, -1)),  # nose down
+        ((QUARTER, QUARTER, 0), (0, 1, 0), (1, 0, 0)),
+        ((QUARTER, QUARTER, 0), (0, 0, 1), (0, -1, 0)),
+        ((0, 0, QUARTER), (1, 0, 0), (1, 0, 0)),  # its heading changes nothing here
+    ],
+)
+def test_a_tilted_robot_s_vectors_are_levelled(
+    angles: tuple[float, ...], body: tuple[float, ...], level: tuple[float, ...]
+) -> None:
+    got = _levelled(np.array(body), np.array(angles))
+    assert got == pytest.approx(np.array(level), abs=1e-12)
+
+
+def test_a_fixed_frame_s_vectors_are_turned_by_the_heading() -> None:
+    left = np.array([0.3, -0.2, QUARTER])  # whatever the tilt
+    ahead, up = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    assert _turned_back(ahead, left) == pytest.approx(np.array([1.0, 0.0, 0.0]), abs=1e-12)
+    right = np.array([1.0, 0.0, 0.0])
+    assert _turned_back(right, left) == pytest.approx(np.array([0.0, -1.0, 0.0]), abs=1e-12)
+    assert _turned_back(up, left) == pytest.approx(up)
+
+
+def xyzw(*values: float) -> SimpleNamespace:
+    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
+
+
+def given(kind: str, message: object, **where: Any) -> list[Sample]:
+    """Samples of a message of cf1."""
+    placed = Placed(Path("bag"), "cf1", **where)
+    return list(HANDLERS[kind](message, 1_500_000_000, placed))
+
+
+TILT = (0.3, -0.2, 0.5)
+TURN = xyzw(*quaternion_zyx(np.array([TILT]))[0])
+
+
+def odometry(child: str, linear: tuple[float, ...]) -> SimpleNamespace:
+    """Where it is, how it is turned, and how it moves and turns, in the frame ``child``."""
+    twist = SimpleNamespace(linear=xyzw(*linear), angular=xyzw(0.1, 0.2, 0.4))
+    held = SimpleNamespace(position=xyzw(1.0, 2.0, 3.0), orientation=TURN)
+    return SimpleNamespace(
+        header=SimpleNamespace(frame_id="odom"),
+        child_frame_id=child,
+        pose=SimpleNamespace(pose=held),
+        twist=SimpleNamespace(twist=twist),
+    )
+
+
+def test_odometry_in_the_robot_s_own_frame_is_levelled() -> None:
+    found = given("nav_msgs/msg/Odometry", odometry("cf1/base_link", (1.0, 2.0, 3.0)))
+    pose, height, attitude, velocity = found
+    assert [s.topic for s in found] == [
+        "/cf1/pose",
+        "/cf1/height",
+        "/cf1/attitude",
+        "/cf1/velocity",
+    ]
+    assert pose.fields["pose"]["position"] == {"x": 1, "y": 2, "z": 3}
+    assert pose.fields["pose"]["orientation"] == vars(TURN)
+    assert pose.fields["timestamp"] == {"seconds": 1, "nanos": 500_000_000}
+    assert height.fields == {"height_m": 3.0}
+    # What turns the yaw is what the gyroscope has about the vertical, over how the robot leans.
+    rate = (0.2 * np.sin(0.3) + 0.4 * np.cos(0.3)) / np.cos(-0.2)
+    assert tuple(attitude.fields.values()) == pytest.approx((*TILT, rate))
+    level = _levelled(np.array([1.0, 2.0, 3.0]), np.array(TILT))
+    assert list(velocity.fields.values()) == pytest.approx(level.tolist())
+    assert list(velocity.fields) == ["vx_mps", "vy_mps", "vz_mps"]
+
+
+@pytest.mark.parametrize("child", ["odom", "cf1/world", "map", "earth"])
+def test_odometry_in_a_fixed_frame_is_turned_by_the_yaw(child: str) -> None:
+    *_, attitude, velocity = given("nav_msgs/msg/Odometry", odometry(child, (1.0, 2.0, 3.0)))
+    assert attitude.fields["yaw_rate_radps"] == 0.4
+    c, s = np.cos(0.5), np.sin(0.5)
+    wanted = (c + 2 * s, -s + 2 * c, 3.0)
+    assert tuple(velocity.fields.values()) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(("norm", "there"), [(0.91, True), (0.89, False), (1.11, False)])
+def test_a_quaternion_a_tenth_from_unit_length_tells_no_angles(norm: float, there: bool) -> None:
+    found = _angles(xyzw(*(norm * value for value in vars(TURN).values())))
+    assert (found is not None) == there
+    assert found is None or found == pytest.approx(np.array(TILT))
+
+
+def test_an_imu_and_a_twist_count_where_there_is_no_odometry() -> None:
+    imu = SimpleNamespace(orientation=TURN, angular_velocity=xyzw(0.1, 0.2, 0.4))
+    (attitude,) = given("sensor_msgs/msg/Imu", imu)
+    rate = (0.2 * np.sin(0.3) + 0.4 * np.cos(0.3)) / np.cos(-0.2)
+    assert tuple(attitude.fields.values()) == pytest.approx((*TILT, rate))
+    twist = SimpleNamespace(linear=xyzw(1.0, 2.0, 3.0))
+    moved = SimpleNamespace(twist=twist, header=SimpleNamespace(frame_id="cf1"))
+    (velocity,) = given("geometry_msgs/msg/TwistStamped", moved)
+    assert tuple(velocity.fields.values()) == (1.0, 2.0, 3.0)
+    assert not given("sensor_msgs/msg/Imu", imu, odometry=True)
+    assert not given("geometry_msgs/msg/TwistStamped", moved, odometry=True)
+    moved.header.frame_id = "cf1/odom"
+    fixed: set[str] = set()
+    assert not given("geometry_msgs/msg/TwistStamped", moved, fixed=fixed)
+    assert fixed == {"cf1"}
+
+
+@pytest.mark.parametrize(("range_m", "count"), [(0.0, 0), (0.01, 1), (59.99, 1), (60.0, 0)])
+def test_ranges_are_over_0_and_under_60_m(range_m: float, count: int) -> None:
+    found = given("sensor_msgs/msg/Range", SimpleNamespace(range=range_m), peer="cf2")
+    assert [(s.topic, s.fields) for s in found] == [
+        ("/cf1/range/cf2", {"range_m": range_m}),
+    ] * count
+
+
+def test_motion_capture_s_poses_are_true() -> None:
+    held = SimpleNamespace(pose=SimpleNamespace(position=xyzw(1, 2, 3), orientation=TURN))
+    kind = "geometry_msgs/msg/PoseStamped"
+    assert [s.topic for s in given(kind, held)] == ["/cf1/pose"]
+    assert [s.topic for s in given(kind, held, captured=True)] == ["/cf1/pose/truth"]
+
+
+@pytest.mark.parametrize("names", ["kpdr", "KPDR"])
+def test_a_camera_s_centre_moves_by_half_a_pixel(names: str) -> None:
+    k, p = np.arange(9.0), np.arange(12.0)
+    values = (k, p, [0.1, 0.2], np.eye(3).ravel())
+    told = SimpleNamespace(
+        **dict(zip(names, values, strict=True)), width=64, height=48, distortion_model="plumb_bob"
+    )
+    (found,) = given("sensor_msgs/msg/CameraInfo", told)
+    assert found.topic == "/cf1/camera/calibration"
+    assert found.fields["K"] == [0, 1, 2.5, 3, 4, 5.5, 6, 7, 8]
+    assert found.fields["P"] == [0, 1, 2.5, 3, 4, 5, 6.5, 7, 8, 9, 10, 11]
+    assert found.fields["D"] == [0.1, 0.2]
+    assert found.fields["R"] == np.eye(3).ravel().tolist()
+    assert (found.fields["width"], found.fields["height"]) == (64, 48)
+    assert found.fields["timestamp"] == {"seconds": 1, "nanos": 500_000_000}
+    assert k[2] == 2  # what was given stays as it was
+
+
+def frames(*stamps: tuple[int, int]) -> SimpleNamespace:
+    def one(sec: int, nanosec: int) -> SimpleNamespace:
+        stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
+        held = SimpleNamespace(translation=xyzw(1, 2, 3), rotation=TURN)
+        header = SimpleNamespace(stamp=stamp, frame_id="world")
+        return SimpleNamespace(header=header, child_frame_id="cf1", transform=held)
+
+    return SimpleNamespace(transforms=[one(*stamp) for stamp in stamps])
+
+
+@pytest.mark.parametrize(("stamp", "time_ns"), [((2, 5), 2_000_000_005), ((0, 0), 1_500_000_000)])
+def test_frames_stand_at_their_stamp_or_when_they_came(
+    stamp: tuple[int, int], time_ns: int
+) -> None:
+    (found,) = given("tf2_msgs/msg/TFMessage", frames(stamp))
+    assert found.time_ns == time_ns
+    (entry,) = found.fields["transforms"]
+    assert entry["translation"] == {"x": 1, "y": 2, "z": 3}
+    assert entry["rotation"] == vars(TURN)
+    assert (entry["parent_frame_id"], entry["child_frame_id"]) == ("world", "cf1")
+    assert entry["timestamp"] == {"seconds": stamp[0], "nanos": stamp[1]}
+
+
+def picture(encoding: str, channels: int, spare: int = 0) -> SimpleNamespace:
+    """5 x 4 pixels, each byte its number in its row and 16 times the row."""
+    step = 5 * channels + spare
+    rows = np.arange(step)[None] + 32 * np.arange(4)[:, None]
+    data = rows.astype(np.uint8).ravel()
+    return SimpleNamespace(height=4, width=5, step=step, encoding=encoding, data=data)
+
+
+@pytest.mark.parametrize("spare", [0, 3])
+@pytest.mark.parametrize(
+    ("encoding", "channels", "order"),
+    [
+        ("mono8", 1, (0, 0, 0)),
+        ("8UC1", 1, (0, 0, 0)),
+        ("rgb8", 3, (0, 1, 2)),
+        ("8UC3", 3, (0, 1, 2)),
+        ("bgr8", 3, (2, 1, 0)),
+        ("rgba8", 4, (0, 1, 2)),
+        ("bgra8", 4, (2, 1, 0)),
+    ],
+)
+def test_pictures_of_every_encoding_have_their_colours(
+    encoding: str, channels: int, order: tuple[int, ...], spare: int
+) -> None:
+    rgb = _rgb(picture(encoding, channels, spare), Path("bag"))
+    v, u, k = np.meshgrid(np.arange(4), np.arange(5), order, indexing="ij")
+    assert rgb.tolist() == (32 * v + channels * u + k).tolist()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"height": 3}, {"height": 10_001}, {"step": 14}, {"step": 16}, {"encoding": "16UC1"}],
+)
+def test_pictures_that_cannot_be_are_one_line(change: dict[str, Any]) -> None:
+    message = SimpleNamespace(**vars(picture("rgb8", 3)) | change)
+    with pytest.raises(SourceError, match="bag: "):
+        _rgb(message, Path("bag"))
+
+
+ANGLE = st.floats(-1.4, 1.4)
+
+
+@hypothesis.given(
+    ANGLE, ANGLE, st.floats(-3, 3), st.lists(st.floats(-2, 2), min_size=3, max_size=3)
+)
+def test_vectors_and_rates_are_turned_as_the_robot_is(
+    roll: float, pitch: float, yaw: float, vector: list[float]
+) -> None:
+    angles, body = np.array([roll, pitch, yaw]), np.array(vector)
+    level = camera_from_horizontal(roll, pitch).T @ body
+    assert _levelled(body, angles) == pytest.approx(level)
+    c, s = np.cos(yaw), np.sin(yaw)
+    heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    assert _turned_back(heading @ level, angles) == pytest.approx(level)
+    turn = camera_from_horizontal(roll, pitch) @ [0, 0, 0.7]  # a steady turn about the vertical
+    assert _yaw_rate(turn, angles) == pytest.approx(0.7)
+    (quaternion,) = quaternion_zyx(angles[None])
+    assert _angles(xyzw(*quaternion)) == pytest.approx(angles, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frame", "parent", "fixed"),
+    [
+        ("", "", False),
+        ("", "odom", False),
+        ("base", "odom", False),
+        ("base", "base", True),
+        ("odom", "", True),
+        ("a/b/map", "x", True),
+        ("map/base", "x", False),
+        ("mapped", "x", False),
+    ],
+)
+def test_frames_that_do_not_turn_are_known_by_their_names(
+    frame: str, parent: str, fixed: bool
+) -> None:
+    assert _is_fixed(frame, parent) == fixed
+
+
+def test_an_imu_that_knows_no_attitude_says_nothing() -> None:
+    lost = SimpleNamespace(orientation=xyzw(0, 0, 0, 0), angular_velocity=xyzw(0.1, 0.2, 0.4))
+    assert given("sensor_msgs/msg/Imu", lost) == []
+    held = odometry("base", (1.0, 2.0, 3.0))
+    held.pose.pose.orientation = lost.orientation
+    assert [s.message for s in given("nav_msgs/msg/Odometry", held)] == ["PoseInFrame", "Height"]
+
+
+def test_compressed_pictures_keep_their_bytes() -> None:
+    rgb = np.full((8, 8, 3), 90, np.uint8)
+    for data, kind in ((encode_png(rgb), "png"), (encode_jpeg(rgb), "jpeg")):
+        message = SimpleNamespace(data=np.frombuffer(data, np.uint8))
+        (found,) = given("sensor_msgs/msg/CompressedImage", message)
+        assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
+        assert (found.fields["data"], found.fields["format"]) == (data, kind)
+    ppm = b"P6\n8 8\n255\n" + rgb.tobytes()
+    with pytest.raises(SourceError, match=r"bag: pictures are ppm\. Save them as PNG or JPEG"):
+        given("sensor_msgs/msg/CompressedImage", SimpleNamespace(data=np.frombuffer(ppm, np.uint8)))
+
+
+def test_a_picture_is_the_robot_s_own() -> None:
+    (found,) = given("sensor_msgs/msg/Image", picture("rgb8", 3))
+    assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
+    assert decode(found.fields["data"]).tolist() == _rgb(picture("rgb8", 3), Path("bag")).tolist()
+
+
+def test_a_colour_sensor_s_picture_gets_its_colours() -> None:
+    raw = np.random.default_rng(0).integers(0, 256, (4, 6), np.uint8)
+    data = np.concatenate([raw, np.zeros((4, 2), np.uint8)], axis=1).ravel()
+    message = SimpleNamespace(height=4, width=6, step=8, encoding="bayer_rggb8", data=data)
+    assert _rgb(message, Path("bag")).tolist() == rgb_of(raw).tolist()

@@ -1,0 +1,156 @@
+"""Which format a source is taken for, and what is said where it is none."""
+
+import os
+from collections.abc import Callable
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from dmrl import plugins
+from dmrl.errors import PluginError, SourceError
+from dmrl.formats import registry
+from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.registry import FIRST, format_of, own
+from dmrl.plugins import Plugin
+from dmrl.samples.sample import Sample
+
+from . import foreign
+
+FORMAT = Format(
+    "theirs",
+    "a log of theirs",
+    lambda source: source.suffix == ".theirs",
+    lambda *_: Content(iter(())),
+)
+BROKEN = Format("broken", "a log", lambda source: 1 / 0 > 0, lambda *_: 1 / 0)  # type: ignore[arg-type,return-value]
+
+
+def late() -> Content:
+    def samples() -> object:
+        yield Sample(1, "/cf1/height", "Height", {"height_m": 1.0})
+        raise KeyError("altitude")
+
+    return Content(samples(), 5)  # type: ignore[arg-type]
+
+
+LATE = Format("late", "a log", lambda source: source.suffix == ".late", lambda *_: late())
+NONE = 1
+
+
+@pytest.fixture
+def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Plug-ins of this module, by name and the name of what they load."""
+
+    def added(**values: str) -> None:
+        rows = {
+            name: Plugin(
+                name, "their-logs", "", EntryPoint(name, f"{__name__}:{value}", plugins.FORMATS)
+            )
+            for name, value in values.items()
+        }
+        monkeypatch.setattr(registry.plugins, "found", lambda group: rows)
+
+    return added
+
+
+def test_formats_stand_in_the_order_in_which_they_are_tried() -> None:
+    names = list(own())
+    assert tuple(names[: len(FIRST)]) == FIRST
+    assert names[-1] == "images"
+    assert names[len(FIRST) : -1] == sorted(names[len(FIRST) : -1]) != []
+    assert all(name == form.name for name, form in own().items())
+
+
+def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
+    (tmp_path / "log").write_bytes(foreign.usd_log())
+    assert format_of(tmp_path / "log").name == "cfusdlog"
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for name, data in foreign.coloured().items():
+        (folder / name).write_bytes(data)
+    assert format_of(folder).name == "images"
+    assert format_of(folder, "csv") is own()["csv"]  # who says so is believed
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("a.txt", b"", "is empty, 0 bytes"),
+        ("a.txt", b"x", "looks like no kind that is known. Say --from: locanet, csv, "),
+        ("a.mcap", b"x", "is a recording already. Say --to: csv, parquet, ros2"),
+    ],
+)
+def test_what_is_no_source_is_said(name: str, data: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SourceError) as e:
+        format_of(tmp_path / name)
+    assert said in str(e.value) and name in str(e.value)
+
+
+def test_folders_that_are_empty_and_things_that_are_not_there_are_said(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="is an empty folder"):
+        format_of(tmp_path)
+    with pytest.raises(SourceError, match=r"no file or folder .*nothing. Name one"):
+        format_of(tmp_path / "nothing")
+    (tmp_path / "below").mkdir()
+    os.mkfifo(tmp_path / "below" / "pipe")
+    for name in (None, "images"):
+        with pytest.raises(SourceError, match=r"pipe is neither a file nor a folder. Move it out"):
+            format_of(tmp_path, name)
+    with pytest.raises(SourceError, match=r"pipe is neither a file nor a folder. Save it"):
+        format_of(tmp_path / "below" / "pipe")
+
+
+def test_a_kind_that_is_misspelled_is_told_the_near_one(
+    tmp_path: Path, plug: Callable[..., None]
+) -> None:
+    plug(theirs="FORMAT")
+    (tmp_path / "a").write_bytes(b"x")
+    for name, hint in (
+        ("imags", "Did you mean images? "),
+        ("their", "Did you mean theirs? "),
+        ("zz", ""),
+    ):
+        with pytest.raises(SourceError) as e:
+            format_of(tmp_path / "a", name)
+        assert f"--from {name}: no such kind. {hint}Kinds: locanet, csv" in str(e.value)
+        assert str(e.value).endswith("images, theirs")
+
+
+def test_a_plug_in_is_asked_after_our_own_and_by_its_name(
+    tmp_path: Path, plug: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    plug(broken="BROKEN", theirs="FORMAT", none="NONE")
+    (tmp_path / "a.theirs").write_bytes(b"x")
+    found = format_of(tmp_path / "a.theirs")
+    assert (found.name, found.what) == ("theirs", "a log of theirs")
+    assert found.recognises(tmp_path / "a.theirs") and not found.recognises(tmp_path / "a.txt")
+    err = capsys.readouterr().err
+    assert "of the package their-logs, fails to look at" in err and "Not tried on" in err
+    (tmp_path / "log").write_bytes(foreign.usd_log())
+    assert format_of(tmp_path / "log").name == "cfusdlog"
+    assert format_of(tmp_path / "log", "theirs").name == "theirs"
+    assert capsys.readouterr().err == ""
+    with pytest.raises(
+        PluginError, match=r"none, of the package their-logs, is not a dmrl.formats"
+    ):
+        format_of(tmp_path / "log", "none")
+
+
+def test_what_fails_in_a_plug_in_names_its_package(
+    tmp_path: Path, plug: Callable[..., None]
+) -> None:
+    plug(broken="BROKEN", late="LATE")
+    (tmp_path / "a.late").write_bytes(b"x")
+    with pytest.raises(
+        PluginError, match=r"broken, of the package their-logs, fails to read .*Zero"
+    ):
+        format_of(tmp_path / "a.late", "broken").content(tmp_path / "a.late", Options())
+    content = format_of(tmp_path / "a.late", "late").content(tmp_path / "a.late", Options())
+    assert content.total == 5
+    assert next(content.samples).fields == {"height_m": 1.0}
+    with pytest.raises(
+        PluginError, match=r"late, of the package their-logs, fails to read .*KeyErr"
+    ):
+        next(content.samples)
