@@ -27,7 +27,7 @@ from dmrl.estimation.model.status import GATE_M, OK, statuses
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, simulate
 from dmrl.geometry.frames import Array
-from dmrl.labelling.logs import RobotLog
+from dmrl.labelling.sensor_logs import RobotLog
 
 SETTLE_S = 20.0
 MARGIN_S = 1.0

@@ -26,7 +26,7 @@ from dmrl.flight.sensors import pair_errors
 from dmrl.formats.base import Options
 from dmrl.formats.files import mapped_csv
 from dmrl.geometry.frames import Array
-from dmrl.labelling.logs import RobotLog
+from dmrl.labelling.sensor_logs import RobotLog
 from dmrl.samples.sample import Columns
 
 NOISE_OF_RANGES = NOISE["calibrated"]

@@ -23,7 +23,7 @@ from dmrl.estimation.model.metrics import (
     overall,
 )
 from dmrl.geometry.frames import Array
-from dmrl.labelling.truth import TOLD, true_pairs, true_path
+from dmrl.labelling.ground_truth import TOLD, true_pairs, true_path
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Contents, input_of, summary
 

@@ -21,8 +21,8 @@ from dmrl.geometry.frames import (
     pixels_from_horizontal,
 )
 from dmrl.labelling.camera import camera_of
-from dmrl.labelling.sight import SEEN, Sight, read_sight
-from dmrl.labelling.truth import TOLD, true_pairs, true_path
+from dmrl.labelling.ground_truth import TOLD, true_pairs, true_path
+from dmrl.labelling.observations import SEEN, Sight, read_sight
 from dmrl.recording import Contents, input_of, summary
 
 TITLE, EACH = "tracks against truth", "observer"

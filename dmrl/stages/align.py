@@ -15,8 +15,8 @@ from dmrl.atomic_output import refuse_existing
 from dmrl.errors import RecordingError, SettingError
 from dmrl.estimation.signals.clocks import Clock, connected
 from dmrl.formats.timestamps import dejitter
-from dmrl.labelling.clocks import camera_clock, mocap_clocks, range_clocks, ranging
-from dmrl.labelling.corrected import MOCAP, Corrected
+from dmrl.labelling.retiming import MOCAP, Corrected
+from dmrl.labelling.time_alignment import camera_clock, mocap_clocks, range_clocks, ranging
 from dmrl.pipeline.folders import is_many, over_folder
 from dmrl.recording import (
     Contents,

@@ -24,7 +24,7 @@ try:
     from dmrl.estimation.tracking.tracker import Track, Tracker, Tuning
     from dmrl.evaluation.tracks import CAMERAS_METADATA
     from dmrl.labelling.camera import camera_given, camera_of
-    from dmrl.labelling.sight import SEEN, Sight, read_sight
+    from dmrl.labelling.observations import SEEN, Sight, read_sight
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 

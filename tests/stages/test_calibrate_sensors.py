@@ -7,8 +7,8 @@ import pytest
 
 from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.flight import Fault
-from dmrl.labelling import agreed
-from dmrl.labelling.known import Sensors, read_sensors, write_sensors
+from dmrl.labelling import sensor_calibration
+from dmrl.labelling.sensor_file import Sensors, read_sensors, write_sensors
 from dmrl.recording import summary
 from dmrl.stages import calibrate, fly, label
 from dmrl.stages.calibrate import Settings
@@ -92,8 +92,8 @@ def test_too_little_is_one_line(flights: list[Path], known: Path, tmp_path: Path
 def test_flights_that_agree_on_nothing_leave_no_file(
     flights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(agreed, "WORTH", 0.0)
-    monkeypatch.setattr(agreed, "OFF", float("inf"))
+    monkeypatch.setattr(sensor_calibration, "WORTH", 0.0)
+    monkeypatch.setattr(sensor_calibration, "OFF", float("inf"))
     with pytest.raises(RecordingError, match="agree on nothing of their sensors"):
         calibrate.run(flights[:2], tmp_path / "sensors.toml", SENSORS)
     assert list(tmp_path.iterdir()) == []

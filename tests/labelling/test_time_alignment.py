@@ -9,7 +9,7 @@ import pytest
 from dmrl import topics
 from dmrl.geometry.turns import quaternion_zyx
 from dmrl.images.codec import encode_png
-from dmrl.labelling.clocks import (
+from dmrl.labelling.time_alignment import (
     MOCAP_STEP_S,
     _increasing,
     _of_pose,

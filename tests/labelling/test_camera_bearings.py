@@ -8,15 +8,15 @@ import pytest
 from dmrl.estimation.model.bearings import polar_of
 from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera, pixels_from_horizontal
-from dmrl.labelling.labels import Positions
-from dmrl.labelling.sight import Sight
-from dmrl.labelling.sighted import (
+from dmrl.labelling.camera_bearings import (
     DISTANCE_RATIO,
     LEAST_RATIO,
     levelled,
     sightings_of,
     with_sightings,
 )
+from dmrl.labelling.labels import Positions
+from dmrl.labelling.observations import Sight
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 
 from ..estimation.sighted_flights import still_pair

@@ -7,8 +7,8 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.solver.residuals import BIAS, CLOCK, OWN_GYRO, PEER_GYRO, PEER_SCALE
-from dmrl.labelling.known import Sensors, read_sensors, write_sensors
-from dmrl.labelling.logs import read_logs
+from dmrl.labelling.sensor_file import Sensors, read_sensors, write_sensors
+from dmrl.labelling.sensor_logs import read_logs
 from dmrl.recording import Contents
 
 from ..estimation.flights import flown, pair_of

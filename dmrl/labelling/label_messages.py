@@ -12,7 +12,7 @@ from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.camera import camera_of
 from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
-from dmrl.labelling.logs import Logs
+from dmrl.labelling.sensor_logs import Logs
 from dmrl.messages import message
 from dmrl.recording import Contents, Series, Timed
 from dmrl.recording.sources import looked_at

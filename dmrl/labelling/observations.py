@@ -11,7 +11,7 @@ from dmrl.errors import MissingTopic, RecordingError
 from dmrl.estimation.calibration.observations import Flight, PeerPath
 from dmrl.estimation.tracking.detections import Motion, View
 from dmrl.geometry.frames import Array, Camera
-from dmrl.labelling.truth import true_pairs, true_path
+from dmrl.labelling.ground_truth import true_pairs, true_path
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Contents
 

@@ -11,7 +11,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.estimation.model.pair import RATE_HZ, Array, Pair, Track, usable_ranges
 from dmrl.estimation.signals.sensor_tracks import Signals, track
-from dmrl.labelling.known import Sensors
+from dmrl.labelling.sensor_file import Sensors
 from dmrl.recording import Contents
 from dmrl.recording.check_units import unit_doubts
 

@@ -9,7 +9,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.estimation.model.pair import RATE_HZ
-from dmrl.labelling.logs import LEAST_RANGES, Logs, RobotLog, read_logs
+from dmrl.labelling.sensor_logs import LEAST_RANGES, Logs, RobotLog, read_logs
 from dmrl.messages import message
 from dmrl.recording import Contents, Provenance, RecordingWriter
 

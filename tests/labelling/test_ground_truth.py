@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import topics
-from dmrl.labelling.truth import true_pairs, true_path
+from dmrl.labelling.ground_truth import true_pairs, true_path
 from dmrl.messages import message
 from dmrl.recording import Contents, Provenance, RecordingWriter
 

@@ -14,8 +14,8 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.keyframes import GLOBALS, Noise
 from dmrl.estimation.solver.residuals import CLOCK
-from dmrl.labelling.known import OF_PAIR, OF_ROBOT, Names, Sensors, Value
-from dmrl.labelling.logs import SENSED, read_logs
+from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, Names, Sensors, Value
+from dmrl.labelling.sensor_logs import SENSED, read_logs
 from dmrl.recording import Contents
 
 Ints = NDArray[np.intp]

@@ -7,7 +7,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.estimation.signals.clocks import Clock
-from dmrl.labelling.corrected import MOCAP, Corrected
+from dmrl.labelling.retiming import MOCAP, Corrected
 from dmrl.messages import message
 from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw
 
