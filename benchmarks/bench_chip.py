@@ -22,8 +22,8 @@ from dmrl.deploy.int8.graph import graph_of
 from dmrl.deploy.int8.quantise import About, quantise
 from dmrl.deploy.int8.rounding import moments_of
 from dmrl.images.codec import decode
-from dmrl.learn.model import load_model
-from dmrl.learn.trace import operations
+from dmrl.learn.inference.loaded_model import load_model
+from dmrl.learn.networks.trace import operations
 
 STEP = 0.211
 JUDGED, CALIBRATION = ("00216", "00495"), ("00185", "00216", "00375", "00495")

@@ -21,7 +21,7 @@ import torch
 from dmrl.datasets import Split, open_dataset
 from dmrl.datasets.training_examples import examples_of
 from dmrl.images.codec import encode_jpeg
-from dmrl.learn.batches import gathered, order
+from dmrl.learn.data.batches import gathered, order
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run

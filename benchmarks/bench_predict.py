@@ -26,7 +26,7 @@ import onnxruntime
 
 from dmrl.deploy.onnx.float_model import float_onnx_of
 from dmrl.images.codec import decode
-from dmrl.learn.model import load_model
+from dmrl.learn.inference.loaded_model import load_model
 from dmrl.learn.pretrained import resolved
 from dmrl.recording import read
 from dmrl.stages import fly, predict

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from dmrl import recipe
-from dmrl.learn.model import load_model
-from dmrl.learn.validate import WATCHED
+from dmrl.learn.inference.loaded_model import load_model
+from dmrl.learn.training.validation import WATCHED
 from dmrl.stages.train import Settings, run
 from dmrl.terminal.tables import print_table
 

@@ -21,13 +21,13 @@ from dmrl import recipe
 from dmrl.datasets import open_dataset
 from dmrl.datasets.training_examples import examples_of
 from dmrl.images.codec import encode_png
-from dmrl.learn.augment import Augmenter
-from dmrl.learn.batches import Batch, Examples, gathered, order
-from dmrl.learn.depthwise import Depthwise
-from dmrl.learn.fit import new_network
-from dmrl.learn.optimizer import new_optimizer
-from dmrl.learn.settings import FitSettings
-from dmrl.learn.step import train_step
+from dmrl.learn.data.augment import Augmenter
+from dmrl.learn.data.batches import Batch, Examples, gathered, order
+from dmrl.learn.networks.depthwise import Depthwise
+from dmrl.learn.training.config import FitSettings
+from dmrl.learn.training.optimizer import new_optimizer
+from dmrl.learn.training.train_step import train_step
+from dmrl.learn.training.trainer import new_network
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run

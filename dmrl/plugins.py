@@ -5,7 +5,7 @@ In the package's pyproject.toml::
     [project.entry-points."dmrl.formats"]
     blackbox = "their_package.blackbox:FORMAT"     # a dmrl.formats.base.Format
     [project.entry-points."dmrl.networks"]
-    their-nano = "their_package.network:TheirNano" # a subclass of dmrl.learn.network.Network
+    their-nano = "their_package.network:TheirNano" # a subclass of dmrl.learn.networks.architectures.Network
     [project.entry-points."dmrl.stages"]
     smooth = "their_package.smooth"                # a module with command(), as in dmrl/stages
 

@@ -45,7 +45,7 @@ REASONS = {
     "formats/aideck/nanocockpit.py: FOLDERS[0]": OURS,
     "formats/aideck/nanocockpit.py: f'{stem}{suffix}'": READ,
     "formats/aideck/nanocockpit.py: folder": OURS,
-    "learn/checkpoint.py: name": OURS,
+    "learn/training/checkpoint.py: name": OURS,
     "learn/pretrained/__init__.py: model": LISTED,
     "output.py: file": "what we wrote ourselves just now",
     "output.py: last": OURS,
@@ -83,7 +83,7 @@ MAY_PARSE = {
     "pipeline/work.py": "what our own processes say to each other",
     "recipe.py": "what json.dumps has just made",
     "recording/inputs.py": "what json.dumps has just made",
-    "learn/checkpoint.py": "what json.dumps has just made",
+    "learn/training/checkpoint.py": "what json.dumps has just made",
 }
 
 

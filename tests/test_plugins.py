@@ -12,8 +12,8 @@ import pytest
 from dmrl import plugins
 from dmrl.errors import PluginError, SettingError, SourceError
 from dmrl.formats.registry import format_of
-from dmrl.learn.model import Model, load_model, save_model
-from dmrl.learn.network import architecture_names, build
+from dmrl.learn.inference.loaded_model import Model, load_model, save_model
+from dmrl.learn.networks.architectures import architecture_names, build
 from dmrl.recording import read_table, summary
 from dmrl.stages import convert
 
@@ -40,7 +40,7 @@ FORMAT = """
 NETWORK = """
     import torch
     from torch import nn
-    from dmrl.learn.network import ConvNorm, Network
+    from dmrl.learn.networks.architectures import ConvNorm, Network
 
     class Tiny(Network):
         def __init__(self, extra=()):
@@ -196,7 +196,7 @@ def test_a_network_of_another_package_is_built_saved_and_loaded(
     ("text", "said"),
     [
         ("1 / 0", "cannot be loaded: ZeroDivisionError"),
-        ("Tiny = dict", "is not a subclass of dmrl.learn.network.Network"),
+        ("Tiny = dict", "is not a subclass of dmrl.learn.networks.architectures.Network"),
         (NETWORK.replace("ConvNorm(3", "ConvNrm(3"), "cannot be built: NameError"),
     ],
 )

@@ -171,7 +171,7 @@ class Tiny(Network):
 
 @pytest.mark.heavy
 def test_a_network(clone: Clone, tmp_path: Path) -> None:
-    name = "dmrl/learn/network.py"
+    name = "dmrl/learn/networks/architectures.py"
     clone.after(name, "    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)\n", "\n" + NETWORK)
     clone.after(name, "ARCHITECTURES: dict[str, type[Network]] = {\n", '    "tiny": Tiny,\n')
     assert clone.touched() == promised("a network")
@@ -182,8 +182,8 @@ def test_a_network(clone: Clone, tmp_path: Path) -> None:
         "import sys\n"
         "from pathlib import Path\n"
         "from dmrl.cli import main\n"
-        "from dmrl.learn.model import Model, save_model\n"
-        "from dmrl.learn.network import build\n"
+        "from dmrl.learn.inference.loaded_model import Model, save_model\n"
+        "from dmrl.learn.networks.architectures import build\n"
         f"save_model(Model(build('tiny').eval(), 'tiny'), Path({str(made)!r}))\n"
         f"sys.argv = ['dmrl', 'export', {str(made)!r}, {str(out)!r}]\n"
         "main()\n",
@@ -201,7 +201,7 @@ def _certain(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
 
 @pytest.mark.heavy
 def test_a_loss(clone: Clone) -> None:
-    name = "dmrl/learn/losses.py"
+    name = "dmrl/learn/training/losses.py"
     clone.after(name, "    classes: tuple[str, ...] = ()\n", "    certain_weight: float = 0.0\n")
     clone.after(name, "return class_loss(logits, wanted.class_id, wanted.weight)\n", LOSS)
     term = '    Term("certain_loss", "certain_weight", ("confidence",), _certain),\n'
@@ -210,10 +210,10 @@ def test_a_loss(clone: Clone) -> None:
     said = clone.python(
         "-c",
         "import torch\n"
-        "from dmrl.learn.batches import Batch\n"
-        "from dmrl.learn.network import build\n"
-        "from dmrl.learn.settings import FitSettings\n"
-        "from dmrl.learn.step import LOSSES, losses\n"
+        "from dmrl.learn.data.batches import Batch\n"
+        "from dmrl.learn.networks.architectures import build\n"
+        "from dmrl.learn.training.config import FitSettings\n"
+        "from dmrl.learn.training.train_step import LOSSES, losses\n"
         "images = torch.zeros(1, 3, 32, 40, dtype=torch.uint8)\n"
         "batch = Batch(images, torch.full((1, 1, 11), torch.nan))\n"
         "network = build('locanet').eval()\n"

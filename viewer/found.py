@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import RecordingError
 from dmrl.geometry.frames import Array, inside
-from dmrl.learn.matching import Points, errors
+from dmrl.learn.inference.matching import Points, errors
 from dmrl.recording import Provenance, stretches, summary
 
 Key = tuple[str, str, int]

@@ -280,6 +280,6 @@ def dataset(path: str | os.PathLike[str]) -> Data:
 
 def _torch_rows() -> Any:
     try:
-        return import_module("dmrl.learn.torch_rows")
+        return import_module("dmrl.learn.data.torch_dataset")
     except ModuleNotFoundError as e:
         raise MissingExtra(str(e.name), "train", "a loader") from None

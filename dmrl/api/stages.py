@@ -157,7 +157,7 @@ def train(
     init
         Model to start from.
     settings
-        Fields of ``dmrl.learn.settings.FitSettings``.
+        Fields of ``dmrl.learn.training.config.FitSettings``.
 
     Raises
     ------

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from dmrl.datasets import Dataset, Split
 from dmrl.errors import DatasetError, SettingError
-from dmrl.learn.batches import BOX, CLASS_ID, FIELDS, Examples
-from dmrl.learn.settings import FitSettings
+from dmrl.learn.data.batches import BOX, CLASS_ID, FIELDS, Examples
+from dmrl.learn.training.config import FitSettings
 
 
 class Material(NamedTuple):

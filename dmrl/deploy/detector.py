@@ -23,7 +23,7 @@ from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_no_text, refuse_pipes
 from dmrl.learn import pretrained
-from dmrl.learn.decode import Grids
+from dmrl.learn.inference.decode import Grids
 
 BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"]
 
@@ -138,7 +138,7 @@ def fastest(model: Path, size_px: tuple[int, int]) -> BackendName:
         if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
             return "onnx"
         written = import_module("dmrl.deploy.onnx.write").OUTPUT_OF
-        learned = import_module("dmrl.learn.model").load_model(model)
+        learned = import_module("dmrl.learn.inference.loaded_model").load_model(model)
     except (MissingExtra, ModuleNotFoundError, ModelError):
         return "torch"  # which says what is wrong
     told = set(learned.network.channels) <= set(written)
@@ -151,7 +151,9 @@ def _torch(model: Path, _backend: BackendName) -> Detector:
             f"{model} is an export folder, which torch cannot run. Give --backend onnx, or the "
             "model that was exported"
         )
-    learned = _room("dmrl.learn.model", "train", "--backend torch").load_model(model)
+    learned = _room("dmrl.learn.inference.loaded_model", "train", "--backend torch").load_model(
+        model
+    )
     file = model / WEIGHTS_NAME if model.is_dir() else None
     return Detector(
         model.name,
@@ -170,7 +172,9 @@ def _onnx(model: Path, _backend: BackendName) -> Detector:
         runs = room.OnnxRun(file, file)
         stride_px, threshold = _described(model / DESCRIPTION_NAME)
     else:
-        learned = _room("dmrl.learn.model", "train", "a model to ONNX").load_model(model)
+        learned = _room("dmrl.learn.inference.loaded_model", "train", "a model to ONNX").load_model(
+            model
+        )
         grey = (model / INTEGER_NAME).is_file() and load(model).channels == 1
         export = _room("dmrl.deploy.onnx.float_model", "deploy", "--backend onnx")
         runs = room.OnnxRun(export.float_onnx_of(learned, grey=grey), model)

@@ -20,7 +20,7 @@ from dmrl.datasets import Split
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import inside
 from dmrl.images.codec import size
-from dmrl.learn.matching import Points
+from dmrl.learn.inference.matching import Points
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Contents, read, splits
 from dmrl.recording.inputs import refuse_twice

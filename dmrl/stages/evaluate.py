@@ -17,8 +17,8 @@ from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
 from dmrl.evaluation.tables import band_values, by_band_table, curve_values, finite
-from dmrl.learn.metrics import DEFINITIONS, BandFigures, Scored, by_band, score
-from dmrl.learn.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
+from dmrl.learn.inference.metrics import DEFINITIONS, BandFigures, Scored, by_band, score
+from dmrl.learn.inference.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.pipeline.crew import cores
 from dmrl.pipeline.folders import all_recordings
 from dmrl.pipeline.once import done_on

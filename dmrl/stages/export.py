@@ -102,7 +102,7 @@ def run(model: Path, out: Path, settings: Settings) -> list[Written]:
     if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
         raise ModelError(f"{model} is an export folder already. Give the model it was made from")
     try:
-        learned = import_module("dmrl.learn.model")
+        learned = import_module("dmrl.learn.inference.loaded_model")
         written = import_module("dmrl.deploy.onnx.float_model")
     except ModuleNotFoundError as e:
         raise MissingExtra(str(e.name), "train", "dmrl export") from None

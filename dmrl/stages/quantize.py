@@ -25,7 +25,7 @@ from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.samples import SAMPLES, save_samples
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation.detections import labels_of_split
-from dmrl.learn.metrics import DEFINITIONS
+from dmrl.learn.inference.metrics import DEFINITIONS
 from dmrl.learn.pretrained import resolved
 from dmrl.recording import provenance
 from dmrl.terminal.arguments import AsJson, Flat
@@ -33,8 +33,8 @@ from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table
 
 try:
-    from dmrl.learn.model import Model, load_model, save_model
-    from dmrl.learn.trace import operations
+    from dmrl.learn.inference.loaded_model import Model, load_model, save_model
+    from dmrl.learn.networks.trace import operations
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "train", "dmrl quantize") from e
 

@@ -22,12 +22,9 @@ from dmrl.terminal.tables import print_json, print_table
 
 try:
     from dmrl.datasets.training_examples import material
-    from dmrl.learn.batches import Examples
-    from dmrl.learn.calibrate import Calibration, calibrate, calibration
-    from dmrl.learn.checkpoint import has_checkpoint, remove_checkpoint
-    from dmrl.learn.fit import Step, Training, device_of, new_network
-    from dmrl.learn.group import Group, in_group
-    from dmrl.learn.model import (
+    from dmrl.learn.data.batches import Examples
+    from dmrl.learn.inference.confidence_calibration import Calibration, calibrate, calibration
+    from dmrl.learn.inference.loaded_model import (
         PUBLISHED_THRESHOLD,
         Model,
         load_model,
@@ -37,10 +34,13 @@ try:
         weights_of,
         with_channels,
     )
-    from dmrl.learn.network import Network
-    from dmrl.learn.settings import AUTO, DEFAULT, FitSettings
-    from dmrl.learn.threshold import best_threshold
-    from dmrl.learn.validate import scores
+    from dmrl.learn.inference.threshold import best_threshold
+    from dmrl.learn.networks.architectures import Network
+    from dmrl.learn.training.checkpoint import has_checkpoint, remove_checkpoint
+    from dmrl.learn.training.config import AUTO, DEFAULT, FitSettings
+    from dmrl.learn.training.distributed import Group, in_group
+    from dmrl.learn.training.trainer import Step, Training, device_of, new_network
+    from dmrl.learn.training.validation import scores
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "train", "dmrl train") from e
 

@@ -16,8 +16,8 @@ from datasets import load_dataset
 import dmrl
 from dmrl.datasets import open_dataset
 from dmrl.errors import SettingError
-from dmrl.learn import batches
-from dmrl.learn.torch_rows import Part
+from dmrl.learn.data import batches
+from dmrl.learn.data.torch_dataset import Part
 from dmrl.stages.dataset import Settings, add, run
 
 from .conftest import Record

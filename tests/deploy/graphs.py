@@ -22,8 +22,8 @@ from dmrl.deploy.int8.graph import (
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.quantise import About, quantise
 from dmrl.deploy.int8.rounding import moments_of
-from dmrl.learn.network import build
-from dmrl.learn.trace import operations
+from dmrl.learn.networks.architectures import build
+from dmrl.learn.networks.trace import operations
 
 SUB_CELL = ("log_depth", "confidence", "offset_u", "offset_v")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
-from dmrl.learn.matching import Points
+from dmrl.learn.inference.matching import Points
 
 
 def outputs(*best: tuple[int, int]) -> dict[str, np.ndarray]:

@@ -15,8 +15,8 @@ from dmrl.deploy.int8.graph import grey_of
 from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.onnx.float_model import float_onnx_of
 from dmrl.errors import ModelError, SettingError, ToolError
-from dmrl.learn.model import Model, load_model, save_model
-from dmrl.learn.network import build
+from dmrl.learn.inference.loaded_model import Model, load_model, save_model
+from dmrl.learn.networks.architectures import build
 
 from .graphs import quantised_network
 

@@ -16,7 +16,7 @@ from dmrl.formats.files.image_folder import list_pictures
 from dmrl.geometry.camera_file import read_camera
 from dmrl.guards.paths import refuse_no_text, refuse_pipe, refuse_pipes
 from dmrl.html_report import gather
-from dmrl.learn.model import load_model
+from dmrl.learn.inference.loaded_model import load_model
 from dmrl.recording.inputs import input_of
 from dmrl.rendering.backdrops import photos_in
 from dmrl.stages import calibrate, convert

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dmrl.learn.batches import Examples
+from dmrl.learn.data.batches import Examples
 
 from .fitting import dots
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import recipe
-from dmrl.learn.batches import FIELDS, Examples
-from dmrl.learn.checkpoint import remove_checkpoint
-from dmrl.learn.fit import Training, new_network
-from dmrl.learn.model import Model, save_model
-from dmrl.learn.network import Network
-from dmrl.learn.settings import FitSettings
+from dmrl.learn.data.batches import FIELDS, Examples
+from dmrl.learn.inference.loaded_model import Model, save_model
+from dmrl.learn.networks.architectures import Network
+from dmrl.learn.training.checkpoint import remove_checkpoint
+from dmrl.learn.training.config import FitSettings
+from dmrl.learn.training.trainer import Training, new_network
 
 PUBLISHED = recipe.load("locanet", "train", FitSettings)
 SETTINGS = replace(PUBLISHED, epochs=4, batch_size=3, warmup_epochs=1, device="cpu")

@@ -6,7 +6,7 @@ import signal
 import torch
 from torch import distributed
 
-from dmrl.learn.group import Group
+from dmrl.learn.training.distributed import Group
 
 
 def rank_sum(group: Group, more: int) -> int:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dmrl.learn.augment import Augmentation, Augmenter
-from dmrl.learn.batches import FIELDS, Batch, Examples
+from dmrl.learn.data.augment import Augmentation, Augmenter
+from dmrl.learn.data.batches import FIELDS, Batch, Examples
 
 GEOMETRY = Augmentation(
     flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0

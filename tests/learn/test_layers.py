@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dmrl.learn.batches import FIELDS
-from dmrl.learn.windows import (
+from dmrl.learn.data.batches import FIELDS
+from dmrl.learn.data.crops import (
     Intrinsics,
     Pixels,
     Point,

@@ -7,10 +7,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from dmrl.learn import augment
-from dmrl.learn.augment import Augmentation, Augmenter
-from dmrl.learn.batches import FIELDS, Examples
-from dmrl.learn.windows import Point, Robot, feather, through
+from dmrl.learn.data import augment
+from dmrl.learn.data.augment import Augmentation, Augmenter
+from dmrl.learn.data.batches import FIELDS, Examples
+from dmrl.learn.data.crops import Point, Robot, feather, through
 
 from .squares import GEOMETRY, augmenter, batches, squares
 

@@ -8,9 +8,9 @@ import pytest
 from dmrl.errors import ModelError
 from dmrl.images.codec import decode
 from dmrl.learn import pretrained
-from dmrl.learn.decode import decode as find
-from dmrl.learn.model import load_model
-from dmrl.learn.network import parameter_count, product_count
+from dmrl.learn.inference.decode import decode as find
+from dmrl.learn.inference.loaded_model import load_model
+from dmrl.learn.networks.architectures import parameter_count, product_count
 
 FRAMES = {"img00185.ppm": (174, 65), "img00375.ppm": (298, 139), "img00495.ppm": (98, 131)}
 """Where the drone is in real frames of the AI-deck, pixels, read off by eye."""

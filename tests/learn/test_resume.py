@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import ModelError, SettingError
-from dmrl.learn.batches import Examples
-from dmrl.learn.checkpoint import has_checkpoint
-from dmrl.learn.fit import Training, new_network
-from dmrl.learn.settings import FitSettings
+from dmrl.learn.data.batches import Examples
+from dmrl.learn.training.checkpoint import has_checkpoint
+from dmrl.learn.training.config import FitSettings
+from dmrl.learn.training.trainer import Training, new_network
 
 from .fitting import EVERYTHING, SETTINGS, dots, trained
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.learn import fit
-from dmrl.learn.batches import Batch, Examples, gathered
-from dmrl.learn.fit import Training, learning_rate_at, new_network
-from dmrl.learn.network import Network, build
-from dmrl.learn.step import LOSSES, train_step
+from dmrl.learn.data.batches import Batch, Examples, gathered
+from dmrl.learn.networks.architectures import Network, build
+from dmrl.learn.training import trainer
+from dmrl.learn.training.train_step import LOSSES, train_step
+from dmrl.learn.training.trainer import Training, learning_rate_at, new_network
 
 from .fitting import PUBLISHED, SETTINGS, dots
 
@@ -78,7 +78,7 @@ def test_curves_stand_at_the_steps_of_what_they_show(
         rows.append(("first", 0.0, first_step))
         yield lambda *row: rows.append(row)
 
-    monkeypatch.setattr(fit.boards, "opened", opened)
+    monkeypatch.setattr(trainer.boards, "opened", opened)
     settings, images = replace(SETTINGS, epochs=2), dots(7)  # three steps, the last of one image
     network = new_network(settings, images)
     training = Training(network, images, settings, tmp_path, validation=dots(3))
@@ -117,11 +117,11 @@ def test_every_step_is_asked_for_as_the_recipe_says(
         return torch.full((len(LOSSES),), float(len(asked)))
 
     updated, hard = [], []
-    monkeypatch.setattr(fit, "train_step", step)
-    monkeypatch.setattr(fit, "save_checkpoint", lambda *_: None)
-    monkeypatch.setattr(fit.boards, "opened", lambda *_: nullcontext(lambda *_: None))
-    monkeypatch.setattr(fit, "mined", lambda *given: hard.append(given))
-    monkeypatch.setattr(fit.Average, "update", lambda _, at: updated.append(at))
+    monkeypatch.setattr(trainer, "train_step", step)
+    monkeypatch.setattr(trainer, "save_checkpoint", lambda *_: None)
+    monkeypatch.setattr(trainer.boards, "opened", lambda *_: nullcontext(lambda *_: None))
+    monkeypatch.setattr(trainer, "mined", lambda *given: hard.append(given))
+    monkeypatch.setattr(trainer.Average, "update", lambda _, at: updated.append(at))
     shares = np.ones(8)
     training = Training(
         new_network(settings, images), images, settings, tmp_path, teacher=teacher, shares=shares

@@ -9,8 +9,8 @@ import torch
 from dmrl import card
 from dmrl.datasets import open_dataset
 from dmrl.images.codec import encode_png
-from dmrl.learn.model import Model, save_model
-from dmrl.learn.network import build, to_input
+from dmrl.learn.inference.loaded_model import Model, save_model
+from dmrl.learn.networks.architectures import build, to_input
 from dmrl.messages import message
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 from dmrl.stages import dataset, fly, quantize

@@ -13,8 +13,8 @@ from dmrl.deploy.detector import fastest
 from dmrl.deploy.onnx import run as onnx_run
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
 from dmrl.images.codec import Opened, decode, encode_png
-from dmrl.learn.model import Model, load_model, save_model
-from dmrl.learn.network import build
+from dmrl.learn.inference.loaded_model import Model, load_model, save_model
+from dmrl.learn.networks.architectures import build
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary
 from dmrl.stages import predict

@@ -11,7 +11,7 @@ from dmrl.deploy.int8.network import Conv
 from dmrl.deploy.int8.store import load
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode, encode_png
-from dmrl.learn.model import load_model
+from dmrl.learn.inference.loaded_model import load_model
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages import convert, dataset, quantize

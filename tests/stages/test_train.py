@@ -18,9 +18,9 @@ from dmrl.datasets import open_dataset
 from dmrl.datasets.training_examples import examples_of, material
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
 from dmrl.images.codec import encode_png
-from dmrl.learn import fit
-from dmrl.learn.batches import FIELDS
-from dmrl.learn.model import load_model
+from dmrl.learn.data.batches import FIELDS
+from dmrl.learn.inference.loaded_model import load_model
+from dmrl.learn.training import trainer
 from dmrl.stages import convert, dataset, train
 from dmrl.stages.train import Flags, Settings, run
 
@@ -158,7 +158,7 @@ def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same
     dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
-    steps, step = count(), fit.train_step
+    steps, step = count(), trainer.train_step
 
     def interrupted(*args: Any) -> Any:
         if next(steps) == 7:  # of the five that an epoch has, the third of the second
@@ -166,7 +166,7 @@ def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same
         return step(*args)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(fit, "train_step", interrupted)
+        patch.setattr(trainer, "train_step", interrupted)
         run(dots_dataset, out, SETTINGS)
     check_that_it_goes_on(dots_dataset, out, SETTINGS)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import SettingError
-from dmrl.learn.model import load_model
+from dmrl.learn.inference.loaded_model import load_model
 from dmrl.stages.train import run
 
 from .trainings import SETTINGS

@@ -13,7 +13,7 @@ from dmrl.datasets.writing.rows import label_source
 from dmrl.errors import DmrlError, RecordingError, SettingError
 from dmrl.evaluation import detections
 from dmrl.geometry.frames import Array
-from dmrl.learn.matching import errors
+from dmrl.learn.inference.matching import errors
 from dmrl.recording import Contents
 from dmrl.terminal.progress import say
 from dmrl.viewer import entities, layouts, plots

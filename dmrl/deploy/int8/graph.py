@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dmrl.deploy.int8.network import PIXEL_ZERO
 from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
 from dmrl.errors import ModelError
-from dmrl.learn.operations import Op
+from dmrl.learn.networks.graph_ops import Op
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]

@@ -2,8 +2,8 @@
 
 from dmrl.deploy.int8.graph import Graph, graph_of
 from dmrl.deploy.onnx.write import float_onnx
-from dmrl.learn.model import Model
-from dmrl.learn.trace import operations
+from dmrl.learn.inference.loaded_model import Model
+from dmrl.learn.networks.trace import operations
 
 
 def float_graph(model: Model, *, grey: bool) -> Graph:

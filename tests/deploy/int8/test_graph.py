@@ -17,9 +17,9 @@ from dmrl.deploy.int8.graph import (
     to_input,
 )
 from dmrl.errors import ModelError
-from dmrl.learn import network as networks
-from dmrl.learn.network import Network, build
-from dmrl.learn.trace import operations
+from dmrl.learn.networks import architectures as networks
+from dmrl.learn.networks.architectures import Network, build
+from dmrl.learn.networks.trace import operations
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3)).astype(np.uint8)
 

@@ -1,0 +1,1 @@
+"""Training data: batches, augmentation, crops and grid targets."""

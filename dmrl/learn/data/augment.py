@@ -1,0 +1,317 @@
+"""Augmentation: new images out of old ones, with labels that stay right.
+
+An image is made of layers. A layer shows a window of one source image, turned, mirrored and
+zoomed, in a rectangle of the canvas: the whole canvas, the parts of a mosaic, or a patch cut
+out around one robot. One sampling a layer does all of the geometry.
+
+A camera of fixed intrinsics sees a robot z times as large when it is z times as near, so a
+zoom by z divides the depth by z. A turn about the optical axis keeps it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dmrl.learn.data.batches import BOX, DEPTH, FIELDS, Batch, Examples, U, V
+from dmrl.learn.data.crops import (
+    Intrinsics,
+    Opacity,
+    Pixels,
+    Point,
+    Rect,
+    Rng,
+    Robot,
+    Turn,
+    Window,
+    blended,
+    defocused,
+    feather,
+    flat,
+    grained,
+    greyed,
+    inside,
+    levelled,
+    moved,
+    parts,
+    present,
+    sample,
+    turned,
+    under,
+)
+
+MAX_ROBOTS = 12
+"""Robots of one canvas that are labelled, at most."""
+PATCH_MARGIN = 1.25
+"""Side of a pasted patch over that of the robot's box."""
+DISTRACTOR_SHARE = 0.4
+"""Share of patches that show any place of any image."""
+FOCUS_SHARE = 0.8
+"""Share of mosaic windows that hold a robot of their image; the rest fall where they may."""
+LEAST_AHEAD = 0.25
+"""Least over greatest depth, along the source's axis, of what a turned camera's corners see."""
+DEPTH_SLACK = 1.1
+"""How far beyond the nearest and the farthest label zooming may bring a robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """How images are varied. All zero: not at all.
+
+    Parameters
+    ----------
+    flip_share
+        Share of windows mirrored left to right.
+    zoom
+        Least and greatest magnification of a window; it is also kept to where the robot's
+        depth stays among those of the labels.
+    rotation_deg
+        Greatest turn about the optical axis, either way.
+    mosaic_share
+        Share of images put together from windows of two or four.
+    paste
+        Mean number of patches of other images pasted into one, most of them around a robot.
+    colour
+        Spread (one sigma) of contrast, brightness and each channel's gain, 0 to 1.
+    noise
+        Greatest sigma of sensor noise, 0 to 1 of full scale.
+    blur_share
+        Share of images that are slightly out of focus.
+    intrinsics
+        Of the camera, undistorted. With them a window is what the camera would have seen had it
+        been turned; without, it is cut out.
+    grey_share
+        Share of images whose three channels become their luma, as of a grey camera.
+    """
+
+    flip_share: float = 0.0
+    zoom: tuple[float, float] = (1.0, 1.0)
+    rotation_deg: float = 0.0
+    mosaic_share: float = 0.0
+    paste: float = 0.0
+    colour: float = 0.0
+    noise: float = 0.0
+    blur_share: float = 0.0
+    intrinsics: Intrinsics | None = None
+    grey_share: float = 0.0
+
+    @property
+    def plain(self) -> "Augmentation":
+        """The same without what moves or cuts anything but whole images."""
+        return replace(self, zoom=(1.0, 1.0), rotation_deg=0.0, mosaic_share=0.0, paste=0.0)
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether images stay as they are."""
+        return self == Augmentation()
+
+
+class Augmenter:
+    """Makes augmented batches of one set of examples.
+
+    Parameters
+    ----------
+    examples
+        The images to vary.
+    settings
+        How.
+    seed
+        Batches depend on the seed, the epoch and their place in it alone.
+    """
+
+    def __init__(self, examples: Examples, settings: Augmentation, *, seed: int) -> None:
+        self._examples, self._settings, self._seed = examples, settings, seed
+        self._height, self._width, _ = examples.image_shape
+        robots = examples.robots
+        there = np.isfinite(robots[..., U])
+        depths = robots[..., DEPTH][there]
+        self._depths = (
+            (float(depths.min()) / DEPTH_SLACK, float(depths.max()) * DEPTH_SLACK)
+            if len(depths)
+            else (0.0, math.inf)
+        )
+        self._pasteable = np.argwhere(there & np.isfinite(robots[..., BOX]).all(axis=-1))
+        numbers = 2 * self._height * self._width * 3 if settings.noise else 0
+        self._grain = np.random.default_rng([seed, 1]).standard_normal(numbers, np.float32)
+
+    def batch(self, chosen: Sequence[int] | NDArray[np.int64], *, epoch: int, index: int) -> Batch:
+        """An augmented batch: one canvas for each of the chosen images.
+
+        Parameters
+        ----------
+        chosen
+            Numbers of images.
+        epoch, index
+            The epoch, and the batch's place in it.
+        """
+        rng = np.random.default_rng([self._seed, epoch, index])
+        canvas = np.empty((len(chosen), self._height, self._width, 3), np.uint8)
+        robots = np.full((len(chosen), MAX_ROBOTS, len(FIELDS)), np.nan, np.float32)
+        for slot, number in enumerate(chosen):
+            if found := self._draw(canvas[slot], int(number), rng)[:MAX_ROBOTS]:
+                robots[slot, : len(found)] = found
+        return Batch(torch.from_numpy(canvas).permute(0, 3, 1, 2), torch.from_numpy(robots))
+
+    def _draw(self, canvas: Pixels, number: int, rng: Rng) -> list[Robot]:
+        """Fill a canvas (H, W, 3); returns the robots in it."""
+        robots: list[Robot] = []
+        whole = (0, 0, self._width, self._height)
+        mosaic = rng.random() < self._settings.mosaic_share
+        rects = parts(whole, rng) if mosaic else [whole]
+        others = rng.integers(len(self._examples), size=len(rects) - 1)
+        for rect, source in zip(rects, (number, *others.tolist()), strict=True):
+            robots = self._layer(canvas, rect, source, robots, rng)
+        for _ in range(int(rng.poisson(self._settings.paste))):
+            robots = self._patch(canvas, robots, rng)
+        self._spoil(canvas, rng)
+        return robots
+
+    def _layer(
+        self, canvas: Pixels, rect: Rect, source: int, robots: list[Robot], rng: Rng
+    ) -> list[Robot]:
+        """Show a window of a source in a rectangle; the robots of the canvas after it."""
+        width, height = rect[2] - rect[0], rect[3] - rect[1]
+        mine = present(self._examples.robots[source])
+        focus = mine[int(rng.integers(len(mine)))] if mine else None
+        zoom = self._zoom(focus, rng)
+        zoom = max(zoom, width / self._width, height / self._height)  # no look past the source
+        held = focus if focus and rng.random() < FOCUS_SHARE else None
+        seen = (
+            _looked_at(self._width, width / (2 * zoom), held[U] if held else None, rng),
+            _looked_at(self._height, height / (2 * zoom), held[V] if held else None, rng),
+        )
+        shown = (width / 2, height / 2)
+        turn = self._turn(zoom, rng)
+        if focus:  # a camera is turned about where the robot comes to be
+            at = _back(turn, focus[U] - seen[0], focus[V] - seen[1])
+            at = (at[0] + shown[0], at[1] + shown[1])
+            if 0 <= at[0] < width and 0 <= at[1] < height:
+                seen, shown = (focus[U], focus[V]), at
+        window = self._window(turn, zoom, seen, shown, rect)
+        return self._show(canvas, rect, source, window, mine, robots, rng)
+
+    def _patch(self, canvas: Pixels, robots: list[Robot], rng: Rng) -> list[Robot]:
+        """Paste a robot of another image, or as much without one.
+
+        Along its mask where that is known, else with what is close around it. Without patches
+        that hold no robot, the edge of a patch would tell that one is in it.
+        """
+        if not len(self._pasteable):
+            return robots
+        source, which = self._pasteable[rng.integers(len(self._pasteable))].tolist()
+        robot: Robot = self._examples.robots[source, which].tolist()
+        zoom = self._zoom(robot, rng)
+        west, north, east, south = robot[BOX]
+        width = math.ceil(zoom * PATCH_MARGIN * (east - west)) + 8
+        height = math.ceil(zoom * PATCH_MARGIN * (south - north)) + 8
+        if width > self._width or height > self._height:
+            return robots
+        left = int(rng.uniform(0, self._width - width + 1))
+        top = int(rng.uniform(0, self._height - height + 1))
+        rect, shown = (left, top, left + width, top + height), (width / 2, height / 2)
+        mask = self._examples.mask(source, which)
+        middle = ((west + east) / 2 + rng.uniform(-2, 2), (north + south) / 2 + rng.uniform(-2, 2))
+        centre = middle
+        if rng.random() < DISTRACTOR_SHARE:
+            source = int(rng.integers(len(self._examples)))
+            centre = (rng.uniform(0, self._width), rng.uniform(0, self._height))
+        turn = self._turn(zoom, rng)
+        window = self._window(turn, zoom, centre, shown, rect)
+        opacity = feather(height, width)
+        if mask is not None:
+            about = self._window(turn, zoom, middle, shown, rect)
+            cut = sample(255 * mask, about, (height, width), sharp=False)
+            opacity = np.asarray(cut / np.float32(255), np.float32)
+        mine = present(self._examples.robots[source])
+        return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
+
+    def _zoom(self, robot: Robot | None, rng: Rng) -> float:
+        """A magnification, log-uniform; the robot's depth stays in the range of the labels."""
+        low, high = self._settings.zoom
+        if robot is not None:
+            depth_m = robot[DEPTH]
+            low = max(low, min(depth_m / self._depths[1], 1.0))
+            high = max(min(high, max(depth_m / self._depths[0], 1.0)), low)
+        return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+    def _turn(self, zoom: float, rng: Rng) -> Turn:
+        """From steps on the canvas to steps in the source."""
+        most = math.radians(self._settings.rotation_deg)
+        angle = rng.uniform(-most, most)
+        mirror = -1.0 if rng.random() < self._settings.flip_share else 1.0
+        along, across = math.cos(angle) / zoom, math.sin(angle) / zoom
+        return (mirror * along, -across), (mirror * across, along)
+
+    def _window(self, turn: Turn, zoom: float, seen: Point, shown: Point, rect: Rect) -> Window:
+        """The window of a rectangle that shows a source's point at one of its own."""
+        camera = self._settings.intrinsics
+        if camera:
+            matrix = turned(camera, turn, seen, shown, (rect[0], rect[1]))
+            x, y, whole = matrix[2].tolist()
+            right, down = x * (rect[2] - rect[0]), y * (rect[3] - rect[1])
+            ahead = (whole, whole + right, whole + down, whole + right + down)
+            if min(ahead) > LEAST_AHEAD * max(ahead):
+                return Window(matrix, zoom, camera)
+        return Window(flat(turn, seen, shown), zoom)
+
+    def _show(
+        self,
+        canvas: Pixels,
+        rect: Rect,
+        source: int,
+        window: Window,
+        mine: list[Robot],
+        robots: list[Robot],
+        rng: Rng,
+        opacity: Opacity | None = None,
+    ) -> list[Robot]:
+        left, top, right, bottom = rect
+        pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
+        pixels = self._tinted(pixels, rng)
+        place = canvas[top:bottom, left:right]
+        place[:] = pixels if opacity is None else blended(place, pixels, opacity)
+        whole = (0, 0, self._width, self._height)
+        new = moved([robot for robot in mine if inside(robot, whole)], window, rect)
+        kept = [robot for robot in robots if not under(robot, rect, opacity)]
+        return kept + [robot for robot in new if under(robot, rect, opacity)]
+
+    def _tinted(self, pixels: Pixels, rng: Rng) -> Pixels:
+        """With other contrast, brightness and white balance."""
+        spread = self._settings.colour
+        if not spread:
+            return pixels
+        contrast, *white, light = rng.normal(0, spread, 5).tolist()
+        gain = [math.exp(contrast + channel / 2) for channel in white]
+        return levelled(pixels, gain, [128 * (1 - times + light) for times in gain])
+
+    def _spoil(self, canvas: Pixels, rng: Rng) -> None:
+        """Defocus, sensor noise and the loss of colours, in place."""
+        if rng.random() < self._settings.blur_share:
+            canvas[:] = defocused(canvas, rng.uniform(0.1, 1 / 3))
+        if self._settings.noise:
+            at = int(rng.integers(len(self._grain) - canvas.size))
+            grain = self._grain[at : at + canvas.size]
+            canvas[:] = grained(canvas, grain, 255 * self._settings.noise * rng.random())
+        if self._settings.grey_share and rng.random() < self._settings.grey_share:
+            canvas[:] = greyed(canvas)
+
+
+def _looked_at(whole: float, half: float, held: float | None, rng: Rng) -> float:
+    """Where along an axis the middle of a window lies, that reaches so far to either side.
+
+    Within the whole; about what is to be held, where there is such.
+    """
+    low, high = half, max(whole - half, half)
+    if held is not None:
+        low, high = (min(max(held + far, low), high) for far in (-half, half))
+    return float(rng.uniform(low, high))
+
+
+def _back(turn: Turn, right: float, down: float) -> Point:
+    """Steps on the canvas from those in the source."""
+    (a, b), (c, d) = turn
+    area = a * d - b * c
+    return (d * right - b * down) / area, (a * down - c * right) / area

@@ -1,0 +1,180 @@
+"""Training targets: what the network should say in every cell, from the robots of an image.
+
+One rule gives both the paper's labels and softer ones. A robot is present in a cell by
+g = exp(-d^2 / 2 s^2), d the distance from the middle of the cell to the robot's centre in
+cells; at s = 0 g is 1 in the cell of the centre and 0 elsewhere (paper eq. 4). The cell's
+depth and offset are those of the robot that is most present there, the nearer one of equals.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dmrl.learn.data.batches import CLASS_ID, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, U, V
+from dmrl.learn.networks.architectures import by_name
+
+PRESENT = 0.1
+"""Cells where g is below this learn neither depth nor offset."""
+TOLERANCE_PX, TOLERANCE_DEPTH = 8.0, 0.1
+"""A label with such a sigma (pixels; share of the depth) counts half."""
+
+LabelNoise = Literal["ignore", "weight", "soften"]
+
+
+class Targets(NamedTuple):
+    """Targets of N images, all float32.
+
+    Parameters
+    ----------
+    confidence
+        (N, rows, cols), 0 to 1.
+    confidence_weight
+        (N, rows, cols) weight of a cell in the confidence loss; 1 where labels are exact.
+    weight, offset_weight
+        (N, rows, cols) weight of a cell in the loss of the depth and of the offset; 0 away
+        from robots.
+    depth_m
+        (N, rows, cols) metres; 1 where the weight is 0.
+    offset
+        (N, 2, rows, cols) centre minus middle of the cell, (u, v), cells.
+    class_id
+        (N, rows, cols) class of the robot, -1 where it is not known or there is none.
+    """
+
+    confidence: Tensor
+    confidence_weight: Tensor
+    weight: Tensor
+    offset_weight: Tensor
+    depth_m: Tensor
+    offset: Tensor
+    class_id: Tensor
+
+
+def targets(
+    robots: Tensor,
+    shape: tuple[int, int],
+    *,
+    sigma_cells: float,
+    stride_px: int = 8,
+    label_noise: LabelNoise = "ignore",
+) -> Targets:
+    """Targets of a batch.
+
+    Parameters
+    ----------
+    robots
+        (N, K, 11), see ``batches.FIELDS``. A robot whose centre is outside the image is in no
+        cell, but may reach into it.
+    shape
+        Rows and columns of the grid.
+    sigma_cells
+        s of this module's rule.
+    stride_px
+        Pixels per cell, both ways.
+    label_noise
+        What the labels' sigmas do. "weight": a robot's cells count by
+        1 / (1 + (sigma / tolerance)^2). "soften": s^2 grows by the square of the sigma, the
+        height of g sinks with it, as the mean of g over where the robot may be.
+    """
+    robots = robots.to(torch.float32)
+    ahead = torch.isfinite(robots[..., :3]).all(dim=-1) & (robots[..., DEPTH] > 0)
+    # ``ahead`` removes robots by a product with 0, which NaN would survive.
+    clean = torch.nan_to_num(robots, nan=0.0)
+    sigma_px = (clean[..., SIGMA_U].square() + clean[..., SIGMA_V].square()).div(2).sqrt()
+    du, dv = _from_middles(clean[..., (U, V)] / stride_px, shape)
+    present = _presence(du, dv, sigma_cells, sigma_px / stride_px, soften=label_noise == "soften")
+    present = present * ahead[..., None, None]
+    # A hair more presence for the nearer of equals.
+    rank = present * (1 + 1e-3 / (1 + clean[..., DEPTH, None, None]))
+    best = rank.argmax(dim=1, keepdim=True)
+    confidence = present.amax(dim=1)
+    near = confidence * (confidence >= PRESENT)
+    trust_px, trust_depth = torch.ones_like(near), torch.ones_like(near)
+    if label_noise == "weight":
+        relative = clean[..., SIGMA_DEPTH] / clean[..., DEPTH].clamp(min=1e-3)
+        trust_px = _of(best, _trust(sigma_px / TOLERANCE_PX))
+        trust_depth = _of(best, _trust(relative / TOLERANCE_DEPTH))
+    found = near > 0
+    class_id = torch.nan_to_num(robots[..., CLASS_ID, None, None], nan=-1.0)
+    return Targets(
+        confidence,
+        # Background cells count in full: that nobody is there does not depend on a label's sigma.
+        torch.where(confidence > 0.01, trust_px, 1.0),
+        near * trust_depth,
+        near * trust_px,
+        # 1 m where there is no robot, so that its logarithm exists; the weight there is 0.
+        torch.where(found, _of(best, clean[..., DEPTH, None, None]), 1.0),
+        torch.stack((_of(best, du), _of(best, dv)), dim=1) * found[:, None],
+        torch.where(found, _of(best, class_id), -1.0).to(torch.int64),
+    )
+
+
+def _from_middles(centre: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(N, K, 1, cols) and (N, K, rows, 1) from the middle of each cell to each centre, cells."""
+    rows, cols = (torch.arange(n, device=centre.device) + 0.5 for n in shape)
+    return centre[..., 0, None, None] - cols, centre[..., 1, None, None] - rows[:, None]
+
+
+def _of(best: Tensor, values: Tensor) -> Tensor:
+    """(N, rows, cols) value in each cell of the robot that is most present there.
+
+    ``best`` is (N, 1, rows, cols), the robot's place in the image's list; ``values`` are
+    (N, K, ...), stretched over the cells.
+    """
+    every = values.expand(*values.shape[:2], *best.shape[2:])
+    return every.gather(1, best)[:, 0]
+
+
+def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Targets:
+    """What a teacher says of N images, for others to learn (Hinton et al. 2015).
+
+    Its confidence is present everywhere, also where it doubts; depth and offset count where it
+    sees a robot, by its confidence. Classes are those of the labels.
+
+    Parameters
+    ----------
+    channels
+        Of the output.
+    output
+        (N, C, rows, cols).
+    labelled
+        Targets of the same images by their labels.
+    """
+    out = by_name(channels, output)
+    confidence = out["confidence"].sigmoid()
+    near = confidence * (confidence >= PRESENT)
+    offset = labelled.offset
+    if "offset_u" in out:
+        offset = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
+    return labelled._replace(
+        confidence=confidence,
+        confidence_weight=torch.ones_like(confidence),
+        weight=near,
+        offset_weight=near,
+        depth_m=torch.where(near > 0, out["log_depth"].exp(), 1.0),
+        offset=offset,
+    )
+
+
+def _presence(
+    du: Tensor, dv: Tensor, sigma_cells: float, sigma_label: Tensor, *, soften: bool
+) -> Tensor:
+    """(N, K, rows, cols) g of every robot in every cell."""
+    if sigma_cells == 0:
+        # Half open, so that a centre on a border is in one cell.
+        inside: Tensor = (du >= -0.5) & (du < 0.5) & (dv >= -0.5) & (dv < 0.5)
+        return inside.to(torch.float32)
+    variance = torch.full_like(sigma_label, sigma_cells**2)
+    height = torch.ones_like(variance)
+    if soften:
+        height = variance / (variance + sigma_label.square())
+        variance = variance + sigma_label.square()
+    scale = (-0.5 / variance)[..., None, None]
+    # exp of a sum is the product of two small ones: rows and columns, not cells.
+    return (scale * du.square()).exp() * (scale * dv.square()).exp() * height[..., None, None]
+
+
+def _trust(ratio: Tensor) -> Tensor:
+    return (1 / (1 + ratio.square()))[..., None, None]

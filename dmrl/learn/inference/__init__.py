@@ -1,0 +1,1 @@
+"""Inference: load a model, decode its grids, match detections, set the threshold."""

@@ -1,0 +1,311 @@
+"""A trained network with what is needed to use it: run folders, safetensors, published .h5.
+
+A run folder holds ``model.safetensors`` and ``model.json``. Nothing is ever unpickled.
+"""
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from dmrl.errors import ModelError, SettingError
+from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.paths import refuse_no_text, refuse_pipes
+from dmrl.learn import pretrained
+from dmrl.learn.inference.decode import Grids
+from dmrl.learn.networks.architectures import (
+    CLASS,
+    SPREAD,
+    Network,
+    architecture,
+    architecture_names,
+    build,
+    by_name,
+    parameter_count,
+    to_input,
+)
+from dmrl.learn.networks.keras_weights import read_h5
+
+WEIGHTS_NAME = "model.safetensors"
+DESCRIPTION_NAME = "model.json"
+PUBLISHED_THRESHOLD = 0.33
+"""Confidence threshold of the published evaluation."""
+
+Grid = NDArray[np.float32]
+
+
+def grids_of(network: Network, images: Tensor) -> Grids:
+    """Grids of (N, 3, H, W) uint8 images; the network as it stands, on its device."""
+    device = next(network.parameters()).device
+    with torch.inference_mode():
+        out = network(to_input(images.to(device))).cpu()
+    named = by_name(network.channels, out)
+    classes = [named[name] for name in network.channels if name.startswith(CLASS)]
+    return Grids(
+        named["confidence"].sigmoid().numpy(),
+        named["log_depth"].exp().numpy(),
+        np.stack([named["offset_u"], named["offset_v"]], axis=1) if "offset_u" in named else None,
+        named[SPREAD].exp().numpy() if SPREAD in named else None,
+        torch.stack(classes).argmax(dim=0).numpy() if classes else None,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A network and its description.
+
+    Parameters
+    ----------
+    network
+        In evaluation mode.
+    architecture
+        Its name, one of ``network.architecture_names()``.
+    name
+        Of the file or folder it came from.
+    width_px, height_px
+        Size of the images it was trained on.
+    threshold
+        Confidence above which a detection is to be believed, 0 to 1.
+    label_source
+        Source of the labels it was trained on ("truth", "published", ...); empty: not known.
+    training
+        Summary of the training: settings, losses, images.
+    """
+
+    network: Network
+    architecture: str
+    name: str = ""
+    width_px: int = 320
+    height_px: int = 224
+    threshold: float = PUBLISHED_THRESHOLD
+    label_source: str = ""
+    training: dict[str, Any] = field(default_factory=dict)
+
+    def require_size(self, width_px: int, height_px: int, what: object) -> None:
+        """Nothing, if the network can take images of this size.
+
+        Raises
+        ------
+        SettingError
+            If a side is not a whole number of grid cells.
+        """
+        cell = self.network.stride_px
+        if width_px % cell or height_px % cell:
+            raise SettingError(
+                f"{what}: images of {width_px} x {height_px} px do not divide into cells of "
+                f"{cell} px, as {self.architecture} needs. Crop or scale the images first"
+            )
+
+    def grids(self, images: NDArray[np.uint8]) -> Grids:
+        """What the network says of (N, H, W, 3) RGB images.
+
+        Raises
+        ------
+        SettingError
+            If the network cannot take images of this size.
+        """
+        self.require_size(images.shape[2], images.shape[1], self.name or self.architecture)
+        # torch takes writable arrays only; a view of a mapped file is copied here.
+        writable = np.require(images, requirements="W")
+        return grids_of(self.network, torch.from_numpy(writable).permute(0, 3, 1, 2))
+
+
+def weights_of(network: Network) -> dict[str, Tensor]:
+    """Every tensor of a network, contiguous, on the CPU.
+
+    Batch counters are left out: no fixed-momentum normalisation reads them.
+    """
+    return {
+        name: value.detach().cpu().contiguous()
+        for name, value in network.state_dict().items()
+        if not name.endswith("num_batches_tracked")
+    }
+
+
+def mixed(network: Network, first: dict[str, Tensor], share: float) -> None:
+    """Bring a network's weights towards others by a share of the way, in place.
+
+    Parameters
+    ----------
+    network
+        Changed in place.
+    first
+        By the names of ``weights_of``, of the same shapes.
+    share
+        0: nothing changes; 1: the others.
+    """
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if name in first and value.is_floating_point():
+                value.lerp_(first[name].to(value.device), share)
+
+
+def with_channels(known: Network, network: Network) -> dict[str, Tensor]:
+    """Weights of a known network for one that may have other channels on top of the same body.
+
+    Channels that only the latter has keep the weights it has now.
+    """
+    weights, fresh = weights_of(known), weights_of(network)
+    for name in ("head.weight", "head.bias"):
+        if known.channels == network.channels or name not in weights:
+            continue
+        rows = fresh[name].clone()
+        for k, channel in enumerate(network.channels):
+            if channel in known.channels:
+                rows[k] = weights[name][known.channels.index(channel)]
+        weights[name] = rows
+    return weights
+
+
+def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> None:
+    """Copy weights into a network.
+
+    Raises
+    ------
+    ModelError
+        If a tensor is missing, unknown, not finite or of another shape.
+    """
+    wanted = weights_of(network)
+    if odd := sorted(wanted.keys() ^ weights.keys()):
+        verb = "lacks" if odd[0] in wanted else "has an unknown"
+        raise ModelError(f"{where} {verb} tensor {odd[0]}. Give weights of this architecture")
+    for name, value in weights.items():
+        if value.dtype not in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
+            raise ModelError(f"{where}: {name} holds {value.dtype}. Give weights in float32")
+        if value.shape != wanted[name].shape:
+            raise ModelError(
+                f"{where}: {name} has shape {tuple(value.shape)}, the network needs "
+                f"{tuple(wanted[name].shape)}. Give weights of this architecture"
+            )
+        if not torch.isfinite(value).all():
+            raise ModelError(f"{where}: {name} holds values that are not finite. Train again")
+    network.load_state_dict(weights, strict=False)
+
+
+def write_tensors(tensors: dict[str, Tensor], path: Path) -> None:
+    """Write a .safetensors file. A full disk is an OSError, unlike in the library's own way."""
+    path.write_bytes(save(tensors))
+
+
+def describe(model: Model) -> dict[str, Any]:
+    """What ``model.json`` says about a model."""
+    return {
+        "architecture": model.architecture,
+        "parameters": parameter_count(model.network),
+        "width_px": model.width_px,
+        "height_px": model.height_px,
+        "stride_px": model.network.stride_px,
+        "channels": 3,
+        "outputs": list(model.network.channels),
+        "threshold": model.threshold,
+        "label_source": model.label_source,
+        "training": model.training,
+    }
+
+
+def save_model(model: Model, folder: Path) -> None:
+    """Write ``model.safetensors`` and ``model.json`` into a folder."""
+    write_tensors(weights_of(model.network), folder / WEIGHTS_NAME)
+    text = json.dumps(describe(model), indent=1) + "\n"
+    (folder / DESCRIPTION_NAME).write_text(text, encoding="utf-8")
+
+
+def load_model(path: Path) -> Model:
+    """Model of a run folder, of a .safetensors with its .json beside it, or of a Keras .h5.
+
+    The kind is told by the content, not the name.
+
+    Raises
+    ------
+    ModelError
+        If the file is none of these (a pickle is refused unread), is damaged, or its tensors
+        do not fit the architecture.
+    """
+    refuse_no_text(path)
+    refuse_pipes(path)
+    if path.is_dir():
+        return _load_safetensors(path / WEIGHTS_NAME, path / DESCRIPTION_NAME, path.name)
+    if not path.is_file():
+        raise ModelError(
+            f"no model {path}. Give a run folder, a .safetensors, a Keras .h5, or the name of one "
+            f"that ships with dmrl: {', '.join(pretrained.names())}"
+        )
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    if head.startswith(b"\x89HDF\r\n\x1a\n"):
+        network = build("locanet")
+        set_weights(network, read_h5(path), path)
+        return Model(network.eval(), "locanet", path.name)
+    if head[4:9] != b"\0\0\0\0{":
+        if head.startswith((b"PK\x03\x04", b"\x80")):
+            raise ModelError(
+                f"{path} is a pickle, which can run any code when it is opened, so it is not. "
+                "Give a run folder, a .safetensors or a Keras .h5"
+            )
+        raise ModelError(f"{path} is not a model. Give a run folder, a .safetensors or a Keras .h5")
+    return _load_safetensors(path, path.with_suffix(".json"), path.name)
+
+
+def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
+    for file in (weights, description):
+        if not file.is_file():
+            raise ModelError(f"no {file.name} in {file.parent}. Give a run folder of dmrl train")
+    said = _read_description(description)
+    network = build(said["architecture"], extra=_extra(said, description))
+    try:
+        tensors = load_file(weights)
+    except (SafetensorError, OSError) as e:
+        raise ModelError(f"{weights} is damaged: {e}. Copy it again or train again") from None
+    set_weights(network, tensors, weights)
+    known = ("width_px", "height_px", "threshold", "label_source", "training")
+    return Model(network.eval(), said["architecture"], name, **{k: said[k] for k in known})
+
+
+def _extra(said: dict[str, Any], path: Path) -> list[str]:
+    """Channels on top of the architecture's own, as a description lists them all."""
+    own = list(architecture(said["architecture"]).own)
+    outputs = said.get("outputs", own)
+    extra = outputs[len(own) :] if isinstance(outputs, list) else None
+    wanted = [name for name in extra or [] if name == SPREAD]
+    wanted += [f"{CLASS}{k}" for k in range(len(extra or []) - len(wanted))]
+    if extra is None or outputs != own + wanted:
+        raise ModelError(f"{path} has no valid outputs. Give the model.json of dmrl train")
+    return wanted
+
+
+def _read_description(path: Path) -> dict[str, Any]:
+    kinds: dict[str, type | tuple[type, ...]] = {
+        "architecture": str,
+        "width_px": int,
+        "height_px": int,
+        "threshold": (int, float),
+        "label_source": str,
+        "training": dict,
+    }
+    try:
+        said = parse_json(path.read_text(encoding="utf-8"))
+    except ValueError as e:
+        raise ModelError(f"{path} is not JSON: {e}. Copy it again") from None
+    for key, kind in kinds.items():
+        if not isinstance(said, dict) or not isinstance(said.get(key), kind):
+            raise ModelError(f"{path} has no valid {key}. Give the model.json of dmrl train")
+    if not 0 < said["width_px"] * said["height_px"] <= limits.PIXELS or said["width_px"] < 0:
+        size = f"{said['width_px']} x {said['height_px']}"
+        raise ModelError(f"{path} is for images of {size}. Give the model.json of dmrl train")
+    if not math.isfinite(said["threshold"]):
+        raise ModelError(f"{path} has no valid threshold. Give the model.json of dmrl train")
+    if said["architecture"] not in architecture_names():
+        raise ModelError(
+            f"{path} asks for architecture {said['architecture']}, this dmrl knows "
+            f"{', '.join(architecture_names())}. Update dmrl, or install the package that brings it"
+        )
+    return dict(said)

@@ -1,0 +1,335 @@
+"""Figures of detections against labels, by distance, with bootstrap intervals. NumPy only.
+
+Every figure is a function of a weight per image, so that one piece of code gives the value
+(all weights 1) and its bootstrap (weights are how often an image was drawn). Intervals are
+95 % percentile intervals over images. Definitions of the figures: ``DEFINITIONS``.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.learn.inference.matching import Array, Errors, Index, Points, errors, hits
+
+BANDS_M = ((0.0, np.inf), (0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 2.0), (2.0, np.inf))
+"""Ranges of the label's depth, metres, lower end included; the first is all of them."""
+
+Band = tuple[float, float]
+Across = Callable[[Callable[[Band], "BandFigures"], Sequence[Band]], Iterable["BandFigures"]]
+
+SCORE_RADIUS_PX = 16.0
+
+DEFINITIONS = {
+    "error": "label minus detection; an image with N labels inside the image has its N most "
+    "confident detections matched to them one-to-one with the least total distance",
+    "median_px": "median length of the pixel error; a label without a detection is infinitely far",
+    "mean_px": "mean length of the pixel error, over labels with a detection",
+    "rmse_px": "root mean square length of the pixel error, over labels with a detection",
+    "p95_px": "95th percentile of the length of the pixel error",
+    "within_8_px": "share of labels with an error of at most 8 px",
+    "within_20_px": "share of labels with an error of at most 20 px",
+    "bias_u_px": "median error in u, label minus detection",
+    "bias_v_px": "median error in v, label minus detection",
+    "depth_mae_m": "mean absolute depth error, over labels with a detection",
+    "depth_rmse_m": "root mean square depth error, over labels with a detection",
+    "precision": "share of detections at or above the threshold that are right: in order of "
+    "confidence each takes the nearest free label within 16 px",
+    "recall": "share of labels taken by a detection at or above the threshold",
+    "f1": "harmonic mean of precision and recall",
+    "ap_8_px": "area under the precision envelope over recall, detections right within 8 px",
+    "ap_16_px": "the same within 16 px",
+    "band": "by the label's depth; a detection without a label counts by its own depth",
+    "interval": "95 % percentile bootstrap over images",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure with its 95 % interval; NaN where there is nothing to measure."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class BandFigures:
+    """Figures of the labels in one range of depth.
+
+    Parameters
+    ----------
+    from_m, to_m
+        The range, lower end included.
+    labels, images, unmatched
+        Labels in the range, images that hold them, and labels without any detection.
+    figures
+        By the names of ``DEFINITIONS``.
+    """
+
+    from_m: float
+    to_m: float
+    labels: int
+    images: int
+    unmatched: int
+    figures: dict[str, Figure]
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """Labels and detections of ``images`` images, matched.
+
+    Parameters
+    ----------
+    images
+        Number of images, also those without labels.
+    label_error
+        Error of each label.
+    right_8_px, right_16_px
+        Label of each detection within 8 and 16 px, -1 for none.
+    """
+
+    images: int
+    labels: Points
+    detections: Points
+    label_error: Errors
+    right_8_px: Index
+    right_16_px: Index
+
+
+def score(images: int, labels: Points, detections: Points) -> Scored:
+    """Labels and detections with their matches."""
+    return Scored(
+        images,
+        labels,
+        detections,
+        errors(labels, detections),
+        hits(labels, detections, 8.0),
+        hits(labels, detections, SCORE_RADIUS_PX),
+    )
+
+
+def by_band(
+    scored: Scored, *, threshold: float, draws: int = 1000, seed: int = 0, across: Across = map
+) -> list[BandFigures]:
+    """Figures over all distances, then for each band of ``BANDS_M``.
+
+    Parameters
+    ----------
+    scored
+        Matched labels and detections.
+    threshold
+        Confidence at or above which a detection counts in precision, recall and F1.
+    draws
+        Bootstrap samples.
+    seed
+        Of the bootstrap.
+    across
+        What does a thing for every band, in their order: processes, perhaps.
+    """
+    one = partial(_band, scored=scored, threshold=threshold, draws=draws, seed=seed)
+    return list(across(one, BANDS_M))
+
+
+def _band(band: Band, scored: Scored, threshold: float, draws: int, seed: int) -> BandFigures:
+    inside = _in_band(scored.labels.depth_m, band)
+    value = figures(scored, band, threshold, np.ones((1, scored.images)))
+    blocks = [
+        figures(scored, band, threshold, weights) for weights in resamples(scored, draws, seed)
+    ]
+    out = {}
+    for name, (point,) in value.items():
+        sample = np.concatenate([block[name] for block in blocks])
+        sample = sample[np.isfinite(sample)]
+        # Nearest ranks, so that an infinite neighbour cannot turn a limit into NaN.
+        low, high = (
+            np.quantile(sample, (0.025, 0.975), method="inverted_cdf")
+            if len(sample) and np.isfinite(point)
+            else (np.nan, np.nan)
+        )
+        out[name] = Figure(float(point), float(low), float(high))
+    return BandFigures(
+        *band,
+        labels=int(inside.sum()),
+        images=len(np.unique(scored.labels.image[inside])),
+        unmatched=int(np.isinf(scored.label_error.norm_px[inside]).sum()),
+        figures=out,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """What a threshold would cost, and whether confidence is a probability.
+
+    Parameters
+    ----------
+    confidence, precision, recall
+        (K,) of all detections at or above that confidence, surest first.
+    bin_confidence, bin_right, bin_count
+        (10,) mean confidence, share of detections that are right, and how many there are, in
+        tenths of the confidence; NaN where there is none.
+    """
+
+    confidence: Array
+    precision: Array
+    recall: Array
+    bin_confidence: Array
+    bin_right: Array
+    bin_count: Index
+
+
+def curves(scored: Scored, most: int = 200) -> Curves:
+    """Precision over recall, and reliability, of detections that are right within 16 px.
+
+    Parameters
+    ----------
+    scored
+        Matched labels and detections.
+    most
+        Points of the curve at most, evenly over the detections.
+    """
+    confidence = scored.detections.confidence
+    order = np.argsort(-confidence, kind="stable")
+    right = (scored.right_16_px >= 0)[order]
+    found = np.cumsum(right)
+    # Detections of equal confidence are taken or left together.
+    last = np.flatnonzero(np.diff(confidence[order], append=-1.0))
+    last = last[np.unique(np.linspace(0, len(last) - 1, min(most, len(last))).round().astype(int))]
+    place = np.clip((confidence[order] * 10).astype(int), 0, 9)
+    count = np.bincount(place, minlength=10)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Curves(
+            confidence[order][last],
+            found[last] / (last + 1.0),
+            found[last] / np.float64(len(scored.labels)),
+            np.bincount(place, confidence[order], minlength=10) / count,
+            np.bincount(place, right, minlength=10) / count,
+            count,
+        )
+
+
+def resamples(scored: Scored, draws: int, seed: int) -> Iterator[Array]:
+    """Blocks of (b, images) weights: how often each image was drawn, ``draws`` rows in all."""
+    rng = np.random.default_rng(seed)
+    widest = max(scored.images, len(scored.labels), len(scored.detections), 1)
+    block = max(1, 2_000_000 // widest)
+    for start in range(0, draws, block):
+        rows = min(block, draws - start)
+        drawn = rng.integers(scored.images, size=(rows, scored.images))
+        drawn += np.arange(rows)[:, None] * scored.images
+        counts = np.bincount(drawn.ravel(), minlength=rows * scored.images)
+        yield counts.reshape(rows, scored.images).astype(np.float64)
+
+
+def figures(scored: Scored, band: Band, threshold: float, weights: Array) -> dict[str, Array]:
+    """Every figure for (b, images) weights: name to (b,) values."""
+    inside = _in_band(scored.labels.depth_m, band)
+    out = _error_figures(scored, inside, weights[:, scored.labels.image[inside]])
+    total = weights[:, scored.labels.image[inside]].sum(axis=1)
+    right, wrong = _judged(scored, scored.right_16_px, band, inside)
+    sure = scored.detections.confidence >= threshold
+    seen = weights[:, scored.detections.image]
+    true, false = seen @ (right & sure), seen @ (wrong & sure)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        out["precision"], out["recall"] = true / (true + false), true / total
+        out["f1"] = 2 * true / (true + false + total)
+        for name, taken in (("ap_8_px", scored.right_8_px), ("ap_16_px", scored.right_16_px)):
+            judged = _judged(scored, taken, band, inside)
+            out[name] = average_precision(scored.detections.confidence, *judged, seen, total)
+    return out
+
+
+def _error_figures(scored: Scored, inside: NDArray[np.bool_], weights: Array) -> dict[str, Array]:
+    error = scored.label_error
+    norm_px = error.norm_px[inside]
+    found = np.isfinite(norm_px)
+    matched = weights[:, found]
+    with np.errstate(invalid="ignore", divide="ignore"):
+
+        def mean(values: Array, by: Array = matched) -> Array:
+            result: Array = (by @ values) / by.sum(axis=1)
+            return result
+
+        depth_m = error.depth_m[inside][found]
+        return {
+            "median_px": weighted_quantile(norm_px, weights, 0.5),
+            "mean_px": mean(norm_px[found]),
+            "rmse_px": np.sqrt(mean(norm_px[found] ** 2)),
+            "p95_px": weighted_quantile(norm_px, weights, 0.95),
+            "within_8_px": mean((norm_px <= 8).astype(np.float64), weights),
+            "within_20_px": mean((norm_px <= 20).astype(np.float64), weights),
+            "bias_u_px": weighted_quantile(error.u_px[inside][found], matched, 0.5),
+            "bias_v_px": weighted_quantile(error.v_px[inside][found], matched, 0.5),
+            "depth_mae_m": mean(np.abs(depth_m)),
+            "depth_rmse_m": np.sqrt(mean(depth_m**2)),
+        }
+
+
+def weighted_quantile(values: Array, weights: Array, share: float) -> Array:
+    """(b,) quantiles of (n,) values under (b, n) weights, as if repeated that often.
+
+    Where the share falls between two values it is their mean, so the median of an even
+    number of values is the usual one. NaN where the weights are all zero.
+    """
+    if not len(values):
+        return np.full(len(weights), np.nan)
+    order = np.argsort(values, kind="stable")
+    ascending = values[order]
+    mass = np.cumsum(weights[:, order], axis=1)
+    wanted = mass[:, -1:] * share
+    last = len(values) - 1
+    below = np.minimum((mass < wanted - 1e-9).sum(axis=1), last)
+    above = np.minimum((mass <= wanted + 1e-9).sum(axis=1), last)
+    return np.where(mass[:, -1] > 0, (ascending[below] + ascending[above]) / 2, np.nan)
+
+
+def average_precision(
+    confidence: Array,
+    right: NDArray[np.bool_],
+    wrong: NDArray[np.bool_],
+    weights: Array,
+    total: Array,
+) -> Array:
+    """(b,) areas under the precision envelope over recall.
+
+    No threshold lies between equal confidences: they count together, whatever their order.
+
+    Parameters
+    ----------
+    confidence, right, wrong
+        (D,) of each detection; one that is neither right nor wrong is ignored.
+    weights
+        (b, D) of each detection.
+    total
+        (b,) weight of all labels.
+    """
+    judged = np.flatnonzero(right | wrong)
+    order = judged[np.argsort(-confidence[judged], kind="stable")]
+    mass = weights[:, order]
+    # Precision peaks at right detections, so the envelope needs no other.
+    at = np.flatnonzero(right[order])
+    true = mass[:, at]
+    falling = -confidence[order]
+    last = np.searchsorted(falling, falling[at], side="right") - 1
+    claimed = np.cumsum(mass, axis=1)[:, last]
+    found = np.cumsum(mass * right[order], axis=1)[:, last]
+    precision = np.divide(found, claimed, out=np.zeros_like(claimed), where=claimed > 0)
+    envelope = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
+    area: Array = (envelope * true).sum(axis=1) / total
+    return area
+
+
+def _judged(
+    scored: Scored, taken: Index, band: Band, inside: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(D,) right and (D,) wrong detections of a band; the others are another band's."""
+    free = taken < 0
+    right = np.zeros(len(taken), bool)
+    right[~free] = inside[taken[~free]]
+    return right, free & _in_band(scored.detections.depth_m, band)
+
+
+def _in_band(depth_m: Array, band: Band) -> NDArray[np.bool_]:
+    return (band[0] <= depth_m) & (depth_m < band[1])

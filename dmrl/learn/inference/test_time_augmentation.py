@@ -1,0 +1,123 @@
+"""Test-time augmentation: one image, shifted by parts of a cell and mirrored. NumPy only.
+
+What a network errs by depends on where in its cell a robot lies, and on left and right: the median
+over views errs less. A camera in flight has no time for it; labels have.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.images.codec import Rgb
+from dmrl.learn.inference.decode import PER_DETECTION, Found
+
+Rows = NDArray[np.float64]
+
+ONE_ROBOT_PX = 16.0
+"""Detections of different views closer than this are of one robot."""
+
+
+class View(NamedTuple):
+    """A mirrored image or not, shifted right and down by these parts of a cell."""
+
+    mirrored: bool
+    right: float
+    down: float
+
+
+SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (-0.25, 0.25), (0.25, -0.25))
+VIEWS = tuple(View(mirrored, *shift) for shift in SHIFTS for mirrored in (False, True))
+"""The first is the image as it is."""
+
+
+def shown(images: Rgb, view: View, stride_px: int) -> Rgb:
+    """(N, H, W, 3) images in a view; what it shifts in repeats the rim."""
+    right_px, down_px = _shift_px(view, stride_px)
+    reach = stride_px
+    padded = np.pad(images, ((0, 0), (reach, reach), (reach, reach), (0, 0)), mode="edge")
+    padded = padded[:, :, ::-1] if view.mirrored else padded
+    rows = slice(reach - down_px, reach - down_px + images.shape[1])
+    cols = slice(reach - right_px, reach - right_px + images.shape[2])
+    return np.ascontiguousarray(padded[:, rows, cols])
+
+
+def returned(found: Found, view: View, stride_px: int, size_px: tuple[int, int]) -> Found:
+    """Detections in a view of N images, where they are in the images of this height and width."""
+    height_px, width_px = size_px
+    right_px, down_px = _shift_px(view, stride_px)
+    u_px, v_px = found.u_px - right_px, found.v_px - down_px
+    u_px = width_px - u_px if view.mirrored else u_px
+    columns = {name: getattr(found, name) for name in PER_DETECTION}
+    columns |= {"u_px": np.clip(u_px, 0, width_px), "v_px": np.clip(v_px, 0, height_px)}
+    return Found(**columns, count=found.count)
+
+
+def agreed(views: Sequence[Found], *, most: int = 20, min_confidence: float = 0.01) -> Found:
+    """What several views of N images say together.
+
+    From the most confident detection on, the nearest of each other view within `ONE_ROBOT_PX` are
+    of the same robot. Its position, depth and sigma are their medians, its class the first's, its
+    confidence the mean over all views, 0 where one saw nothing.
+
+    Parameters
+    ----------
+    views
+        Detections of each, placed in the images.
+    most, min_confidence
+        As in ``decode``.
+    """
+    images = [
+        _best(list(_robots(_pooled(views, image), len(views))), most, min_confidence)
+        for image in range(len(views[0].count))
+    ]
+    wide = max(map(len, images))
+    table = np.zeros((len(images), wide, len(PER_DETECTION)))
+    for rows, mine in zip(table, images, strict=True):
+        rows[: len(mine)] = mine
+    columns: dict[str, Any] = dict(zip(PER_DETECTION, np.moveaxis(table, 2, 0), strict=True))
+    columns["class_id"] = columns["class_id"].astype(np.int64)
+    return Found(**columns, count=np.array([len(mine) for mine in images]))
+
+
+def _shift_px(view: View, stride_px: int) -> tuple[int, int]:
+    return round(view.right * stride_px), round(view.down * stride_px)
+
+
+def _pooled(views: Sequence[Found], image: int) -> Rows:
+    """(D, 1 + columns) the view's number and its detections, the most confident first."""
+    parts = [
+        np.column_stack(
+            [np.full(found.count[image], number)]
+            + [getattr(found, name)[image, : found.count[image]] for name in PER_DETECTION]
+        )
+        for number, found in enumerate(views)
+    ]
+    rows = np.concatenate(parts)
+    order = np.argsort(-rows[:, 1 + PER_DETECTION.index("confidence")], kind="stable")
+    return np.asarray(rows[order])
+
+
+def _robots(rows: Rows, views: int) -> Iterator[Rows]:
+    """Each robot's row, (columns,)."""
+    confidence, class_id = map(PER_DETECTION.index, ("confidence", "class_id"))
+    while len(rows):
+        away_px = np.hypot(*(rows[:, 1:3] - rows[0, 1:3]).T)
+        near = np.flatnonzero(away_px <= ONE_ROBOT_PX)
+        near = near[np.argsort(away_px[near], kind="stable")]
+        mine = near[np.unique(rows[near, 0], return_index=True)[1]]
+        robot = np.median(rows[mine, 1:], axis=0)
+        robot[confidence] = rows[mine, 1 + confidence].sum() / views
+        robot[class_id] = rows[0, 1 + class_id]
+        yield robot
+        rows = np.delete(rows, mine, axis=0)
+
+
+def _best(robots: list[Rows], most: int, min_confidence: float) -> Rows:
+    """(K, columns) the most confident first, at least one."""
+    table = np.stack(robots)
+    confidence = table[:, PER_DETECTION.index("confidence")]
+    order = np.argsort(-confidence, kind="stable")[:most]
+    kept = max(int((confidence[order] >= min_confidence).sum()), 1)
+    return np.asarray(table[order[:kept]])

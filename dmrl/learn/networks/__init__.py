@@ -1,0 +1,1 @@
+"""Network architectures, their graph and foreign weights."""

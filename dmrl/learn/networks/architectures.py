@@ -1,0 +1,291 @@
+"""The networks, by name. A new one is a class here and a row of ``ARCHITECTURES``, or a plug-in.
+
+Every network takes images as ``to_input`` gives them and returns (N, C, rows, cols), one cell
+per ``stride_px`` pixels both ways. Its ``channels`` name what each of the C is; the first two
+are the same for all, see ``CHANNEL_MEANINGS``.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import nullcontext
+from typing import ClassVar, cast
+
+import torch
+from torch import Tensor, nn
+
+from dmrl import plugins
+from dmrl.errors import SettingError
+from dmrl.learn.networks.depthwise import Depthwise
+
+CHANNELS = 3
+CHANNEL_MEANINGS = {
+    "log_depth": "natural log of the depth, metres",
+    "confidence": "logit of the confidence that a robot's centre lies in the cell",
+    "offset_u": "centre minus middle of the cell, to the right, in cells",
+    "offset_v": "the same, downwards",
+    "log_spread": "natural log of the scale b of log depth's error, exp(-|error| / b)",
+    "class_0": "logit that the robot is of class 0; class_1 and so on for the others",
+}
+DETECTION = ("log_depth", "confidence")
+"""Channels of a network that knows a robot to the cell."""
+SUB_CELL = (*DETECTION, "offset_u", "offset_v")
+"""Channels of a network that knows where in its cell a robot is."""
+SPREAD, CLASS = "log_spread", "class_"
+"""Channels that a recipe may add to those of an architecture; classes are numbered."""
+# One cell in 1120 holds a robot. With a zero-mean head the loss starts near 190 and the first
+# epochs go into learning that most cells are empty.
+CONFIDENCE_BIAS = -4.0
+
+
+class Network(nn.Module, ABC):
+    """What training, prediction and export ask of a network.
+
+    ``stride_px`` is the side of a grid cell; images are a whole number of cells. ``channels``
+    are names in ``CHANNEL_MEANINGS``, in the order of the output: the architecture's ``own``
+    first, then those that were asked for on top.
+    """
+
+    stride_px: ClassVar[int] = 8
+    own: ClassVar[tuple[str, ...]] = DETECTION
+
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__()
+        self.channels = (*self.own, *extra)
+
+    @abstractmethod
+    def forward(self, images: Tensor) -> Tensor:
+        """(N, C, rows, cols) of ``channels``, of (N, 3, H, W) images."""
+
+
+class LocaNet(Network):
+    """The network of the paper: 24,778 parameters, receptive field 38 px.
+
+    Four blocks of 3x3 convolution, batch normalisation and ReLU, a 2x2 max-pool before all
+    but the first, then a 1x1 convolution. Layers, paddings and constants are those of the
+    published Keras weights, so these load into it.
+    """
+
+    widths: ClassVar[tuple[int, ...]] = (8, 16, 32, 64)
+
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__(extra)
+        ins = (CHANNELS, *self.widths)
+        self.convs = nn.ModuleList(
+            nn.Conv2d(a, b, 3, padding=1, bias=False)
+            for a, b in zip(ins, self.widths, strict=False)
+        )
+        # torch's momentum is the share of the new batch: 0.01 is Keras' 0.99.
+        self.norms = nn.ModuleList(nn.BatchNorm2d(w, eps=1e-3, momentum=0.01) for w in self.widths)
+        self.head = nn.Conv2d(self.widths[-1], len(self.channels), 1)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        for conv in (*self.convs, self.head):
+            assert isinstance(conv, nn.Conv2d)
+            nn.init.normal_(conv.weight, std=0.01)  # as published
+        _start_empty(self.head, self.channels)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(N, C, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
+        x = images
+        for index, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
+            if index:
+                x = torch.max_pool2d(x, 2)
+            x = torch.relu(norm(conv(x)))
+        out: Tensor = self.head(x)
+        return out
+
+
+def _start_empty(head: nn.Conv2d, channels: Sequence[str]) -> None:
+    """Biases of a head that takes nearly every cell for empty."""
+    assert head.bias is not None
+    with torch.no_grad():
+        head.bias.zero_()
+        head.bias[channels.index("confidence")] = CONFIDENCE_BIAS
+
+
+class ConvNorm(nn.Sequential):
+    """Convolution without bias, batch normalisation, and a ReLU unless told otherwise.
+
+    The three fold into one convolution: what an int8 path carries.
+    """
+
+    def __init__(
+        self,
+        ins: int,
+        outs: int,
+        kernel: int = 3,
+        *,
+        stride: int = 1,
+        dilation: int = 1,
+        depthwise: bool = False,
+        relu: bool = True,
+    ) -> None:
+        if depthwise:
+            conv: nn.Conv2d = Depthwise(ins, stride=stride, dilation=dilation)
+        else:
+            conv = nn.Conv2d(ins, outs, kernel, stride, kernel // 2, bias=False)
+        fan_out = kernel**2 * (1 if depthwise else outs)
+        nn.init.normal_(conv.weight, std=(2 / fan_out) ** 0.5)  # He et al. 2015
+        last = (nn.ReLU(inplace=True),) if relu else ()
+        super().__init__(conv, nn.BatchNorm2d(outs), *last)
+
+
+class Residual(nn.Module):
+    """A dilated depthwise 3x3 and a 1x1 convolution beside a shortcut; ReLU after the sum."""
+
+    def __init__(self, width: int, dilation: int) -> None:
+        super().__init__()
+        self.depthwise = ConvNorm(width, width, dilation=dilation, depthwise=True)
+        self.pointwise = ConvNorm(width, width, 1, relu=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, width, rows, cols) of the same."""
+        return torch.relu(x + self.pointwise(self.depthwise(x)))
+
+
+class DmrlNano(Network):
+    """dmrl's own small network: 24,836 parameters, 57.7 million products, receptive field 287 px.
+
+    Two dense strided 3x3 convolutions, two residual blocks at stride 4, where a robot 2 m away
+    is still a few cells wide, a separable step to stride 8, five residual blocks there whose
+    dilation grows to see a near robot whole, and a 1x1 convolution for the four channels.
+    """
+
+    own: ClassVar[tuple[str, ...]] = SUB_CELL
+    widths: ClassVar[tuple[int, int, int]] = (16, 32, 48)
+    dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 1), (1, 2, 4, 8, 1))
+
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        super().__init__(extra)
+        stem, fine, coarse = self.widths
+        self.body = nn.Sequential(
+            ConvNorm(CHANNELS, stem, stride=2),
+            ConvNorm(stem, fine, stride=2),
+            *(Residual(fine, dilation) for dilation in self.dilations[0]),
+            ConvNorm(fine, fine, stride=2, depthwise=True),
+            ConvNorm(fine, coarse, 1),
+            *(Residual(coarse, dilation) for dilation in self.dilations[1]),
+        )
+        self.head = nn.Conv2d(coarse, len(self.channels), 1)
+        nn.init.normal_(self.head.weight, std=0.01)
+        _start_empty(self.head, self.channels)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(N, C, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
+        features = self.body(images)
+        with torch.autocast(features.device.type, enabled=False):
+            out: Tensor = self.head(features.float())
+        return out
+
+
+class DmrlNanoFine(DmrlNano):
+    """dmrl-nano with more at stride 4, for robots far away; receptive field 311 px.
+
+    24,740 parameters and 75.1 million products: all of a budget of 25,000 and 80 million.
+    """
+
+    dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 2, 1, 2, 1, 2), (2, 4, 8))
+
+
+class DmrlLarge(DmrlNano):
+    """The same, wider: a teacher, too large for a microcontroller."""
+
+    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)
+
+
+ARCHITECTURES: dict[str, type[Network]] = {
+    "dmrl-nano": DmrlNano,
+    "dmrl-nano-fine": DmrlNanoFine,
+    "dmrl-large": DmrlLarge,
+    "locanet": LocaNet,
+}
+
+
+def architecture_names() -> list[str]:
+    """Names of all architectures, dmrl's and those of plug-ins, sorted."""
+    return sorted({*ARCHITECTURES, *plugins.found(plugins.NETWORKS)})
+
+
+def architecture(name: str) -> type[Network]:
+    """The class of an architecture.
+
+    Raises
+    ------
+    SettingError
+        If there is no architecture of this name.
+    PluginError
+        If it is a plug-in's, and cannot be loaded.
+    """
+    if name in ARCHITECTURES:
+        return ARCHITECTURES[name]
+    plugin = plugins.found(plugins.NETWORKS).get(name)
+    if plugin is None:
+        raise SettingError(
+            f"no architecture {name}. Choose one of: {', '.join(architecture_names())}"
+        )
+    loaded = plugin.load()
+    fits = isinstance(loaded, type) and issubclass(loaded, Network)
+    plugin.require(fits, "a subclass of dmrl.learn.networks.architectures.Network")
+    return cast(type[Network], loaded)
+
+
+def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
+    """A new network, its weights drawn with ``seed``, channels last in memory.
+
+    ``extra`` are channels on top of the architecture's own.
+
+    Raises
+    ------
+    SettingError
+        If there is no architecture of this name.
+    PluginError
+        If it is a plug-in's, and cannot be loaded.
+    """
+    form, plugin = architecture(name), plugins.found(plugins.NETWORKS).get(name)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        with plugin.blamed("cannot be built") if plugin else nullcontext():
+            network = form(extra)
+    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
+
+
+def by_name(channels: Sequence[str], output: Tensor) -> dict[str, Tensor]:
+    """(N, rows, cols) of each channel of an output (N, C, rows, cols)."""
+    return dict(zip(channels, output.unbind(1), strict=True))
+
+
+def to_input(images: Tensor) -> Tensor:
+    """Network input, x / 128 - 1, of uint8 images; float32, memory order unchanged.
+
+    Parameters
+    ----------
+    images
+        (N, 3, H, W) uint8, RGB.
+    """
+    return images.to(torch.float32).mul_(1 / 128).sub_(1)
+
+
+def product_count(network: Network, height_px: int = 224, width_px: int = 320) -> int:
+    """Multiplications of one image's convolutions."""
+    total = 0
+
+    def count(layer: nn.Module, _: object, out: Tensor) -> None:
+        nonlocal total
+        assert isinstance(layer, nn.Conv2d)
+        total += out.shape[2] * out.shape[3] * layer.weight.numel()
+
+    hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
+    training = network.training
+    with torch.inference_mode():
+        image = next(network.parameters()).new_zeros(1, CHANNELS, height_px, width_px)
+        network.eval()(image)
+    network.train(training)
+    for hook in hooks:
+        hook.remove()
+    return total
+
+
+def parameter_count(network: Network) -> int:
+    """Number of trained parameters."""
+    return sum(p.numel() for p in network.parameters())

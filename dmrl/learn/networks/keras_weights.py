@@ -1,0 +1,99 @@
+"""Published Keras weights (.h5) as torch weights of ``locanet``.
+
+Keras keeps a kernel as (height, width, in, out), torch as (out, in, height, width). 'same'
+padding at stride 1 is symmetric, so a 3x3 kernel moves over with padding 1.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dmrl.errors import MissingExtra, ModelError
+from dmrl.guards.memory import Bounded
+from dmrl.learn.networks.architectures import LocaNet
+
+try:
+    import h5py
+except ImportError:
+    h5py = None
+
+NORM = {
+    "gamma": "weight",
+    "beta": "bias",
+    "moving_mean": "running_mean",
+    "moving_variance": "running_var",
+}
+
+
+def read_h5(path: Path) -> dict[str, Tensor]:
+    """Weights of ``locanet`` from a Keras file, by torch name.
+
+    Parameters
+    ----------
+    path
+        A whole saved model, or weights alone, with layers conv2d, conv2d_1 .. conv2d_4 and
+        batch_normalization .. batch_normalization_3.
+
+    Raises
+    ------
+    ModelError
+        If a layer is missing or of another shape; it is named with both shapes.
+    MissingExtra
+        If h5py is not installed.
+    """
+    if h5py is None:
+        raise MissingExtra("h5py", "keras", f"{path.name}")
+    try:
+        with Bounded(path.stat().st_size), h5py.File(path, "r") as file:
+            inner = file.get("model_weights", getlink=True)
+            group = file["model_weights"] if isinstance(inner, h5py.HardLink) else file
+            return {name: _read(path, group, *where) for name, where in _places().items()}
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError, MemoryError) as e:
+        why = " ".join(str(e).split())
+        raise ModelError(f"{path} cannot be read: {why}. Download it again") from None
+
+
+def _places() -> dict[str, tuple[str, str]]:
+    """Layer and variable in the Keras file of every torch tensor."""
+    blocks = len(LocaNet.widths)
+    numbered = [f"_{i}" if i else "" for i in range(blocks + 1)]
+    places = {f"convs.{i}.weight": (f"conv2d{numbered[i]}", "kernel") for i in range(blocks)}
+    for i in range(blocks):
+        for keras, ours in NORM.items():
+            places[f"norms.{i}.{ours}"] = (f"batch_normalization{numbered[i]}", keras)
+    places["head.weight"] = (f"conv2d{numbered[blocks]}", "kernel")
+    places["head.bias"] = (f"conv2d{numbered[blocks]}", "bias")
+    return places
+
+
+def _read(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
+    found: h5py.Group | h5py.Dataset | None = group
+    for part in (layer, layer, f"{variable}:0"):
+        # A soft or external link may lead anywhere, also into files that are not the stranger's.
+        own = isinstance(found, h5py.Group) and isinstance(
+            found.get(part, getlink=True), h5py.HardLink
+        )
+        found = found[part] if found is not None and own else None
+    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+        raise ModelError(f"{path} has no {layer}/{variable}. Give weights of locanet")
+    wanted, shape = _keras_shape(layer, variable), found.shape
+    if shape != wanted:
+        raise ModelError(
+            f"{path}: {layer}/{variable} has shape {shape}, locanet needs {wanted}. "
+            "Give weights of locanet"
+        )
+    values = np.asarray(found, dtype=np.float32)
+    if values.ndim == 4:
+        values = values.transpose(3, 2, 0, 1)
+    return torch.from_numpy(np.ascontiguousarray(values))
+
+
+def _keras_shape(layer: str, variable: str) -> tuple[int, ...]:
+    ins, outs = (3, *LocaNet.widths), (*LocaNet.widths, 2)
+    index = int(layer.rpartition("_")[2]) if layer[-1].isdigit() else 0
+    if variable != "kernel":
+        return (outs[index],)
+    side = 1 if index == len(LocaNet.widths) else 3
+    return (side, side, ins[index], outs[index])

@@ -1,0 +1,1 @@
+"""Training: losses, optimizer, train step, validation and checkpoints."""

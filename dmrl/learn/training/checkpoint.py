@@ -1,0 +1,139 @@
+"""Training that can go on after a kill: weights and optimizer state at the end of an epoch.
+
+Tensors are a safetensors file named by the epoch; ``checkpoint.json`` names it. The JSON is
+replaced in one step once the tensors are whole, so it never names half a file.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+from torch.optim import Optimizer
+
+from dmrl.errors import ModelError, SettingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.safe_names import inside
+from dmrl.learn.inference.loaded_model import set_weights, weights_of, write_tensors
+from dmrl.learn.networks.architectures import Network
+
+STATE_NAME = "checkpoint.json"
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Where a training stands.
+
+    Parameters
+    ----------
+    run
+        What makes it this training and no other: settings, identity of the data. A training
+        resumes only where these are equal.
+    epochs_done
+        Whole epochs behind it.
+    history
+        Mean losses of each epoch.
+    """
+
+    run: dict[str, Any]
+    epochs_done: int = 0
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a training in this folder can be resumed."""
+    return (folder / STATE_NAME).is_file()
+
+
+def save_checkpoint(
+    folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, state: State
+) -> None:
+    """Write the state of a training; the previous one is there until this one is whole."""
+    tensors = {
+        f"{role}.{name}": value
+        for role, network in networks.items()
+        for name, value in weights_of(network).items()
+    }
+    for index, moments in optimizer.state_dict()["state"].items():
+        for name, value in moments.items():
+            tensors[f"optimizer.{index}.{name}"] = value.detach().cpu().contiguous()
+    name = f"checkpoint-{state.epochs_done:04d}.safetensors"
+    write_tensors(tensors, folder / name)
+    unfinished = folder / f"{STATE_NAME}.partial"
+    document = {**asdict(state), "tensors": name}
+    unfinished.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    unfinished.replace(folder / STATE_NAME)
+    for old in folder.glob("checkpoint-*.safetensors"):
+        if old.name != name:
+            old.unlink()
+
+
+def load_checkpoint(
+    folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, run: dict[str, Any]
+) -> State:
+    """State of an interrupted training; networks (by role) and optimizer are set to it.
+
+    Raises
+    ------
+    ModelError
+        If there is no whole checkpoint in the folder.
+    SettingError
+        If it belongs to a training with other settings or data.
+    """
+    if not has_checkpoint(folder):
+        raise ModelError(f"no checkpoint in {folder} to resume from. Train without --resume")
+    try:
+        said = parse_json((folder / STATE_NAME).read_text(encoding="utf-8"))
+        tensors = load_file(inside(folder, said.pop("tensors"), f"{folder}: the tensors"))
+        state = State(**said)
+        if not isinstance(state.run, dict) or not isinstance(state.epochs_done, int):
+            raise ValueError("it tells no run")
+    except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:
+        raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
+    _require_same(state.run, run, folder)
+    for role, network in networks.items():
+        start = f"{role}."
+        mine = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
+        set_weights(network, mine, folder)
+    try:
+        _set_optimizer(optimizer, tensors)
+    except (ValueError, LookupError, RuntimeError) as e:
+        raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
+    return state
+
+
+def _require_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
+    now = json.loads(json.dumps(now))
+    different = sorted(k for k in before.keys() | now.keys() if before.get(k) != now.get(k))
+    if different:
+        key = different[0]
+        raise SettingError(
+            f"{folder} was trained with {key} {before.get(key)}, not {now.get(key)}. "
+            "Resume with the settings and data it was started with, or train anew"
+        )
+
+
+def _set_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
+    fresh = optimizer.state_dict()
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    state: dict[int, dict[str, Tensor]] = {i: {} for i in range(len(parameters))}
+    for key, value in tensors.items():
+        if key.startswith("optimizer."):
+            _, index, name = key.split(".")
+            like = parameters[int(index)]
+            # The memory order of the parameter: another order may round differently.
+            state[int(index)][name] = (
+                torch.empty_like(like).copy_(value) if value.shape == like.shape else value
+            )
+    optimizer.load_state_dict({"state": state, "param_groups": fresh["param_groups"]})
+
+
+def remove_checkpoint(folder: Path) -> None:
+    """Take the checkpoint out of a folder whose training is done."""
+    for path in (folder / STATE_NAME, *folder.glob("checkpoint-*.safetensors")):
+        path.unlink(missing_ok=True)

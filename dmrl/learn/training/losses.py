@@ -1,0 +1,225 @@
+"""Losses on a grid of cells: summed over cells, mean over images.
+
+A loss is a function, a key of `LossSettings` that weighs it, and a row of `TERMS`.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
+
+from dmrl.learn.data.targets import Targets
+from dmrl.learn.networks.architectures import CLASS, SPREAD
+
+DepthLoss = Literal["squared", "log"]
+Outputs = Mapping[str, Tensor]
+"""(N, rows, cols) of each channel of a network's output, by the channel's name."""
+LEAST_LOG_SPREAD = math.log(0.01)
+"""A spread below this is taken for it: a hundredth of the depth."""
+
+
+@dataclass(frozen=True, slots=True)
+class LossSettings:
+    """What is learnt, and how much each part of it counts: the base of `FitSettings`.
+
+    Parameters
+    ----------
+    confidence_weight
+        Factor of the confidence loss.
+    focus
+        Exponent of the focal confidence loss. 0: plain cross entropy.
+    depth_weight
+        Factor of the depth loss.
+    depth_loss
+        "log": absolute error of the log depth. "squared": squared error in m^2, as published.
+    offset_weight
+        Factor of the sub-cell offset's loss, for networks that have the channels.
+    spread_weight
+        Factor of the loss of a channel that says how sure the depth is. 0: no such channel.
+    class_weight
+        Factor of the class loss.
+    classes
+        What tells robots apart, one pattern of peer names each: ["cf2", "cf[3-9]"] is two
+        classes. Empty: the network does not tell.
+    """
+
+    confidence_weight: float = 1.0
+    focus: float = 2.0
+    depth_weight: float = 1.0
+    depth_loss: DepthLoss = "log"
+    offset_weight: float = 0.5
+    spread_weight: float = 0.0
+    class_weight: float = 1.0
+    classes: tuple[str, ...] = ()
+
+
+def confidence_loss(
+    logit: Tensor, confidence: Tensor, weight: Tensor | None = None, *, focus: float = 2.0
+) -> Tensor:
+    """Focal cross entropy |c - p|^focus * BCE(p, c); the paper's with a focus of 2.
+
+    Parameters
+    ----------
+    logit
+        (N, rows, cols) confidence logits; p is their sigmoid.
+    confidence
+        (N, rows, cols) labels c, 0 to 1.
+    weight
+        (N, rows, cols) factor of each cell. None: 1.
+    focus
+        How much cells that are nearly right are left alone. 0: plain cross entropy.
+    """
+    entropy = binary_cross_entropy_with_logits(logit, confidence, weight, reduction="none")
+    if focus:
+        entropy = (confidence - logit.sigmoid()).abs().pow(focus) * entropy
+    return entropy.sum(dim=(1, 2)).mean()
+
+
+def depth_loss(
+    log_depth: Tensor, depth_m: Tensor, weight: Tensor, kind: DepthLoss = "squared"
+) -> Tensor:
+    """Depth error in cells with a robot.
+
+    Parameters
+    ----------
+    log_depth
+        (N, rows, cols) predicted natural log of the depth in metres.
+    depth_m
+        (N, rows, cols) labels, metres; any value where ``weight`` is 0.
+    weight
+        (N, rows, cols) factor of each cell.
+    kind
+        "squared": squared error, m^2, as in the paper. "log": absolute error of the
+        logarithm, that is, of the share.
+    """
+    # Masked first: a far-off log depth in an empty cell must not give inf * 0.
+    there = weight > 0
+    if kind == "log":
+        wanted = torch.where(there, depth_m, 1.0).log()
+        error = (log_depth * there - wanted).abs()
+    else:
+        error = ((log_depth * there).exp() - depth_m).square()
+    return (weight * error).sum(dim=(1, 2)).mean()
+
+
+def offset_loss(predicted: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
+    """Absolute error of the offset in cells with a robot, cells.
+
+    Parameters
+    ----------
+    predicted, offset
+        (N, 2, rows, cols), cells.
+    weight
+        (N, rows, cols) factor of each cell.
+    """
+    return (weight[:, None] * (predicted - offset).abs()).sum(dim=(1, 2, 3)).mean()
+
+
+def spread_loss(log_spread: Tensor, log_depth: Tensor, depth_m: Tensor, weight: Tensor) -> Tensor:
+    """How badly the spread fits the error of log depth: -log of a Laplace density (less log 2).
+
+    The depth does not learn from it: a network that also says how sure it is sees as well as one
+    that does not.
+
+    Parameters
+    ----------
+    log_spread, log_depth
+        (N, rows, cols) predicted: log of the scale b of the error, and log of the depth, metres.
+    depth_m
+        (N, rows, cols) labels, metres; any value where ``weight`` is 0.
+    weight
+        (N, rows, cols) factor of each cell.
+    """
+    there = weight > 0
+    error = (log_depth.detach() - torch.where(there, depth_m, 1.0).log()).abs() * there
+    # Without a floor, a depth that is met exactly is worth infinitely much.
+    log_b = log_spread.clamp(min=LEAST_LOG_SPREAD)
+    return (weight * (error * (-log_b).exp() + log_b)).sum(dim=(1, 2)).mean()
+
+
+def class_loss(logits: Tensor, class_id: Tensor, weight: Tensor) -> Tensor:
+    """Cross entropy of every class in cells with a robot (paper eq. 8).
+
+    Parameters
+    ----------
+    logits
+        (N, classes, rows, cols).
+    class_id
+        (N, rows, cols) labels; -1 where it is not known.
+    weight
+        (N, rows, cols) factor of each cell.
+    """
+    known = class_id >= 0
+    wanted = one_hot(class_id.clamp(min=0), logits.shape[1]).movedim(3, 1).to(logits.dtype)
+    entropy = binary_cross_entropy_with_logits(logits, wanted, reduction="none").sum(dim=1)
+    return (weight * known * entropy).sum(dim=(1, 2)).mean()
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One part of the loss.
+
+    Parameters
+    ----------
+    name
+        As histories and curves call it.
+    weight
+        Key of `LossSettings` with its factor.
+    channels
+        What a network must give for it; the term is 0 for one that lacks any of them.
+    of
+        The loss before its factor: a scalar, of outputs, targets and settings.
+    """
+
+    name: str
+    weight: str
+    channels: tuple[str, ...]
+    of: Callable[[Outputs, Targets, LossSettings], Tensor]
+
+
+def _confidence(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+    weight = wanted.confidence_weight
+    return confidence_loss(out["confidence"], wanted.confidence, weight, focus=settings.focus)
+
+
+def _depth(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+    return depth_loss(out["log_depth"], wanted.depth_m, wanted.weight, settings.depth_loss)
+
+
+def _offset(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+    both = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
+    return offset_loss(both, wanted.offset, wanted.offset_weight)
+
+
+def _spread(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+    return spread_loss(out[SPREAD], out["log_depth"], wanted.depth_m, wanted.weight)
+
+
+def _class(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+    logits = torch.stack([out[name] for name in out if name.startswith(CLASS)], dim=1)
+    return class_loss(logits, wanted.class_id, wanted.weight)
+
+
+TERMS = (
+    Term("confidence_loss", "confidence_weight", ("confidence",), _confidence),
+    Term("depth_loss", "depth_weight", ("log_depth",), _depth),
+    Term("offset_loss", "offset_weight", ("offset_u", "offset_v"), _offset),
+    Term("spread_loss", "spread_weight", (SPREAD, "log_depth"), _spread),
+    Term("class_loss", "class_weight", (f"{CLASS}0",), _class),
+)
+"""Every part of the loss; what is minimised is their sum."""
+
+
+def weighted(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+    """Every term times its factor, in the order of ``TERMS``; 0 without its channels."""
+    none = out["confidence"].new_zeros(())
+    parts = [
+        term.of(out, wanted, settings) if out.keys() >= set(term.channels) else none
+        for term in TERMS
+    ]
+    factors = none.new_tensor([getattr(settings, term.weight) for term in TERMS])
+    return torch.stack(parts) * factors

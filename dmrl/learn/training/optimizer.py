@@ -1,0 +1,121 @@
+"""Optimizers: Adam as published, or Muon for the kernels that mix channels."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from dmrl.learn.networks.architectures import CHANNELS, Network
+
+OptimizerName = Literal["muon", "adam"]
+
+ADAM_EPSILON = 1e-7  # Keras' default, with which the paper trained
+MOMENTUM = 0.95
+UPDATE_RMS = 0.2
+"""Root mean square of an update over the learning rate: about that of Adam's, so that one
+learning rate suits both (Liu et al. 2025)."""
+NEWTON_SCHULZ = (3.4445, -4.7750, 2.0315)
+NEWTON_SCHULZ_STEPS = 5
+
+
+def new_optimizer(
+    network: Network, name: OptimizerName, weight_decay: float
+) -> torch.optim.Optimizer:
+    """The optimizer of a training.
+
+    Parameters
+    ----------
+    network
+        What it steps.
+    name
+        "adam", or "muon" for the kernels that mix channels beside Adam for all the rest.
+    weight_decay
+        Decoupled, on kernels alone. 0 with "adam": the paper's plain Adam.
+    """
+    kernels = [p for p in network.parameters() if p.ndim > 1]
+    others = [p for p in network.parameters() if p.ndim == 1]
+    if name == "muon":
+        mixing = _mixing(network)
+        rest = [p for p in kernels if not any(p is q for q in mixing)]
+        return Muon(
+            [
+                {"params": mixing, "weight_decay": weight_decay, "mixing": True},
+                {"params": rest, "weight_decay": weight_decay, "mixing": False},
+                {"params": others, "weight_decay": 0.0, "mixing": False},
+            ]
+        )
+    if not weight_decay:
+        return torch.optim.Adam(network.parameters(), eps=ADAM_EPSILON)
+    groups = [
+        {"params": kernels, "weight_decay": weight_decay},
+        {"params": others, "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, eps=ADAM_EPSILON)
+
+
+def _mixing(network: Network) -> list[Tensor]:
+    """Kernels between hidden layers: neither of the image, nor depthwise, nor the head's."""
+    convs = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
+    return [
+        conv.weight
+        for conv in convs[:-1]
+        if conv.groups == 1 and conv.in_channels > CHANNELS and conv.out_channels > 1
+    ]
+
+
+class Muon(torch.optim.AdamW):
+    """Muon (Jordan et al. 2024) for groups that are ``mixing``, AdamW for the others.
+
+    Adam scales every number of a kernel by itself. A kernel that mixes channels is one matrix:
+    Muon takes its smoothed gradient for the direction and makes all of its singular values
+    about 1, so that rare directions are learnt as fast as common ones.
+
+    ``torch.optim.Muon`` takes matrices alone, these kernels are (out, in, rows, cols).
+
+    Parameters
+    ----------
+    groups
+        As for `torch.optim.AdamW`, each with ``mixing``.
+    """
+
+    def __init__(self, groups: list[dict[str, Any]]) -> None:
+        super().__init__(groups, eps=ADAM_EPSILON)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """One step of all parameters; the mixing kernels' gradients are used up."""
+        for group in self.param_groups:
+            if group["mixing"]:
+                for kernel in group["params"]:
+                    self._turn(kernel, group["lr"], group["weight_decay"])
+                    kernel.grad = None  # so AdamW passes it by
+        return super().step(closure)
+
+    def _turn(self, kernel: Tensor, learning_rate: float, weight_decay: float) -> None:
+        state = self.state[kernel]
+        if not state:
+            # AdamW's own name: it looks for it in every state that it loads.
+            state["step"] = torch.tensor(0.0)
+            state["momentum"] = torch.zeros_like(kernel)
+        assert kernel.grad is not None
+        momentum = state["momentum"].lerp_(kernel.grad, 1 - MOMENTUM)
+        ahead = torch.lerp(kernel.grad, momentum, MOMENTUM).flatten(1)  # Nesterov's
+        update = orthogonal(ahead).reshape(kernel.shape)
+        kernel.mul_(1 - learning_rate * weight_decay)
+        kernel.add_(update, alpha=-learning_rate * UPDATE_RMS * max(ahead.shape) ** 0.5)
+
+
+def orthogonal(matrix: Tensor) -> Tensor:
+    """A matrix with its singular values all brought to about 1 (0.7 to 1.2).
+
+    By five rounds of a quintic Newton-Schulz iteration: products alone, no decomposition.
+    """
+    tall = matrix.shape[0] > matrix.shape[1]
+    x: Tensor = matrix.T if tall else matrix
+    x = x / (x.norm() + ADAM_EPSILON)
+    a, b, c = NEWTON_SCHULZ
+    for _ in range(NEWTON_SCHULZ_STEPS):
+        square = x @ x.T
+        x = a * x + (b * square + c * square @ square) @ x
+    return x.T if tall else x

@@ -1,0 +1,65 @@
+"""How good a network is on images held out."""
+
+import numpy as np
+import torch
+
+from dmrl.learn.data.batches import DEPTH, Examples, U, V, in_order
+from dmrl.learn.inference.decode import decode
+from dmrl.learn.inference.loaded_model import grids_of
+from dmrl.learn.inference.matching import Points
+from dmrl.learn.inference.metrics import Scored, figures, score
+from dmrl.learn.networks.architectures import Network
+from dmrl.learn.training.config import FitSettings
+from dmrl.learn.training.train_step import losses
+
+WATCHED = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
+"""Figures of ``metrics`` that are watched during a training."""
+EVERYWHERE = (0.0, np.inf)
+
+
+def validation_figures(
+    network: Network, examples: Examples, settings: FitSettings
+) -> dict[str, float]:
+    """Loss and figures on images held out, each name beginning with validation.
+
+    Parameters
+    ----------
+    network
+        In evaluation mode.
+    examples
+        Images held out, as they are.
+    settings
+        The recipe, for its losses and batch size.
+    """
+    total = 0.0
+    with torch.inference_mode():
+        for batch in in_order(examples, settings.batch_size):
+            total += float(losses(network, batch, settings).sum()) * len(batch.images)
+    scored = scores(network, examples)
+    found = figures(scored, EVERYWHERE, 0.5, np.ones((1, len(examples))))
+    watched = {f"validation_{name}": float(found[name][0]) for name in WATCHED}
+    return {"validation_loss": total / len(examples), **watched}
+
+
+def scores(network: Network, examples: Examples, batch_size: int = 16) -> Scored:
+    """A network's detections in images, matched with their labels."""
+    parts = []
+    for batch in in_order(examples, batch_size):
+        found = decode(*grids_of(network, batch.images), stride_px=network.stride_px)
+        image, place = np.nonzero(np.arange(found.u_px.shape[1]) < found.count[:, None])
+        columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
+        parts.append(Points(image, *(column[image, place] for column in columns)))
+    first = np.arange(0, len(examples), batch_size)
+    return score(len(examples), labels(examples), Points.concatenate(parts, first))
+
+
+def labels(examples: Examples) -> Points:
+    """Robots whose centres are inside the images."""
+    height_px, width_px, _ = examples.image_shape
+    robots = examples.robots.astype(np.float64)
+    u, v = robots[..., U], robots[..., V]
+    with np.errstate(invalid="ignore"):
+        inside = (u >= 0) & (u < width_px) & (v >= 0) & (v < height_px)
+    image, _ = np.nonzero(inside)
+    depth_m = robots[..., DEPTH][inside]
+    return Points(image, u[inside], v[inside], depth_m, np.ones(len(image)))

@@ -1,0 +1,284 @@
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dmrl.learn.inference.matching import Points
+from dmrl.learn.inference.metrics import (
+    BANDS_M,
+    DEFINITIONS,
+    BandFigures,
+    average_precision,
+    by_band,
+    curves,
+    figures,
+    resamples,
+    score,
+    weighted_quantile,
+)
+
+
+def scene(images: int, offset_px: float = 0.0, depth_m: float = 1.0) -> tuple[Points, Points]:
+    """One label per image, found with an offset in u and 0.1 m too near."""
+    image = np.arange(images)
+    u, v, d = np.full(images, 100.0), np.full(images, 50.0), np.full(images, depth_m)
+    ones = np.ones(images)
+    return Points(image, u, v, d, ones), Points(image, u - offset_px, v, d - 0.1, 0.9 * ones)
+
+
+def overall(labels: Points, found: Points, images: int, draws: int = 20) -> BandFigures:
+    return by_band(score(images, labels, found), threshold=0.33, draws=draws)[0]
+
+
+def values(band: BandFigures) -> dict[str, float]:
+    return {name: figure.value for name, figure in band.figures.items()}
+
+
+def test_a_perfect_detector_has_perfect_figures() -> None:
+    labels, found = scene(10)
+    got = values(overall(labels, found, 10))
+    assert got["median_px"] == got["p95_px"] == got["rmse_px"] == got["bias_u_px"] == 0
+    assert got["within_8_px"] == got["f1"] == got["ap_8_px"] == got["ap_16_px"] == 1
+    assert got["depth_mae_m"] == pytest.approx(0.1)
+
+
+def test_curves_of_four_detections_by_hand() -> None:
+    labels, _ = scene(3)
+    at = np.full(4, 100.0)
+    at[2] = 200.0  # the third is beside every label
+    confidence = np.array([0.95, 0.85, 0.85, 0.15])
+    depth = np.ones(4)
+    found = Points(np.array([0, 1, 1, 2]), at, np.full(4, 50.0), depth, confidence)
+    got = curves(score(3, labels, found))
+    # Equal confidences are one point of the curve.
+    assert got.confidence.tolist() == [0.95, 0.85, 0.15]
+    assert got.precision == pytest.approx([1, 2 / 3, 3 / 4])
+    assert got.recall == pytest.approx([1 / 3, 2 / 3, 1])
+    assert got.bin_count.tolist() == [0, 1, 0, 0, 0, 0, 0, 0, 2, 1]
+    assert got.bin_right[[1, 8, 9]].tolist() == [1, 0.5, 1]
+    assert got.bin_confidence[[1, 8, 9]] == pytest.approx([0.15, 0.85, 0.95])
+    assert np.isnan(got.bin_right[0])
+
+
+def test_curves_without_detections_or_labels_are_empty() -> None:
+    labels, found = scene(3)
+    none = found.select(found.image > 9)
+    assert curves(score(3, labels, none)).recall.size == 0
+    assert np.isnan(curves(score(3, none, found)).recall).all()
+    many = curves(score(3, *scene(3)), most=1)
+    assert many.recall.tolist() == [1.0]
+
+
+def test_figures_of_a_known_offset() -> None:
+    labels, found = scene(10, offset_px=12)
+    got = values(overall(labels, found, 10))
+    assert got["median_px"] == got["mean_px"] == got["rmse_px"] == got["bias_u_px"] == 12
+    assert (got["within_8_px"], got["within_20_px"]) == (0, 1)
+    assert (got["ap_8_px"], got["ap_16_px"], got["recall"]) == (0, 1, 1)
+
+
+def test_half_the_labels_missed() -> None:
+    labels, found = scene(10)
+    half = found.select(found.image < 5)
+    band = overall(labels, half, 10)
+    got = values(band)
+    assert band.unmatched == 5
+    assert got["within_20_px"] == got["recall"] == got["ap_16_px"] == 0.5
+    assert got["precision"] == 1
+    assert got["f1"] == pytest.approx(2 / 3)
+    assert got["rmse_px"] == 0
+    assert got["median_px"] == math.inf
+
+
+def test_detections_in_images_without_labels_are_wrong() -> None:
+    labels, found = scene(10)
+    got = values(overall(labels.select(labels.image < 5), found, 10))
+    assert (got["precision"], got["recall"], got["within_8_px"]) == (0.5, 1, 1)
+
+
+def test_below_the_threshold_is_not_claimed() -> None:
+    labels, found = scene(4)
+    sure = Points(found.image, found.u_px, found.v_px, found.depth_m, np.array([0.9, 0.33, 0.3, 0]))
+    got = values(overall(labels, sure, 4))
+    assert (got["precision"], got["recall"]) == (1, 0.5)
+    assert got["ap_16_px"] == 1
+
+
+def test_bands_hold_their_own_labels_and_empty_ones_say_nothing() -> None:
+    labels, found = scene(10, depth_m=0.7)
+    bands = by_band(score(10, labels, found), threshold=0.33, draws=5)
+    assert [(b.from_m, b.to_m) for b in bands] == list(BANDS_M)
+    assert [b.labels for b in bands] == [10, 0, 10, 0, 0, 0]
+    assert all(math.isnan(figure.value) for figure in bands[-1].figures.values())
+    assert set(bands[0].figures) == set(DEFINITIONS) - {"error", "band", "interval"}
+
+
+def test_a_wrong_detection_counts_in_the_band_of_its_own_depth() -> None:
+    labels, found = scene(10, depth_m=0.7)
+    extra = Points(np.arange(10), np.zeros(10), np.zeros(10), np.full(10, 1.7), np.full(10, 0.8))
+    order = np.argsort(np.concatenate([found.image, extra.image]), kind="stable")
+    both = Points.concatenate([found, extra], np.zeros(2, np.int64)).select(order)
+    bands = by_band(score(10, labels, both), threshold=0.33, draws=5)
+    assert [b.figures["precision"].value for b in bands[:3:2]] == [0.5, 1]
+    assert bands[4].figures["precision"].value == 0
+
+
+def test_average_precision_of_a_ranked_list_by_hand() -> None:
+    right = np.array([True, False, True, False])
+    area = average_precision(
+        np.array([0.9, 0.8, 0.7, 0.6]), right, ~right, np.ones((1, 4)), np.array([4.0])
+    )
+    # Recall 1/4 at precision 1, then 2/4 at 2/3; two of four labels are never found.
+    assert area[0] == pytest.approx(1 / 4 + 1 / 4 * 2 / 3)
+
+
+def test_equal_confidences_count_together_whatever_their_order() -> None:
+    confidence = np.array([0.9, 0.5, 0.5, 0.5])
+    for right in ([True, True, False, False], [True, False, False, True]):
+        is_right = np.array(right)
+        area = average_precision(confidence, is_right, ~is_right, np.ones((1, 4)), np.array([2.0]))
+        # The second label is found by a threshold that lets four detections through.
+        assert area[0] == pytest.approx(1 / 2 + 1 / 2 * 2 / 4)
+
+
+def test_intervals_cover_the_value_and_shrink_with_more_images() -> None:
+    rng = np.random.default_rng(0)
+    widths = []
+    for images in (30, 3000):
+        labels, found = scene(images)
+        near = rng.random(images) < 0.7
+        off = Points(
+            found.image, np.where(near, found.u_px, 0), found.v_px, found.depth_m, found.confidence
+        )
+        share = overall(labels, off, images, draws=300).figures["within_8_px"]
+        assert share.low < share.value < share.high
+        widths.append(share.high - share.low)
+    assert widths[1] == pytest.approx(2 * 1.96 * math.sqrt(0.7 * 0.3 / 3000), rel=0.2)
+    assert widths[0] > 5 * widths[1]
+
+
+def test_the_seed_decides_the_intervals() -> None:
+    rng = np.random.default_rng(1)
+    labels, found = scene(40)
+    off = Points(found.image, rng.random(40) * 200, found.v_px, found.depth_m, found.confidence)
+    scored = score(40, labels, off)
+
+    def figures(seed: int) -> list[BandFigures]:
+        return by_band(scored, threshold=0.33, draws=50, seed=seed)[:1]
+
+    assert figures(1) == figures(1) != figures(2)
+
+
+@given(st.lists(st.floats(-100, 100), min_size=1, max_size=30), st.randoms())
+def test_the_median_is_numpys_also_with_repeats(numbers: list[float], random: object) -> None:
+    array = np.array(numbers)
+    times = np.array([random.randint(1, 3) for _ in numbers])  # type: ignore[attr-defined]
+    repeated = np.repeat(array, times)
+    got = weighted_quantile(array, times[None].astype(float), 0.5)
+    assert got[0] == pytest.approx(np.median(repeated))
+
+
+@pytest.mark.slow
+def test_ten_thousand_images_take_seconds() -> None:
+    rng = np.random.default_rng(0)
+    images = 10_000
+    labels, found = scene(images)
+    off = Points(
+        found.image,
+        rng.random(images) * 200,
+        found.v_px,
+        rng.random(images) * 2.5,
+        found.confidence,
+    )
+    begun = time.process_time()
+    by_band(score(images, labels, off), threshold=0.33)
+    assert time.process_time() - begun < 20
+
+
+def test_an_interval_holds_the_middle_95_percent() -> None:
+    images = 400
+    labels, found = scene(images)
+    half = Points(
+        found.image,
+        found.u_px - 30 * (found.image % 2),
+        found.v_px,
+        found.depth_m,
+        found.confidence,
+    )
+    band = by_band(score(images, labels, half), threshold=0.33, draws=2000)[0]
+    share = band.figures["within_8_px"]
+    reach = 1.96 * math.sqrt(0.25 / images)  # of a share of one half
+    assert share.value == 0.5
+    assert (share.low, share.high) == pytest.approx((0.5 - reach, 0.5 + reach), abs=0.006)
+
+
+def off_by(*errors: tuple[float, float, float]) -> dict[str, float]:
+    """Figures of one label an image that was found so far right, down and behind."""
+    off = np.array(errors)
+    image, u = np.arange(len(off)), np.full(len(off), 100.0)
+    truth = Points(image, u, u / 2, u / 50, np.ones(len(off)))
+    found = Points(image, u + off[:, 0], u / 2 + off[:, 1], u / 50 + off[:, 2], np.ones(len(off)))
+    weights = np.ones((1, len(off)))
+    got = figures(score(len(off), truth, found), (0.0, np.inf), 0.5, weights)
+    return {name: float(value[0]) for name, value in got.items()}
+
+
+def test_figures_of_unlike_errors_by_hand() -> None:
+    got = off_by((3.0, 4.0, 0.1), (0.0, 12.0, -0.2), (-8.0, 0.0, 0.4), (30.0, 40.0, 0.0))
+    assert got["mean_px"] == pytest.approx((5 + 12 + 8 + 50) / 4)
+    assert got["rmse_px"] == pytest.approx(((25 + 144 + 64 + 2500) / 4) ** 0.5)
+    assert got["median_px"] == pytest.approx(10)
+    assert got["p95_px"] == pytest.approx(50)
+    assert got["bias_u_px"] == pytest.approx(-1.5)  # label minus detection: -3, 0, 8, -30
+    assert got["bias_v_px"] == pytest.approx(-8)
+    assert got["depth_mae_m"] == pytest.approx(0.7 / 4)
+    assert got["depth_rmse_m"] == pytest.approx((0.21 / 4) ** 0.5)
+    assert (got["within_8_px"], got["within_20_px"]) == (0.5, 0.75)
+    assert (got["ap_8_px"], got["ap_16_px"]) == pytest.approx((0.5 * 0.5, 0.75 * 0.75))
+
+
+@pytest.mark.parametrize(("off_px", "name"), [(8.0, "within_8_px"), (20.0, "within_20_px")])
+def test_an_error_of_the_radius_is_within_it(off_px: float, name: str) -> None:
+    assert [off_by((off, 0, 0))[name] for off in (off_px, off_px + 0.1)] == [1, 0]
+
+
+def test_a_band_holds_its_lower_end() -> None:
+    for depth_m, held in ((0.5, 2), (0.499, 1), (1.0, 3), (1.5, 4), (2.0, 5)):
+        bands = by_band(score(1, *scene(1, depth_m=depth_m)), threshold=0.33, draws=2)
+        assert [band.labels for band in bands] == [1, *(int(k == held) for k in range(1, 6))]
+        assert bands[held].images == 1
+
+
+def test_resamples_draw_as_many_images_as_there_are() -> None:
+    labels, found = scene(7)
+    rows = np.concatenate(list(resamples(score(7, labels, found), 500, 3)))
+    assert rows.shape == (500, 7)
+    assert (rows.sum(axis=1) == 7).all()
+    assert rows.mean(axis=0) == pytest.approx(np.ones(7), abs=0.15)
+    assert rows.var() == pytest.approx(6 / 7, rel=0.1)  # binomial: 7 draws of 1 / 7
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 3)), min_size=1, max_size=12))
+def test_a_weighted_quantile_is_that_of_repeated_values(pairs: list[tuple[int, int]]) -> None:
+    values_, counts = (np.array(x, float) for x in zip(*pairs, strict=True))
+    repeated = np.repeat(values_, counts.astype(int))
+    for share in (0.25, 0.5, 0.95):
+        (got,) = weighted_quantile(values_, counts[None], share)
+        if len(repeated):
+            wanted = np.quantile(repeated, share, method="averaged_inverted_cdf")
+            assert got == pytest.approx(wanted)
+        else:
+            assert math.isnan(got)
+
+
+def test_curves_are_thinned_evenly_and_full_confidence_is_in_the_last_bin() -> None:
+    labels, _ = scene(100)
+    confidence = np.linspace(1.0, 0.01, 100)
+    found = Points(labels.image, labels.u_px, labels.v_px, labels.depth_m, confidence)
+    got = curves(score(100, labels, found), most=5)
+    assert got.confidence == pytest.approx([1.0, 0.75, 0.5, 0.26, 0.01], abs=0.011)
+    assert got.recall == pytest.approx([0.01, 0.26, 0.51, 0.75, 1.0], abs=0.011)
+    assert got.bin_count[9] == 11 and got.bin_count.sum() == 100

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+import torch
+
+from dmrl.learn.data.batches import FIELDS, Examples
+from dmrl.learn.networks.architectures import DETECTION, Network
+from dmrl.learn.training.hard_negatives import beliefs, empties, mined
+
+
+class Bright(Network):
+    """Believes in a robot where the picture is bright."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.tensor(1.0))
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        light = torch.nn.functional.avg_pool2d(images.mean(dim=1, keepdim=True), 8)
+        return torch.cat([light, self.scale * light], dim=1)
+
+
+def examples() -> Examples:
+    """Two images with a robot, then three without: dark, grey and bright."""
+    pixels = np.zeros((5, 16, 24, 3), np.uint8)
+    pixels[3], pixels[4] = 128, 255
+    robots = np.full((5, 1, len(FIELDS)), np.nan, np.float32)
+    robots[:2, 0, :6] = (12, 8, 1, 0, 0, 0)
+    return Examples([pixels], robots)
+
+
+def test_what_the_network_believes_comes_more_often() -> None:
+    network = Bright().train()
+    assert network.channels == DETECTION
+    believed = beliefs(network, examples(), np.arange(5))
+    assert (np.diff(believed[2:]) > 0).all()
+    shares = mined(network, examples(), None, 0.4)
+    assert shares is not None
+    assert network.training
+    assert shares.mean() == pytest.approx(1)
+    assert shares[2:].sum() / shares.sum() == pytest.approx(0.4)
+    np.testing.assert_allclose(shares[2:] / shares[4], (believed[2:] / believed[4]) ** 2)
+    assert shares[0] == shares[1]
+
+
+def test_images_with_a_robot_keep_their_proportions() -> None:
+    shares = mined(Bright(), examples(), np.array([1.0, 3.0, 1.0, 0.5, 0.5]), 0.2)
+    assert shares is not None
+    assert shares[1] == pytest.approx(3 * shares[0])
+    assert shares[:2].sum() / shares.sum() == pytest.approx(0.8)
+
+
+def test_an_image_without_a_share_is_not_mined() -> None:
+    shares = mined(Bright(), examples(), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 0.4)
+    assert shares is not None
+    assert shares[4] == 0
+    assert shares[2:].sum() / shares.sum() == pytest.approx(0.4)
+
+
+def test_without_images_of_either_kind_nothing_changes() -> None:
+    full = examples().select(np.array([True, True, False, False, False]))
+    assert empties(full).tolist() == [False, False]
+    assert mined(Bright(), full, None, 0.4) is None

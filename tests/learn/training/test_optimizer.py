@@ -1,0 +1,121 @@
+import numpy as np
+import pytest
+import torch
+
+from dmrl.learn.networks.architectures import build
+from dmrl.learn.training.optimizer import Muon, new_optimizer, orthogonal
+
+
+@pytest.mark.parametrize("shape", [(48, 48), (48, 32), (32, 144)])
+def test_every_direction_of_an_update_is_of_about_the_same_size(shape: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    u, _, v = torch.linalg.svd(torch.randn(shape), full_matrices=False)
+    before = torch.logspace(0, -2, min(shape))
+    after = orthogonal(u @ torch.diag(before) @ v)
+    torch.testing.assert_close(u.T @ after @ v.T, torch.diag((u.T @ after @ v.T).diagonal()))
+    sizes = torch.linalg.svdvals(after)
+    assert float(sizes.min()) > 0.6
+    assert float(sizes.max()) < 1.3
+
+
+def test_muon_takes_the_kernels_that_mix_channels() -> None:
+    network = build("dmrl-nano")
+    optimizer = new_optimizer(network, "muon", 0.01)
+    assert isinstance(optimizer, Muon)
+    mixing = {id(p) for p in optimizer.param_groups[0]["params"]}
+    names = [name for name, p in network.named_parameters() if id(p) in mixing]
+    assert len(names) == 9
+    assert "body.1.0.weight" in names  # the second convolution
+    assert not {"body.0.0.weight", "body.2.depthwise.0.weight", "head.weight"} & set(names)
+    every = [p for group in optimizer.param_groups for p in group["params"]]
+    assert {id(p) for p in every} == {id(p) for p in network.parameters()}
+    assert len(every) == len(list(network.parameters()))
+
+
+def test_a_step_of_muon_is_as_large_as_one_of_adam_and_downhill() -> None:
+    sizes = {}
+    for name in ("adam", "muon"):
+        network = build("dmrl-nano", seed=3)
+        optimizer = new_optimizer(network, name, 0.01)  # type: ignore[arg-type]
+        kernel = network.get_parameter("body.5.0.weight")
+        before = kernel.detach().clone()
+        torch.manual_seed(1)
+        loss = (network(torch.randn(2, 3, 32, 32)) ** 2).sum()
+        loss.backward()  # type: ignore[no-untyped-call]
+        assert kernel.grad is not None
+        gradient = kernel.grad.clone()
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-3
+        optimizer.step()
+        moved = kernel.detach() - before
+        assert float((moved * gradient).sum()) < 0
+        sizes[name] = float(moved.square().mean().sqrt())
+    assert 0.1 < sizes["muon"] / sizes["adam"] < 1.0
+
+
+def test_without_weight_decay_adam_is_the_papers() -> None:
+    assert type(new_optimizer(build("locanet"), "adam", 0.0)) is torch.optim.Adam
+    assert type(new_optimizer(build("locanet"), "adam", 0.1)) is torch.optim.AdamW
+
+
+@pytest.mark.parametrize("name", ["adam", "muon"])
+def test_only_kernels_decay(name: str) -> None:
+    network = build("dmrl-nano")
+    groups = new_optimizer(network, name, 0.01).param_groups  # type: ignore[arg-type]
+    decays = {id(p): group["weight_decay"] for group in groups for p in group["params"]}
+    for parameter in network.parameters():
+        assert decays[id(parameter)] == (0.01 if parameter.ndim > 1 else 0.0)
+
+
+def plain_orthogonal(matrix: np.ndarray) -> np.ndarray:
+    """The published iteration, for a matrix no taller than wide."""
+    x = matrix / np.linalg.norm(matrix)
+    for _ in range(5):
+        square = x @ x.T
+        x = 3.4445 * x + (-4.7750 * square + 2.0315 * square @ square) @ x
+    return x
+
+
+def test_steps_of_muon_are_those_that_were_published_and_the_rest_is_adam() -> None:
+    torch.manual_seed(2)
+    rate, decay = 0.02, 0.1
+    kernel = torch.nn.Parameter(torch.randn(4, 3, 3, 3))
+    other, plain = (torch.nn.Parameter(torch.linspace(-1, 1, 6)) for _ in range(2))
+    muon = Muon(
+        [
+            {"params": [kernel], "weight_decay": decay, "mixing": True, "lr": rate},
+            {"params": [other], "weight_decay": 0.0, "mixing": False, "lr": rate},
+        ]
+    )
+    adam = torch.optim.AdamW([plain], lr=rate, weight_decay=0.0, eps=1e-7)
+    wanted, momentum = kernel.detach().numpy().copy().reshape(4, 27), np.zeros((4, 27))
+    for _ in range(3):
+        gradient = torch.randn(4, 3, 3, 3)
+        flat = gradient.numpy().reshape(4, 27)
+        kernel.grad, other.grad, plain.grad = gradient.clone(), torch.ones(6), torch.ones(6)
+        muon.step()
+        adam.step()
+        momentum = 0.95 * momentum + 0.05 * flat
+        update = plain_orthogonal(0.05 * flat + 0.95 * momentum)
+        wanted = wanted * (1 - rate * decay) - rate * 0.2 * 27**0.5 * update
+        assert kernel.detach().numpy().reshape(4, 27) == pytest.approx(wanted, abs=1e-5)
+        assert kernel.grad is None
+        torch.testing.assert_close(other, plain)
+    assert muon.state[kernel]["step"] == 0
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(3, 5), (5, 3), (4, 4), (1, 7)])
+def test_a_matrix_is_brought_to_even_singular_values_lying_or_standing(
+    rows: int, columns: int
+) -> None:
+    matrix = np.random.default_rng(rows).normal(size=(rows, columns)).astype(np.float32)
+    lying = matrix.T if rows > columns else matrix
+    wanted = plain_orthogonal(lying)
+    found = orthogonal(torch.from_numpy(matrix)).numpy()
+    assert (found.T if rows > columns else found) == pytest.approx(wanted, abs=1e-4)
+
+
+def test_adam_s_epsilon_is_the_paper_s() -> None:
+    for name, decay in (("adam", 0.0), ("adam", 0.1), ("muon", 0.1)):
+        optimizer = new_optimizer(build("dmrl-nano"), name, decay)  # type: ignore[arg-type]
+        assert {group["eps"] for group in optimizer.param_groups} == {1e-7}
