@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.live.feed import Received
+from dmrl.live.queue import Received
 from dmrl.samples.sample import Sample
 from dmrl.viewer.entity import escaped
 from dmrl.viewer.layouts import BACKGROUND, TIMELINE

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from dmrl.errors import MissingExtra, SettingError
-from dmrl.live.log_plan import SLOW_PERIOD_MS, Block, Plan
+from dmrl.live.log_blocks import SLOW_PERIOD_MS, Block, Plan
 
 UDP_BUFFER_BYTES = 1 << 22
 """Asked for, so that a busy computer loses nothing; the system gives what it allows."""

@@ -11,8 +11,8 @@ from dmrl.errors import SettingError
 from dmrl.formats.timestamps import Unwrapped
 from dmrl.live.cflib_session import Session
 from dmrl.live.clocks import HostTime, SenderClock
-from dmrl.live.feed import Feed, Health, Received
-from dmrl.live.log_plan import Plan, Reading, plan
+from dmrl.live.log_blocks import Plan, Reading, plan
+from dmrl.live.queue import Feed, Health, Received
 
 MS = 1_000_000
 TIMESTAMP_BITS = 24

@@ -9,9 +9,9 @@ from dmrl.live.camera import CameraClient
 from dmrl.live.cflib_session import check_uri
 from dmrl.live.clocks import HostTime
 from dmrl.live.crazyflie import Link
-from dmrl.live.feed import Feed
-from dmrl.live.pictures import Colours, Stored
-from dmrl.live.robots import Robot, peers_of
+from dmrl.live.image_assembly import Colours, Stored
+from dmrl.live.queue import Feed
+from dmrl.live.robot_options import Robot, peers_of
 from dmrl.terminal.progress import say
 
 

@@ -17,10 +17,10 @@ from cyclopts import Parameter, validators
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import Array
-from dmrl.live.fake_camera import FakeCamera, Sends
-from dmrl.live.fake_crazyflie import FakeCrazyflie
-from dmrl.live.fake_flight import FakeFlight, Faults, FlightClock, Pictures
-from dmrl.live.log_plan import number_of
+from dmrl.live.log_blocks import number_of
+from dmrl.live.simulated.aideck import FakeCamera, Sends
+from dmrl.live.simulated.crazyflie import FakeCrazyflie
+from dmrl.live.simulated.flight import FakeFlight, Faults, FlightClock, Pictures
 from dmrl.recording import read, read_table, summary
 from dmrl.terminal.arguments import Flat
 from dmrl.terminal.progress import say

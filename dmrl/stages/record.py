@@ -18,11 +18,11 @@ from dmrl.live.camera import CameraClient
 from dmrl.live.cflib_session import load_cflib
 from dmrl.live.clocks import HostTime
 from dmrl.live.crazyflie import Link
-from dmrl.live.feed import Feed, Health, Received
+from dmrl.live.image_assembly import Colours, Stored
 from dmrl.live.links import cameras_of, check, end_all, links_of, nothing_came
-from dmrl.live.pictures import Colours, Stored
-from dmrl.live.robots import Robot, robot_of
-from dmrl.live.table import LiveTable
+from dmrl.live.queue import Feed, Health, Received
+from dmrl.live.robot_options import Robot, robot_of
+from dmrl.live.status_table import LiveTable
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance
 from dmrl.terminal.arguments import AsJson, Flat

@@ -15,7 +15,7 @@ from dmrl.formats.aideck.cpx_log import APP, GAP8, HOST, Packet, pack_packet
 from dmrl.formats.aideck.cpx_state import State
 from dmrl.live.camera import GARBAGE_BYTES, CameraClient, _Times, address
 from dmrl.live.clocks import HostTime
-from dmrl.live.feed import Feed, Received
+from dmrl.live.queue import Feed, Received
 
 PATIENCE_S = 100.0
 RNG = np.random.default_rng(5)

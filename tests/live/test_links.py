@@ -3,9 +3,9 @@
 import pytest
 
 from dmrl.live.clocks import HostTime
-from dmrl.live.feed import Feed
 from dmrl.live.links import links_of
-from dmrl.live.robots import Robot
+from dmrl.live.queue import Feed
+from dmrl.live.robot_options import Robot
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import pytest
 from dmrl.errors import MissingExtra, MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import decode
 from dmrl.live import crazyflie
-from dmrl.live.robots import Robot, robot_of
+from dmrl.live.robot_options import Robot, robot_of
 from dmrl.recording import read, read_table, recover
 from dmrl.stages import fake_drone, fly, record
 from dmrl.stages.fake_drone import Fleet

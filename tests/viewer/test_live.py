@@ -8,7 +8,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from dmrl.images.codec import encode_png
-from dmrl.live.feed import Received
+from dmrl.live.queue import Received
 from dmrl.samples.flight import ranges
 from dmrl.samples.sample import Sample, image
 from dmrl.viewer.live import LiveView, layout

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.geometry.frames import Array
-from dmrl.live.log_plan import number_of
+from dmrl.live.log_blocks import number_of
 
 Signal = tuple[Array, Array]
 """Times (N,), seconds since take-off, and values (N,)."""

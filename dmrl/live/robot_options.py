@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dmrl.errors import SettingError
 from dmrl.live.camera import address
-from dmrl.live.log_plan import number_of
+from dmrl.live.log_blocks import number_of
 
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 

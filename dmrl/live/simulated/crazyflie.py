@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dmrl.errors import SettingError
-from dmrl.live.fake_flight import FakeFlight, Faults, FlightClock
-from dmrl.live.log_plan import BLOCK_BYTES, BLOCKS_MAX
+from dmrl.live.log_blocks import BLOCK_BYTES, BLOCKS_MAX
+from dmrl.live.simulated.flight import FakeFlight, Faults, FlightClock
 
 PARAM, COMMANDER, MEMORY, LOG, GENERIC, PLATFORM, LINK = 2, 3, 4, 5, 7, 13, 15
 PROTOCOL_VERSION = 10

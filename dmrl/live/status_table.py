@@ -13,7 +13,7 @@ from rich.table import Table
 
 from dmrl.errors import one_line
 from dmrl.live.crazyflie import Link
-from dmrl.live.feed import Health
+from dmrl.live.queue import Health
 
 RATE_S = 1.0
 """Rates are of the last second, or a little more."""

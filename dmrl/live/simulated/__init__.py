@@ -1,0 +1,1 @@
+"""Simulated Crazyflies and AI-decks that send a flight over the network."""
