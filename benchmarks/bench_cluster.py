@@ -22,9 +22,9 @@ os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 from dmrl.messages import message
-from dmrl.pipeline.crew import cores
-from dmrl.pipeline.executors import executor
-from dmrl.pipeline.folders import over_folder, tasks_of
+from dmrl.pipeline.batch import over_folder, tasks_of
+from dmrl.pipeline.executor import executor
+from dmrl.pipeline.process_pool import cores
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.terminal.tables import print_table
 from dmrl.topics import attitude

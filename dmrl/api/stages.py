@@ -17,7 +17,7 @@ from dmrl.api.models import Model, load
 from dmrl.api.recordings import PathLike, Recording
 from dmrl.api.results import Result, judged
 from dmrl.errors import SettingError
-from dmrl.pipeline.interface import interface_of
+from dmrl.pipeline.stage_signature import interface_of
 
 OneOrMore: TypeAlias = PathLike | Sequence[PathLike]
 

@@ -17,8 +17,8 @@ from dmrl.evaluation import figure_specs
 from dmrl.geometry.camera_file import KNOWN
 from dmrl.guards.safe_names import file_name
 from dmrl.learn import pretrained
-from dmrl.pipeline.interface import Interface, interface_of
-from dmrl.pipeline.language import expanded
+from dmrl.pipeline.recipe_language import expanded
+from dmrl.pipeline.stage_signature import Interface, interface_of
 
 KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE, figure_specs.KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")

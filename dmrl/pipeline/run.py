@@ -15,8 +15,8 @@ from dmrl.atomic_output import as_output_error, partial_of, rewritten_file
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.report import Done
 from dmrl.guards.paths import refuse_no_text
-from dmrl.pipeline.executors import executor
-from dmrl.pipeline.memory import Memory
+from dmrl.pipeline.build_cache import Memory
+from dmrl.pipeline.executor import executor
 from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located
 from dmrl.pipeline.runner import Runner
 from dmrl.storage import Remote

@@ -12,11 +12,11 @@ from dmrl import recipe as recipes
 from dmrl.atomic_output import note, partial_of
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.report import Done
-from dmrl.pipeline.executors import Executor
-from dmrl.pipeline.interface import NO_CONTENT
+from dmrl.pipeline.build_cache import Memory, key_of
+from dmrl.pipeline.executor import Executor
 from dmrl.pipeline.job import Answer, job
-from dmrl.pipeline.memory import Memory, key_of
 from dmrl.pipeline.plan import UNFINISHED, Plan, Step, located, makers, mapped
+from dmrl.pipeline.stage_signature import NO_CONTENT
 from dmrl.storage import Remote
 from dmrl.terminal.progress import say
 

@@ -17,7 +17,7 @@ from dmrl.estimation.signals.clocks import Clock, connected
 from dmrl.formats.timestamps import dejitter
 from dmrl.labelling.retiming import MOCAP, Corrected
 from dmrl.labelling.time_alignment import camera_clock, mocap_clocks, range_clocks, ranging
-from dmrl.pipeline.folders import is_many, over_folder
+from dmrl.pipeline.batch import is_many, over_folder
 from dmrl.recording import (
     Contents,
     RecordingWriter,

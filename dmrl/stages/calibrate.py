@@ -17,8 +17,8 @@ from dmrl.geometry.frames import Camera
 from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
 from dmrl.images.codec import decode
-from dmrl.pipeline.crew import cores
-from dmrl.pipeline.spread import spread
+from dmrl.pipeline.parallel_map import spread
+from dmrl.pipeline.process_pool import cores
 from dmrl.recording import Contents, read, summary
 from dmrl.recording.inputs import refuse_twice
 from dmrl.terminal.arguments import AsJson, Flat, Workers

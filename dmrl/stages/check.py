@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.executors import Executor, executor
-from dmrl.pipeline.folders import Task, all_recordings, end, is_many, outcomes, tasks_of, words_of
+from dmrl.pipeline.batch import Task, all_recordings, end, is_many, outcomes, tasks_of, words_of
+from dmrl.pipeline.executor import Executor, executor
 from dmrl.pipeline.job import Answer, failed
 from dmrl.recording import Finding, summary
 from dmrl.recording import check as findings_of

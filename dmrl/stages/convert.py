@@ -22,7 +22,7 @@ from dmrl.formats.registry import format_of
 from dmrl.geometry.camera_file import camera_named
 from dmrl.guards.paths import refuse_pipes
 from dmrl.messages import message
-from dmrl.pipeline.folders import over_folder, recordings_in
+from dmrl.pipeline.batch import over_folder, recordings_in
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,

@@ -28,9 +28,9 @@ from dmrl.datasets.writing.rows import Tally
 from dmrl.datasets.writing.splits import SplitOf
 from dmrl.datasets.writing.writer import write_shards
 from dmrl.errors import SettingError
-from dmrl.pipeline.crew import cores
-from dmrl.pipeline.folders import all_recordings, differing
-from dmrl.pipeline.once import done_on
+from dmrl.pipeline.batch import all_recordings, differing
+from dmrl.pipeline.process_pool import cores
+from dmrl.pipeline.single_run import done_on
 from dmrl.recording import Contents, Provenance, provenance
 from dmrl.recording.inputs import input_of
 from dmrl.recording.provenance import FILE_NAME as PROVENANCE

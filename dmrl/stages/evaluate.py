@@ -19,10 +19,10 @@ from dmrl.evaluation.detections import Pairs, join
 from dmrl.evaluation.tables import band_values, by_band_table, curve_values, finite
 from dmrl.learn.inference.metrics import DEFINITIONS, BandFigures, Scored, by_band, score
 from dmrl.learn.inference.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
-from dmrl.pipeline.crew import cores
-from dmrl.pipeline.folders import all_recordings
-from dmrl.pipeline.once import done_on
-from dmrl.pipeline.spread import spread
+from dmrl.pipeline.batch import all_recordings
+from dmrl.pipeline.parallel_map import spread
+from dmrl.pipeline.process_pool import cores
+from dmrl.pipeline.single_run import done_on
 from dmrl.recording import input_of, summary
 from dmrl.terminal.arguments import AsJson, Flat, On, Workers
 from dmrl.terminal.progress import say

@@ -19,7 +19,7 @@ from dmrl.flight import NOISE, Clock, Fault, Flight, Scenario, Trajectory, Truth
 from dmrl.geometry.frames import AIDECK_PINHOLE, Array
 from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
-from dmrl.pipeline.once import done_on
+from dmrl.pipeline.single_run import done_on
 from dmrl.recording import Provenance, RecordingWriter, provenance
 from dmrl.rendering import aloft, renderer
 from dmrl.rendering.environment import ensure

@@ -8,8 +8,8 @@ import pyarrow as pa
 
 from dmrl.catalogue import Row, describe, open_catalogue, unread
 from dmrl.catalogue.table import rows_table, stamp
-from dmrl.pipeline.executors import Executor, executor
-from dmrl.pipeline.folders import outcomes, recordings_in, tasks_of, words_of
+from dmrl.pipeline.batch import outcomes, recordings_in, tasks_of, words_of
+from dmrl.pipeline.executor import Executor, executor
 from dmrl.pipeline.job import failed
 from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.progress import say

@@ -14,9 +14,9 @@ from dmrl import topics
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import MissingExtra, MissingTopic, RecordingError, SettingError
 from dmrl.messages import message
-from dmrl.pipeline.crew import cores
-from dmrl.pipeline.folders import is_many, over_folder
-from dmrl.pipeline.spread import spread
+from dmrl.pipeline.batch import is_many, over_folder
+from dmrl.pipeline.parallel_map import spread
+from dmrl.pipeline.process_pool import cores
 from dmrl.recording import Contents, Timed, provenance, rewrite
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.folders import all_recordings
+from dmrl.pipeline.batch import all_recordings
 from dmrl.recording import merge, say_findings
 from dmrl.terminal.tables import print_line
 

@@ -23,7 +23,7 @@ from dmrl.learn.inference.decode import decode as find
 from dmrl.learn.inference.test_time_augmentation import VIEWS, agreed, returned, shown
 from dmrl.learn.pretrained import resolved
 from dmrl.messages import message
-from dmrl.pipeline.folders import is_many, over_folder
+from dmrl.pipeline.batch import is_many, over_folder
 from dmrl.recording import (
     Provenance,
     RawMessage,

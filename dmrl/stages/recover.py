@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from dmrl.pipeline.folders import is_many, over_folder
+from dmrl.pipeline.batch import is_many, over_folder
 from dmrl.recording import Recovery, recover
 from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.tables import print_json, print_line

@@ -19,7 +19,7 @@ from dmrl.errors import OutputError, RecipeError, SettingError
 from dmrl.geometry.camera_file import KNOWN, camera_named
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
-from dmrl.pipeline.once import done_on
+from dmrl.pipeline.single_run import done_on
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,

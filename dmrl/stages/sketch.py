@@ -22,8 +22,8 @@ from dmrl.formats.files.label_csv import LabelRow, write_labels
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 from dmrl.images.codec import encode_png
-from dmrl.pipeline.crew import cores
-from dmrl.pipeline.spread import spread
+from dmrl.pipeline.parallel_map import spread
+from dmrl.pipeline.process_pool import cores
 from dmrl.recording import provenance
 from dmrl.rendering.scene import random_look, random_poses
 from dmrl.rendering.sketch import Sketch, draw

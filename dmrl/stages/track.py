@@ -13,7 +13,7 @@ from dmrl.errors import MissingExtra, MissingTopic, SettingError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
-from dmrl.pipeline.folders import is_many, over_folder
+from dmrl.pipeline.batch import is_many, over_folder
 from dmrl.recording import Contents, Timed, provenance, rewrite, summary
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track

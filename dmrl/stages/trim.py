@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.folders import is_many, over_folder
+from dmrl.pipeline.batch import is_many, over_folder
 from dmrl.recording import Provenance, provenance, summary, trim
 from dmrl.terminal.arguments import Flat, On, Workers
 from dmrl.terminal.tables import print_line

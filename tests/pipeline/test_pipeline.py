@@ -14,9 +14,9 @@ import pytest
 from dmrl.errors import DmrlError, OutputError, RecipeError, SettingError
 from dmrl.evaluation.report import report
 from dmrl.pipeline import run as pipeline
-from dmrl.pipeline import work
-from dmrl.pipeline.crew import Crew
+from dmrl.pipeline import worker as work
 from dmrl.pipeline.job import job
+from dmrl.pipeline.process_pool import Crew
 
 SMALL = """
 kind = "pipeline"

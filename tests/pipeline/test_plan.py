@@ -14,8 +14,8 @@ import pytest
 from dmrl import plugins, recipe
 from dmrl.errors import RecipeError, SettingError
 from dmrl.pipeline import run as pipeline
-from dmrl.pipeline.interface import interface_of
 from dmrl.pipeline.plan import Step
+from dmrl.pipeline.stage_signature import interface_of
 from dmrl.stages.run import command as run_command
 
 from .chain import HEAD, PICTURES

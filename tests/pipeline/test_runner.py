@@ -13,10 +13,10 @@ import pytest
 from dmrl.atomic_output import partial_of
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.report import Done
-from dmrl.pipeline.crew import Crew
+from dmrl.pipeline.build_cache import Memory
 from dmrl.pipeline.job import Answer
-from dmrl.pipeline.memory import Memory
 from dmrl.pipeline.plan import Plan, Step
+from dmrl.pipeline.process_pool import Crew
 from dmrl.pipeline.runner import Runner
 from dmrl.recording.inputs import sha256_of_file
 from dmrl.terminal.progress import Lines

@@ -15,7 +15,7 @@ from dmrl.datasets import open_dataset
 from dmrl.errors import OutputError, StorageError, UnsafeName
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.pipeline.folders import recordings_in, tasks_of
+from dmrl.pipeline.batch import recordings_in, tasks_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
 from dmrl.recording.inputs import input_of, sha256_of_file
 from dmrl.recording.listed import place_of

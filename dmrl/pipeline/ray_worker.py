@@ -4,8 +4,8 @@ import socket
 from pathlib import Path
 from time import perf_counter
 
-from dmrl.pipeline.crew import Process, end, environment
 from dmrl.pipeline.job import Answer, failed
+from dmrl.pipeline.process_pool import Process, end, environment
 
 _idle: list[Process] = []
 
@@ -16,7 +16,7 @@ def perform(line: str, folder: str, *, alone: bool) -> Answer:
     Parameters
     ----------
     line
-        As `dmrl.pipeline.work.perform` takes it.
+        As `dmrl.pipeline.worker.perform` takes it.
     folder
         That its names are relative to.
     alone

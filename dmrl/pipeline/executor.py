@@ -5,8 +5,8 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.crew import Crew
 from dmrl.pipeline.job import Answer
+from dmrl.pipeline.process_pool import Crew
 from dmrl.terminal.progress import Lines
 
 RAY, SLURM = "ray", "slurm"
@@ -70,6 +70,6 @@ def executor(on: str | None, workers: int | None, *, bars: bool = False) -> Exec
     scheme, _, address = on.partition("://")
     if scheme != RAY or (address == "" and on != RAY):
         raise SettingError(f"--on {on}: this takes ray, or ray://HOST:PORT")
-    from dmrl.pipeline.cluster import Ray  # noqa: PLC0415 - an extra
+    from dmrl.pipeline.ray_executor import Ray  # noqa: PLC0415 - an extra
 
     return Ray(address)

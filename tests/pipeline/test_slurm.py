@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import OutputError, SettingError
-from dmrl.pipeline import array
-from dmrl.pipeline.folders import over_folder
-from dmrl.pipeline.once import done_on
+from dmrl.pipeline import slurm
+from dmrl.pipeline.batch import over_folder
+from dmrl.pipeline.single_run import done_on
 from dmrl.stages import trim
 
 from .test_folders import bytes_in, record
@@ -38,7 +38,7 @@ def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(array, "MOST", 2)
+    monkeypatch.setattr(slurm, "MOST", 2)
     out = tmp_path / "out"
     over_folder("trim", flights, out, KEPT, workers=None, on="slurm")
     said = capsys.readouterr().out
@@ -73,7 +73,7 @@ def test_names_that_a_shell_would_run_are_names(
     for k, name in enumerate(sorted(names)):
         record(here / "flights" / name, roll_rad=k)
     monkeypatch.chdir(here)
-    monkeypatch.setattr(array, "MOST", 1)
+    monkeypatch.setattr(slurm, "MOST", 1)
     out = tmp_path / "out"
     over_folder("trim", Path("flights"), out, KEPT, workers=None, on="slurm")
     script = out / ".dmrl-job.sh"
@@ -98,5 +98,5 @@ def test_a_folder_whose_name_slurm_would_read_otherwise_is_refused(
     """What stands behind a line end in the script would be run."""
     (tmp_path / name).mkdir()
     with pytest.raises(OutputError, match="Name another folder"):
-        array.array_job([], tmp_path / name)
+        slurm.array_job([], tmp_path / name)
     assert list((tmp_path / name).iterdir()) == []

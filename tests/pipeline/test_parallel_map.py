@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import RecordingError, SettingError
-from dmrl.pipeline.spread import spread
+from dmrl.pipeline.parallel_map import spread
 
 pytestmark = pytest.mark.heavy  # a process takes half a second to begin
 
@@ -19,7 +19,7 @@ WAITS = """
 import sys, time
 from pathlib import Path
 from test_spread import wait_there
-from dmrl.pipeline.spread import spread
+from dmrl.pipeline.parallel_map import spread
 
 if __name__ == "__main__":
     list(spread(wait_there, [Path(sys.argv[1])] * 2, 2))

@@ -14,7 +14,7 @@ import pytest
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.pipeline.folders import is_many, over_folder, recordings_in
+from dmrl.pipeline.batch import is_many, over_folder, recordings_in
 from dmrl.recording import Provenance, RecordingWriter, summary
 from dmrl.stages import check, convert, trim
 from dmrl.topics import attitude

@@ -1,6 +1,6 @@
 """One function of many things, in processes: for a stage whose own work is many alike parts.
 
-Stages on many recordings are jobs with names of files in and out, see `dmrl.pipeline.crew`. Here
+Stages on many recordings are jobs with names of files in and out, see `dmrl.pipeline.process_pool`. Here
 arrays go in and come out.
 """
 
@@ -15,7 +15,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.crew import ONE_THREAD
+from dmrl.pipeline.process_pool import ONE_THREAD
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dmrl.guards import limits
-from dmrl.pipeline.language import expanded
+from dmrl.pipeline.recipe_language import expanded
 
 
 def steps(text: str) -> list[dict[str, Any]]:

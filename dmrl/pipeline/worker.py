@@ -19,8 +19,8 @@ from typing import Any
 
 from dmrl import recipe as recipes
 from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, words_of
-from dmrl.pipeline.interface import Interface, interface_of
 from dmrl.pipeline.job import Answer
+from dmrl.pipeline.stage_signature import Interface, interface_of
 from dmrl.recording import Provenance, provenance
 from dmrl.recording.inputs import input_of, sha256_of_file, sha256_of_folder
 from dmrl.storage import path_of

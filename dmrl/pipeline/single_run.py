@@ -6,10 +6,10 @@ from typing import Any
 
 from dmrl.atomic_output import note
 from dmrl.errors import DmrlError, SettingError
-from dmrl.pipeline.executors import SLURM, executor
-from dmrl.pipeline.folders import Task, differing, words_of
-from dmrl.pipeline.interface import interface_of
+from dmrl.pipeline.batch import Task, differing, words_of
+from dmrl.pipeline.executor import SLURM, executor
 from dmrl.pipeline.job import failed, job
+from dmrl.pipeline.stage_signature import interface_of
 
 
 def done_on(
