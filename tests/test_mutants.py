@@ -58,7 +58,7 @@ def test_tests_near_a_change_are_the_module_s_own_then_those_that_name_it_or_all
     found = of("dmrl/recording/recover.py")
     assert found[0] == "tests/recording/test_recover.py"
     assert "tests/recording/test_flips.py" in found
-    assert "tests/recording/test_inputs.py" not in found
+    assert "tests/recording/test_provenance_inputs.py" not in found
     assert len(of("dmrl/recording/nobody_names_this.py")) == len(files_of("recording"))
 
 

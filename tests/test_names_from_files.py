@@ -82,7 +82,7 @@ MAY_PARSE = {
     "pipeline/process_pool.py": "what our own processes say to each other",
     "pipeline/worker.py": "what our own processes say to each other",
     "recipe.py": "what json.dumps has just made",
-    "recording/inputs.py": "what json.dumps has just made",
+    "recording/provenance_inputs.py": "what json.dumps has just made",
     "learn/training/checkpoint.py": "what json.dumps has just made",
 }
 

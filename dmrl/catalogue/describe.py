@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from dmrl import topics
 from dmrl.messages import status_name
 from dmrl.recording import Contents, Provenance, check
-from dmrl.recording.inputs import sha256_of_file
+from dmrl.recording.provenance_inputs import sha256_of_file
 
 Row = dict[str, Any]
 """Values of `table.COLUMNS` by name, but for what only the file system says."""

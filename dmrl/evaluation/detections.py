@@ -23,8 +23,8 @@ from dmrl.images.codec import size
 from dmrl.learn.inference.matching import Points
 from dmrl.messages import STATUS_OK
 from dmrl.recording import Contents, read, splits
-from dmrl.recording.inputs import refuse_twice
-from dmrl.recording.sources import LOOKED, sources_in
+from dmrl.recording.label_sources import LOOKED, sources_in
+from dmrl.recording.provenance_inputs import refuse_twice
 from dmrl.terminal.progress import track
 
 Mask = NDArray[np.bool_]

@@ -18,7 +18,7 @@ from dmrl.evaluation.figure_specs import Shown
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes
 from dmrl.recording import Provenance, Summary, summary
-from dmrl.recording.inputs import provenance_of
+from dmrl.recording.provenance_inputs import provenance_of
 
 DOCUMENTS = {
     "evaluation.json": "evaluations",

@@ -15,7 +15,7 @@ from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, 
 from dmrl.labelling.sensor_logs import Logs
 from dmrl.messages import message
 from dmrl.recording import Contents, Series, Timed
-from dmrl.recording.sources import looked_at
+from dmrl.recording.label_sources import looked_at
 
 Times = NDArray[np.int64]
 

@@ -15,7 +15,7 @@ from dmrl import __version__
 from dmrl.atomic_output import rewritten_file
 from dmrl.errors import OutputError
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.recording.inputs import sha256_of_file, sha256_of_folder
+from dmrl.recording.provenance_inputs import sha256_of_file, sha256_of_folder
 from dmrl.storage import Remote
 
 

@@ -22,7 +22,7 @@ from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, words_o
 from dmrl.pipeline.job import Answer
 from dmrl.pipeline.stage_signature import Interface, interface_of
 from dmrl.recording import Provenance, provenance
-from dmrl.recording.inputs import input_of, sha256_of_file, sha256_of_folder
+from dmrl.recording.provenance_inputs import input_of, sha256_of_file, sha256_of_folder
 from dmrl.storage import path_of
 
 

@@ -3,17 +3,18 @@
 The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
 """
 
-from dmrl.recording.channel import Channel, RawMessage
-from dmrl.recording.check import check, label_findings, say_findings
-from dmrl.recording.contents import Contents
+from dmrl.recording.attachments import copy_extras, splits
+from dmrl.recording.checks.finding import Finding
+from dmrl.recording.checks.run import check, label_findings, say_findings
 from dmrl.recording.edit import merge, trim
-from dmrl.recording.extras import copy_extras, splits
-from dmrl.recording.finding import Finding
-from dmrl.recording.glance import glance
-from dmrl.recording.index import SPLIT_METADATA, Summary, TopicInfo, summary
-from dmrl.recording.inputs import input_of, provenance
 from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
+from dmrl.recording.loaded import Contents
+from dmrl.recording.log_times import log_times
+from dmrl.recording.mcap.channel import Channel, RawMessage
+from dmrl.recording.mcap.summary_index import SPLIT_METADATA, Summary, TopicInfo, summary
+from dmrl.recording.preview import glance
 from dmrl.recording.provenance import Input, Provenance
+from dmrl.recording.provenance_inputs import input_of, provenance
 from dmrl.recording.reader import (
     Stamped,
     columns,
@@ -28,7 +29,6 @@ from dmrl.recording.recover import recover
 from dmrl.recording.recovery import Recovery
 from dmrl.recording.resume import Interrupted, interrupted
 from dmrl.recording.rewrite import Series, Timed, retime, rewrite, time_slices
-from dmrl.recording.times import log_times
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [

@@ -28,21 +28,21 @@ from mcap.summary import Summary as McapSummary
 
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
-from dmrl.recording import sums
-from dmrl.recording.block import Block
-from dmrl.recording.blocks import tally
-from dmrl.recording.channel import Channel
-from dmrl.recording.chunks import loose, scanned, unpacked
-from dmrl.recording.copying import Piece, put
-from dmrl.recording.extras import copy_extras
-from dmrl.recording.index import Summary
-from dmrl.recording.inputs import sha256_of_file
-from dmrl.recording.message_index import ENTRY_BYTES
-from dmrl.recording.opening import DAMAGE, MAGIC, RECORD, Bounded, too_large
+from dmrl.recording.attachments import copy_extras
+from dmrl.recording.chunk_copy import Piece, put
+from dmrl.recording.mcap import checksums
+from dmrl.recording.mcap.batch_reader import tally
+from dmrl.recording.mcap.channel import Channel
+from dmrl.recording.mcap.chunk import loose, scanned, unpacked
+from dmrl.recording.mcap.file import DAMAGE, MAGIC, RECORD, Bounded, too_large
+from dmrl.recording.mcap.message_batch import Block
+from dmrl.recording.mcap.message_index import ENTRY_BYTES
+from dmrl.recording.mcap.record_scan import channel_of
+from dmrl.recording.mcap.summary_index import Summary
+from dmrl.recording.mcap.summary_section import places, stated
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
+from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.recording.recovery import Recovery
-from dmrl.recording.section import places, stated
-from dmrl.recording.walk import channel_of
 from dmrl.recording.writer import RecordingWriter
 
 INDEX_HEAD = struct.Struct("<HI")  # of a message index: channel, bytes of entries
@@ -69,7 +69,7 @@ class _Walk:
     attachments: dict[str, bytes] = field(default_factory=dict)
     found: Counter[int] = field(default_factory=Counter)  # messages by channel number
     skipped: Counter[int] = field(default_factory=Counter)  # in damaged chunks, by their indexes
-    summed: sums.Sums = field(default_factory=sums.Sums)
+    summed: checksums.Sums = field(default_factory=checksums.Sums)
     extras: int = 0  # metadata and attachments
     chunks: int = 0
     unpacked: int = 0
@@ -167,8 +167,8 @@ def _copied_sums(record: McapRecord, at: int) -> bool:
     """Whether this record holds sums of another file."""
     return (
         isinstance(record, Metadata)
-        and record.name == sums.METADATA_NAME
-        and not sums.of_this_file(record.metadata, at)
+        and record.name == checksums.METADATA_NAME
+        and not checksums.of_this_file(record.metadata, at)
     )
 
 
@@ -267,7 +267,7 @@ def _parsed(opcode: int, body: bytes, walk: _Walk) -> McapRecord | _Indexed | No
         int.from_bytes(body[-4:], "little") or zlib.crc32(body[:-4])
     ):
         walk.recovery.doubtful = True
-    if isinstance(record, Metadata) and record.name != sums.METADATA_NAME:
+    if isinstance(record, Metadata) and record.name != checksums.METADATA_NAME:
         walk.summed.add_metadata(RECORD.pack(opcode, len(body)) + body)
     return record
 
@@ -299,8 +299,8 @@ def _account(walk: _Walk) -> None:
     recovery.counted = said is not None
     if said is not None and said.metadata_count + said.attachment_count != walk.extras:
         recovery.doubtful = True
-    crc = walk.metadata.get(sums.METADATA_NAME)
-    if crc and crc[-1].get("metadata") != sums.text(walk.summed.metadata):
+    crc = walk.metadata.get(checksums.METADATA_NAME)
+    if crc and crc[-1].get("metadata") != checksums.text(walk.summed.metadata):
         recovery.doubtful = True
     recovery.whole = (
         walk.footer

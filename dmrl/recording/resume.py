@@ -7,12 +7,12 @@ from pathlib import Path
 
 from dmrl.atomic_output import partial_of
 from dmrl.errors import OutputError, RecordingError
-from dmrl.recording.channel import RawMessage, holds_pictures
-from dmrl.recording.index import summary
+from dmrl.recording.log_times import log_times
+from dmrl.recording.mcap.channel import RawMessage, holds_pictures
+from dmrl.recording.mcap.summary_index import summary
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.reader import read_raw
 from dmrl.recording.recover import recover
-from dmrl.recording.times import log_times
 from dmrl.recording.writer import RecordingWriter
 
 

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dmrl.recording.block import EVER_NS, ROWS, Ints
-from dmrl.recording.channel import RawMessage
-from dmrl.recording.copying import Wanted, adopt, copy, pieces, put
-from dmrl.recording.encode import Value
-from dmrl.recording.extras import copy_extras
-from dmrl.recording.index import summary
+from dmrl.recording.attachments import copy_extras
+from dmrl.recording.chunk_copy import Wanted, adopt, copy, pieces, put
+from dmrl.recording.mcap.channel import RawMessage
+from dmrl.recording.mcap.message_batch import EVER_NS, ROWS, Ints
+from dmrl.recording.mcap.summary_index import summary
+from dmrl.recording.protobuf.encode import Value
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.writer import RecordingWriter
 

@@ -14,12 +14,12 @@ from google.protobuf.descriptor import Descriptor
 from dmrl.atomic_output import as_output_error, partial_file
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import schema_bytes
-from dmrl.recording.assembly import OLDEST, Assembly
-from dmrl.recording.block import HEAD_BYTES, Ints
-from dmrl.recording.channel import Channel, RawMessage
-from dmrl.recording.container import Container
-from dmrl.recording.encode import Value, encode
-from dmrl.recording.open_chunk import OpenChunk
+from dmrl.recording.mcap.channel import Channel, RawMessage
+from dmrl.recording.mcap.chunk_builder import OpenChunk
+from dmrl.recording.mcap.chunk_writer import OLDEST, Assembly
+from dmrl.recording.mcap.file_writer import Container
+from dmrl.recording.mcap.message_batch import HEAD_BYTES, Ints
+from dmrl.recording.protobuf.encode import Value, encode
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.topics import row_of
 

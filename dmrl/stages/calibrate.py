@@ -20,7 +20,7 @@ from dmrl.images.codec import decode
 from dmrl.pipeline.parallel_map import spread
 from dmrl.pipeline.process_pool import cores
 from dmrl.recording import Contents, read, summary
-from dmrl.recording.inputs import refuse_twice
+from dmrl.recording.provenance_inputs import refuse_twice
 from dmrl.terminal.arguments import AsJson, Flat, Workers
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table

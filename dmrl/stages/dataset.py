@@ -32,8 +32,8 @@ from dmrl.pipeline.batch import all_recordings, differing
 from dmrl.pipeline.process_pool import cores
 from dmrl.pipeline.single_run import done_on
 from dmrl.recording import Contents, Provenance, provenance
-from dmrl.recording.inputs import input_of
 from dmrl.recording.provenance import FILE_NAME as PROVENANCE
+from dmrl.recording.provenance_inputs import input_of
 from dmrl.storage import Remote
 from dmrl.terminal.arguments import AsJson, Flat, On, Workers
 from dmrl.terminal.progress import say

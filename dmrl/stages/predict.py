@@ -37,7 +37,7 @@ from dmrl.recording import (
     rewrite,
     summary,
 )
-from dmrl.recording.inputs import sha256_of_file
+from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table

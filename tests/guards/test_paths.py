@@ -17,7 +17,7 @@ from dmrl.geometry.camera_file import read_camera
 from dmrl.guards.paths import refuse_no_text, refuse_pipe, refuse_pipes
 from dmrl.html_report import gather
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.recording.inputs import input_of
+from dmrl.recording.provenance_inputs import input_of
 from dmrl.rendering.backdrops import photos_in
 from dmrl.stages import calibrate, convert
 from dmrl.storage import path_of

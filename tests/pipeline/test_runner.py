@@ -18,7 +18,7 @@ from dmrl.pipeline.job import Answer
 from dmrl.pipeline.plan import Plan, Step
 from dmrl.pipeline.process_pool import Crew
 from dmrl.pipeline.runner import Runner
-from dmrl.recording.inputs import sha256_of_file
+from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.terminal.progress import Lines
 
 A = Step("sketch", "a", settings={"seed": 1})

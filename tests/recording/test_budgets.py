@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
 from dmrl.messages import schema_bytes
-from dmrl.recording.chunks import unpacked
+from dmrl.recording.mcap.chunk import unpacked
 
 MAGIC = b"\x89MCAP0\r\n"
 HEIGHT = schema_bytes("Height")

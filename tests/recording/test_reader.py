@@ -14,9 +14,7 @@ from dmrl.recording import (
     RecordingWriter,
     columns,
     glance,
-    listed,
     log_times,
-    open_chunk,
     read,
     read_raw,
     read_table,
@@ -24,6 +22,7 @@ from dmrl.recording import (
     stretches,
     summary,
 )
+from dmrl.recording.mcap import chunk_builder, chunk_reader
 
 HEIGHT = message("Height")
 
@@ -283,15 +282,17 @@ def test_a_glance_sees_every_topic_all_over_the_recording_in_a_few_chunks(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "chunks.mcap"
-    monkeypatch.setattr(open_chunk, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1000)
     with RecordingWriter(path, Provenance("test")) as sink:
         for raw in read_raw(flight):
             sink.write_raw(raw)
         # One message, in the middle of the file though not of the time.
         sink.write(39_000_000_000, "/cf2/height", HEIGHT(height_m=2.0))
-    unpacked, chunks = listed.unpacked, set()
+    unpacked, chunks = chunk_reader.unpacked, set()
     monkeypatch.setattr(
-        listed, "unpacked", lambda path, chunk, at: chunks.add(at) or unpacked(path, chunk, at)
+        chunk_reader,
+        "unpacked",
+        lambda path, chunk, at: chunks.add(at) or unpacked(path, chunk, at),
     )
     wanted = {"/cf1/attitude": ("roll_rad",), "/cf1/range/cf2": None, "/cf2/height": None}
     seen = glance(path, {**wanted, "/cf9/height": None}, start_ns=0, end_ns=10**12)

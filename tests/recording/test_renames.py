@@ -20,7 +20,7 @@ from dmrl.recording import (
     summary,
     trim,
 )
-from dmrl.recording.opening import MAGIC
+from dmrl.recording.mcap.file import MAGIC
 
 from .records import records, small
 

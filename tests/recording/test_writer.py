@@ -13,16 +13,8 @@ from mcap.stream_reader import StreamReader
 
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import message
-from dmrl.recording import (
-    Provenance,
-    RecordingWriter,
-    listed,
-    read,
-    read_raw,
-    read_table,
-    recover,
-    summary,
-)
+from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_table, recover, summary
+from dmrl.recording.mcap import chunk_reader
 
 HEIGHT = message("Height")
 
@@ -171,9 +163,9 @@ def test_pictures_stand_apart_and_numbers_are_read_without_them(
 ) -> None:
     path = filmed(tmp_path / "a.mcap")
     read_bytes: list[int] = []
-    unpacked = listed.unpacked
+    unpacked = chunk_reader.unpacked
     monkeypatch.setattr(
-        listed,
+        chunk_reader,
         "unpacked",
         lambda *a: read_bytes.append(len(found := unpacked(*a))) or found,
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.messages import LogType, message
-from dmrl.recording.encode import encode
+from dmrl.recording.protobuf.encode import encode
 from dmrl.samples.sample import Columns
 
 TIMES_NS = np.arange(4) * 10

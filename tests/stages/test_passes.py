@@ -10,17 +10,9 @@ from mcap.reader import make_reader
 
 from dmrl import card, topics
 from dmrl.messages import message
-from dmrl.recording import (
-    RecordingWriter,
-    check,
-    listed,
-    merge,
-    open_chunk,
-    provenance,
-    summary,
-    trim,
-)
-from dmrl.recording.copying import Wanted, copy
+from dmrl.recording import RecordingWriter, check, merge, provenance, summary, trim
+from dmrl.recording.chunk_copy import Wanted, copy
+from dmrl.recording.mcap import chunk_builder, chunk_reader
 from dmrl.stages import dataset, evaluate, fly, label, track
 
 Passes = Callable[[Path], float]
@@ -32,7 +24,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("passes")
     flown, out = folder / "flown.mcap", folder / "flight.mcap"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(open_chunk, "CHUNK_BYTES", 16 * 1024)  # many chunks of a short flight
+        patch.setattr(chunk_builder, "CHUNK_BYTES", 16 * 1024)  # many chunks of a short flight
         fly.run(
             flown,
             fly.Settings(2, 30.0, seed=1001, camera=True, cameras_max=1, camera_rate_hz=4.0),
@@ -64,13 +56,13 @@ def _chunks(path: Path) -> int:
 def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
     """How often a recording was gone over since the last call."""
     opened: Counter[str] = Counter()
-    unpacked = listed.unpacked
+    unpacked = chunk_reader.unpacked
 
     def counted(path: Path, *rest: object) -> object:
         opened[path.name] += 1
         return unpacked(path, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(listed, "unpacked", counted)
+    monkeypatch.setattr(chunk_reader, "unpacked", counted)
     monkeypatch.setattr(card, "plots", None)
 
     def count(path: Path) -> float:

@@ -10,7 +10,7 @@ from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, Se
 from dmrl.geometry.camera_file import write_camera
 from dmrl.labelling.camera import camera_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw, summary, trim
-from dmrl.recording.inputs import sha256_of_file
+from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.stages import evaluate, fly, track
 from dmrl.stages.track import Settings
 

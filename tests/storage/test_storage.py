@@ -17,10 +17,10 @@ from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.pipeline.batch import recordings_in, tasks_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
-from dmrl.recording.inputs import input_of, sha256_of_file
-from dmrl.recording.listed import place_of
-from dmrl.recording.opening import opened
-from dmrl.recording.section import section
+from dmrl.recording.mcap.chunk_reader import place_of
+from dmrl.recording.mcap.file import opened
+from dmrl.recording.mcap.summary_section import section
+from dmrl.recording.provenance_inputs import input_of, sha256_of_file
 from dmrl.storage import Remote, path_of
 from dmrl.storage.remote import UNFINISHED
 

@@ -10,7 +10,8 @@ import pytest
 
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
-from dmrl.recording import glance, listed, open_chunk, reader
+from dmrl.recording import glance, reader
+from dmrl.recording.mcap import chunk_builder, chunk_reader
 from dmrl.viewer import Settings, save, scene
 from dmrl.viewer.session import prepare
 
@@ -218,13 +219,15 @@ def test_a_robot_that_is_not_there_is_named_with_those_that_are(fly: Make, rrd: 
 def test_images_come_first_and_wait_for_no_more_of_the_flight(
     fly: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(open_chunk, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
     monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
     monkeypatch.setattr(sys.modules[glance.__module__], "CHUNKS", 2)
     opened: list[int] = []
-    unpacked = listed.unpacked
+    unpacked = chunk_reader.unpacked
     monkeypatch.setattr(
-        listed, "unpacked", lambda path, chunk, at: opened.append(at) or unpacked(path, chunk, at)
+        chunk_reader,
+        "unpacked",
+        lambda path, chunk, at: opened.append(at) or unpacked(path, chunk, at),
     )
     show = prepare([fly()], Settings())
     paths, before = [], None
@@ -251,7 +254,7 @@ def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_e
         }
 
     whole = saved("whole")
-    monkeypatch.setattr(open_chunk, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
     monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
     monkeypatch.setattr(scene, "ROWS_AT_ONCE", 1)
     pieces = saved("pieces")

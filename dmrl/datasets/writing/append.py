@@ -14,7 +14,7 @@ from dmrl.datasets.writing.near_duplicates import read_seen
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.recording import Input, Provenance
-from dmrl.recording.inputs import provenance_of
+from dmrl.recording.provenance_inputs import provenance_of
 
 
 @dataclass(frozen=True, slots=True)

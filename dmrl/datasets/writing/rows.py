@@ -29,7 +29,7 @@ from dmrl.geometry.frames import STRIDE_PX, grid_label
 from dmrl.images.codec import decode
 from dmrl.messages import STATUS_OK, status_name
 from dmrl.recording import Contents, Stamped, matching, read, summary
-from dmrl.recording.sources import LOOKED, looked_at, sources_in
+from dmrl.recording.label_sources import LOOKED, looked_at, sources_in
 
 SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""

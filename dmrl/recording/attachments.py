@@ -1,0 +1,56 @@
+"""What copying stages carry over besides messages: metadata and attachments."""
+
+from pathlib import Path
+
+from dmrl.errors import RecordingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.safe_names import split_name
+from dmrl.recording.mcap import checksums
+from dmrl.recording.mcap.summary_index import SPLIT_METADATA, Summary
+from dmrl.recording.provenance import METADATA_NAME
+from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
+
+
+def copy_extras(found: Summary, out: RecordingWriter) -> None:
+    """Copy a recording's metadata and attachments into another.
+
+    Its provenance and recipe are left out: they are in the ancestry of the new one.
+    """
+    for name, records in found.metadata.items():
+        if name not in (METADATA_NAME, checksums.METADATA_NAME):
+            for values in records:
+                out.add_metadata(name, values)
+    for name, data in found.attachments.items():
+        if name != RECIPE_NAME:
+            out.add_attachment(name, "application/octet-stream", data)
+
+
+def splits(path: Path, found: Summary) -> dict[str, list[tuple[int, int]]]:
+    """The source's own split: by name, log times in [first, last], nanoseconds.
+
+    Parameters
+    ----------
+    path
+        The recording, for errors.
+    found
+        Its summary.
+
+    Raises
+    ------
+    RecordingError
+        If its metadata is not that.
+    UnsafeName
+        If a split has a name that could not be a folder's.
+    """
+    out: dict[str, list[tuple[int, int]]] = {}
+    try:
+        for record in found.metadata.get(SPLIT_METADATA, []):
+            for name, ranges in record.items():
+                split_name(name, f"{path}: a split")
+                out.setdefault(name, []).extend((int(a), int(b)) for a, b in parse_json(ranges))
+    except (ValueError, TypeError) as e:
+        raise RecordingError(
+            f"{path}: its split is not a list of [start_ns, end_ns] ({e}). "
+            "Convert it again, or ignore it with --split recordings"
+        ) from None
+    return out

@@ -1,0 +1,1 @@
+"""Check recordings: clocks, labels, motion and units."""

@@ -1,0 +1,81 @@
+"""Do the times of a recording belong together? Topic and text of what does not."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.recording.checks.scan import Seen
+from dmrl.topics import CALIBRATION, TRANSFORMS, names
+
+Times = Mapping[str, NDArray[np.int64]]
+Found = Iterator[tuple[str, str]]
+Span = tuple[int, int]
+"""Log times of a first and a last message, nanoseconds."""
+
+EPOCH_NS = 10**18
+"""Times from here on count from 1970: it is 2001."""
+SPARSE = 2
+"""Topics with fewer messages tell nothing of a clock."""
+
+
+def clocks(seen: Seen) -> Found:
+    """Robots, or topics of a robot, that share no time; times and stamps of 0."""
+    times = {topic: np.sort(t) for topic, t in seen.times.items() if len(t)}
+    yield from _zeros(times)
+    robots = _spans(times)
+    for spans in robots.values():
+        yield from _topics_apart(spans)
+    yield from _robots_apart({robot: _around(spans.values()) for robot, spans in robots.items()})
+    for topic, wrong in seen.unset.items():
+        if wrong:
+            yield topic, f"{wrong} messages have a time stamp of 0"
+
+
+def _zeros(times: Times) -> Found:
+    if not times or max(int(t[-1]) for t in times.values()) < EPOCH_NS:
+        return
+    for topic, moments in times.items():
+        if zeros := int((moments == 0).sum()):
+            yield topic, f"{zeros} messages are at time 0, others of the recording after 2001"
+
+
+def _spans(times: Times) -> dict[str, dict[str, Span]]:
+    """By robot, the time from the first to the last message of each of its topics."""
+    robots: dict[str, dict[str, Span]] = {}
+    for topic, moments in times.items():
+        moments = moments[moments > 0]  # those at 0 are said already
+        # A stranger's topic without a robot in front has no clock to compare.
+        of_a_robot = topic.startswith("/") and topic != TRANSFORMS
+        if of_a_robot and len(moments) >= SPARSE and not names(CALIBRATION, topic):
+            robot = topic.split("/")[1]
+            robots.setdefault(robot, {})[topic] = (int(moments[0]), int(moments[-1]))
+    return robots
+
+
+def _topics_apart(spans: Mapping[str, Span]) -> Found:
+    """Topics of one robot that share no time with any other of its topics."""
+    for topic, span in spans.items():
+        others = [other for name, other in spans.items() if name != topic]
+        if others and (gap_s := _gap_s(span, _around(others))) > 0:
+            yield topic, f"shares no time with the robot's other topics: {gap_s:.0f} s between"
+
+
+def _robots_apart(robots: Mapping[str, Span]) -> Found:
+    """Pairs of robots that share no time."""
+    for one, other in combinations(sorted(robots), 2):
+        if (gap_s := _gap_s(robots[one], robots[other])) > 0:
+            between = f"shares no time with /{other}: {gap_s:.0f} s between"
+            yield f"/{one}", f"{between}. Clocks of their own? Try: dmrl align"
+
+
+def _around(spans: Iterable[Span]) -> Span:
+    """The shortest span that holds all of these."""
+    firsts, lasts = zip(*spans, strict=True)
+    return min(firsts), max(lasts)
+
+
+def _gap_s(one: Span, other: Span) -> float:
+    """Seconds between two spans; 0 or less where they overlap."""
+    return (max(one[0], other[0]) - min(one[1], other[1])) * 1e-9

@@ -1,0 +1,199 @@
+"""The bytes of an MCAP file, written front to back: records, chunks, and the summary at the end.
+
+What stands in it is decided above. mcap lays out the records that are few; chunks and message
+indexes are laid out here, from arrays.
+"""
+
+import io
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
+
+from dmrl.recording.mcap import checksums
+from dmrl.recording.mcap.file import MAGIC, RECORD
+from dmrl.recording.mcap.message_index import MessageIndex
+
+CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of a name
+FOOTER = struct.Struct("<BQQQ")  # opcode, length, summary start, summary offset start
+
+
+def laid_out(*records: McapRecord) -> bytes:
+    """The bytes of some records."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """A chunk, compressed, and its message indexes.
+
+    Parameters
+    ----------
+    compression, data
+        How its records are compressed, and to what.
+    size, crc
+        Length of its records, and their CRC-32.
+    first_ns, last_ns
+        Of its log times.
+    index
+        Where its messages are.
+    """
+
+    compression: str
+    data: bytes
+    size: int
+    crc: int
+    first_ns: int
+    last_ns: int
+    index: MessageIndex
+
+
+class Container:
+    """An MCAP file that is being written.
+
+    Every finished piece is handed to the system at once, so that a killed process keeps it.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    library
+        What the header says of the writer.
+    """
+
+    def __init__(self, path: Path, library: str) -> None:
+        self._stream = io.FileIO(path, "wb")
+        self._at = self._crc = 0
+        self._sums = checksums.Sums()
+        self._said = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
+        self._counts: Counter[int] = Counter()
+        self._chunks: list[ChunkIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._attachments: list[AttachmentIndex] = []
+        try:
+            self._put(MAGIC + laid_out(Header("dmrl", library)))
+        except OSError:
+            self.close()
+            raise
+
+    def _put(self, data: bytes) -> int:
+        """Write some bytes; where they stand."""
+        at = self._at
+        left = memoryview(data)
+        while left:
+            left = left[self._stream.write(left) :]
+        self._crc = zlib.crc32(data, self._crc)
+        self._at += len(data)
+        return at
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """Append named strings."""
+        record = laid_out(Metadata(name, values))
+        self._sums.add_metadata(record)
+        self._metadata.append(MetadataIndex(self._put(record), len(record), name))
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Append a named file."""
+        record = laid_out(Attachment(0, 0, name, media_type, data))
+        at = self._put(record)
+        self._attachments.append(
+            AttachmentIndex(at, len(record), 0, 0, len(data), name, media_type)
+        )
+
+    def add_chunk(self, chunk: Packed) -> None:
+        """Append a chunk with its message indexes."""
+        first, last, index = chunk.first_ns, chunk.last_ns, chunk.index
+        name = chunk.compression.encode()
+        length = CHUNK.size - RECORD.size + len(name) + 8 + len(chunk.data)
+        head = CHUNK.pack(Opcode.CHUNK, length, first, last, chunk.size, chunk.crc, len(name))
+        head += name + struct.pack("<Q", len(chunk.data))
+        after = self._at + RECORD.size + length
+        self._sums.add_indexes(index.records)
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=RECORD.size + length,
+                chunk_start_offset=self._put(b"".join((head, chunk.data, index.records))),
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=last,
+                message_index_length=len(index.records),
+                message_index_offsets={n: after + at for n, at in index.places.items()},
+                message_start_time=first,
+                uncompressed_size=chunk.size,
+            )
+        )
+        said = self._said
+        earlier = said.message_count > 0
+        said.message_start_time = min(said.message_start_time, first) if earlier else first
+        said.message_end_time = max(said.message_end_time, last)
+        said.message_count += sum(index.counts.values())
+        self._counts.update(index.counts)
+
+    def finish(self, schemas: Sequence[bytes], channels: Sequence[bytes]) -> None:
+        """Write the sums and the summary, with the records that define every message."""
+        self.add_metadata(checksums.METADATA_NAME, self._sums.to_metadata(self._at))
+        self._put(laid_out(DataEnd(self._crc)))
+        said = self._said
+        said.schema_count, said.channel_count = len(schemas), len(channels)
+        said.chunk_count, said.metadata_count = len(self._chunks), len(self._metadata)
+        said.attachment_count = len(self._attachments)
+        said.channel_message_counts = dict(sorted(self._counts.items()))
+        start, body, offsets = self._at, b"", b""
+        chunks = b"".join(_chunk_index(chunk) for chunk in self._chunks)
+        before = b"".join(schemas), b"".join(channels), laid_out(said)
+        for records in (*before, chunks, laid_out(*self._attachments), laid_out(*self._metadata)):
+            if records:
+                at = start + len(body)
+                offsets += laid_out(SummaryOffset(records[0], at, len(records)))
+            body += records
+        self._end(start, body, offsets)
+
+    def _end(self, start: int, body: bytes, offsets: bytes) -> None:
+        """The summary section and the footer."""
+        places = start, start + len(body)
+        footer = FOOTER.pack(Opcode.FOOTER, FOOTER.size - RECORD.size + 4, *places)
+        crc = zlib.crc32(body + offsets + footer)
+        self._put(body + offsets + laid_out(Footer(*places, crc)) + MAGIC)
+
+    def close(self) -> None:
+        """Close the file, whole or not."""
+        self._stream.close()
+
+
+def _chunk_index(chunk: ChunkIndex) -> bytes:
+    """Its record. With hundreds of topics mcap takes longer for it than for the chunk."""
+    flat = [value for place in chunk.message_index_offsets.items() for value in place]
+    places = struct.pack(f"<{len(flat) // 2 * 'HQ'}", *flat)
+    name = chunk.compression.encode()
+    body = struct.pack(
+        "<QQQQI",
+        chunk.message_start_time,
+        chunk.message_end_time,
+        chunk.chunk_start_offset,
+        chunk.chunk_length,
+        len(places),
+    )
+    body += places + struct.pack("<QI", chunk.message_index_length, len(name)) + name
+    body += struct.pack("<QQ", chunk.compressed_size, chunk.uncompressed_size)
+    return RECORD.pack(Opcode.CHUNK_INDEX, len(body)) + body

@@ -1,0 +1,129 @@
+"""Values in protobuf's wire format, read at many places of a block at once."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pyarrow as pa
+from google.protobuf.descriptor import FieldDescriptor
+from numpy.typing import NDArray
+
+from dmrl.recording.mcap.message_batch import Bytes, Ints
+
+# Below this mean size one gather of all bytes beats a slice per value.
+GATHER_BYTES = 64
+
+F = FieldDescriptor
+FIXED = {
+    F.TYPE_DOUBLE: "<f8",
+    F.TYPE_FLOAT: "<f4",
+    F.TYPE_FIXED64: "<u8",
+    F.TYPE_SFIXED64: "<i8",
+    F.TYPE_FIXED32: "<u4",
+    F.TYPE_SFIXED32: "<i4",
+}
+VARINTS = {
+    F.TYPE_INT64: "i8",
+    F.TYPE_UINT64: "u8",
+    F.TYPE_INT32: "i4",
+    F.TYPE_UINT32: "u4",
+    F.TYPE_ENUM: "i4",
+    F.TYPE_BOOL: "?",
+    F.TYPE_SINT32: "i4",
+    F.TYPE_SINT64: "i8",
+}
+
+
+class WireError(ValueError):
+    """The bytes are not messages of the type they are said to be."""
+
+
+def varint(data: Bytes, at: Ints) -> tuple[NDArray[np.uint64], Ints]:
+    """Value of the varint at each offset, and the offset after it."""
+    try:
+        byte = data[at]
+    except IndexError:
+        raise WireError("a value runs beyond its message") from None
+    value = (byte & 0x7F).astype(np.uint64)
+    at = at + 1
+    more = np.flatnonzero(byte & 0x80)
+    shift = 7
+    while len(more):
+        if shift > 63:
+            raise WireError("a varint is longer than ten bytes")
+        try:
+            byte = data[at[more]]
+        except IndexError:
+            raise WireError("a value runs beyond its message") from None
+        value[more] |= (byte & 0x7F).astype(np.uint64) << np.uint64(shift)
+        at[more] += 1
+        more = more[(byte & 0x80) != 0]
+        shift += 7
+    return value, at
+
+
+def unless_absent(
+    present: NDArray[np.bool_] | None,
+    start: Ints,
+    read: Callable[[Ints], NDArray[np.generic]],
+    dtype: np.dtype[np.generic],
+) -> NDArray[np.generic]:
+    """Values read at ``start``; zero where absent."""
+    if present is None or present.all():
+        return read(start)
+    out = np.zeros(len(start), dtype.newbyteorder("="))
+    out[present] = read(start[present])
+    return out
+
+
+def fixed(data: Bytes, at: Ints, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+    """(N,) values of fixed size at these offsets.
+
+    Raises
+    ------
+    WireError
+        If one reaches beyond the data.
+    """
+    # A view with a stride of one byte reads unaligned values in one gather.
+    view = np.ndarray((max(len(data) - dtype.itemsize + 1, 0),), dtype, data, 0, (1,))
+    try:
+        return np.ascontiguousarray(view[at])
+    except IndexError:
+        raise WireError("a value runs beyond its message") from None
+
+
+def integers(
+    data: Bytes, at: Ints, dtype: np.dtype[np.generic], zigzag: bool
+) -> NDArray[np.generic]:
+    """(N,) integers, enums or booleans whose varints begin at these offsets."""
+    value, _ = varint(data, at)
+    if zigzag:
+        value = (value >> np.uint64(1)) ^ (np.uint64(0) - (value & np.uint64(1)))
+    return value.astype(np.bool_) if dtype == np.bool_ else value.view(np.int64).astype(dtype)
+
+
+def text(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa.Array:
+    """(N,) strings or bytes that fill these spans.
+
+    Raises
+    ------
+    WireError
+        If there are too many for a block, or one of strings is not UTF-8.
+    """
+    size = end - start
+    offsets = np.zeros(len(size) + 1, np.int64)
+    np.cumsum(size, out=offsets[1:])
+    if offsets[-1] > np.iinfo(np.int32).max:
+        raise WireError("more than 2 GiB of text in one block")
+    if len(size) and offsets[-1] > GATHER_BYTES * len(size):
+        view = data.data
+        body = b"".join(view[a:b] for a, b in zip(start.tolist(), end.tolist(), strict=True))
+    else:
+        index = np.arange(offsets[-1]) + np.repeat(start - offsets[:-1], size)
+        body = data[index].tobytes()
+    buffers = [None, pa.py_buffer(offsets.astype(np.int32)), pa.py_buffer(body)]
+    made = pa.Array.from_buffers(kind, len(size), buffers)
+    try:
+        made.validate(full=True)
+    except pa.ArrowInvalid:
+        raise WireError("a text is not UTF-8") from None
+    return made

@@ -1,0 +1,143 @@
+"""Provenance of an output about to be written: its inputs hashed, their ancestry nested."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from dmrl.errors import RecordingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.paths import refuse_pipe
+from dmrl.recording.mcap.file import expect_unchanged
+from dmrl.recording.mcap.summary_index import summary
+from dmrl.recording.provenance import FILE_NAME, Input, Provenance
+from dmrl.storage import Remote
+
+NO_CONTENT = ("README.md", "figures", "tensorboard")
+
+
+def refuse_twice(paths: Sequence[Path]) -> None:
+    """Nothing, if every recording is named once.
+
+    Raises
+    ------
+    RecordingError
+        If one is named twice.
+    """
+    if len({path.resolve() for path in paths}) != len(paths):
+        raise RecordingError(f"{paths[0]}: a recording is given twice. Name each once")
+
+
+def provenance(
+    stage: str,
+    settings: Any = None,
+    inputs: Sequence[Path] = (),
+    *,
+    seed: int | None = None,
+    libraries: Sequence[str] = (),
+) -> Provenance:
+    """Provenance of an output about to be written; hashes the inputs.
+
+    Parameters
+    ----------
+    stage
+        The command's name.
+    settings
+        A settings dataclass, a dictionary, or None.
+    inputs
+        Files and folders that are read.
+    seed
+        Random seed.
+    libraries
+        Names of installed packages whose version matters.
+
+    Raises
+    ------
+    RecordingError
+        If an input is not there.
+    """
+    values = settings if isinstance(settings, dict) else asdict(settings) if settings else {}
+    return Provenance(
+        stage=stage,
+        settings=json.loads(json.dumps(values, default=_name)),
+        seed=seed,
+        inputs=tuple(input_of(path) for path in inputs),
+        libraries={name: _version(name) for name in libraries},
+    )
+
+
+def _name(value: object) -> str:
+    # A path in a setting is named, not located, for the same reason as an input.
+    return value.name if isinstance(value, Path) else str(value)
+
+
+def _version(package: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - as in plugins
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "absent"
+
+
+def input_of(path: Path) -> Input:
+    """Name, hash and own provenance of a file or folder.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such file or folder.
+    UnsafeName
+        If it is a pipe or a device, which has no end.
+    """
+    if not path.exists():
+        raise RecordingError(f"no file or folder {path}. Check the name")
+    refuse_pipe(path)  # in a folder, a link may lead to a device
+    if path.suffix == ".mcap" and path.is_file():
+        expect_unchanged(path)
+    digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
+    return Input(path.resolve().name, digest, provenance_of(path))
+
+
+def sha256_of_file(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    if isinstance(path, Remote):
+        return path.sha256()
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def sha256_of_folder(folder: Path) -> str:
+    """SHA-256 over the sorted relative names and contents of a folder's files.
+
+    Of a folder that dmrl wrote, the card is left out, which may be written again at any time, and
+    the log of a training, which tells when it ran.
+    """
+    left_out = NO_CONTENT if (folder / FILE_NAME).is_file() else ()
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        if path.relative_to(folder).parts[0] in left_out:
+            continue
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of_file(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def provenance_of(path: Path) -> Provenance | None:
+    """How a recording, or an output folder, was made; None: it does not say.
+
+    Raises
+    ------
+    RecordingError
+        If what it says is damaged.
+    """
+    if path.suffix == ".mcap" and path.is_file():
+        return summary(path).provenance
+    file = path / FILE_NAME
+    if not file.is_file():
+        return None
+    try:
+        return Provenance.from_json(parse_json(file.read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError) as e:
+        raise RecordingError(f"{file} is damaged: {e}. Make {path} again") from e

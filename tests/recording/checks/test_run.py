@@ -1,0 +1,308 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from dmrl.images.codec import encode_png
+from dmrl.messages import message, schema_bytes
+from dmrl.recording import Provenance, RecordingWriter, check
+from dmrl.recording.checks.run import say_findings
+
+PNG = encode_png(np.zeros((224, 320, 3), np.uint8))
+Write = Callable[[int, str, Any], None]
+
+
+def record(path: Path, fill: Callable[[Write], None]) -> list[str]:
+    """Findings of a recording, each as "level topic text"."""
+    with RecordingWriter(path, Provenance("test")) as sink:
+        fill(sink.write)
+    return [f"{f.level} {f.topic} {f.text}" for f in check(path)]
+
+
+def calibrated(width: int = 320, height: int = 224, **other: Any) -> Any:
+    numbers = {"K": [180, 0, width / 2, 0, 180, height / 2, 0, 0, 1]} | other
+    return message("CameraCalibration")(width=width, height=height, **numbers)
+
+
+def image(data: bytes = PNG) -> Any:
+    return message("CompressedImage")(data=data, format="png")
+
+
+def label(u_px: float, v_px: float, *, source: str = "truth", box: bool = True) -> Any:
+    return message("PeerLabel")(
+        peer="cf2",
+        u_px=u_px,
+        v_px=v_px,
+        depth_m=1.0,
+        source=source,
+        box_px=[u_px - 10, v_px - 6, u_px + 10, v_px + 6] if box else [],
+    )
+
+
+def labelled(write: Write, shift_v_px: float = 0.0) -> None:
+    """Forty images with a true label each, and one whose source shifts it."""
+    write(0, "/cf1/camera/calibration", calibrated())
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        u_px, v_px = rng.uniform(50, 170, 2)
+        true, other = label(u_px, v_px), label(u_px, v_px, source="published")
+        other.u_px += rng.normal(0, 1)
+        other.v_px += shift_v_px + rng.normal(0, 1)
+        write(k * 10**9, "/cf1/camera/image", image())
+        write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[true, other]))
+
+
+def test_a_sound_recording_has_no_findings(tmp_path: Path) -> None:
+    assert record(tmp_path / "a.mcap", labelled) == []
+
+
+def test_a_label_bias_is_found_and_said_in_one_line(tmp_path: Path) -> None:
+    (finding,) = record(tmp_path / "a.mcap", lambda write: labelled(write, shift_v_px=10.0))
+    assert finding.startswith("warning /cf1/labels labels of source 'published' are biased:")
+    assert "+10." in finding or "+9." in finding
+    assert "\n" not in finding
+
+
+def test_times_that_go_back_repeat_or_leave_gaps_are_found(tmp_path: Path) -> None:
+    times_s = [*range(20), 15, 15, 15, *range(60, 70)]
+
+    def fill(write: Write) -> None:
+        for time_s in times_s:
+            write(time_s * 10**9, "/cf1/height", message("Height")())
+
+    findings = record(tmp_path / "a.mcap", fill)
+    assert "warning /cf1/height 1 messages go back in time, by up to 4.000 s" in findings
+    assert "warning /cf1/height 2 messages repeat the time before them" in findings
+    assert any("1 gaps, the longest 45.000 s" in f for f in findings)
+
+
+def test_clocks_that_share_no_time_are_found(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        for k in range(20):
+            write(k * 10**9, "/cf1/height", message("Height")())
+            write(k * 10**9, "/cf1/velocity", message("Velocity")())
+            write((k + 56) * 10**9, "/cf2/height", message("Height")())
+            write((k + 119) * 10**9, "/cf1/range/cf2", message("UwbRange")())
+
+    assert record(tmp_path / "a.mcap", fill) == [
+        "warning /cf1/range/cf2 shares no time with the robot's other topics: 100 s between",
+    ]
+
+    def two(write: Write) -> None:
+        for k in range(20):
+            write(k * 10**9, "/cf1/height", message("Height")())
+            write((k + 56) * 10**9, "/cf2/height", message("Height")())
+
+    assert record(tmp_path / "b.mcap", two) == [
+        "warning /cf1 shares no time with /cf2: 37 s between. Clocks of their own? Try: dmrl align"
+    ]
+
+
+def test_times_and_stamps_of_zero_are_found(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        pose = message("PoseInFrame")
+        now_s = 1_800_000_000
+        for k in range(3):
+            moment = {"seconds": now_s + k}
+            write((now_s + k) * 10**9, "/cf1/pose", pose(timestamp=moment))
+            write((now_s + k) * 10**9, "/cf1/pose/truth", pose(timestamp={}))
+        write(0, "/cf1/height", message("Height")())
+
+    findings = record(tmp_path / "a.mcap", fill)
+    assert findings == [
+        "warning /cf1/height 1 messages are at time 0, others of the recording after 2001",
+        "warning /cf1/pose/truth 3 messages have a time stamp of 0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("bad", "complaint"),
+    [
+        (label(400.0, 50.0), "warning /cf1/labels 1 of 1 labels of source 'truth' lie outside"),
+        (
+            message("PeerLabel")(u_px=5, v_px=5, source="hand"),
+            "error /cf1/labels 1 labels of source",
+        ),
+        (label(float("nan"), 5.0), "error /cf1/labels 1 labels of source 'truth' have no pixel"),
+    ],
+    ids=["outside", "no depth", "not a number"],
+)
+def test_impossible_labels_are_found(tmp_path: Path, bad: Any, complaint: str) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", calibrated())
+        write(0, "/cf1/camera/image", image())
+        write(0, "/cf1/labels", message("PeerLabels")(peers=[bad]))
+
+    assert any(f.startswith(complaint) for f in record(tmp_path / "a.mcap", fill))
+
+
+def test_labels_without_their_image_are_found(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", calibrated())
+        write(0, "/cf1/camera/image", image())
+        write(5, "/cf1/labels", message("PeerLabels")())
+
+    (finding,) = record(tmp_path / "a.mcap", fill)
+    assert finding == "error /cf1/labels 1 of 1 messages have no image at their time"
+
+
+def test_an_empty_recording_is_an_error(tmp_path: Path) -> None:
+    assert record(tmp_path / "a.mcap", lambda _: None) == ["error  has no messages"]
+
+
+def test_a_topic_without_messages_is_no_trouble(tmp_path: Path) -> None:
+    """Other writers announce topics that nothing is ever sent on."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, name in (
+            ("/cf1/camera/image", "CompressedImage"),
+            ("/cf1/camera/calibration", "CameraCalibration"),
+            ("/cf1/labels", "PeerLabels"),
+        ):
+            full = message(name).DESCRIPTOR.full_name
+            schema = writer.register_schema(full, "protobuf", schema_bytes(name))
+            channel = writer.register_channel(topic, "protobuf", schema)
+        empty = message("PeerLabels")(peers=[label(5.0, 5.0)]).SerializeToString()
+        writer.add_message(channel, 0, empty, 0)
+        writer.finish()
+    assert [f.text for f in check(path)] == ["1 of 1 messages have no image at their time"]
+
+
+@pytest.mark.parametrize(
+    ("period_s", "hole_s", "found"),
+    [(0.1, 0.95, 0), (0.1, 1.05, 1), (0.01, 0.45, 0), (0.01, 0.55, 1)],
+)
+def test_a_gap_is_ten_periods_long_and_half_a_second(
+    tmp_path: Path, period_s: float, hole_s: float, found: int
+) -> None:
+    def fill(write: Write) -> None:
+        for k in range(40):
+            time_s = k * period_s + (hole_s - period_s) * (k >= 20)
+            write(round(time_s * 1e9), "/cf1/height", message("Height")())
+
+    findings = record(tmp_path / "a.mcap", fill)
+    assert len(findings) == found
+    assert all(
+        f"1 gaps, the longest {hole_s:.3f} s; the usual period: {period_s:.3f}" in f
+        for f in findings
+    )
+
+
+def test_ten_steps_make_a_rhythm(tmp_path: Path) -> None:
+    for steps, found in ((9, 0), (10, 1)):
+        moments = [*range(steps), steps + 50]
+
+        def fill(write: Write, moments: list[int] = moments) -> None:
+            for moment in moments:
+                write(moment * 10**9, "/cf1/height", message("Height")())
+
+        assert len(record(tmp_path / f"{steps}.mcap", fill)) == found
+
+
+def off_by(write: Write, off_px: list[tuple[float, float]]) -> None:
+    """Labels beside the middle of their boxes."""
+    write(0, "/cf1/camera/calibration", calibrated())
+    for k, (u_px, v_px) in enumerate(off_px):
+        peer = label(100.0, 100.0)
+        peer.u_px += u_px
+        peer.v_px += v_px
+        write(k * 10**9, "/cf1/camera/image", image())
+        write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[peer]))
+
+
+def test_a_bias_is_told_by_its_standard_error(tmp_path: Path) -> None:
+    def spread(middle_px: float, by_px: float) -> list[float]:
+        return [middle_px + by_px * (-1) ** k for k in range(40)] + [middle_px]
+
+    # The MAD is by_px: 1.2533 * 1.4826 * by_px / sqrt(41) is the error, and five of it count.
+    (finding,) = record(tmp_path / "a.mcap", lambda w: off_by(w, [(0.1, v) for v in spread(3, 2)]))
+    assert "+0.1 px in u and +3.0 px in v" in finding
+    assert "(median of 41, standard error 0.00 and 0.58 px)" in finding
+    far = [(u, 0.0) for u in spread(3, 2.2)]  # five errors are 3.19 px
+    assert record(tmp_path / "b.mcap", lambda w: off_by(w, far)) == []
+    small = [(1.4, -1.4)] * 41
+    assert record(tmp_path / "c.mcap", lambda w: off_by(w, small)) == []
+    few = [(9.0, 9.0)] * 19
+    assert record(tmp_path / "d.mcap", lambda w: off_by(w, few)) == []
+    assert len(record(tmp_path / "e.mcap", lambda w: off_by(w, [(9.0, 9.0)] * 20))) == 1
+
+
+def test_what_was_just_written_is_looked_at_without_its_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, Provenance("test")) as sink:
+        sink.write(0, "/cf1/camera/image", image(b"no image"))
+        for topic in ("/cf1/height", "/cf1/velocity", "/cf1/attitude"):
+            kind = message(topic.rpartition("/")[2].title())
+            for second in (*range(12), 99):
+                sink.write(second * 10**9, topic, kind())
+    say_findings(path)
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 3
+    assert all("1 gaps, the longest 88.000 s" in line for line in said[:2])
+    assert said[-1] == f"1 more: dmrl check {path}"
+
+
+@pytest.mark.parametrize("topic", ["height", "camera/calibration", "labels", "camera/image"])
+def test_what_cannot_be_judged_in_what_was_just_written_is_no_error(
+    topic: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The work is done, and stands."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("dmrl.v1.Velocity", "protobuf", schema_bytes("Velocity"))
+        channel = writer.register_channel(f"/cf2/{topic}", "protobuf", schema)
+        writer.add_message(channel, 0, b"", 0)
+        writer.finish()
+    say_findings(path)
+    assert f"/cf2/{topic}" in capsys.readouterr().err
+
+
+def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> None:
+    def fill(write: Write, left_px: float, right_px: float) -> None:
+        write(0, "/cf1/camera/calibration", calibrated())
+        for k in range(40):
+            box = [left_px, 50, right_px, 70]
+            peer = message("PeerLabel")(u_px=100, v_px=60, depth_m=1, source="hand", box_px=box)
+            write(k * 10**9, "/cf1/camera/image", image())
+            write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[peer]))
+
+    for k, (left_px, right_px, found) in enumerate(
+        [(1.5, 100, 1), (1, 100, 0), (100, 318.5, 1), (100, 319, 0)]
+    ):
+        assert (
+            len(record(tmp_path / f"{k}.mcap", lambda w, a=left_px, b=right_px: fill(w, a, b)))
+            == found
+        )
+
+
+def test_topics_that_are_not_dmrl_s_are_left_alone(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        for k in range(3):
+            write(k, "/cf1/own", message("Height")())
+
+    assert record(tmp_path / "a.mcap", fill) == []
+
+
+def test_a_stamp_of_zero_counts_only_where_one_is_given_and_the_time_is_another(
+    tmp_path: Path,
+) -> None:
+    def fill(write: Write) -> None:
+        pose = message("PoseInFrame")
+        write(0, "/cf1/pose", pose(timestamp={}))
+        write(5, "/cf1/pose", pose())
+        write(6, "/cf1/pose", pose(timestamp={"nanos": 6}))
+        write(7, "/cf1/pose", pose(timestamp={"seconds": 1}))
+        write(8, "/cf1/pose", pose(timestamp={}))
+
+    assert record(tmp_path / "a.mcap", fill) == [
+        "warning /cf1/pose 1 messages have a time stamp of 0"
+    ]

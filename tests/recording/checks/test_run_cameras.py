@@ -1,0 +1,82 @@
+"""Images and their camera as `dmrl check` judges them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl.images.codec import encode_png
+
+from ..test_check import Write, calibrated, image, record
+
+
+def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path) -> None:
+    assert record(tmp_path / "a.mcap", lambda write: write(0, "/cf1/camera/image", image())) == [
+        "warning /cf1/camera/image no calibration on /cf1/camera/calibration"
+    ]
+
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", calibrated(324, 244))
+        write(0, "/cf1/camera/image", image())
+        write(1, "/cf1/camera/image", image(b"no image"))
+
+    findings = record(tmp_path / "b.mcap", fill)
+    assert (
+        "error /cf1/camera/image images of 320x224, but the calibration is for 324x244" in findings
+    )
+    assert "error /cf1/camera/image 1 messages hold no image that can be read" in findings
+
+
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [
+        ([(320, 224)], []),
+        ([(320, 224), (160, 112)], ["warning /cf1/camera/image images of 2 sizes: 160x112, "]),
+        ([(160, 112)], ["error /cf1/camera/image images of 160x112, but the calibration is for "]),
+    ],
+)
+def test_images_are_of_one_size_and_of_the_calibrated(
+    tmp_path: Path, sizes: list[tuple[int, int]], said: list[str]
+) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", calibrated())
+        for k, (width, height) in enumerate(sizes):
+            data = encode_png(np.zeros((height, width, 3), np.uint8))
+            write(k, "/cf1/camera/image", image(data))
+
+    found = record(tmp_path / "a.mcap", fill)
+    assert len(found) == len(said)
+    assert all(one.startswith(words) for one, words in zip(found, said, strict=True))
+    assert all("320x224" in one for one in found)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "finding"),
+    [
+        ({"K": []}, "warning /cf1/camera/calibration is not calibrated: K is zero or missing"),
+        ({"K": [0] * 9}, "warning /cf1/camera/calibration is not calibrated: K is zero or missing"),
+        ({"K": [1, 2]}, "error /cf1/camera/calibration has 2 numbers in K, not 9"),
+        (
+            {"D": [float("nan")]},
+            "error /cf1/camera/calibration has numbers in K or D that are not finite or too large",
+        ),
+        (
+            {"K": [180, 0, 1e300, 0, 180, 112, 0, 0, 1]},
+            "error /cf1/camera/calibration has numbers in K or D that are not finite or too large",
+        ),
+        (
+            {"K": [180, 0, 160, 0, -180, 112, 0, 0, 1]},
+            "error /cf1/camera/calibration has a focal length that is not above 0",
+        ),
+        ({"height": 0}, "error /cf1/camera/calibration is of images of 320 x 0 px"),
+    ],
+)
+def test_a_calibration_that_no_camera_has_is_found(
+    tmp_path: Path, numbers: dict[str, Any], finding: str
+) -> None:
+    def fill(write: Write) -> None:
+        write(0, "/cf1/camera/calibration", calibrated())
+        write(1, "/cf1/camera/calibration", calibrated(**numbers))
+
+    assert record(tmp_path / "a.mcap", fill) == [finding]

@@ -1,0 +1,73 @@
+"""Values and periods that cannot be in their units, counted without keeping them."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from dmrl.recording.checks.units import Sizes, periods
+
+
+def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]:
+    sizes = Sizes()
+    for part in np.array_split(values, 3):
+        sizes.add(topic, pa.RecordBatch.from_pydict({name: pa.array(part)}))
+    return list(sizes.doubted())
+
+
+@pytest.mark.parametrize(
+    ("topic", "name", "usual"),
+    [
+        ("/cf1/height", "height_m", 0.8),
+        ("/cf1/velocity", "vx_mps", 0.5),
+        ("/cf1/range/cf2", "range_m", 3.0),
+        ("/cf1/attitude", "roll_rad", 0.05),
+    ],
+)
+def test_thousandths_are_doubted_and_the_unit_is_not(topic: str, name: str, usual: float) -> None:
+    values = usual * np.random.default_rng(1).uniform(-1, 1, 200)
+    assert _doubted(topic, name, values) == []
+    ((where, text),) = _doubted(topic, name, 1000 * values)
+    assert where == topic and text.startswith(f"{name}: ")
+
+
+def test_a_tenth_is_borne_and_more_is_not() -> None:
+    values = np.full(100, 0.5)
+    values[:10] = 500.0
+    assert _doubted("/cf1/height", "height_m", values) == []
+    values[10] = -500.0
+    ((_, text),) = _doubted("/cf1/height", "height_m", values)
+    assert text == "height_m: 11% of the values are over 30 m. Are they mm or cm?"
+
+
+def test_nothing_zero_or_infinite_counts_and_few_values_tell_nothing() -> None:
+    odd = np.array([np.nan, np.inf, -np.inf, 0.0] * 30)
+    assert _doubted("/cf1/height", "height_m", odd) == []
+    assert _doubted("/cf1/height", "height_m", np.full(19, 500.0)) == []
+    assert _doubted("/own/topic", "height_m", np.full(99, 500.0)) == []
+
+
+def test_periods_of_sensors() -> None:
+    times = np.arange(100) * 10_000_000
+    assert list(periods({"/cf1/height": times})) == []
+    ((_, rare),) = periods({"/cf1/height": times * 1000})
+    assert rare == "one message in 10 s. Were its times in ms, us or ns?"
+    ((_, often),) = periods({"/cf1/height": times // 1_000_000})
+    assert "in s, ms or us" in often
+    assert list(periods({"/cf1/labels": times * 1000, "/cf1/height": times[:19] * 1000})) == []
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "said"), [(4_900_000_000, 0), (5_100_000_000, 1), (9_000, 1), (11_000, 0), (0, 0)]
+)
+def test_periods_beyond_a_sensor_s(period_ns: int, said: int) -> None:
+    times = np.arange(20) * period_ns
+    assert len(list(periods({"/cf1/height": times}))) == said
+    assert list(periods({"/cf1/height": times[:19]})) == []
+
+
+def test_sizes_are_told_apart_to_a_fifth_of_their_limit() -> None:
+    assert _doubted("/cf1/height", "height_m", np.full(20, 30.0)) == []
+    assert len(_doubted("/cf1/height", "height_m", np.full(20, 36.0))) == 1
+    for tiny, huge in ((1e-80, 1e80), (-1e-300, -1e300)):
+        assert _doubted("/cf1/height", "height_m", np.full(20, tiny)) == []
+        assert len(_doubted("/cf1/height", "height_m", np.full(20, huge))) == 1

@@ -1,0 +1,43 @@
+"""As many messages as the statistics say, and no other number."""
+
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dmrl.errors import RecordingError
+from dmrl.recording.mcap.batch_reader import compare
+
+
+def summary(counts: dict[int, int] | None) -> Any:
+    """Of a recording of these messages by channel; None: it has no statistics."""
+    said = None if counts is None else SimpleNamespace(channel_message_counts=counts)
+    return SimpleNamespace(statistics=said)
+
+
+CHANNELS: Any = {1: SimpleNamespace(topic="/a"), 2: SimpleNamespace(topic="/b")}
+
+
+@pytest.mark.parametrize(
+    ("said", "found", "fault"),
+    [
+        ({1: 3, 2: 1}, {1: 3, 2: 1}, ""),
+        ({1: 3}, {1: 3}, ""),
+        ({1: 3, 2: 1}, {1: 2, 2: 1}, "/a has 2 of 3 messages"),
+        ({1: 3, 2: 1}, {1: 3, 2: 2}, "/b has 2 of 1 messages"),
+        ({1: 3, 2: 1}, {1: 3}, "/b has 0 of 1 messages"),
+        ({1: 3}, {1: 3, 2: 1}, "/b has 1 of 0 messages"),
+        (None, {1: 3}, ""),
+        ({}, {1: 3}, ""),
+    ],
+)
+def test_a_recording_has_the_messages_that_its_statistics_say(
+    said: dict[int, int] | None, found: dict[int, int], fault: str
+) -> None:
+    if not fault:
+        compare(Path("a.mcap"), summary(said), CHANNELS, Counter(found))
+        return
+    with pytest.raises(RecordingError, match=fault):
+        compare(Path("a.mcap"), summary(said), CHANNELS, Counter(found))

@@ -1,0 +1,120 @@
+"""Chunks, packed by hand: what stands in them comes out, and nothing else does."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Chunk, Message
+
+from dmrl.errors import RecordingError
+from dmrl.guards import limits
+from dmrl.recording.mcap.chunk import loose, messages_at, of_channels, scanned, unpacked
+from dmrl.recording.mcap.message_batch import Block
+
+PATH = Path("a.mcap")
+ROWS = [(7, 30, 31, b"ab"), (300, 2**40, 2**50, b""), (7, 5, 6, b"xyz")]
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def message_record(number: int, time_ns: int, publish_ns: int, data: bytes) -> bytes:
+    return record(Opcode.MESSAGE, struct.pack("<HIQQ", number, 0, time_ns, publish_ns) + data)
+
+
+def bytes_of(data: bytes) -> np.ndarray:
+    return np.frombuffer(data, np.uint8)
+
+
+def block(rows: list[tuple[int, int, int, bytes]] = ROWS) -> Block:
+    return scanned(bytes_of(b"".join(message_record(*row) for row in rows))).block
+
+
+def test_messages_among_other_records_are_found_at_any_byte() -> None:
+    for junk in range(4):
+        parts = [record(Opcode.SCHEMA, bytes(junk)) + message_record(*row) for row in ROWS]
+        assert list(scanned(bytes_of(b"".join(parts))).block.rows()) == ROWS
+    assert len(scanned(bytes_of(b"")).block) == 0
+    assert len(messages_at(bytes_of(b"abc"), np.zeros(0, np.int64))) == 0
+
+
+def test_loose_messages_are_a_block() -> None:
+    found = loose([Message(n, t, d, p, 0) for n, t, p, d in ROWS])
+    assert list(found.rows()) == ROWS
+
+
+def test_records_fill_a_chunk_to_its_last_byte() -> None:
+    whole, other = message_record(1, 2, 3, b"data"), record(Opcode.SCHEMA, b"abc")
+    scan = scanned(bytes_of(whole + other + whole))
+    assert scan.messages == [0, len(whole + other)]
+    assert scan.others == [(Opcode.SCHEMA, len(whole), len(whole + other))]
+    for lost in range(1, len(whole)):
+        with pytest.raises(McapError):
+            scanned(bytes_of(whole + whole[:-lost]))
+    short = record(Opcode.MESSAGE, bytes(21))  # a message's own header takes 22
+    with pytest.raises(McapError, match="wrong length"):
+        scanned(bytes_of(short))
+    assert scanned(bytes_of(record(Opcode.MESSAGE, bytes(22)))).messages == [0]
+
+
+def test_only_the_channels_that_are_asked_for() -> None:
+    assert list(of_channels(block(), {7}, {7, 300}).rows()) == [ROWS[0], ROWS[2]]
+    assert list(of_channels(block(), {300}, {7, 300}).rows()) == [ROWS[1]]
+    assert list(of_channels(block(), {7, 300, 9}, {7, 300, 9}).rows()) == ROWS
+    with pytest.raises(McapError, match="channel 300, which is not defined"):
+        of_channels(block(), {7}, {7})
+
+
+LATE = [(1, 2**63, 0, b""), (1, 0, 2**63, b""), (1, 2**63 - 1, 0, b"")]
+
+
+@pytest.mark.parametrize("late", LATE)
+def test_times_that_64_bits_with_a_sign_cannot_hold(late: tuple[int, int, int, bytes]) -> None:
+    """Of the log not the last of them either: no span could end after it."""
+    last = (1, 2**63 - 2, 2**63 - 1, b"")
+    assert len(of_channels(block([last]), {1}, {1})) == 1
+    with pytest.raises(McapError, match="beyond the year 2262"):
+        of_channels(block([last, late]), {1}, {1})
+
+
+def chunk(data: bytes, packed: bytes, how: str, crc: int | None = None) -> Chunk:
+    return Chunk(how, packed, 0, 0, zlib.crc32(data) if crc is None else crc, len(data))
+
+
+DATA = b"".join(message_record(*row) for row in ROWS)
+PACKED = {
+    "": DATA,
+    "zstd": zstandard.ZstdCompressor().compress(DATA),
+    "lz4": lz4.frame.compress(DATA),
+}
+
+
+@pytest.mark.parametrize("how", PACKED)
+def test_a_chunk_is_unpacked_and_held_against_what_it_says(
+    how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packed = PACKED[how]
+    assert unpacked(PATH, chunk(DATA, packed, how), 9).tobytes() == DATA
+    assert unpacked(PATH, chunk(DATA, packed, how, crc=0), 9).tobytes() == DATA  # says none
+    with pytest.raises(RecordingError, match="chunk at byte 9 fails its CRC"):
+        unpacked(PATH, chunk(DATA, packed, how, crc=1), 9)
+    for said in (DATA + b"\0", DATA[:-1]):
+        with pytest.raises(RecordingError, match=r"a\.mcap.*(more or less than|more than) it says"):
+            unpacked(PATH, chunk(said, packed, how, crc=0), 9)
+    monkeypatch.setattr(limits, "UNPACKED_BYTES", len(DATA))
+    assert len(unpacked(PATH, chunk(DATA, packed, how), 9)) == len(DATA)
+    monkeypatch.setattr(limits, "UNPACKED_BYTES", len(DATA) - 1)
+    with pytest.raises(RecordingError, match="unpacks to 0 MB"):
+        unpacked(PATH, chunk(DATA, packed, how), 9)
+
+
+def test_a_compression_that_nobody_knows_is_named() -> None:
+    with pytest.raises(RecordingError, match="unknown compression 'rar'"):
+        unpacked(PATH, chunk(DATA, DATA, "rar"), 0)

@@ -1,0 +1,77 @@
+import os
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dmrl.messages import message
+from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording.mcap import summary_index
+
+
+def write(path: Path, heights: int) -> None:
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(heights):
+            sink.write(k, "/cf1/height", message("Height")(height_m=k))
+
+
+def settled(path: Path, second: int) -> None:
+    """As if it had been written long ago, at that second."""
+    os.utime(path, (second, second))
+
+
+def test_a_summary_is_not_made_again_while_the_file_is_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, 3)
+    settled(path, 1_000_000_000)
+    assert summary(path) is summary(path)
+
+
+def test_a_file_written_anew_under_its_name_is_read_anew(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, 3)
+    settled(path, 1_000_000_000)
+    assert summary(path).count == 3
+    path.unlink()
+    write(path, 5)
+    settled(path, 1_000_000_001)
+    assert summary(path).count == 5
+
+
+def test_a_file_of_this_second_is_always_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, 3)
+    settled(path, int(time.time()) + 60)  # a slow machine must not let the second pass
+    assert summary(path) is not summary(path)
+
+
+def test_what_is_remembered_is_of_the_same_file_and_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(summary_index, "_MADE", {})
+    monkeypatch.setattr(summary_index, "MOST_REMEMBERED", 2)
+    now, made = time.time_ns(), list[str]()
+
+    def asked(name: str, age_s: float = 60.0, ranged: object = None, size: int = 7) -> str:
+        status = SimpleNamespace(st_ino=1, st_size=size, st_mtime_ns=now - round(age_s * 1e9))
+        stream: Any = SimpleNamespace(status=status, ranged=ranged)
+        found = summary_index._remembered(
+            "x", Path(name), stream, lambda: made.append(name) or name
+        )
+        return str(found)
+
+    for name in ("a", "a", "b", "a"):
+        assert asked(name) == name
+    assert made == ["a", "b"]
+    asked("c")  # a, the oldest, is forgotten
+    asked("b")
+    asked("a")
+    assert made == ["a", "b", "c", "a"]
+    asked("a", size=8)
+    asked("a", age_s=61.0)
+    assert made[4:] == ["a", "a"]
+    made.clear()
+    for age_s, ranged, times in ((0.0, None, 2), (0.0, "bucket", 1), (30.0, None, 1)):
+        for _ in range(2):
+            asked(f"new {age_s} {ranged}", age_s, ranged)
+        assert made.count(f"new {age_s} {ranged}") == times

@@ -1,0 +1,59 @@
+"""A summary whose numbers contradict each other is damaged."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dmrl.errors import RecordingError
+from dmrl.recording.mcap.summary_section import _counted
+
+
+def summary(**more: Any) -> Any:
+    """Of two channels with five messages in one chunk; ``more`` is otherwise."""
+    chunk = SimpleNamespace(message_index_offsets={1: 0, 2: 0})
+    channel = SimpleNamespace(topic="/a", schema_id=3)
+    statistics = {
+        "channel_message_counts": {1: 3, 2: 2},
+        "message_count": 5,
+        "chunk_count": 1,
+        "metadata_count": 0,
+        "attachment_count": 0,
+    }
+    said = {key: value for key, value in more.items() if key in statistics}
+    held = {
+        "statistics": SimpleNamespace(**statistics | said),
+        "chunk_indexes": [chunk],
+        "channels": {1: channel, 2: channel},
+        "schemas": {3: SimpleNamespace(name="x")},
+        "metadata_indexes": [],
+        "attachment_indexes": [],
+    }
+    return SimpleNamespace(**held | {key: more[key] for key in more.keys() - said.keys()})
+
+
+@pytest.mark.parametrize(
+    ("more", "fault"),
+    [
+        ({}, ""),
+        ({"statistics": None}, ""),
+        ({"message_count": 6}, "its statistics contradict themselves"),
+        ({"message_count": 4}, "its statistics contradict themselves"),
+        ({"channel_message_counts": {}, "message_count": 6}, ""),
+        ({"chunk_count": 2}, "its summary lists 1 of 2 chunks"),
+        ({"metadata_count": 2, "metadata_indexes": [1]}, "its summary lists 1 of 2 metadata"),
+        ({"attachment_count": 0, "attachment_indexes": [1]}, "lists 1 of 0 attachments"),
+        ({"metadata_count": 2}, ""),  # it need not list them
+        ({"channel_message_counts": {1: 3, 7: 2}}, "its summary lacks channel 7"),
+        ({"channel_message_counts": {1: 5, 7: 0}}, ""),
+        ({"channels": {1: SimpleNamespace(topic="/a", schema_id=3)}}, "lacks channel 2"),
+        ({"schemas": {}}, "its summary lacks the message type of /a"),
+    ],
+)
+def test_a_summary_agrees_with_itself(more: dict[str, Any], fault: str) -> None:
+    if not fault:
+        _counted(Path("a.mcap"), summary(**more))
+        return
+    with pytest.raises(RecordingError, match=fault):
+        _counted(Path("a.mcap"), summary(**more))

@@ -1,0 +1,199 @@
+"""Copies by the chunk: what goes over as it is, what as slices, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import RecordingError
+from dmrl.messages import message
+from dmrl.recording import (
+    Provenance,
+    RecordingWriter,
+    Timed,
+    merge,
+    read_raw,
+    recover,
+    rewrite,
+    summary,
+    trim,
+)
+from dmrl.recording.mcap import chunk_reader
+
+from .records import channels, chunks, packed, unchanged
+
+MADE = Provenance("test")
+MOMENTS = 6000
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Attitude and height of two robots, a picture of 3 kB now and then."""
+    path = tmp_path_factory.mktemp("copying") / "flight.mcap"
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, MADE) as sink:
+        sink.write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320))
+        for k in range(MOMENTS):
+            for robot in ("cf1", "cf2"):
+                turn = message("Attitude")(roll_rad=rng.normal(), pitch_rad=rng.normal())
+                sink.write(k, f"/{robot}/attitude", turn, publish_ns=k + 3)
+                sink.write(k, f"/{robot}/height", message("Height")(height_m=rng.normal()))
+            if k % 10 == 0:
+                picture = message("CompressedImage")(data=rng.bytes(3000), format="jpeg")
+                sink.write(k, "/cf1/camera/image", picture)
+        sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
+    return path
+
+
+@pytest.mark.heavy
+def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[int] = []
+    unpacked = chunk_reader.unpacked
+    monkeypatch.setattr(
+        chunk_reader, "unpacked", lambda p, c, at: opened.append(at) or unpacked(p, c, at)
+    )
+    fresh = [Timed(k * 100, "/cf1/labels", message("PeerLabels")()) for k in range(20)]
+    out = tmp_path / "out.mcap"
+    rewrite(flight, out, MADE, without=(), fresh=[fresh])
+    assert len(opened) == len(set(opened)) == len(chunks(flight)) > 8
+    assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 2
+    unchanged(flight, out, list(summary(flight).topics))
+    assert [r for r in read_raw(out) if r.topic != "/cf1/labels"] == list(read_raw(flight))
+    assert [raw.time_ns for raw in read_raw(out, "/cf1/labels")] == [m.time_ns for m in fresh]
+
+
+@pytest.mark.heavy
+def test_what_is_left_out_leaves_the_rest_bit_for_bit(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    rewrite(flight, out, MADE, without=["/cf2/attitude"], fresh=())
+    kept = [topic for topic in summary(flight).topics if topic != "/cf2/attitude"]
+    assert list(summary(out).topics) == kept
+    unchanged(flight, out, kept)
+
+
+def test_a_stretch_is_trimmed_out_of_its_chunks(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert trim(flight, out, start_ns=1000, end_ns=3000) == 2000 * 4 + 200
+    ours = [r for r in read_raw(flight) if 1000 <= r.time_ns < 3000]
+    assert list(read_raw(out))[1:] == ours
+    assert len(set(packed(flight)) & set(packed(out))) >= 2
+
+
+def test_a_stretch_that_begins_with_a_chunk_defines_what_it_holds(
+    flight: Path, tmp_path: Path
+) -> None:
+    for k, chunk in enumerate(chunks(flight)[2:4]):
+        out, start_ns = tmp_path / f"{k}.mcap", chunk.message_start_time
+        trim(flight, out, start_ns=start_ns, topics=["/*/attitude", "/*/height"])
+        ours = [r for r in read_raw(flight, "/*/attitude", "/*/height") if r.time_ns >= start_ns]
+        assert list(read_raw(out)) == ours
+        cut = out.with_suffix(".cut.mcap")
+        cut.write_bytes(out.read_bytes()[:-100])  # without its summary
+        recover(cut, tmp_path / f"{k}.whole.mcap")
+        assert summary(tmp_path / f"{k}.whole.mcap").count == len(ours)
+
+
+@pytest.mark.heavy
+def test_parts_are_merged_to_what_they_were(flight: Path, tmp_path: Path) -> None:
+    parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    trim(flight, parts[0], topics=["/cf1/*", "/cf1/camera/*"])
+    trim(flight, parts[1], topics=["/cf2/*"])
+    out = tmp_path / "out.mcap"
+    assert merge(parts, out) == summary(flight).count
+    unchanged(flight, out, list(summary(flight).topics))
+    again = tmp_path / "again.mcap"
+    merge(parts, again)
+    assert again.read_bytes() == out.read_bytes()
+
+
+def test_message_indexes_of_whole_chunks_go_along_as_they_are(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    rewrite(flight, out, MADE, without=())
+    before, after = (indexes(path) for path in (flight, out))
+    assert len(set(before) & set(after)) >= len(chunks(flight)) - 2
+    assert len(after) == len(chunks(out))
+
+
+def indexes(path: Path) -> list[bytes]:
+    """The message indexes of all chunks."""
+    data, found = path.read_bytes(), chunks(path)
+    ends = [(c.chunk_start_offset + c.chunk_length, c.message_index_length) for c in found]
+    return [data[at : at + size] for at, size in ends]
+
+
+@pytest.mark.parametrize("start_ns", [0, 2000, 2001, 5900])
+def test_a_trim_cuts_the_chunks_at_both_its_ends(
+    flight: Path, tmp_path: Path, start_ns: int
+) -> None:
+    """Where it begins, and one short of the end of a chunk."""
+    end_ns = next(c.message_end_time for c in chunks(flight) if c.message_end_time > start_ns)
+    out = tmp_path / "out.mcap"
+    trim(flight, out, start_ns=start_ns, end_ns=end_ns, topics=["/cf1/attitude", "/cf2/height"])
+    ours = read_raw(flight, "/cf1/attitude", "/cf2/height", start_ns=start_ns, end_ns=end_ns)
+    assert list(read_raw(out)) == list(ours)
+    assert len(list(read_raw(out))) == 2 * (end_ns - start_ns)
+
+
+def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Path) -> None:
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    rng = np.random.default_rng(0)
+    for path, robot in zip(paths, ("cf1", "cf2"), strict=True):
+        with RecordingWriter(path, MADE) as sink:
+            for k in range(12_000):
+                sink.write(k, f"/{robot}/height", message("Height")(height_m=rng.normal()))
+    assert {*channels(paths[0])} == {*channels(paths[1])}
+    out = tmp_path / "out.mcap"
+    assert merge(paths, out) == 24_000
+    for path, topic in zip(paths, ("/cf1/height", "/cf2/height"), strict=True):
+        unchanged(path, out, [topic])
+    assert len(channels(out)) == 2
+
+
+def test_an_index_that_gives_a_message_to_another_channel_is_damage(
+    flight: Path, tmp_path: Path
+) -> None:
+    bad, data = tmp_path / "bad.mcap", bytearray(flight.read_bytes())
+    chunk = chunks(flight)[1]
+    first, second = sorted(chunk.message_index_offsets.values())[:2]
+    for at in range(15, 15 + 16):  # their first entries change places
+        data[first + at], data[second + at] = data[second + at], data[first + at]
+    bad.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"index of the chunk at byte \d+ is wrong"):
+        rewrite(bad, tmp_path / "out.mcap", MADE, without=())
+
+
+def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path) -> None:
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
+    last = max(c.chunk_start_offset for c in chunks(flight))
+    cut.write_bytes(flight.read_bytes()[:last])
+    result = recover(cut, out)
+    assert result.messages == summary(out).count > MOMENTS
+    assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 3
+
+
+def test_what_is_copied_is_checked(flight: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "a.mcap"
+    for chunk in chunks(flight)[2], chunks(flight)[-1]:
+        data = bytearray(flight.read_bytes())
+        data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+        damaged.write_bytes(data)
+        with pytest.raises(RecordingError, match="damaged"):
+            rewrite(damaged, tmp_path / "out.mcap", MADE, without=(), fresh=())
+        with pytest.raises(RecordingError, match="damaged"):
+            merge([damaged, flight], tmp_path / "out.mcap")
+        assert not (tmp_path / "out.mcap").exists()
+
+
+def test_small_chunks_of_a_live_recording_are_put_together(tmp_path: Path) -> None:
+    path, out = tmp_path / "live.mcap", tmp_path / "out.mcap"
+    with RecordingWriter(path, MADE) as sink:
+        for k in range(500):
+            sink.write(k, "/cf1/height", message("Height")(height_m=k))
+            if k % 10 == 9:
+                sink.flush()
+    assert len(chunks(path)) == 50
+    rewrite(path, out, MADE, without=(), fresh=())
+    assert len(chunks(out)) == 1
+    unchanged(path, out, ["/cf1/height"])
