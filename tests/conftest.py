@@ -9,7 +9,7 @@ import pytest
 from hypothesis import settings
 
 import dmrl.learn  # noqa: F401  # before any test imports torch, which reads its settings once
-from dmrl.rendering import environment
+from dmrl.rendering.backgrounds import environment
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dmrl.colours import OWN, RGB, STATUS_RGB
 from dmrl.geometry.frames import Array
-from dmrl.rendering import crazyflie
+from dmrl.rendering.robots import crazyflie
 from dmrl.viewer.entity import (
     ELLIPSE_SIGMAS,
     LINE_UI,

@@ -15,8 +15,8 @@ from dmrl.datasets import Split, is_dataset, open_dataset
 from dmrl.errors import SettingError
 from dmrl.images.bayer import load_opencv
 from dmrl.images.codec import Rgb
-from dmrl.rendering.backdrops import Photos, photos_in
-from dmrl.rendering.interiors import ROOMS, rooms
+from dmrl.rendering.backgrounds.photos import Photos, photos_in
+from dmrl.rendering.backgrounds.rooms import ROOMS, rooms
 
 MOST_HIDDEN = 0.15
 """Share of an image that may be painted over; of more, too little is left to be a background."""

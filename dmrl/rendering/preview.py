@@ -7,14 +7,14 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.plots import Side, model_sides
-from dmrl.rendering.designs import DESIGNS
+from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.randomise import random_paint
 from dmrl.rendering.renderer import Renderer
-from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.robots.primitives import Design
+from dmrl.rendering.robots.registry import DESIGNS
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch import Pose
-from dmrl.rendering.solids import Design
 
 SIDE_PX = 480
 DISTANCE = 12.0

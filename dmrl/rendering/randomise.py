@@ -9,14 +9,14 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.rendering.backdrops import Photos, panorama_view, smeared, stretched
-from dmrl.rendering.crazyflie import CRAZYFLIE
-from dmrl.rendering.lens import Picture, pinhole_from_image
-from dmrl.rendering.sensor import Sensor, blur
+from dmrl.rendering.backgrounds.photos import Photos, panorama_view, smeared, stretched
+from dmrl.rendering.camera.lens import Picture, pinhole_from_image
+from dmrl.rendering.camera.sensor import Sensor, blur
+from dmrl.rendering.robots.crazyflie import CRAZYFLIE
+from dmrl.rendering.robots.primitives import Design
 from dmrl.rendering.settings import Range, Settings
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch import Pose
-from dmrl.rendering.solids import Design
 
 TRIES = 30
 # Of panoramas, whose suns and lamps would leave nothing else to see; photos end below.

@@ -15,12 +15,12 @@ import numpy as np
 
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import Array, Camera
-from dmrl.rendering.compose import compose
-from dmrl.rendering.crazyflie import BETWEEN_ROTORS_RAD, BLADE_HALF_WIDTH_M, CRAZYFLIE
-from dmrl.rendering.lens import Picture
-from dmrl.rendering.pool import Pool, Start, Worker
+from dmrl.rendering.camera.lens import Picture
+from dmrl.rendering.compositing import compose
+from dmrl.rendering.robots.crazyflie import BETWEEN_ROTORS_RAD, BLADE_HALF_WIDTH_M, CRAZYFLIE
+from dmrl.rendering.robots.primitives import Design
 from dmrl.rendering.shot import Layer, Look, Robot, Shot, requests
-from dmrl.rendering.solids import Design
+from dmrl.rendering.worker_pool import Pool, Start, Worker
 
 MODEL_KINDS = (".blend", ".glb", ".gltf", ".obj", ".stl")
 PANORAMA_KINDS = (".exr", ".hdr")

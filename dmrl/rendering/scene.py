@@ -7,8 +7,8 @@ from numpy.random import Generator
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.images.canvas import Picture
-from dmrl.rendering.background import background, window
-from dmrl.rendering.quadrotor import RADIUS_M
+from dmrl.rendering.backgrounds.procedural import background, window
+from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.sketch import Look, Pose
 
 DEPTH_M = (0.2, 2.0)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.rendering.lens import Canvas, Picture, canvas_of
-from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.camera.lens import Canvas, Picture, canvas_of
+from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.sketch import Pose
 
 Part = tuple[slice, slice]

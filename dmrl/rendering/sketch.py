@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.images.canvas import Canvas, Levels, Picture, bands
-from dmrl.rendering import quadrotor
+from dmrl.rendering.robots import quadrotor
 
 SEEN = 1 / 255
 """Opacity from which a pixel counts as covered by a robot."""

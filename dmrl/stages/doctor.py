@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 
 from dmrl.deploy.c.run import toolchain
 from dmrl.errors import SettingError, ToolError
-from dmrl.rendering import environment
+from dmrl.rendering.backgrounds import environment
 from dmrl.terminal.arguments import AsJson
 from dmrl.terminal.tables import print_json, print_line, print_table
 

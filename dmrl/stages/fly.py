@@ -21,9 +21,9 @@ from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
 from dmrl.pipeline.single_run import done_on
 from dmrl.recording import Provenance, RecordingWriter, provenance
-from dmrl.rendering import aloft, renderer
-from dmrl.rendering.environment import ensure
-from dmrl.rendering.onboard import Body, Renderer, sketched, view
+from dmrl.rendering import flight_images, renderer
+from dmrl.rendering.backgrounds.environment import ensure
+from dmrl.rendering.onboard_camera import Body, Renderer, sketched, view
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch import Sketch
 from dmrl.samples import flight as samples
@@ -142,7 +142,7 @@ def _renderer(
         return sketched, made
     blender = stack.enter_context(renderer.Renderer(ensure(say), renderer.Model()))
     made = replace(made, libraries={**made.libraries, "blender": blender.version})
-    return aloft.Flight(blender, settings.seed), made
+    return flight_images.Flight(blender, settings.seed), made
 
 
 def _check(settings: Settings) -> None:

@@ -20,10 +20,10 @@ from dmrl.formats.files.image_folder import list_pictures
 from dmrl.images.codec import Rgb, decode, size
 from dmrl.recording import read, summary
 from dmrl.rendering import settings as looks
+from dmrl.rendering.backgrounds.rooms import ROOMS
+from dmrl.rendering.camera.image_statistics import FIGURES, Likeness, Seen, seen
 from dmrl.rendering.contact_sheet import evenly, sheet
-from dmrl.rendering.fitting import KNOBS, ROUNDS, fitted, pictures, scenes
-from dmrl.rendering.interiors import ROOMS
-from dmrl.rendering.likeness import FIGURES, Likeness, Seen, seen
+from dmrl.rendering.preset_fitting import KNOBS, ROUNDS, fitted, pictures, scenes
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_line, print_table

@@ -31,13 +31,13 @@ from dmrl.recording import (
     licence_words,
     provenance,
 )
-from dmrl.rendering.designs import DESIGNS
-from dmrl.rendering.environment import ensure
-from dmrl.rendering.interiors import ROOMS
-from dmrl.rendering.lens import canvas_of
+from dmrl.rendering.backgrounds.environment import ensure
+from dmrl.rendering.backgrounds.rooms import ROOMS
+from dmrl.rendering.camera.lens import canvas_of
 from dmrl.rendering.messages import ROBOT, samples
 from dmrl.rendering.randomise import Drawn, World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer, Scene, panoramas_in
+from dmrl.rendering.robots.registry import DESIGNS
 from dmrl.rendering.settings import Settings, filled
 from dmrl.samples.sample import Sample, calibration, intervals
 from dmrl.terminal.arguments import AsJson, On

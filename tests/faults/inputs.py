@@ -30,7 +30,9 @@ STAND_INS = {
     "run": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),
     "trim": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),
     "evaluate": (("matplotlib.figure:Figure", "draw", "blank"),),
-    "likeness": tuple(("dmrl.rendering.fitting:", name, "FEW") for name in ("COARSE", "FINE")),
+    "likeness": tuple(
+        ("dmrl.rendering.preset_fitting:", name, "FEW") for name in ("COARSE", "FINE")
+    ),
     "index": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),
     "report": (("matplotlib.figure:Figure", "draw", "blank"),),
     "dataset": (("dmrl.card:", "plots", "nothing"),),

@@ -16,9 +16,9 @@ from typing import Any, NoReturn, TextIO
 import numpy as np
 
 from dmrl.pipeline import worker
-from dmrl.rendering import crazyflie
 from dmrl.rendering.blender.protocol import Arrays
-from dmrl.rendering.pool import Start
+from dmrl.rendering.robots import crazyflie
+from dmrl.rendering.worker_pool import Start
 
 FEW = (2, 3)
 """In place of the rounds, and the pictures, that `dmrl likeness` fits a camera by."""
@@ -28,7 +28,7 @@ class Painter:
     """In place of a Blender process: a grey spot for every robot that is asked for."""
 
     def ask(self, head: dict[str, Any], arrays: Arrays | None = None) -> tuple[Any, Arrays]:
-        """As `dmrl.rendering.pool.Worker.ask`."""
+        """As `dmrl.rendering.worker_pool.Worker.ask`."""
         if "panorama" in head:
             return {}, {"panorama": np.full((8, 16, 3), 0.5, np.float32)}
         left, top, right, bottom = head["crop_px"]
@@ -42,7 +42,7 @@ class Painter:
 
 
 class Painters:
-    """In place of `dmrl.rendering.pool.Pool`."""
+    """In place of `dmrl.rendering.worker_pool.Pool`."""
 
     def __init__(self, start: Start, count: int) -> None:
         self.version = "0"
@@ -70,7 +70,7 @@ def sky(_: Path) -> list[Path]:
 
 
 def no_python(_: object) -> Path:
-    """In place of `dmrl.rendering.environment.ensure`."""
+    """In place of `dmrl.rendering.backgrounds.environment.ensure`."""
     return Path("python")
 
 

@@ -18,7 +18,7 @@ from dmrl.guards.paths import refuse_no_text, refuse_pipe, refuse_pipes
 from dmrl.html_report import gather
 from dmrl.learn.inference.loaded_model import load_model
 from dmrl.recording.provenance_inputs import input_of
-from dmrl.rendering.backdrops import photos_in
+from dmrl.rendering.backgrounds.photos import photos_in
 from dmrl.stages import calibrate, convert
 from dmrl.storage import path_of
 

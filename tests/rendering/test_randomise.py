@@ -9,10 +9,10 @@ import pytest
 
 from dmrl.geometry.frames import PUBLISHED_RENDER, Camera, project
 from dmrl.images.codec import encode_png
-from dmrl.rendering.backdrops import photos_in
-from dmrl.rendering.crazyflie import CRAZYFLIE
+from dmrl.rendering.backgrounds.photos import photos_in
+from dmrl.rendering.camera.sensor import expose
 from dmrl.rendering.randomise import World, draw_scene, strong_colours
-from dmrl.rendering.sensor import expose
+from dmrl.rendering.robots.crazyflie import CRAZYFLIE
 from dmrl.rendering.settings import PRESETS, Settings
 
 SMALL = Camera(40, 28, 15.0, 15.0, 20.0, 14.0)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import AIDECK
-from dmrl.rendering import pool
+from dmrl.rendering import worker_pool
 from dmrl.rendering.blender import protocol
+from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.renderer import Model, Renderer, Scene
-from dmrl.rendering.sensor import Sensor
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch import Pose
 
@@ -43,8 +43,8 @@ def test_pixels_come_through_files_where_memory_is_shut(
     with Renderer(blender, Model(), workers=1, samples=2) as renderer:
         asked = [scene(renderer.lights[0], depth_m) for depth_m in (0.5, 1.0)]
         expected = list(renderer.shots(asked))
-    monkeypatch.setattr(pool, "WORKER", tmp_path / "worker.py")
-    pool.WORKER.write_text(SHUT)
+    monkeypatch.setattr(worker_pool, "WORKER", tmp_path / "worker.py")
+    worker_pool.WORKER.write_text(SHUT)
     with Renderer(blender, Model(), workers=1, samples=2) as renderer:
         found = list(renderer.shots(asked))
         assert renderer.pool.replaced == 0

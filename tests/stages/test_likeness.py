@@ -18,11 +18,11 @@ from dmrl.errors import (
     SourceError,
 )
 from dmrl.images.codec import decode, encode_png
-from dmrl.rendering import fitting
+from dmrl.rendering import preset_fitting
 from dmrl.rendering import settings as looks
-from dmrl.rendering.fitting import pictures, scenes
-from dmrl.rendering.interiors import rooms
-from dmrl.rendering.likeness import FIGURES, Likeness
+from dmrl.rendering.backgrounds.rooms import rooms
+from dmrl.rendering.camera.image_statistics import FIGURES, Likeness
+from dmrl.rendering.preset_fitting import pictures, scenes
 from dmrl.stages.likeness import Settings, run
 from dmrl.stages.render import settings_of
 
@@ -148,7 +148,7 @@ def test_what_frames_do_not_show_is_said_and_left(
 ) -> None:
     """Black and white stripes have sharp edges, but no grain."""
     for name in ("COARSE", "FINE"):
-        monkeypatch.setattr(fitting, name, (1, 2))
+        monkeypatch.setattr(preset_fitting, name, (1, 2))
     own, out = folder_of(tmp_path / "own", [STRIPES]), tmp_path / "a.toml"
     app(["likeness", str(own), str(out)], result_action="return_value")
     said = capsys.readouterr()
@@ -164,7 +164,7 @@ def test_a_picture_that_a_killed_run_left_is_no_obstacle(
 ) -> None:
     """It has its name before the recipe; another's picture stays, and an error leaves neither."""
     for name in ("COARSE", "FINE"):
-        monkeypatch.setattr(fitting, name, (1, 2))
+        monkeypatch.setattr(preset_fitting, name, (1, 2))
     dots, out = Inputs(tmp_path).dots, tmp_path / "a.toml"
     run(dots, out, Settings())
     made = {end: (tmp_path / f"a{end}").read_bytes() for end in (".toml", ".png")}

@@ -16,11 +16,11 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.images.codec import decode, encode_png
 from dmrl.recording import check, licences, read, summary
-from dmrl.rendering import crazyflie
-from dmrl.rendering.lens import image_from_pinhole
+from dmrl.rendering.camera.lens import image_from_pinhole
 from dmrl.rendering.messages import quaternion
 from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot
 from dmrl.stages.render import camera_of, run

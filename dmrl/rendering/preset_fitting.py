@@ -13,10 +13,10 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
 from dmrl.images.codec import Rgb, decode, encode_jpeg
-from dmrl.rendering.backdrops import LIGHT_OF, Photos
-from dmrl.rendering.likeness import Seen, middle_of, seen
+from dmrl.rendering.backgrounds.photos import LIGHT_OF, Photos
+from dmrl.rendering.camera.image_statistics import Seen, middle_of, seen
+from dmrl.rendering.camera.sensor import expose
 from dmrl.rendering.randomise import behind, random_sensor, without_highlights
-from dmrl.rendering.sensor import expose
 from dmrl.rendering.settings import LIMITS, Settings
 
 COARSE, FINE = (8, 32), (5, 192)

@@ -7,7 +7,13 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import AIDECK
-from dmrl.rendering.lens import between, canvas_of, image_from_pinhole, pinhole_from_image, sample
+from dmrl.rendering.camera.lens import (
+    between,
+    canvas_of,
+    image_from_pinhole,
+    pinhole_from_image,
+    sample,
+)
 
 
 def test_undistorting_takes_distortion_back() -> None:

@@ -4,9 +4,9 @@ from typing import get_args, get_type_hints
 
 import numpy as np
 
-from dmrl.rendering.designs import DESIGNS
+from dmrl.rendering.robots.registry import DESIGNS
+from dmrl.rendering.robots.violet import FITTED_SIZE, FITTED_Z_M, VIOLET
 from dmrl.rendering.settings import Settings
-from dmrl.rendering.violet import FITTED_SIZE, FITTED_Z_M, VIOLET
 
 
 def test_it_has_four_motors_as_far_apart_as_fitted() -> None:

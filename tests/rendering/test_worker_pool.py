@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dmrl.errors import BlenderError
-from dmrl.rendering import pool
+from dmrl.rendering import worker_pool
 from dmrl.rendering.blender import protocol
-from dmrl.rendering.pool import Pool, Start, Worker
+from dmrl.rendering.worker_pool import Pool, Start, Worker
 
 # Doubles numbers as a worker would; dies once of 5 and always of 13.
 FAKE = f"""
@@ -42,7 +42,7 @@ while True:
 def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Start:
     script = tmp_path / "worker.py"
     script.write_text(FAKE)
-    monkeypatch.setattr(pool, "WORKER", script)
+    monkeypatch.setattr(worker_pool, "WORKER", script)
     return Start(Path(sys.executable), {"died": str(tmp_path / "died"), "model": None})
 
 
@@ -92,6 +92,6 @@ def test_what_the_worker_says_of_a_model_is_the_error(start: Start) -> None:
 
 
 def test_a_worker_that_does_not_start_says_why(start: Start) -> None:
-    pool.WORKER.write_text("import nothing_of_that_name")
+    worker_pool.WORKER.write_text("import nothing_of_that_name")
     with pytest.raises(BlenderError, match=r"nothing_of_that_name.*dmrl render --setup"):
         Pool(start, 1)

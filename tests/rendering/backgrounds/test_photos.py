@@ -9,7 +9,7 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import encode_jpeg, encode_png
-from dmrl.rendering.backdrops import LIGHT_OF, panorama_view, photos_in, smeared
+from dmrl.rendering.backgrounds.photos import LIGHT_OF, panorama_view, photos_in, smeared
 
 CAMERA = replace(AIDECK, distortion=())
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping
 
-from dmrl.rendering.crazyflie import CRAZYFLIE
-from dmrl.rendering.solids import Design
-from dmrl.rendering.violet import VIOLET
+from dmrl.rendering.robots.crazyflie import CRAZYFLIE
+from dmrl.rendering.robots.primitives import Design
+from dmrl.rendering.robots.violet import VIOLET
 
 DESIGNS: Mapping[str, Design] = {"crazyflie": CRAZYFLIE, "violet": VIOLET}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import AIDECK, project
-from dmrl.rendering.onboard import NEAREST_M, Body, View, in_front, pose_of, sketched, view
+from dmrl.rendering.onboard_camera import NEAREST_M, Body, View, in_front, pose_of, sketched, view
 
 CAMERA = replace(AIDECK, distortion=())
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.rendering.quadrotor import RADIUS_M
+from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.scene import random_look
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch import Pose, Sketch, draw

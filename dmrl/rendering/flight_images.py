@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
-from dmrl.rendering.backdrops import panorama_view, smeared
-from dmrl.rendering.crazyflie import CRAZYFLIE
-from dmrl.rendering.lens import Picture
-from dmrl.rendering.onboard import View
+from dmrl.rendering.backgrounds.photos import panorama_view, smeared
+from dmrl.rendering.camera.lens import Picture
+from dmrl.rendering.camera.sensor import blur
+from dmrl.rendering.onboard_camera import View
 from dmrl.rendering.randomise import HIGHLIGHTS, random_paint, random_sensor
 from dmrl.rendering.renderer import Renderer, Scene
-from dmrl.rendering.sensor import blur
+from dmrl.rendering.robots.crazyflie import CRAZYFLIE
 from dmrl.rendering.settings import PRESETS, Settings
 from dmrl.rendering.shot import Light, Look, Robot, Shot
 

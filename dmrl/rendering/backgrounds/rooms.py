@@ -12,7 +12,7 @@ from numpy.random import Generator
 from dmrl.geometry.frames import Array
 from dmrl.images.canvas import LEVELS, Canvas, Colour, Picture
 from dmrl.images.codec import Rgb
-from dmrl.rendering.backdrops import Photos
+from dmrl.rendering.backgrounds.photos import Photos
 
 ROOMS = "rooms"
 """What ``backgrounds`` says for `rooms`."""

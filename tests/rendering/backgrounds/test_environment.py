@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import BlenderError
-from dmrl.rendering import environment
+from dmrl.rendering.backgrounds import environment
 
 
 @pytest.fixture(autouse=True)

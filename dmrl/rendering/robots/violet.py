@@ -10,7 +10,16 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from dmrl.rendering.solids import Colour, Design, Finish, Part, box, cylinder, rounded, turned
+from dmrl.rendering.robots.primitives import (
+    Colour,
+    Design,
+    Finish,
+    Part,
+    box,
+    cylinder,
+    rounded,
+    turned,
+)
 
 PAINT: Mapping[str, Finish] = {
     "board": ((0.072, 0.029, 1.000), 0.75, 0.0, 0.0),

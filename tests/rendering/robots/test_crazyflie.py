@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dmrl.rendering.crazyflie import CRAZYFLIE, outline
+from dmrl.rendering.robots.crazyflie import CRAZYFLIE, outline
 
 
 def test_it_is_life_size_about_the_middle_of_its_box() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from dmrl.geometry.frames import Array
-from dmrl.rendering.solids import (
+from dmrl.rendering.robots.primitives import (
     ROTOR,
     Colour,
     Design,

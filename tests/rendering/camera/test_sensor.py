@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmrl.rendering.sensor import Sensor, blur, demosaic, expose, mosaic
+from dmrl.rendering.camera.sensor import Sensor, blur, demosaic, expose, mosaic
 
 
 def rng() -> np.random.Generator:

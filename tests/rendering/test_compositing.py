@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import AIDECK, Camera
-from dmrl.rendering.compose import compose
-from dmrl.rendering.lens import canvas_of, image_from_pinhole
-from dmrl.rendering.sensor import Sensor
+from dmrl.rendering.camera.lens import canvas_of, image_from_pinhole
+from dmrl.rendering.camera.sensor import Sensor
+from dmrl.rendering.compositing import compose
 from dmrl.rendering.shot import Layer, Light, Look, Robot, crop_of
 from dmrl.rendering.sketch import Pose
 

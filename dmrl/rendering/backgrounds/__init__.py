@@ -1,0 +1,1 @@
+"""Backgrounds of rendered images: photos, rooms and environments."""
