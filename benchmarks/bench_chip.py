@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dmrl import plots
 from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
-from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.activation_ranges import calibrate
 from dmrl.deploy.int8.equalisation import equalise
 from dmrl.deploy.int8.graph import graph_of
 from dmrl.deploy.int8.quantise import About, quantise

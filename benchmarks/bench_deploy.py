@@ -17,7 +17,7 @@ import numpy as np
 from dmrl.deploy.backends import seen_by
 from dmrl.deploy.c.run.compiled import Compiled
 from dmrl.deploy.int8.store import load
-from dmrl.deploy.onnx.run import OnnxRun
+from dmrl.deploy.onnx.runtime import OnnxRun
 from dmrl.deploy.samples import load_samples
 
 PEER = "onnxruntime int8"

@@ -134,10 +134,10 @@ def fastest(model: Path, size_px: tuple[int, int]) -> BackendName:
         Width and height of the images.
     """
     try:
-        import_module("dmrl.deploy.onnx.run")
+        import_module("dmrl.deploy.onnx.runtime")
         if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
             return "onnx"
-        written = import_module("dmrl.deploy.onnx.write").OUTPUT_OF
+        written = import_module("dmrl.deploy.onnx.graph_writer").OUTPUT_OF
         learned = import_module("dmrl.learn.inference.loaded_model").load_model(model)
     except (MissingExtra, ModuleNotFoundError, ModelError):
         return "torch"  # which says what is wrong
@@ -166,7 +166,7 @@ def _torch(model: Path, _backend: BackendName) -> Detector:
 
 
 def _onnx(model: Path, _backend: BackendName) -> Detector:
-    room = _room("dmrl.deploy.onnx.run", "deploy", "--backend onnx")
+    room = _room("dmrl.deploy.onnx.runtime", "deploy", "--backend onnx")
     file = model / FLOAT_ONNX_NAME
     if file.is_file():
         runs = room.OnnxRun(file, file)
@@ -186,12 +186,14 @@ def _onnx(model: Path, _backend: BackendName) -> Detector:
 
 
 def _onnx_int8(model: Path, backend: BackendName) -> Detector:
-    room = _room("dmrl.deploy.onnx.run", "deploy", "--backend onnx-int8")
+    room = _room("dmrl.deploy.onnx.runtime", "deploy", "--backend onnx-int8")
     network = _network(model, backend)
     file = model / INT8_ONNX_NAME
     if file.is_file():
         return _of_network(model, network, room.OnnxRun(file, file), file)
-    written = _room("dmrl.deploy.onnx.write", "deploy", "--backend onnx-int8").int8_onnx(network)
+    written = _room("dmrl.deploy.onnx.graph_writer", "deploy", "--backend onnx-int8").int8_onnx(
+        network
+    )
     return _of_network(model, network, room.OnnxRun(written, model), _integer_file(model))
 
 

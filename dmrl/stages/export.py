@@ -125,7 +125,7 @@ def run(model: Path, out: Path, settings: Settings) -> list[Written]:
 
 
 def _write_int8(network: IntegerNetwork, model: Path, folder: Path, settings: Settings) -> None:
-    int8_onnx = import_module("dmrl.deploy.onnx.write").int8_onnx
+    int8_onnx = import_module("dmrl.deploy.onnx.graph_writer").int8_onnx
     (folder / INT8_ONNX_NAME).write_bytes(int8_onnx(network))
     for name in (INTEGER_NAME, SAMPLES_NAME):
         shutil.copyfile(model / name, folder / name)

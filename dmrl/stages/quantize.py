@@ -14,10 +14,10 @@ from dmrl.atomic_output import partial_folder, refuse_existing
 from dmrl.datasets import Dataset, Split, open_dataset
 from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
 from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
-from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.activation_ranges import calibrate
 from dmrl.deploy.int8.equalisation import equalise
-from dmrl.deploy.int8.folding import LayerFigures, layer_figures
 from dmrl.deploy.int8.graph import Graph, graph_of
+from dmrl.deploy.int8.layer_errors import LayerFigures, layer_figures
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.quantise import About, quantise
 from dmrl.deploy.int8.rounding import moments_of

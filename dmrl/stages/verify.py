@@ -14,10 +14,10 @@ from dmrl.atomic_output import partial_file
 from dmrl.datasets import open_dataset
 from dmrl.deploy.backends import seen_by
 from dmrl.deploy.c import L1_FOR_STATE
+from dmrl.deploy.c.run.compile_targets import targets
 from dmrl.deploy.c.run.compiled import require_c
 from dmrl.deploy.c.run.measure import Cost, Memory, cost, memory_of, rates
-from dmrl.deploy.c.run.targets import targets
-from dmrl.deploy.c.run.verify import TargetResult, expected, prove
+from dmrl.deploy.c.run.verification import TargetResult, expected, prove
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.store import load
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples

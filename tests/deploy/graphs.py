@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.activation_ranges import calibrate
 from dmrl.deploy.int8.equalisation import equalise
 from dmrl.deploy.int8.graph import (
     FloatAdd,

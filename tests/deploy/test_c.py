@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dmrl.deploy.bayer import demosaic
+from dmrl.deploy.bayer_input import demosaic
 from dmrl.deploy.c import c_name, write_c
 from dmrl.deploy.c.harness import answers
+from dmrl.deploy.c.run.compile_targets import RISCV_FLAGS, SANITIZERS, Build, Target
 from dmrl.deploy.c.run.compiled import Compiled
 from dmrl.deploy.c.run.measure import cost
-from dmrl.deploy.c.run.targets import RISCV_FLAGS, SANITIZERS, Build, Target
 from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, missing
-from dmrl.deploy.c.run.verify import TargetResult, expected, prove
-from dmrl.deploy.c.source import source
-from dmrl.deploy.c.text import names_of
+from dmrl.deploy.c.run.verification import TargetResult, expected, prove
+from dmrl.deploy.c.source_file import source
+from dmrl.deploy.c.templating import names_of
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
 from dmrl.deploy.int8.reference import decode, run
 from dmrl.errors import ModelError, SettingError, ToolError

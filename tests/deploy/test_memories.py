@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.c import L1_FOR_STATE, write_c
-from dmrl.deploy.c.memories import split, traffic_bytes
-from dmrl.deploy.c.plan import Plan, plan
+from dmrl.deploy.c.buffer_plan import Plan, plan
+from dmrl.deploy.c.memory_levels import split, traffic_bytes
+from dmrl.deploy.c.run.compile_targets import SANITIZERS, Build, Target
 from dmrl.deploy.c.run.measure import Memory, memory_of
-from dmrl.deploy.c.run.targets import SANITIZERS, Build, Target
-from dmrl.deploy.c.run.verify import TargetResult, expected, prove
+from dmrl.deploy.c.run.verification import TargetResult, expected, prove
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import SettingError
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.backends import Float, integer
-from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.activation_ranges import calibrate
 from dmrl.deploy.int8.graph import FloatConv, Graph
 from dmrl.deploy.int8.network import Add, Conv, IntegerNetwork
 from dmrl.deploy.int8.quantise import HEAD_OF, About, quantise
-from dmrl.deploy.onnx.run import OnnxRun
-from dmrl.deploy.onnx.write import float_onnx, int8_onnx
+from dmrl.deploy.onnx.graph_writer import float_onnx, int8_onnx
+from dmrl.deploy.onnx.runtime import OnnxRun
 from dmrl.errors import ModelError
 
 from .graphs import SUB_CELL, quantised_network, random_graph

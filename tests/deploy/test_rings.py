@@ -2,8 +2,8 @@
 
 import pytest
 
-from dmrl.deploy.c.plan import plan
-from dmrl.deploy.c.rings import Step, play, rows_held, shared_ring
+from dmrl.deploy.c.buffer_plan import plan
+from dmrl.deploy.c.row_schedule import Step, play, rows_held, shared_ring
 from dmrl.deploy.int8.network import Conv
 
 from .graphs import quantised_network, untrained

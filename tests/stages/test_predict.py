@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dmrl.deploy.detector import fastest
-from dmrl.deploy.onnx import run as onnx_run
+from dmrl.deploy.onnx import runtime as onnx_run
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
 from dmrl.images.codec import Opened, decode, encode_png
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
@@ -213,7 +213,7 @@ def test_torch_is_taken_where_onnx_would_not_do(
     save_model(Model(network, "dmrl-nano", width_px=64, height_px=48), tmp_path / "more")
     assert fastest(tmp_path / "more", (64, 48)) == "torch"  # which says the spread as well
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.delitem(sys.modules, "dmrl.deploy.onnx.run", raising=False)
+    monkeypatch.delitem(sys.modules, "dmrl.deploy.onnx.runtime", raising=False)
     assert fastest(settled, (64, 48)) == "torch"
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from dmrl.cli import app
 from dmrl.deploy.c import write_c
-from dmrl.deploy.c.run import targets
-from dmrl.deploy.c.source import STACK_BYTES
+from dmrl.deploy.c.run import compile_targets
+from dmrl.deploy.c.source_file import STACK_BYTES
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
 from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.samples import save_samples
@@ -86,7 +86,7 @@ def test_counting_instructions_gives_the_same_number_again(
 @pytest.fixture
 def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
     """The C is compiled once and its cost not counted: the slow tests do all of that."""
-    monkeypatch.setattr(targets, "LEVELS", ("-O0",))
+    monkeypatch.setattr(compile_targets, "LEVELS", ("-O0",))
     monkeypatch.setattr(verify, "cost", lambda *_: None)
 
 

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from dmrl.deploy.c.memories import rows_read
-from dmrl.deploy.c.places import RANGES, TYPES, Desk, body, plus, suffixes
-from dmrl.deploy.c.plan import Plan, along, taps_of
-from dmrl.deploy.c.rings import Step
-from dmrl.deploy.c.text import wrapped
+from dmrl.deploy.c.buffer_plan import Plan, along, taps_of
+from dmrl.deploy.c.memory_levels import rows_read
+from dmrl.deploy.c.row_addresses import RANGES, TYPES, Desk, body, plus, suffixes
+from dmrl.deploy.c.row_schedule import Step
+from dmrl.deploy.c.templating import wrapped
 from dmrl.deploy.int8.network import Conv
 
 

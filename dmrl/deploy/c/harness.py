@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c.text import fill, names_of
+from dmrl.deploy.c.templating import fill, names_of
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import Detection
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.calibration import Ranges
+from dmrl.deploy.int8.activation_ranges import Ranges
 from dmrl.deploy.int8.graph import FloatConv, Graph
 
 Array = NDArray[np.float64]

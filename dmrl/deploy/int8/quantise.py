@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.calibration import Ranges
+from dmrl.deploy.int8.activation_ranges import Ranges
 from dmrl.deploy.int8.graph import (
     FloatAdd,
     FloatConv,

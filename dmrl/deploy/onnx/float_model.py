@@ -1,7 +1,7 @@
 """A trained model as float ONNX: the way from torch to a file in one call."""
 
 from dmrl.deploy.int8.graph import Graph, graph_of
-from dmrl.deploy.onnx.write import float_onnx
+from dmrl.deploy.onnx.graph_writer import float_onnx
 from dmrl.learn.inference.loaded_model import Model
 from dmrl.learn.networks.trace import operations
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from dmrl.deploy.backends import Float, integer
 from dmrl.deploy.int8 import reference
-from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.activation_ranges import calibrate
 from dmrl.deploy.int8.equalisation import equalise
-from dmrl.deploy.int8.folding import layer_figures
 from dmrl.deploy.int8.graph import FloatConv, Graph, grey_of, outputs_of, tensors_of, to_input
+from dmrl.deploy.int8.layer_errors import layer_figures
 from dmrl.deploy.int8.network import Conv
 from dmrl.deploy.int8.quantise import MEANINGS, About, _fixed_point, _odd, _shortened, quantise
 from dmrl.errors import ModelError, SettingError

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.c import write_c
-from dmrl.deploy.c.run.targets import SANITIZERS, Build, Target
-from dmrl.deploy.c.run.verify import expected, prove
+from dmrl.deploy.c.run.compile_targets import SANITIZERS, Build, Target
+from dmrl.deploy.c.run.verification import expected, prove
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import Quantised, convolve, tensors_of
 from dmrl.deploy.int8.refinement import POINT, Seen, last_layer, learn, start, with_learned

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.backends import Float, integer
-from dmrl.deploy.int8.calibration import calibrate
+from dmrl.deploy.int8.activation_ranges import calibrate
 from dmrl.deploy.int8.equalisation import equalise
 from dmrl.deploy.int8.graph import FloatConv, Graph, tensors_of, to_input
 from dmrl.deploy.int8.quantise import About, quantise

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.c import c_name, write_c
 from dmrl.deploy.c.harness import answers
+from dmrl.deploy.c.run.compile_targets import Build, Target, targets
 from dmrl.deploy.c.run.compiled import require_c
-from dmrl.deploy.c.run.targets import Build, Target, targets
 from dmrl.deploy.c.run.toolchain import run
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ToolError

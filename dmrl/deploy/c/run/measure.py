@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c import L1_FOR_STATE, c_name
-from dmrl.deploy.c.run.targets import RISCV_FLAGS, Build
+from dmrl.deploy.c.run.compile_targets import RISCV_FLAGS, Build
 from dmrl.deploy.c.run.toolchain import (
     EMULATOR,
     RISCV,
@@ -19,7 +19,7 @@ from dmrl.deploy.c.run.toolchain import (
     run,
     run_both,
 )
-from dmrl.deploy.c.text import fill
+from dmrl.deploy.c.templating import fill
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError, ToolError
 

@@ -8,8 +8,8 @@ memory; what it makes of a far ring goes out from there.
 import itertools
 from dataclasses import dataclass, replace
 
-from dmrl.deploy.c.plan import SHARED, Plan, taps_of, up
-from dmrl.deploy.c.rings import Step
+from dmrl.deploy.c.buffer_plan import SHARED, Plan, taps_of, up
+from dmrl.deploy.c.row_schedule import Step
 from dmrl.deploy.int8.network import Conv, MaxPool
 from dmrl.errors import SettingError
 

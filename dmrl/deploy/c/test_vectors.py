@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.bayer import demosaic, mosaic
-from dmrl.deploy.c.text import array, fill
+from dmrl.deploy.bayer_input import demosaic, mosaic
+from dmrl.deploy.c.templating import array, fill
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import decode, run
 

@@ -3,8 +3,8 @@
 import re
 from dataclasses import dataclass
 
-from dmrl.deploy.c.memories import Load
-from dmrl.deploy.c.plan import Buffer, Plan
+from dmrl.deploy.c.buffer_plan import Buffer, Plan
+from dmrl.deploy.c.memory_levels import Load
 
 TYPES = {False: ("u8", "uint8_t"), True: ("s8", "int8_t")}
 RANGES = {False: "0, 255", True: "-128, 127"}

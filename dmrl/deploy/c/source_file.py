@@ -2,19 +2,19 @@
 
 from dataclasses import dataclass, replace
 
+from dmrl.deploy.c.buffer_plan import Buffer, Plan, plan
 from dmrl.deploy.c.convolutions import shared_kernels
-from dmrl.deploy.c.layers import (
+from dmrl.deploy.c.layer_code import (
     constants,
     declarations,
     kernels,
     require_carried,
     row_function,
 )
-from dmrl.deploy.c.memories import split, traffic_bytes
-from dmrl.deploy.c.places import marked_unused, one_row, slot, state_names
-from dmrl.deploy.c.plan import Buffer, Plan, plan
-from dmrl.deploy.c.state import members, rings
-from dmrl.deploy.c.text import array, fill
+from dmrl.deploy.c.memory_levels import split, traffic_bytes
+from dmrl.deploy.c.row_addresses import marked_unused, one_row, slot, state_names
+from dmrl.deploy.c.state_struct import members, rings
+from dmrl.deploy.c.templating import array, fill
 from dmrl.deploy.int8.layers import GAIN_SHIFT
 from dmrl.deploy.int8.network import SUBPIXEL, Head, IntegerNetwork
 from dmrl.learn.inference.decode import SAME_PX

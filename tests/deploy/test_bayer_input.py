@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.deploy.bayer import demosaic, mosaic
+from dmrl.deploy.bayer_input import demosaic, mosaic
 
 PHASES = [(row, col) for row in (0, 1) for col in (0, 1)]
 

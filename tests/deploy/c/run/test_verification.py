@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.c.harness import Answer
-from dmrl.deploy.c.run import measure, verify
+from dmrl.deploy.c.run import measure, verification
+from dmrl.deploy.c.run.compile_targets import Build, Target
 from dmrl.deploy.c.run.measure import CLUSTER_HZ, KERNEL_MACS, Cost, Memory, memory_of, rates
-from dmrl.deploy.c.run.targets import Build, Target
-from dmrl.deploy.c.run.verify import BuildResult, TargetResult, expected, prove, same
-from dmrl.deploy.c.source import STACK_BYTES
+from dmrl.deploy.c.run.verification import BuildResult, TargetResult, expected, prove, same
+from dmrl.deploy.c.source_file import STACK_BYTES
 from dmrl.deploy.int8.reference import Detection
 from dmrl.errors import ModelError
 
@@ -67,9 +67,9 @@ def test_a_build_answers_every_image_within_its_stack(
     }
     given[True][1] = replace(given[True][1], detections=FOUND)
     monkeypatch.setattr(Build, "program", lambda build, *_: [build])
-    monkeypatch.setattr(verify, "run", lambda command, *_, **__: command[0].bayer)
+    monkeypatch.setattr(verification, "run", lambda command, *_, **__: command[0].bayer)
     kept = slice(drop, None)
-    monkeypatch.setattr(verify, "answers", lambda _, bayer: given[bayer][kept])
+    monkeypatch.setattr(verification, "answers", lambda _, bayer: given[bayer][kept])
     builds = Build("-O1", "cc", ()), Build("Bayer", "cc", (), bayer=True)
     monkeypatch.setattr(Target, "skipped", "")
     result = prove(network, tmp_path, Target("cc", builds), wanted)

@@ -7,7 +7,7 @@ steps is a ring of its newest rows, see `rings`.
 import re
 from dataclasses import dataclass, replace
 
-from dmrl.deploy.c.rings import Step, Write, needed_together, play, rows_held, shared_ring
+from dmrl.deploy.c.row_schedule import Step, Write, needed_together, play, rows_held, shared_ring
 from dmrl.deploy.int8.network import Conv, IntegerNetwork, MaxPool, Shape
 from dmrl.errors import ModelError
 

@@ -1,8 +1,9 @@
 """The C of each step: its kernel, its function of one row, its constants."""
 
+from dmrl.deploy.c.buffer_plan import Plan
 from dmrl.deploy.c.convolutions import row_of_convolution, templates_of
-from dmrl.deploy.c.memories import loads
-from dmrl.deploy.c.places import (
+from dmrl.deploy.c.memory_levels import loads
+from dmrl.deploy.c.row_addresses import (
     RANGES,
     TYPES,
     Desk,
@@ -12,9 +13,8 @@ from dmrl.deploy.c.places import (
     state_names,
     suffixes,
 )
-from dmrl.deploy.c.plan import Plan
-from dmrl.deploy.c.rings import Step
-from dmrl.deploy.c.text import array, fill
+from dmrl.deploy.c.row_schedule import Step
+from dmrl.deploy.c.templating import array, fill
 from dmrl.deploy.int8.network import Add, Conv, MaxPool
 from dmrl.errors import ModelError
 

@@ -1,6 +1,6 @@
 """Members of the state, as C text."""
 
-from dmrl.deploy.c.plan import Buffer, Plan
+from dmrl.deploy.c.buffer_plan import Buffer, Plan
 
 
 def members(planned: Plan, prefix: str) -> str:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dmrl.deploy.c.plan import plan
-from dmrl.deploy.c.text import fill, wrapped
+from dmrl.deploy.c.buffer_plan import plan
+from dmrl.deploy.c.templating import fill, wrapped
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.refinement import gains, last_layer
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.bayer import demosaic, mosaic
+from dmrl.deploy.bayer_input import demosaic, mosaic
 from dmrl.deploy.c.harness import MOST, Answer, answers
-from dmrl.deploy.c.run.targets import Build, Target
+from dmrl.deploy.c.run.compile_targets import Build, Target
 from dmrl.deploy.c.run.toolchain import run
-from dmrl.deploy.c.source import STACK_BYTES
-from dmrl.deploy.c.text import c_name
+from dmrl.deploy.c.source_file import STACK_BYTES
+from dmrl.deploy.c.templating import c_name
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import decode, tensors_of
 from dmrl.deploy.int8.reference import run as reference_run
