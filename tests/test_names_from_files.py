@@ -80,7 +80,7 @@ MAY_PARSE = {
     "guards/bounded_parsing.py": "the home",
     "rendering/blender/protocol.py": "what our own processes say to each other",
     "pipeline/process_pool.py": "what our own processes say to each other",
-    "pipeline/worker.py": "what our own processes say to each other",
+    "pipeline/job_worker.py": "what our own processes say to each other",
     "recipe.py": "what json.dumps has just made",
     "recording/provenance_inputs.py": "what json.dumps has just made",
     "learn/training/checkpoint.py": "what json.dumps has just made",

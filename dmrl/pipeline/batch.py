@@ -16,9 +16,9 @@ from typing import Any
 from dmrl.atomic_output import note
 from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
 from dmrl.guards.paths import refuse_no_text
+from dmrl.pipeline.cluster.slurm import array_job
 from dmrl.pipeline.executor import SLURM, Executor, executor
 from dmrl.pipeline.job import Answer, failed, job
-from dmrl.pipeline.slurm import array_job
 from dmrl.storage import Remote
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_line, print_table
@@ -38,7 +38,7 @@ class Task:
     out
         What it writes; None: nothing.
     line
-        As `dmrl.pipeline.worker.perform` takes it.
+        As `dmrl.pipeline.job_worker.perform` takes it.
     """
 
     source: Path

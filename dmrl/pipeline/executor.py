@@ -70,6 +70,6 @@ def executor(on: str | None, workers: int | None, *, bars: bool = False) -> Exec
     scheme, _, address = on.partition("://")
     if scheme != RAY or (address == "" and on != RAY):
         raise SettingError(f"--on {on}: this takes ray, or ray://HOST:PORT")
-    from dmrl.pipeline.ray_executor import Ray  # noqa: PLC0415 - an extra
+    from dmrl.pipeline.cluster.ray_executor import Ray  # noqa: PLC0415 - an extra
 
     return Ray(address)

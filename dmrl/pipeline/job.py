@@ -1,4 +1,4 @@
-"""One run of a stage as a line of JSON, which any process can do: see `dmrl.pipeline.worker`."""
+"""One run of a stage as a line of JSON, which any process can do: see `dmrl.pipeline.job_worker`."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def job(
     resume: bool = False,
     keep: bool = False,
 ) -> str:
-    """One line that `dmrl.pipeline.worker.perform` understands.
+    """One line that `dmrl.pipeline.job_worker.perform` understands.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from dmrl.terminal.progress import Lines
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """A step has one core, however many run: so its sums, and its bytes, are always the same."""
-START = "from dmrl.pipeline.worker import main; main()"
+START = "from dmrl.pipeline.job_worker import main; main()"
 NO_BARS = {"TTY_COMPATIBLE": "0"}
 """Bars of several processes would overwrite each other."""
 LAST_WORDS_S = 20.0

@@ -8,7 +8,7 @@ from cyclopts import Parameter, validators
 
 from dmrl.errors import MissingExtra
 from dmrl.evaluation.report import report
-from dmrl.pipeline import run as pipeline
+from dmrl.pipeline import recipe_run as pipeline
 from dmrl.terminal.arguments import AsJson, On
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_line

@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TextIO
 
 import numpy as np
 
-from dmrl.pipeline import worker
+from dmrl.pipeline import job_worker
 from dmrl.rendering.blender.protocol import Arrays
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.worker_pool import Start
@@ -126,7 +126,7 @@ def _work(jobs: int, answers: int) -> NoReturn:
         os.closerange(3, 4096)
         sys.stdin = os.fdopen(0, "r", encoding="utf-8")
         sys.stdout = sys.stderr = os.fdopen(2, "w", encoding="utf-8")
-        worker.main()
+        job_worker.main()
     except BaseException:
         traceback.print_exc()
     os._exit(1)

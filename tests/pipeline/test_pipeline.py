@@ -13,8 +13,8 @@ import pytest
 
 from dmrl.errors import DmrlError, OutputError, RecipeError, SettingError
 from dmrl.evaluation.report import report
-from dmrl.pipeline import run as pipeline
-from dmrl.pipeline import worker as work
+from dmrl.pipeline import job_worker as work
+from dmrl.pipeline import recipe_run as pipeline
 from dmrl.pipeline.job import job
 from dmrl.pipeline.process_pool import Crew
 

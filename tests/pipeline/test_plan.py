@@ -13,7 +13,7 @@ import pytest
 
 from dmrl import plugins, recipe
 from dmrl.errors import RecipeError, SettingError
-from dmrl.pipeline import run as pipeline
+from dmrl.pipeline import recipe_run as pipeline
 from dmrl.pipeline.plan import Step
 from dmrl.pipeline.stage_signature import interface_of
 from dmrl.stages.run import command as run_command

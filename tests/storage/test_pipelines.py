@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dmrl import recipe as recipes
-from dmrl.pipeline import run as pipeline
+from dmrl.pipeline import recipe_run as pipeline
 from dmrl.storage import path_of
 
 from ..pipeline.chain import CHAIN

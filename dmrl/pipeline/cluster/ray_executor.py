@@ -61,7 +61,7 @@ def _perform(line: str, version: str, folder: str, alone: bool) -> Answer:
         return {"error": words, "node": node}
     if not line:
         return {"result": "the same", "node": node}
-    from dmrl.pipeline.ray_worker import perform  # noqa: PLC0415
+    from dmrl.pipeline.cluster.ray_worker import perform  # noqa: PLC0415
 
     return {**perform(line, folder, alone=alone), "node": node}
 

@@ -16,7 +16,7 @@ def perform(line: str, folder: str, *, alone: bool) -> Answer:
     Parameters
     ----------
     line
-        As `dmrl.pipeline.worker.perform` takes it.
+        As `dmrl.pipeline.job_worker.perform` takes it.
     folder
         That its names are relative to.
     alone

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import OutputError, SettingError
-from dmrl.pipeline import slurm
 from dmrl.pipeline.batch import over_folder
+from dmrl.pipeline.cluster import slurm
 from dmrl.pipeline.single_run import done_on
 from dmrl.stages import trim
 
-from .test_folders import bytes_in, record
+from ..test_folders import bytes_in, record
 
 KEPT = trim.Settings(to_s=1.5)
 

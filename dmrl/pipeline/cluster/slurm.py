@@ -15,8 +15,8 @@ from typing import Protocol
 from dmrl.atomic_output import rewritten_file
 from dmrl.errors import OutputError, SettingError, one_line
 from dmrl.pipeline.job import failed
+from dmrl.pipeline.job_worker import perform
 from dmrl.pipeline.process_pool import ONE_THREAD
-from dmrl.pipeline.worker import perform
 from dmrl.storage import Remote
 
 PLAIN = re.compile(r"[\w/.+@=-]+")
@@ -30,7 +30,7 @@ SCRIPT = """#!/bin/sh
 #SBATCH --output={out}/.dmrl-%a.log
 cd {here} || exit 1
 export {threads}
-exec {python} -P -m dmrl.pipeline.slurm {lines} "$SLURM_ARRAY_TASK_ID" {elements}
+exec {python} -P -m dmrl.pipeline.cluster.slurm {lines} "$SLURM_ARRAY_TASK_ID" {elements}
 """
 
 
@@ -39,7 +39,7 @@ class Line(Protocol):
 
     @property
     def line(self) -> str:
-        """As `dmrl.pipeline.worker.perform` takes it."""
+        """As `dmrl.pipeline.job_worker.perform` takes it."""
 
 
 def array_job(tasks: Sequence[Line], out: Path) -> str:

@@ -24,7 +24,7 @@ from dmrl.pipeline.job import job
 from dmrl.pipeline.single_run import done_on
 from dmrl.stages import dataset, fly, trim
 
-from .test_folders import bytes_in, record
+from ..test_folders import bytes_in, record
 
 pytestmark = [
     pytest.mark.slow,
@@ -258,7 +258,7 @@ def test_one_that_fails_stops_no_other(nodes: Nodes, flights: Path, tmp_path: Pa
 def test_other_versions_and_wrong_addresses_are_one_line(
     nodes: Nodes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dmrl.pipeline.ray_executor.__version__", "9.9.9")
+    monkeypatch.setattr("dmrl.pipeline.cluster.ray_executor.__version__", "9.9.9")
     with pytest.raises(ClusterError, match=r"has dmrl \S+, not 9\.9\.9\. Install the same"):
         executor("ray", None)
     monkeypatch.undo()
