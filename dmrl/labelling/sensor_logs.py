@@ -13,7 +13,7 @@ from dmrl.estimation.model.pair import RATE_HZ, Array, Pair, Track, usable_range
 from dmrl.estimation.signals.sensor_tracks import Signals, track
 from dmrl.labelling.sensor_file import Sensors
 from dmrl.recording import Contents
-from dmrl.recording.checks.units import unit_doubts
+from dmrl.recording.checks.unit_checks import unit_doubts
 
 LEAST_S = 5.0
 """Shortest common stretch of two logs that is worth estimating."""

@@ -4,9 +4,11 @@ The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
 """
 
 from dmrl.recording.attachments import copy_extras, splits
+from dmrl.recording.checks.check_recording import check, label_findings, say_findings
 from dmrl.recording.checks.finding import Finding
-from dmrl.recording.checks.run import check, label_findings, say_findings
-from dmrl.recording.edit import merge, trim
+from dmrl.recording.copying.edit import merge, trim
+from dmrl.recording.copying.resume import Interrupted, interrupted
+from dmrl.recording.copying.rewrite import Series, Timed, retime, rewrite, time_slices
 from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
 from dmrl.recording.loaded import Contents
 from dmrl.recording.log_times import log_times
@@ -27,8 +29,6 @@ from dmrl.recording.reader import (
 )
 from dmrl.recording.recover import recover
 from dmrl.recording.recovery import Recovery
-from dmrl.recording.resume import Interrupted, interrupted
-from dmrl.recording.rewrite import Series, Timed, retime, rewrite, time_slices
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [

@@ -29,7 +29,7 @@ from mcap.summary import Summary as McapSummary
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
 from dmrl.recording.attachments import copy_extras
-from dmrl.recording.chunk_copy import Piece, put
+from dmrl.recording.copying.chunk_copy import Piece, put
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.batch_reader import tally
 from dmrl.recording.mcap.channel import Channel

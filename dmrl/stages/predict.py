@@ -34,9 +34,9 @@ from dmrl.recording import (
     provenance,
     read,
     read_raw,
-    rewrite,
     summary,
 )
+from dmrl.recording import rewrite
 from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track

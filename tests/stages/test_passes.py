@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from dmrl import card, topics
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, check, merge, provenance, summary, trim
-from dmrl.recording.chunk_copy import Wanted, copy
+from dmrl.recording.copying.chunk_copy import Wanted, copy
 from dmrl.recording.mcap import chunk_builder, chunk_reader
 from dmrl.stages import dataset, evaluate, fly, label, track
 

@@ -11,8 +11,8 @@ import pyarrow.compute as pc
 
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import size
-from dmrl.recording.checks.motion import Moved
-from dmrl.recording.checks.units import Sizes
+from dmrl.recording.checks.odometry_checks import Moved
+from dmrl.recording.checks.unit_checks import Sizes
 from dmrl.recording.loaded import Contents
 from dmrl.recording.log_times import log_times
 from dmrl.recording.mcap.batch_reader import in_file_order

@@ -9,7 +9,7 @@ from mcap.writer import Writer
 from dmrl.images.codec import encode_png
 from dmrl.messages import message, schema_bytes
 from dmrl.recording import Provenance, RecordingWriter, check
-from dmrl.recording.checks.run import say_findings
+from dmrl.recording.checks.check_recording import say_findings
 
 PNG = encode_png(np.zeros((224, 320, 3), np.uint8))
 Write = Callable[[int, str, Any], None]

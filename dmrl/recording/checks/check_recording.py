@@ -12,11 +12,11 @@ import numpy as np
 
 from dmrl.errors import RecordingError
 from dmrl.geometry.calibration import no_camera
-from dmrl.recording.checks.clocks import clocks
+from dmrl.recording.checks.clock_checks import clocks
 from dmrl.recording.checks.finding import Finding
-from dmrl.recording.checks.labels import labels
+from dmrl.recording.checks.label_checks import labels
 from dmrl.recording.checks.scan import HELD, Seen, Size, carries, glimpse, look
-from dmrl.recording.checks.units import periods
+from dmrl.recording.checks.unit_checks import periods
 from dmrl.recording.loaded import Contents
 from dmrl.recording.mcap.message_batch import Ints
 from dmrl.terminal.progress import say

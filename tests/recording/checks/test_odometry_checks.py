@@ -11,8 +11,16 @@ from dmrl import topics
 from dmrl.geometry.turns import quaternion_zyx
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, check
-from dmrl.recording.checks import motion as check_motion
-from dmrl.recording.checks.motion import Moved, _alike, _attitude, _motion, _rms, _signal, _velocity
+from dmrl.recording.checks import odometry_checks as check_motion
+from dmrl.recording.checks.odometry_checks import (
+    Moved,
+    _alike,
+    _attitude,
+    _motion,
+    _rms,
+    _signal,
+    _velocity,
+)
 
 Columns = dict[str, NDArray[np.float64]]
 TIME_S = np.arange(0.0, 30.0, 0.02)

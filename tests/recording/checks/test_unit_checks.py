@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.recording.checks.units import Sizes, periods
+from dmrl.recording.checks.unit_checks import Sizes, periods
 
 
 def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]:

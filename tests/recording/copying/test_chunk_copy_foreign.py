@@ -11,14 +11,10 @@ from mcap.writer import ChunkBuilder, CompressionType, Writer
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
-from dmrl.recording import (
-    Provenance,
-    read_raw,
-    rewrite,
-    trim,
-)
+from dmrl.recording import Provenance, read_raw, trim
+from dmrl.recording import rewrite
 
-from .records import channels, chunks, packed, unchanged
+from ..records import channels, chunks, packed, unchanged
 
 MADE = Provenance("test")
 

@@ -14,13 +14,13 @@ from dmrl.recording import (
     merge,
     read_raw,
     recover,
-    rewrite,
     summary,
     trim,
 )
+from dmrl.recording import rewrite
 from dmrl.recording.mcap import chunk_reader
 
-from .records import channels, chunks, packed, unchanged
+from ..records import channels, chunks, packed, unchanged
 
 MADE = Provenance("test")
 MOMENTS = 6000

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dmrl.recording.attachments import copy_extras
-from dmrl.recording.chunk_copy import Wanted, adopt, copy, pieces, put
+from dmrl.recording.copying.chunk_copy import Wanted, adopt, copy, pieces, put
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import EVER_NS, ROWS, Ints
 from dmrl.recording.mcap.summary_index import summary

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dmrl.recording.checks.clocks import EPOCH_NS, clocks
+from dmrl.recording.checks.clock_checks import EPOCH_NS, clocks
 
 S = 1_000_000_000
 

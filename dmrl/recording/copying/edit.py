@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dmrl.errors import RecordingError
 from dmrl.recording.attachments import copy_extras
-from dmrl.recording.chunk_copy import Piece, Wanted, adopt, pieces, put
+from dmrl.recording.copying.chunk_copy import Piece, Wanted, adopt, pieces, put
 from dmrl.recording.log_times import log_times
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.summary_index import Summary, summary

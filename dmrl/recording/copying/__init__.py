@@ -1,0 +1,1 @@
+"""Copy recordings: whole chunks, merged, trimmed, rewritten or resumed."""
