@@ -21,8 +21,8 @@ from fault_cases import CASES as FAULTS
 
 from dmrl.estimation.flight.data_association import told_apart
 from dmrl.estimation.flight.pairs import estimate_pairs
-from dmrl.estimation.model.metrics import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
 from dmrl.estimation.model.pair import Pair
+from dmrl.estimation.model.position_metrics import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate

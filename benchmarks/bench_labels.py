@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
-from dmrl.estimation.model.metrics import GOOD_M, Figures, Judged, figures, overall
 from dmrl.estimation.model.pair import Mask, Pair, Track, usable_ranges
+from dmrl.estimation.model.position_metrics import GOOD_M, Figures, Judged, figures, overall
 from dmrl.estimation.model.status import AMBIGUOUS, OK, probability_beyond
 from dmrl.estimation.signals.sensor_tracks import track as sensed
 from dmrl.estimation.solver.estimate import Estimate

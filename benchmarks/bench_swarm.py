@@ -13,7 +13,7 @@ from bench_label_faults import judged, pair_of, times
 
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.swarm import estimate_swarm
-from dmrl.estimation.model.metrics import figures, overall
+from dmrl.estimation.model.position_metrics import figures, overall
 from dmrl.estimation.model.status import OK
 from dmrl.flight import NOISE, TRAJECTORIES, Scenario, simulate
 

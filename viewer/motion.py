@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.estimation.model.metrics import GAP_S
+from dmrl.estimation.model.position_metrics import GAP_S
 from dmrl.geometry.frames import Array
 from dmrl.recording import Summary, glance
 from dmrl.viewer.entity import WORLD, horizontal_frame

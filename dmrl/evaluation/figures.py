@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
-from dmrl.estimation.model.metrics import ErrorTrace
+from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.evaluation.detections import At, Pairs
 from dmrl.guards.safe_names import inside
 from dmrl.images.codec import decode

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError
-from dmrl.estimation.model.metrics import (
+from dmrl.estimation.model.position_metrics import (
     DEFINITIONS,
     GOOD_M,
     ErrorTrace,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
-from dmrl.estimation.model.metrics import inside_truth
-from dmrl.estimation.tracking.metrics import DEFINITIONS, NEAR_M, Judged, assigned, figures
+from dmrl.estimation.model.position_metrics import inside_truth
+from dmrl.estimation.tracking.track_metrics import DEFINITIONS, NEAR_M, Judged, assigned, figures
 from dmrl.geometry.camera_file import parse_camera
 from dmrl.geometry.frames import (
     Array,

@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.estimation.model.metrics import inside_truth
+from dmrl.estimation.model.position_metrics import inside_truth
 from dmrl.geometry.frames import Array
 from dmrl.geometry.turns import euler_zyx
 from dmrl.recording import Contents

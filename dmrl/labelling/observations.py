@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.estimation.calibration.observations import Flight, PeerPath
-from dmrl.estimation.tracking.detections import Motion, View
+from dmrl.estimation.tracking.tracker_input import Motion, View
 from dmrl.geometry.frames import Array, Camera
 from dmrl.labelling.ground_truth import true_pairs, true_path
 from dmrl.messages import STATUS_OK

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dmrl.estimation.model.metrics import inside_truth
+from dmrl.estimation.model.position_metrics import inside_truth
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import Estimate, Refused
 from dmrl.estimation.solver.residuals import (

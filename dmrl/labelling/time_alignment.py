@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.estimation.signals.clocks import Clock, estimate_clock
+from dmrl.estimation.signals.clock_alignment import Clock, estimate_clock
 from dmrl.estimation.signals.image_motion import rates, shift, small
 from dmrl.estimation.signals.ranging_clocks import estimate_from_exchanges
 from dmrl.geometry.frames import Array

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import RecordingError, SettingError
-from dmrl.estimation.signals.clocks import Clock, connected
+from dmrl.estimation.signals.clock_alignment import Clock, connected
 from dmrl.formats.timestamps import dejitter
 from dmrl.labelling.retiming import MOCAP, Corrected
 from dmrl.labelling.time_alignment import camera_clock, mocap_clocks, range_clocks, ranging

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dmrl import topics
-from dmrl.estimation.signals.clocks import Clock
+from dmrl.estimation.signals.clock_alignment import Clock
 from dmrl.labelling.retiming import MOCAP, Corrected
 from dmrl.messages import message
 from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.signals.clocks import HUBER, ITERATIONS, Array, Clock, estimate_clock
+from dmrl.estimation.signals.clock_alignment import HUBER, ITERATIONS, Array, Clock, estimate_clock
 
 SAME_M = 0.002
 """Two logs of one exchange differ by no more: one may be in whole millimetres."""

@@ -17,7 +17,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
-from dmrl.estimation.tracking.detections import Motion, View
+from dmrl.estimation.tracking.tracker_input import Motion, View
 from dmrl.geometry.frames import (
     Array,
     Camera,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.signals import ranging_clocks
-from dmrl.estimation.signals.clocks import Clock
+from dmrl.estimation.signals.clock_alignment import Clock
 from dmrl.estimation.signals.ranging_clocks import (
     POLLED_S,
     SAME_M,

@@ -6,9 +6,9 @@ import pytest
 from numpy.random import default_rng
 from scipy.stats import chi2
 
-from dmrl.estimation.tracking.detections import Motion, View
 from dmrl.estimation.tracking.identity import Identity
 from dmrl.estimation.tracking.tracker import Tracker, Tuning
+from dmrl.estimation.tracking.tracker_input import Motion, View
 from dmrl.geometry.frames import (
     AIDECK,
     Array,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from dmrl.estimation.model.metrics import ErrorTrace
+from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.geometry.frames import Array
 
 NEAR_M = 1.0

@@ -3,7 +3,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.model.metrics import (
+from dmrl.estimation.model.position_metrics import (
     DEFINITIONS,
     Figures,
     Judged,

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from dmrl.estimation.signals.clocks import (
+from dmrl.estimation.signals.clock_alignment import (
     OVERLAP_S,
     SLOW_S,
     STEP_S,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.tracking.metrics import NEAR_M, Judged, assigned, figures
+from dmrl.estimation.tracking.track_metrics import NEAR_M, Judged, assigned, figures
 
 NOTHING = [np.nan] * 3
 ERRORS = np.array([[0.3, 0.0, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 1.2], NOTHING])
