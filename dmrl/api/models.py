@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dmrl.api import pages
 from dmrl.deploy.detector import BackendName, Detector, open_detector
 from dmrl.errors import SettingError
-from dmrl.learn.inference.decode import PER_DETECTION, Grids, decode
+from dmrl.learn.inference.decode_grids import PER_DETECTION, Grids, decode
 from dmrl.learn.pretrained import resolved
 
 Rgb = NDArray[np.uint8]

@@ -3,9 +3,9 @@
 import numpy as np
 
 from dmrl.deploy.backends import Outputs, grids_of
-from dmrl.learn.inference.decode import decode
+from dmrl.learn.inference.decode_grids import decode
+from dmrl.learn.inference.detection_metrics import by_band, score
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.metrics import by_band, score
 
 
 def points_of(outputs: Outputs, stride_px: int) -> Points:

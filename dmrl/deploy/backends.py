@@ -10,7 +10,7 @@ from dmrl.deploy.int8 import reference
 from dmrl.deploy.int8.graph import Float32, Graph, grey_of, outputs_of, tensors_of, to_input
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.quantise import HEAD_OF
-from dmrl.learn.inference.decode import Grids
+from dmrl.learn.inference.decode_grids import Grids
 
 Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 """(N, height, width, 3) RGB, or N images of one size."""

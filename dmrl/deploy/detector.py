@@ -23,7 +23,7 @@ from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_no_text, refuse_pipes
 from dmrl.learn import pretrained
-from dmrl.learn.inference.decode import Grids
+from dmrl.learn.inference.decode_grids import Grids
 
 BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"]
 

@@ -12,8 +12,8 @@ from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.evaluation.detections import At, Pairs
 from dmrl.guards.safe_names import inside
 from dmrl.images.codec import decode
+from dmrl.learn.inference.detection_metrics import Scored
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.metrics import Scored
 from dmrl.plots import Circled, Example
 from dmrl.recording import read, summary
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from dmrl.learn.inference.metrics import BandFigures, Figure, Scored, curves
+from dmrl.learn.inference.detection_metrics import BandFigures, Figure, Scored, curves
 
 # Name of a figure, its words in the table, and its format.
 ROWS = (

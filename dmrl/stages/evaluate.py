@@ -17,7 +17,7 @@ from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
 from dmrl.evaluation.tables import band_values, by_band_table, curve_values, finite
-from dmrl.learn.inference.metrics import DEFINITIONS, BandFigures, Scored, by_band, score
+from dmrl.learn.inference.detection_metrics import DEFINITIONS, BandFigures, Scored, by_band, score
 from dmrl.learn.inference.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.pipeline.batch import all_recordings
 from dmrl.pipeline.parallel_map import spread

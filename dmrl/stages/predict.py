@@ -18,8 +18,8 @@ from dmrl.errors import MissingTopic
 from dmrl.guards import limits
 from dmrl.images.ahead import ahead
 from dmrl.images.codec import Opened, Rgb, opened, size
-from dmrl.learn.inference.decode import PER_DETECTION, Found, Grids
-from dmrl.learn.inference.decode import decode as find
+from dmrl.learn.inference.decode_grids import PER_DETECTION, Found, Grids
+from dmrl.learn.inference.decode_grids import decode as find
 from dmrl.learn.inference.test_time_augmentation import VIEWS, agreed, returned, shown
 from dmrl.learn.pretrained import resolved
 from dmrl.messages import message

@@ -25,7 +25,7 @@ from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.samples import SAMPLES, save_samples
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation.detections import labels_of_split
-from dmrl.learn.inference.metrics import DEFINITIONS
+from dmrl.learn.inference.detection_metrics import DEFINITIONS
 from dmrl.learn.pretrained import resolved
 from dmrl.recording import provenance
 from dmrl.terminal.arguments import AsJson, Flat

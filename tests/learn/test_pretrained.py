@@ -8,7 +8,7 @@ import pytest
 from dmrl.errors import ModelError
 from dmrl.images.codec import decode
 from dmrl.learn import pretrained
-from dmrl.learn.inference.decode import decode as find
+from dmrl.learn.inference.decode_grids import decode as find
 from dmrl.learn.inference.loaded_model import load_model
 from dmrl.learn.networks.architectures import parameter_count, product_count
 

@@ -17,7 +17,7 @@ from dmrl.deploy.c.state_struct import members, rings
 from dmrl.deploy.c.templating import array, fill
 from dmrl.deploy.int8.layers import GAIN_SHIFT
 from dmrl.deploy.int8.network import SUBPIXEL, Head, IntegerNetwork
-from dmrl.learn.inference.decode import SAME_PX
+from dmrl.learn.inference.decode_grids import SAME_PX
 
 STACK_BYTES = 640
 """Stack that the C may use on a 32-bit core, optimised; `dmrl verify` measures it."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
 from dmrl.deploy.int8.network import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
 from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
-from dmrl.learn.inference.decode import SAME_PX
+from dmrl.learn.inference.decode_grids import SAME_PX
 
 Quantised = NDArray[np.int16]
 """Values of uint8 or int8 tensors; int16 holds both."""

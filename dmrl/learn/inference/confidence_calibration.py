@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from dmrl.learn.inference.detection_metrics import Scored
 from dmrl.learn.inference.matching import Array
-from dmrl.learn.inference.metrics import Scored
 from dmrl.learn.networks.architectures import Network
 
 LEAST = 30

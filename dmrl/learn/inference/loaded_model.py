@@ -21,7 +21,7 @@ from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_no_text, refuse_pipes
 from dmrl.learn import pretrained
-from dmrl.learn.inference.decode import Grids
+from dmrl.learn.inference.decode_grids import Grids
 from dmrl.learn.networks.architectures import (
     CLASS,
     SPREAD,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.images.codec import Rgb
-from dmrl.learn.inference.decode import PER_DETECTION, Found
+from dmrl.learn.inference.decode_grids import PER_DETECTION, Found
 
 Rows = NDArray[np.float64]
 

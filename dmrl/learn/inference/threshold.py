@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.learn.inference.metrics import Scored
+from dmrl.learn.inference.detection_metrics import Scored
 
 LEAST_LABELS = 10
 """Labels below which a threshold would hang on chance."""

@@ -4,10 +4,10 @@ import numpy as np
 import torch
 
 from dmrl.learn.data.batches import DEPTH, Examples, U, V, in_order
-from dmrl.learn.inference.decode import decode
+from dmrl.learn.inference.decode_grids import decode
+from dmrl.learn.inference.detection_metrics import Scored, figures, score
 from dmrl.learn.inference.loaded_model import grids_of
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.metrics import Scored, figures, score
 from dmrl.learn.networks.architectures import Network
 from dmrl.learn.training.config import FitSettings
 from dmrl.learn.training.train_step import losses

@@ -6,7 +6,7 @@ import pytest
 from dmrl.deploy.backends import grids_of, integer
 from dmrl.deploy.int8.network import Add, Conv, IntegerNetwork, MaxPool
 from dmrl.deploy.int8.reference import Detection, compute, decode, run
-from dmrl.learn.inference.decode import decode as float_decode
+from dmrl.learn.inference.decode_grids import decode as float_decode
 
 from ..graphs import quantised_network
 from ..networks import random_network

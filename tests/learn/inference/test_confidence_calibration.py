@@ -12,8 +12,8 @@ from dmrl.learn.inference.confidence_calibration import (
     calibrate,
     calibration,
 )
+from dmrl.learn.inference.detection_metrics import Curves, Scored, curves, score
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.metrics import Curves, Scored, curves, score
 from dmrl.learn.networks.architectures import build
 
 

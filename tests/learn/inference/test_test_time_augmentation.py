@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from dmrl.learn.inference.decode import PER_DETECTION, Found
+from dmrl.learn.inference.decode_grids import PER_DETECTION, Found
 from dmrl.learn.inference.test_time_augmentation import VIEWS, View, agreed, returned, shown
 
 STRIDE_PX = 8

@@ -9,7 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dmrl.errors import SettingError
 from dmrl.learn.data.batches import CLASS_ID, FIELDS, Examples, gathered
-from dmrl.learn.inference.decode import decode
+from dmrl.learn.inference.decode_grids import decode
 from dmrl.learn.inference.loaded_model import Model, save_model
 from dmrl.learn.inference.threshold import best_threshold
 from dmrl.learn.networks.architectures import build

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from dmrl.learn.data.batches import FIELDS, Examples
+from dmrl.learn.inference.detection_metrics import score
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.metrics import score
 from dmrl.learn.inference.threshold import alarms, best_threshold
 from dmrl.learn.networks.architectures import build
 from dmrl.learn.training.config import FitSettings

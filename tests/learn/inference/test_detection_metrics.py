@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.metrics import (
+from dmrl.learn.inference.detection_metrics import (
     BANDS_M,
     DEFINITIONS,
     BandFigures,
@@ -19,6 +18,7 @@ from dmrl.learn.inference.metrics import (
     score,
     weighted_quantile,
 )
+from dmrl.learn.inference.matching import Points
 
 
 def scene(images: int, offset_px: float = 0.0, depth_m: float = 1.0) -> tuple[Points, Points]:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dmrl.learn.inference.decode import decode, peaks
+from dmrl.learn.inference.decode_grids import decode, peaks
 
 
 def test_peaks_come_best_first_at_the_cell_centre() -> None:

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.metrics import (
+from dmrl.learn.inference.detection_metrics import (
     average_precision,
     figures,
     score,
 )
+from dmrl.learn.inference.matching import Points
 
 
 def anything(seed: int, images: int) -> tuple[Points, Points]:
