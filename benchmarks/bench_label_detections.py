@@ -28,7 +28,7 @@ from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
 from dmrl.geometry.frames import AIDECK, Array, pixels_from_horizontal
 from dmrl.labelling.camera_bearings import sightings_of, with_sightings
-from dmrl.labelling.observations import Sight
+from dmrl.labelling.observer_log import Sight
 
 IMAGES_HZ = 10.0
 PIXEL_STD_PX, DISTANCE_RATIO, MISSED, FARTHEST_M = 1.5, 0.1, 0.15, 5.0

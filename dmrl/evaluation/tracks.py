@@ -20,9 +20,9 @@ from dmrl.geometry.frames import (
     inside,
     pixels_from_horizontal,
 )
-from dmrl.labelling.camera import camera_of
 from dmrl.labelling.ground_truth import TOLD, true_pairs, true_path
-from dmrl.labelling.observations import SEEN, Sight, read_sight
+from dmrl.labelling.observer_log import SEEN, Sight, read_sight
+from dmrl.labelling.recorded_camera import camera_of
 from dmrl.recording import Contents, input_of, summary
 
 TITLE, EACH = "tracks against truth", "observer"

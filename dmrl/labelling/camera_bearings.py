@@ -9,8 +9,8 @@ from dmrl.estimation.filters.ou_smoother import faded
 from dmrl.estimation.model.bearings import claim, polar_of
 from dmrl.estimation.model.pair import Pair, Sightings
 from dmrl.geometry.frames import horizontal_from_pixels
-from dmrl.labelling.labels import Positions
-from dmrl.labelling.observations import Sight
+from dmrl.labelling.image_labels import Positions
+from dmrl.labelling.observer_log import Sight
 from dmrl.messages import STATUS_OK
 
 DISTANCE_RATIO = 0.25

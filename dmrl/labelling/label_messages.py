@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera
-from dmrl.labelling.camera import camera_of
-from dmrl.labelling.labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
+from dmrl.labelling.image_labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
+from dmrl.labelling.recorded_camera import camera_of
 from dmrl.labelling.sensor_logs import Logs
 from dmrl.messages import message
 from dmrl.recording import Contents, Series, Timed

@@ -29,9 +29,9 @@ try:
     from dmrl.estimation.calibration import intrinsics as board
     from dmrl.estimation.calibration.extrinsics import LEAST, Calibration, calibrate
     from dmrl.estimation.calibration.observations import Noise
-    from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.ground_truth import TOLD
-    from dmrl.labelling.observations import SEEN, camera_flight
+    from dmrl.labelling.observer_log import SEEN, camera_flight
+    from dmrl.labelling.recorded_camera import camera_given, camera_of
     from dmrl.labelling.sensor_calibration import Constant, agreed, solutions
     from dmrl.labelling.sensor_file import Sensors, write_sensors
 except ModuleNotFoundError as e:

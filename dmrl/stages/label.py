@@ -30,13 +30,13 @@ try:
     from dmrl.estimation.model.pair import Pair, Sightings
     from dmrl.estimation.model.status import GATE_M
     from dmrl.estimation.solver.estimate import Estimate
-    from dmrl.labelling.camera import camera_given, camera_of
     from dmrl.labelling.camera_bearings import levelled, sightings_of, with_sightings
     from dmrl.labelling.ground_truth import TOLD
+    from dmrl.labelling.image_labels import SOURCE, Look, Positions
     from dmrl.labelling.label_messages import label_messages, position_series
-    from dmrl.labelling.labels import SOURCE, Look, Positions
-    from dmrl.labelling.observations import SEEN, read_sight
-    from dmrl.labelling.report import PairReport, pair_report, reasons
+    from dmrl.labelling.observer_log import SEEN, read_sight
+    from dmrl.labelling.pair_report import PairReport, pair_report, reasons
+    from dmrl.labelling.recorded_camera import camera_given, camera_of
     from dmrl.labelling.sensor_file import Sensors, read_sensors
     from dmrl.labelling.sensor_logs import SENSED, Logs, read_logs
 except ModuleNotFoundError as e:

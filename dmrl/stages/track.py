@@ -24,8 +24,8 @@ try:
     from dmrl.estimation.tracking.identity import Identity
     from dmrl.estimation.tracking.tracker import Track, Tracker, Tuning
     from dmrl.evaluation.tracks import CAMERAS_METADATA
-    from dmrl.labelling.camera import camera_given, camera_of
-    from dmrl.labelling.observations import SEEN, Sight, read_sight
+    from dmrl.labelling.observer_log import SEEN, Sight, read_sight
+    from dmrl.labelling.recorded_camera import camera_given, camera_of
 except ModuleNotFoundError as e:
     raise MissingExtra(str(e.name), "label", "dmrl track") from e
 

@@ -15,8 +15,8 @@ from dmrl.labelling.camera_bearings import (
     sightings_of,
     with_sightings,
 )
-from dmrl.labelling.labels import Positions
-from dmrl.labelling.observations import Sight
+from dmrl.labelling.image_labels import Positions
+from dmrl.labelling.observer_log import Sight
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 
 from ..estimation.sighted_flights import still_pair

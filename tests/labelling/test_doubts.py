@@ -6,7 +6,7 @@ import pytest
 from dmrl.estimation.model.pair import SWAPPED
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.keyframes import GLOBALS, Noise
-from dmrl.labelling.report import doubts, reasons, refusal
+from dmrl.labelling.pair_report import doubts, reasons, refusal
 
 
 def estimate(status: int = 0, **constants: float) -> Estimate:

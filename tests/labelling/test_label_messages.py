@@ -10,8 +10,8 @@ import pytest
 
 from dmrl import topics
 from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
+from dmrl.labelling.image_labels import NEAREST_M, Look, Positions
 from dmrl.labelling.label_messages import label_messages, position_series
-from dmrl.labelling.labels import NEAREST_M, Look, Positions
 from dmrl.labelling.sensor_logs import Logs, RobotLog
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import Contents, Provenance, RecordingWriter, read

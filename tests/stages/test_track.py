@@ -8,7 +8,7 @@ import pytest
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.geometry.camera_file import write_camera
-from dmrl.labelling.camera import camera_of
+from dmrl.labelling.recorded_camera import camera_of
 from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw, summary, trim
 from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.stages import evaluate, fly, track

@@ -9,8 +9,8 @@ import pytest
 from dmrl import topics
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.residuals import BIAS, OWN_GYRO, PEER_GYRO
-from dmrl.labelling.labels import Positions
-from dmrl.labelling.report import PairReport, pair_report
+from dmrl.labelling.image_labels import Positions
+from dmrl.labelling.pair_report import PairReport, pair_report
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import Contents, Provenance, RecordingWriter
 

@@ -11,7 +11,7 @@ import pytest
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.geometry.frames import AIDECK
-from dmrl.labelling.observations import LONGEST_GAP_S, UNSAID, Sight, camera_flight, read_sight
+from dmrl.labelling.observer_log import LONGEST_GAP_S, UNSAID, Sight, camera_flight, read_sight
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
 from dmrl.recording import Contents, Provenance, RecordingWriter
 

@@ -12,7 +12,7 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
-from dmrl.labelling.camera import camera_given, camera_of
+from dmrl.labelling.recorded_camera import camera_given, camera_of
 from dmrl.messages import message
 from dmrl.recording import Contents, Provenance, RecordingWriter
 

@@ -18,7 +18,7 @@ from dmrl.estimation.solver.residuals import (
     PEER_SCALE,
 )
 from dmrl.labelling.ground_truth import true_pairs, true_path
-from dmrl.labelling.labels import Positions
+from dmrl.labelling.image_labels import Positions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 from dmrl.recording import Contents
 

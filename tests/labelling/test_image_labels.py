@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import Array, Camera, pixels_from_horizontal
-from dmrl.labelling.labels import MARGIN_SIGMAS, NEAREST_M, Look, Positions, anywhere, image_labels
+from dmrl.labelling.image_labels import (
+    MARGIN_SIGMAS,
+    NEAREST_M,
+    Look,
+    Positions,
+    anywhere,
+    image_labels,
+)
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED
 
 CAMERA = Camera(320, 224, 180.0, 190.0, 150.0, 100.0)
