@@ -25,8 +25,8 @@ import numpy as np
 from dmrl.cli import COMMANDS
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import encode_jpeg
-from dmrl.rendering.scene import random_look, random_poses
-from dmrl.rendering.sketch import draw
+from dmrl.rendering.sketch_renderer import draw
+from dmrl.rendering.sketch_scene import random_look, random_poses
 from dmrl.stages import sketch
 
 SKETCHES = 40

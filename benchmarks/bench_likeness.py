@@ -28,14 +28,14 @@ from dmrl.formats.published.locanet import LocanetImage, read
 from dmrl.geometry.frames import PUBLISHED_RENDER
 from dmrl.images.codec import Rgb, decode, encode_jpeg
 from dmrl.recording import read as read_messages
-from dmrl.rendering.backgrounds.environment import ensure
 from dmrl.rendering.backgrounds.photos import LIGHT_OF
+from dmrl.rendering.blender_environment import ensure
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.randomise import random_paint
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.robots.violet import VIOLET
 from dmrl.rendering.shot import Light, Look, Robot, Shot
-from dmrl.rendering.sketch import Pose
+from dmrl.rendering.sketch_renderer import Pose
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_table
 

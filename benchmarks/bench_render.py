@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from render_exactness import grain, grey, reprojection
 
-from dmrl.rendering.backgrounds.environment import ensure
+from dmrl.rendering.blender_environment import ensure
 from dmrl.rendering.randomise import World, draw_scene
 from dmrl.stages.render import camera_of, run, settings_of
 from dmrl.terminal.progress import say

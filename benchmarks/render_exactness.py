@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.rendering.backgrounds.environment import ensure
 from dmrl.rendering.backgrounds.photos import photos_in
-from dmrl.rendering.camera.lens import Picture, image_from_pinhole
+from dmrl.rendering.blender_environment import ensure
+from dmrl.rendering.camera.distortion import Picture, image_from_pinhole
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.shot import Shot
-from dmrl.rendering.sketch import Pose
+from dmrl.rendering.sketch_renderer import Pose
 from dmrl.stages.render import camera_of, settings_of
 from dmrl.terminal.progress import say
 

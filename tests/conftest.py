@@ -9,7 +9,7 @@ import pytest
 from hypothesis import settings
 
 import dmrl.learn  # noqa: F401  # before any test imports torch, which reads its settings once
-from dmrl.rendering.backgrounds import environment
+from dmrl.rendering import blender_environment
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -46,7 +46,7 @@ def data() -> Path:
 @pytest.fixture(scope="session")
 def blender() -> Path:
     """Python of Blender's environment. Skips where it is not set up."""
-    python = environment.python()
+    python = blender_environment.python()
     if python is None:
         pytest.skip("Blender is not set up; run: dmrl render --setup")
     return python

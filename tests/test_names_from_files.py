@@ -65,7 +65,7 @@ REASONS = {
     "recording/copying/resume.py: kept.name + '.new'": GIVEN,
     "recording/copying/resume.py: out.name + '.kept'": GIVEN,
     "rendering/blender/passes.py: f'{name}{self.scene.frame_current:04d}.exr'": OURS,
-    "rendering/backgrounds/environment.py: f'{target.name}.partial-{os.getpid()}'": GIVEN,
+    "rendering/blender_environment.py: f'{target.name}.partial-{os.getpid()}'": GIVEN,
     "stages/card.py: card.name": OURS,
     "stages/evaluate.py: name": OURS,
     "stages/export.py: name": OURS,

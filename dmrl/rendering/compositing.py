@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.rendering.camera.lens import Canvas, Picture, canvas_of, image_from_pinhole, sample
+from dmrl.rendering.camera.distortion import Canvas, Picture, canvas_of, image_from_pinhole, sample
 from dmrl.rendering.camera.sensor import blur, expose
 from dmrl.rendering.shot import Layer, Look, Part, Robot, Shot
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
 from dmrl.rendering.backgrounds.photos import panorama_view, smeared
-from dmrl.rendering.camera.lens import Picture
+from dmrl.rendering.camera.distortion import Picture
 from dmrl.rendering.camera.sensor import blur
 from dmrl.rendering.onboard_camera import View
 from dmrl.rendering.randomise import HIGHLIGHTS, random_paint, random_sensor

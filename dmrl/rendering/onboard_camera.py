@@ -7,9 +7,9 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.rendering.robots.quadrotor import RADIUS_M
-from dmrl.rendering.scene import random_look
 from dmrl.rendering.shot import Shot
-from dmrl.rendering.sketch import Pose, Sketch, draw
+from dmrl.rendering.sketch_renderer import Pose, Sketch, draw
+from dmrl.rendering.sketch_scene import random_look
 
 NEAREST_M = 2 * RADIUS_M
 """Robots nearer to the image plane than this are not drawn: they would touch it."""

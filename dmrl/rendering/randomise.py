@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.rendering.backgrounds.photos import Photos, panorama_view, smeared, stretched
-from dmrl.rendering.camera.lens import Picture, pinhole_from_image
+from dmrl.rendering.camera.distortion import Picture, pinhole_from_image
 from dmrl.rendering.camera.sensor import Sensor, blur
 from dmrl.rendering.robots.crazyflie import CRAZYFLIE
 from dmrl.rendering.robots.primitives import Design
 from dmrl.rendering.settings import Range, Settings
 from dmrl.rendering.shot import Light, Look, Robot
-from dmrl.rendering.sketch import Pose
+from dmrl.rendering.sketch_renderer import Pose
 
 TRIES = 30
 # Of panoramas, whose suns and lamps would leave nothing else to see; photos end below.

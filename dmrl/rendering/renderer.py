@@ -15,7 +15,7 @@ import numpy as np
 
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import Array, Camera
-from dmrl.rendering.camera.lens import Picture
+from dmrl.rendering.camera.distortion import Picture
 from dmrl.rendering.compositing import compose
 from dmrl.rendering.robots.crazyflie import BETWEEN_ROTORS_RAD, BLADE_HALF_WIDTH_M, CRAZYFLIE
 from dmrl.rendering.robots.primitives import Design

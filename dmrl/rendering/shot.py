@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.rendering.camera.lens import Canvas, Picture, canvas_of
+from dmrl.rendering.camera.distortion import Canvas, Picture, canvas_of
 from dmrl.rendering.camera.sensor import Sensor
-from dmrl.rendering.sketch import Pose
+from dmrl.rendering.sketch_renderer import Pose
 
 Part = tuple[slice, slice]
 """Rows and columns of a picture."""

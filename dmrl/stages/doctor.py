@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 
 from dmrl.deploy.c.run import toolchain
 from dmrl.errors import SettingError, ToolError
-from dmrl.rendering.backgrounds import environment
+from dmrl.rendering import blender_environment
 from dmrl.terminal.arguments import AsJson
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -175,14 +175,16 @@ def _vulkan() -> Part:
 
 def _blender() -> Part:
     serves = "dmrl render, fly --camera-renderer blender"
-    python = environment.python()
+    python = blender_environment.python()
     lacking = [name for name in BLENDER_LIBRARIES if find_library(name) is None]
     if platform.system() == "Linux" and lacking:
-        way = f"apt-get install {environment.LIBRARIES}"
+        way = f"apt-get install {blender_environment.LIBRARIES}"
         return Part("Blender", False, f"no lib{lacking[0]}", serves, way)
     if python is None:
         return Part("Blender", False, "", serves, "dmrl render --setup")
-    return Part("Blender", True, f"{environment.BLENDER} in {environment.folder()}", serves)
+    return Part(
+        "Blender", True, f"{blender_environment.BLENDER} in {blender_environment.folder()}", serves
+    )
 
 
 def _gpu() -> Part:

@@ -22,10 +22,10 @@ from dmrl.messages import message
 from dmrl.pipeline.single_run import done_on
 from dmrl.recording import Provenance, RecordingWriter, provenance
 from dmrl.rendering import flight_images, renderer
-from dmrl.rendering.backgrounds.environment import ensure
+from dmrl.rendering.blender_environment import ensure
 from dmrl.rendering.onboard_camera import Body, Renderer, sketched, view
 from dmrl.rendering.shot import Shot
-from dmrl.rendering.sketch import Sketch
+from dmrl.rendering.sketch_renderer import Sketch
 from dmrl.samples import flight as samples
 from dmrl.samples.flight import Times, in_order, nanoseconds
 from dmrl.samples.sample import Sample, calibration, image, labels

@@ -31,13 +31,13 @@ from dmrl.recording import (
     licence_words,
     provenance,
 )
-from dmrl.rendering.backgrounds.environment import ensure
 from dmrl.rendering.backgrounds.rooms import ROOMS
-from dmrl.rendering.camera.lens import canvas_of
-from dmrl.rendering.messages import ROBOT, samples
+from dmrl.rendering.blender_environment import ensure
+from dmrl.rendering.camera.distortion import canvas_of
+from dmrl.rendering.image_messages import ROBOT, samples
 from dmrl.rendering.randomise import Drawn, World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer, Scene, panoramas_in
-from dmrl.rendering.robots.registry import DESIGNS
+from dmrl.rendering.robots.robot_models import DESIGNS
 from dmrl.rendering.settings import Settings, filled
 from dmrl.samples.sample import Sample, calibration, intervals
 from dmrl.terminal.arguments import AsJson, On
@@ -191,7 +191,7 @@ def look_at(out: Path, settings: Settings) -> dict[str, float]:
     refuse_existing(out)
     if out.suffix.lower() != ".png":
         raise OutputError(f"{out} is not named .png. With --preview OUT is a picture: NAME.png")
-    from dmrl.rendering.preview import preview  # noqa: PLC0415 - an extra
+    from dmrl.rendering.robot_preview import preview  # noqa: PLC0415 - an extra
 
     with _renderer(replace(settings, workers=1, samples=PREVIEW_SAMPLES)) as renderer:
         seen = preview(renderer, settings, camera_of(settings))

@@ -25,8 +25,8 @@ from dmrl.images.codec import encode_png
 from dmrl.pipeline.parallel_map import spread
 from dmrl.pipeline.process_pool import cores
 from dmrl.recording import provenance
-from dmrl.rendering.scene import random_look, random_poses
-from dmrl.rendering.sketch import Sketch, draw
+from dmrl.rendering.sketch_renderer import Sketch, draw
+from dmrl.rendering.sketch_scene import random_look, random_poses
 from dmrl.terminal.arguments import AsJson, Flat, Seed, Share, Workers
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_json, print_table

@@ -70,7 +70,7 @@ def sky(_: Path) -> list[Path]:
 
 
 def no_python(_: object) -> Path:
-    """In place of `dmrl.rendering.backgrounds.environment.ensure`."""
+    """In place of `dmrl.rendering.blender_environment.ensure`."""
     return Path("python")
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import AIDECK, Camera
-from dmrl.rendering.camera.lens import canvas_of, image_from_pinhole
+from dmrl.rendering.camera.distortion import canvas_of, image_from_pinhole
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.compositing import compose
 from dmrl.rendering.shot import Layer, Light, Look, Robot, crop_of
-from dmrl.rendering.sketch import Pose
+from dmrl.rendering.sketch_renderer import Pose
 
 PINHOLE = replace(AIDECK, distortion=())
 LIGHT = Light("x", (0.0, 0.0, 0.0), 1.0, np.array([0.0, 0.0, 1.0]), 0.0, (1.0, 1.0, 1.0), 0.1)

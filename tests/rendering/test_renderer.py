@@ -12,7 +12,7 @@ from dmrl.rendering.blender import protocol
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.renderer import Model, Renderer, Scene
 from dmrl.rendering.shot import Light, Look, Robot
-from dmrl.rendering.sketch import Pose
+from dmrl.rendering.sketch_renderer import Pose
 
 CAMERA = replace(AIDECK, distortion=())
 

@@ -16,8 +16,8 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.images.codec import decode, encode_png
 from dmrl.recording import check, licences, read, summary
-from dmrl.rendering.camera.lens import image_from_pinhole
-from dmrl.rendering.messages import quaternion
+from dmrl.rendering.camera.distortion import image_from_pinhole
+from dmrl.rendering.image_messages import quaternion
 from dmrl.rendering.randomise import World, draw_scene
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.robots import crazyflie

@@ -12,8 +12,8 @@ from dmrl.errors import BlenderError, OutputError, SettingError
 from dmrl.geometry.frames import Array
 from dmrl.images.codec import decode
 from dmrl.recording import read_table
-from dmrl.rendering.preview import views
 from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.robot_preview import views
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.settings import Settings
 from dmrl.stages.render import command, run, settings_of

@@ -14,7 +14,7 @@ from dmrl.geometry.lens import undistort
 from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
 from dmrl.images.codec import Rgb, crop_and_scale, decode, size
-from dmrl.rendering.camera.lens import Picture, between
+from dmrl.rendering.camera.distortion import Picture, between
 from dmrl.rendering.camera.sensor import LUMINANCE
 
 PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array
 from dmrl.images.codec import Rgb
-from dmrl.rendering.camera.lens import Picture
-from dmrl.rendering.camera.noise import blocks_of, grain_of
+from dmrl.rendering.camera.distortion import Picture
+from dmrl.rendering.camera.sensor_noise import blocks_of, grain_of
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 REACH_PX = 4
@@ -77,7 +77,7 @@ class Seen:
     corners
         (N, 2) luma of its corners and of its middle.
     blocks
-        (M, 4) of all pictures, see `dmrl.rendering.camera.noise`.
+        (M, 4) of all pictures, see `dmrl.rendering.camera.sensor_noise`.
     """
 
     rows: Array

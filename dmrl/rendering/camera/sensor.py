@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dmrl.rendering.camera.lens import Picture
+from dmrl.rendering.camera.distortion import Picture
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 

@@ -4,7 +4,7 @@ from typing import get_args, get_type_hints
 
 import numpy as np
 
-from dmrl.rendering.robots.registry import DESIGNS
+from dmrl.rendering.robots.robot_models import DESIGNS
 from dmrl.rendering.robots.violet import FITTED_SIZE, FITTED_Z_M, VIOLET
 from dmrl.rendering.settings import Settings
 

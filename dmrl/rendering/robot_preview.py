@@ -11,10 +11,10 @@ from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.randomise import random_paint
 from dmrl.rendering.renderer import Renderer
 from dmrl.rendering.robots.primitives import Design
-from dmrl.rendering.robots.registry import DESIGNS
+from dmrl.rendering.robots.robot_models import DESIGNS
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Light, Look, Robot
-from dmrl.rendering.sketch import Pose
+from dmrl.rendering.sketch_renderer import Pose
 
 SIDE_PX = 480
 DISTANCE = 12.0

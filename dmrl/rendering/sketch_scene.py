@@ -9,7 +9,7 @@ from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.images.canvas import Picture
 from dmrl.rendering.backgrounds.procedural import background, window
 from dmrl.rendering.robots.quadrotor import RADIUS_M
-from dmrl.rendering.sketch import Look, Pose
+from dmrl.rendering.sketch_renderer import Look, Pose
 
 DEPTH_M = (0.2, 2.0)
 TILT_MAX_RAD = float(np.radians(20))

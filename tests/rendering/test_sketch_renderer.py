@@ -7,8 +7,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from dmrl.geometry.frames import AIDECK, Array, camera_from_horizontal, project
 from dmrl.images.canvas import Canvas
 from dmrl.rendering.robots.quadrotor import DISCS, MESH, RADIUS_M
-from dmrl.rendering.scene import random_look, random_poses
-from dmrl.rendering.sketch import Look, Pose, Sketch, draw
+from dmrl.rendering.sketch_renderer import Look, Pose, Sketch, draw
+from dmrl.rendering.sketch_scene import random_look, random_poses
 
 CAMERA = replace(AIDECK, distortion=())
 LEVEL = np.eye(3)

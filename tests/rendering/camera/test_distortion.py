@@ -7,7 +7,7 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import AIDECK
-from dmrl.rendering.camera.lens import (
+from dmrl.rendering.camera.distortion import (
     between,
     canvas_of,
     image_from_pinhole,

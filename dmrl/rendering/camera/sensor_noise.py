@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array
-from dmrl.rendering.camera.lens import Picture
+from dmrl.rendering.camera.distortion import Picture
 
 BLOCK_PX = 8
 SMOOTH_SHARE = 0.05

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import BlenderError
-from dmrl.rendering.backgrounds import environment
+from dmrl.rendering import blender_environment
 
 
 @pytest.fixture(autouse=True)
@@ -20,9 +20,9 @@ def test_without_python_311_and_uv_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    monkeypatch.setattr(environment, "_python_311", lambda: None)
+    monkeypatch.setattr(blender_environment, "_python_311", lambda: None)
     with pytest.raises(BlenderError, match=r"needs Python 3.11.*nor uv.*pip install uv"):
-        environment.ensure(lambda _: None)
+        blender_environment.ensure(lambda _: None)
     assert list((tmp_path / "dmrl").iterdir()) == []
 
 
@@ -35,13 +35,13 @@ def test_offline_it_says_so_and_leaves_nothing(
 
     monkeypatch.setattr(subprocess, "run", fail)
     with pytest.raises(BlenderError, match=r"No route to host. Check the connection"):
-        environment.ensure(lambda _: None)
+        blender_environment.ensure(lambda _: None)
     assert list((tmp_path / "dmrl").iterdir()) == []
 
 
 def test_an_environment_that_is_there_is_used(tmp_path: Path) -> None:
-    python = environment.folder() / "bin" / "python"
+    python = blender_environment.folder() / "bin" / "python"
     python.parent.mkdir(parents=True)
     python.symlink_to(sys.executable)
-    assert environment.python() == python
-    assert environment.ensure(lambda _: pytest.fail("nothing to say")) == python
+    assert blender_environment.python() == python
+    assert blender_environment.ensure(lambda _: pytest.fail("nothing to say")) == python

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dmrl.rendering.camera.lens import Picture
-from dmrl.rendering.camera.noise import BLOCK_PX, Grain, blocks_of, grain_of, of_white
+from dmrl.rendering.camera.distortion import Picture
 from dmrl.rendering.camera.sensor import blur
+from dmrl.rendering.camera.sensor_noise import BLOCK_PX, Grain, blocks_of, grain_of, of_white
 
 SHAPE = (240, 320)
 
