@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 from dmrl.errors import SettingError
 from dmrl.geometry.camera_file import read_camera
-from dmrl.live.camera import CameraClient
+from dmrl.live.camera_link import CameraClient
 from dmrl.live.cflib_session import check_uri
-from dmrl.live.clocks import HostTime
-from dmrl.live.crazyflie import Link
+from dmrl.live.crazyflie_link import Link
 from dmrl.live.image_assembly import Colours, Stored
 from dmrl.live.queue import Feed
+from dmrl.live.receive_clocks import HostTime
 from dmrl.live.robot_options import Robot, peers_of
 from dmrl.terminal.progress import say
 

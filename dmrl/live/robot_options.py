@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dmrl.errors import SettingError
-from dmrl.live.camera import address
+from dmrl.live.camera_link import address
 from dmrl.live.log_blocks import number_of
 
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")

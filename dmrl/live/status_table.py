@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 
 from dmrl.errors import one_line
-from dmrl.live.crazyflie import Link
+from dmrl.live.crazyflie_link import Link
 from dmrl.live.queue import Health
 
 RATE_S = 1.0

@@ -18,9 +18,9 @@ from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import Array
 from dmrl.live.log_blocks import number_of
-from dmrl.live.simulated.aideck import FakeCamera, Sends
-from dmrl.live.simulated.crazyflie import FakeCrazyflie
-from dmrl.live.simulated.flight import FakeFlight, Faults, FlightClock, Pictures
+from dmrl.live.simulated.aideck_server import FakeCamera, Sends
+from dmrl.live.simulated.crazyflie_server import FakeCrazyflie
+from dmrl.live.simulated.flight_source import FakeFlight, Faults, FlightClock, Pictures
 from dmrl.recording import read, read_table, summary
 from dmrl.terminal.arguments import Flat
 from dmrl.terminal.progress import say

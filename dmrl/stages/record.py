@@ -14,13 +14,13 @@ from cyclopts import Parameter, validators
 from dmrl.atomic_output import partial_of, refuse_existing
 from dmrl.errors import OutputError, RecordingError
 from dmrl.images.bayer import load_opencv
-from dmrl.live.camera import CameraClient
+from dmrl.live.camera_link import CameraClient
 from dmrl.live.cflib_session import load_cflib
-from dmrl.live.clocks import HostTime
-from dmrl.live.crazyflie import Link
+from dmrl.live.crazyflie_link import Link
 from dmrl.live.image_assembly import Colours, Stored
 from dmrl.live.links import cameras_of, check, end_all, links_of, nothing_came
 from dmrl.live.queue import Feed, Health, Received
+from dmrl.live.receive_clocks import HostTime
 from dmrl.live.robot_options import Robot, robot_of
 from dmrl.live.status_table import LiveTable
 from dmrl.messages import message

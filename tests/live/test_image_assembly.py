@@ -5,7 +5,7 @@ from dmrl.errors import SourceError
 from dmrl.formats.aideck.cpx import Image
 from dmrl.images import bayer, codec
 from dmrl.live.image_assembly import encoded
-from dmrl.live.simulated.aideck import whole_sensor
+from dmrl.live.simulated.aideck_server import whole_sensor
 
 RNG = np.random.default_rng(4)
 SMOOTH = np.clip(

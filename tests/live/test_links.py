@@ -2,9 +2,9 @@
 
 import pytest
 
-from dmrl.live.clocks import HostTime
 from dmrl.live.links import links_of
 from dmrl.live.queue import Feed
+from dmrl.live.receive_clocks import HostTime
 from dmrl.live.robot_options import Robot
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.live.log_blocks import BLOCK_BYTES, BLOCKS_MAX, SIZES, Reading, number_of, plan
-from dmrl.live.simulated.crazyflie import LOG_TYPES
+from dmrl.live.simulated.crazyflie_server import LOG_TYPES
 
 TOC = {
     **{f"stateEstimate.{name}": "float" for name in ("roll", "pitch", "yaw", "vx", "vy", "z")},

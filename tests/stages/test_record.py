@@ -16,7 +16,7 @@ import pytest
 
 from dmrl.errors import MissingExtra, MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import decode
-from dmrl.live import crazyflie
+from dmrl.live import crazyflie_link
 from dmrl.live.robot_options import Robot, robot_of
 from dmrl.recording import read, read_table, recover
 from dmrl.stages import fake_drone, fly, record
@@ -155,15 +155,15 @@ def test_a_packet_that_cannot_be_read_costs_a_connection_not_the_recording(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    samples, packets = crazyflie.Reading.samples, count()
+    samples, packets = crazyflie_link.Reading.samples, count()
 
-    def once_wrong(self: crazyflie.Reading, *packet: Any) -> Any:
+    def once_wrong(self: crazyflie_link.Reading, *packet: Any) -> Any:
         if next(packets) == 20:
             raise ValueError("no such number")
         return samples(self, *packet)
 
-    monkeypatch.setattr(crazyflie, "RETRY_S", 0.1)
-    monkeypatch.setattr(crazyflie.Reading, "samples", once_wrong)
+    monkeypatch.setattr(crazyflie_link, "RETRY_S", 0.1)
+    monkeypatch.setattr(crazyflie_link.Reading, "samples", once_wrong)
     with fake_drone.fleet(flight, ANY[:1], (), fake_drone.Settings(speed=0.5)) as fleet:
         result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
     said = "cf1: a packet could not be read (ValueError('no such number')) at udp://"
@@ -175,7 +175,7 @@ def test_a_drone_that_starts_anew_is_connected_again(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, seconds in {"SILENT_S": 1.0, "FIRST_ANSWER_S": 0.5, "RETRY_S": 0.1}.items():
-        monkeypatch.setattr(crazyflie, name, seconds)
+        monkeypatch.setattr(crazyflie_link, name, seconds)
     settings = fake_drone.Settings(dies=("cf1=0.5:0.8",), speed=0.3)
     with fake_drone.fleet(flight, ANY[:1], (), settings) as fleet:
         (drone,) = fleet.drones

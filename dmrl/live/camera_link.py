@@ -10,9 +10,9 @@ from dmrl.errors import SettingError, SourceError
 from dmrl.formats.aideck.cpx import PORT, Image, ImageReader
 from dmrl.formats.timestamps import SteadySender
 from dmrl.geometry.frames import AIDECK, AIDECK_SENSOR_PX, Camera
-from dmrl.live.clocks import HostTime, SenderClock
 from dmrl.live.image_assembly import Colours, Stored, encoded
 from dmrl.live.queue import Feed, Health, Received
+from dmrl.live.receive_clocks import HostTime, SenderClock
 from dmrl.samples.sample import calibration
 from dmrl.samples.sample import image as image_sample
 

@@ -10,9 +10,9 @@ from typing import Any
 from dmrl.errors import SettingError
 from dmrl.formats.timestamps import Unwrapped
 from dmrl.live.cflib_session import Session
-from dmrl.live.clocks import HostTime, SenderClock
 from dmrl.live.log_blocks import Plan, Reading, plan
 from dmrl.live.queue import Feed, Health, Received
+from dmrl.live.receive_clocks import HostTime, SenderClock
 
 MS = 1_000_000
 TIMESTAMP_BITS = 24

@@ -17,7 +17,7 @@ import numpy as np
 
 from dmrl.errors import SettingError
 from dmrl.live.log_blocks import BLOCK_BYTES, BLOCKS_MAX
-from dmrl.live.simulated.flight import FakeFlight, Faults, FlightClock
+from dmrl.live.simulated.flight_source import FakeFlight, Faults, FlightClock
 
 PARAM, COMMANDER, MEMORY, LOG, GENERIC, PLATFORM, LINK = 2, 3, 4, 5, 7, 13, 15
 PROTOCOL_VERSION = 10

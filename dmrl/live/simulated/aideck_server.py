@@ -13,7 +13,7 @@ from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_state import State
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
-from dmrl.live.simulated.flight import Faults, FlightClock, Pictures
+from dmrl.live.simulated.flight_source import Faults, FlightClock, Pictures
 
 Sends = Literal["plain", "stamped", "streamer", "jpeg"]
 """The layouts of raw images, or plain JPEG."""

@@ -13,9 +13,9 @@ from dmrl.formats.aideck.cpx import Image
 from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_log import APP, GAP8, HOST, Packet, pack_packet
 from dmrl.formats.aideck.cpx_state import State
-from dmrl.live.camera import GARBAGE_BYTES, CameraClient, _Times, address
-from dmrl.live.clocks import HostTime
+from dmrl.live.camera_link import GARBAGE_BYTES, CameraClient, _Times, address
 from dmrl.live.queue import Feed, Received
+from dmrl.live.receive_clocks import HostTime
 
 PATIENCE_S = 100.0
 RNG = np.random.default_rng(5)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.live.clocks import SenderClock
+from dmrl.live.receive_clocks import SenderClock
 
 MS = 1_000_000
 BASE_NS = 1_700_000_000_000_000_000
