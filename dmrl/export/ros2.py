@@ -15,7 +15,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from dmrl.atomic_output import partial_folder
 from dmrl.errors import MissingExtra, RecordingError
-from dmrl.formats.ros.messages import HALF_PX, OWN
+from dmrl.formats.ros.ros_messages import HALF_PX, OWN
 from dmrl.recording import Stamped, read, summary
 from dmrl.terminal.progress import track
 

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.aideck import calibration as aideck
+from dmrl.formats.aideck import published_firmware as aideck
 from dmrl.formats.base import Content, Format, Options
 from dmrl.geometry.frames import AIDECK
 from dmrl.images import codec

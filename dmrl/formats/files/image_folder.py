@@ -26,8 +26,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.formats.aideck import calibration as aideck
 from dmrl.formats.aideck.chip_outputs import chip_maps
+from dmrl.formats.aideck import published_firmware as aideck
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import LabelRow, read_labels

@@ -27,7 +27,7 @@ from urllib.parse import quote
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingExtra, SourceError
 from dmrl.formats.base import Content, Format, Options
-from dmrl.formats.ros.messages import HANDLERS, OWN, Placed, own
+from dmrl.formats.ros.ros_messages import HANDLERS, OWN, Placed, own
 from dmrl.guards.memory import Bounded, size_of
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say

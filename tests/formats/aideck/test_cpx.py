@@ -3,7 +3,6 @@ import struct
 import numpy as np
 import pytest
 
-from dmrl.formats.aideck import cpx
 from dmrl.formats.aideck.cpx import Image, ImageReader
 from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_log import (
@@ -16,6 +15,7 @@ from dmrl.formats.aideck.cpx_log import (
     pack_packet,
 )
 from dmrl.formats.aideck.cpx_state import State, compressed, quaternion
+from dmrl.formats.aideck import cpx
 
 from ..test_cpx_packets import app_packet
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmrl.formats.aideck.calibration import FARTHEST_M, is_plausible, samples
+from dmrl.formats.aideck.published_firmware import FARTHEST_M, is_plausible, samples
 from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
 
 VALUES = (10.0, 20.0, 2.0, 0.3, -0.1, 2.5)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
-from dmrl.formats.ros.messages import (
+from dmrl.formats.ros.ros_messages import (
     HANDLERS,
     Placed,
     _angles,
