@@ -18,7 +18,7 @@ from dmrl.guards.durability import empty, sync, sync_one
 from dmrl.guards.locks import is_held, refuse_locked, take_file, take_folder
 from dmrl.guards.paths import refuse_no_text
 from dmrl.storage import Remote, added_files, uploaded_file, uploaded_folder
-from dmrl.storage.whole import require_bucket
+from dmrl.storage.upload import require_bucket
 
 SUFFIX = ".partial"
 MOST_NAME_BYTES = 255 - len(SUFFIX)

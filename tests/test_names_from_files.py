@@ -36,9 +36,9 @@ REASONS = {
     "deploy/c/run/measure.py: f'{name}.o'": "named by c_name",
     "deploy/c/run/compile_targets.py: f'{name}.c'": "named by c_name",
     "deploy/c/run/compile_targets.py: f'{name}_refine.c'": "named by c_name",
-    "evaluation/report.py: name": OURS,
+    "evaluation/pipeline_summary.py: name": OURS,
     "export/ros2.py: path.name": LISTED,
-    "export/tables.py: name": "a number, and one of two endings",
+    "export/csv_parquet.py: name": "a number, and one of two endings",
     "formats/aideck/chip_outputs.py: f'{name}{number}.ppm'": READ,
     "formats/files/flight_csv.py: log.robot": LISTED,
     "formats/published/locanet.py: name": READ,
@@ -51,8 +51,8 @@ REASONS = {
     "output.py: last": OURS,
     "output.py: path.name + SUFFIX": GIVEN,
     "html_report/collect.py: name": LISTED,
-    "html_report/sections.py: name": LISTED,
-    "html_report/figures.py: name": "only read, and nothing outside the folder",
+    "html_report/report_sections.py: name": LISTED,
+    "html_report/recipe_figures.py: name": "only read, and nothing outside the folder",
     "pipeline/batch.py: n": LISTED,
     "pipeline/batch.py: name": LISTED,
     "pipeline/build_cache.py: name": LISTED,
@@ -73,7 +73,7 @@ REASONS = {
     "stages/sketch.py: name": OURS,
     "storage/remote.py: *one.parts[len(self.parts):]": "a name in the same bucket",
     "storage/remote.py: hashlib.sha256(version.encode()).hexdigest()[:16]": OURS,
-    "storage/whole.py: file": "what we wrote ourselves just now",
+    "storage/upload.py: file": "what we wrote ourselves just now",
 }
 PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
 MAY_PARSE = {

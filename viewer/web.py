@@ -14,8 +14,8 @@ from urllib.parse import quote
 from cyclopts import Parameter, validators
 
 from dmrl.errors import SettingError
-from dmrl.terminal.ending import ended_by_signal
 from dmrl.terminal.progress import say
+from dmrl.terminal.signals import ended_by_signal
 from dmrl.viewer.process import (
     LOOPBACK,
     Viewer,

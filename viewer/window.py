@@ -14,7 +14,7 @@ from rerun.experimental import ViewerClient
 from dmrl.atomic_output import partial_file
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode, encode_png
-from dmrl.terminal.ending import ended_by_signal
+from dmrl.terminal.signals import ended_by_signal
 from dmrl.viewer.process import (
     LOOPBACK,
     PATIENCE_S,

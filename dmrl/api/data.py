@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from dmrl.api import pages
+from dmrl.api import notebook_display
 from dmrl.datasets import Dataset, Split, layout, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
-from dmrl.export.tables import flat
+from dmrl.export.csv_parquet import flat
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -186,8 +186,8 @@ class Rows:
         return f"<split {self.name}: {len(self)} images of {width} x {height} px>"
 
     def _repr_html_(self) -> str:
-        shown = pages.spread(len(self))
-        return pages.pictures(repr(self)[1:-1], self._split.images(shown))
+        shown = notebook_display.spread(len(self))
+        return notebook_display.pictures(repr(self)[1:-1], self._split.images(shown))
 
 
 class Data(Mapping[str, Rows]):
@@ -243,7 +243,7 @@ class Data(Mapping[str, Rows]):
 
     def show(self) -> object:
         """Show it in rerun, row by row: in a notebook's cell, or else in a window."""
-        return pages.shown([self.path], None)
+        return notebook_display.shown([self.path], None)
 
     def __repr__(self) -> str:
         return f"<dataset {self.path}: {', '.join(self)}>"
@@ -253,7 +253,7 @@ class Data(Mapping[str, Rows]):
             (name, len(split), "{1} x {0}".format(*split._split.image_shape))
             for name, split in self.items()
         ]
-        return pages.table(f"dataset {self.path}", ("split", "images", "size, px"), rows)
+        return notebook_display.table(f"dataset {self.path}", ("split", "images", "size, px"), rows)
 
 
 def dataset(path: str | os.PathLike[str]) -> Data:

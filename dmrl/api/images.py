@@ -8,7 +8,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.api import pages
+from dmrl.api import notebook_display
 from dmrl.images.codec import Rgb, decode
 from dmrl.messages import message
 from dmrl.recording import log_times, parsed, read_raw
@@ -117,4 +117,6 @@ class Images(Sequence[Rgb]):
         return f"<{len(self)} images of {self.topic} in {self.path}>"
 
     def _repr_html_(self) -> str:
-        return pages.pictures(repr(self)[1:-1], (self[k] for k in pages.spread(len(self))))
+        return notebook_display.pictures(
+            repr(self)[1:-1], (self[k] for k in notebook_display.spread(len(self)))
+        )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.api import pages
+from dmrl.api import notebook_display
 from dmrl.deploy.detector import BackendName, Detector, open_detector
 from dmrl.errors import SettingError
 from dmrl.learn.inference.decode_grids import PER_DETECTION, Grids, decode
@@ -133,7 +133,7 @@ class Model:
 
     def _repr_html_(self) -> str:
         rows = [("threshold", self.threshold), ("side of a cell, px", self.stride_px)]
-        return pages.table(f"model {self.name}", ("", ""), rows)
+        return notebook_display.table(f"model {self.name}", ("", ""), rows)
 
 
 def load(model: str | os.PathLike[str], *, backend: BackendName = "torch") -> Model:

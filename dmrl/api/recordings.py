@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 
 from dmrl import topics
-from dmrl.api import pages
+from dmrl.api import notebook_display
 from dmrl.api.images import Images
 from dmrl.api.topic import Topic, framed, log_time
 from dmrl.errors import MissingTopic, SettingError
-from dmrl.export.tables import flat
+from dmrl.export.csv_parquet import flat
 from dmrl.recording import (
     Finding,
     Provenance,
@@ -204,7 +204,7 @@ class Recording:
         MissingExtra
             If rerun is not installed.
         """
-        return pages.shown([self.path], layout)
+        return notebook_display.shown([self.path], layout)
 
     def __repr__(self) -> str:
         count = self._summary.count
@@ -212,7 +212,7 @@ class Recording:
 
     def _repr_html_(self) -> str:
         rows = [(name, info.schema, info.count) for name, info in self.topics.items()]
-        return pages.table(repr(self)[1:-1], ("topic", "message", "messages"), rows)
+        return notebook_display.table(repr(self)[1:-1], ("topic", "message", "messages"), rows)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self.topics)

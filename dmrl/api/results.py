@@ -5,7 +5,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dmrl.api import pages
+from dmrl.api import notebook_display
 
 
 class Result(Mapping[str, Any]):
@@ -52,7 +52,7 @@ class Result(Mapping[str, Any]):
         return "\n".join([title, *lines])
 
     def _repr_html_(self) -> str:
-        return pages.table(*self._table)
+        return notebook_display.table(*self._table)
 
 
 def judged(recordings: Sequence[Path], settings: Any) -> Result:

@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl.errors import MissingExtra
-from dmrl.export.tables import flat
+from dmrl.export.csv_parquet import flat
 from dmrl.messages import status_name
 from dmrl.recording import TopicInfo, read_table
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dmrl import topics
 from dmrl.card.facts import Facts
-from dmrl.card.sensors import cameras_of, sensors_of
+from dmrl.card.sensor_facts import cameras_of, sensors_of
 from dmrl.datasets.writing.inputs import focal_lengths
 from dmrl.datasets.writing.near_duplicates import Seen
 from dmrl.datasets.writing.rows import Tally, count_images, label_source, sources_of

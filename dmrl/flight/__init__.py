@@ -5,11 +5,11 @@ the truth. A robot's own randomness depends on the seed and its number alone, so
 changes nothing for those already there.
 """
 
-from dmrl.flight.data import Clock, Flight, Ranges, RobotLog, Truth
 from dmrl.flight.faults import Fault
-from dmrl.flight.motion import TRAJECTORIES, Trajectory
+from dmrl.flight.flight_arrays import Clock, Flight, Ranges, RobotLog, Truth
 from dmrl.flight.noise import NOISE, Noise
 from dmrl.flight.simulate import Scenario, simulate
+from dmrl.flight.trajectories import TRAJECTORIES, Trajectory
 
 __all__ = [
     "NOISE",

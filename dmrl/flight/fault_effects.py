@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.flight.data import RATE_HZ, Clock, Ranges, RobotLog, Truth
 from dmrl.flight.faults import Happened
-from dmrl.flight.motion import Motion
+from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
+from dmrl.flight.trajectories import Motion
 from dmrl.geometry.frames import Array
 
 COAST_S = 0.3

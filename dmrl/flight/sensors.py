@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.flight.data import RATE_HZ, Clock, Ranges, RobotLog, Truth, scanned
+from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth, scanned
 from dmrl.flight.noise import Noise
 from dmrl.geometry.frames import Array
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.errors import SettingError
-from dmrl.flight import fault_effects, motion, sensors
-from dmrl.flight.data import RATE_HZ, Clock, Flight
+from dmrl.flight import fault_effects, sensors, trajectories
 from dmrl.flight.faults import ENDS, Fault, Happened, check, happened
-from dmrl.flight.motion import TRAJECTORIES, Motion, Start, Trajectory
+from dmrl.flight.flight_arrays import RATE_HZ, Clock, Flight
 from dmrl.flight.noise import Noise
+from dmrl.flight.trajectories import TRAJECTORIES, Motion, Start, Trajectory
 from dmrl.geometry.frames import Array
 
 ROBOTS_MAX = 20
@@ -76,7 +76,7 @@ def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault
     for k, name in enumerate(names):
         mine = [event for event in events if event.fault.robot == name]
         way, height = _flown(moves[k], _height(_rng(seed, "height", k), scenario), mine)
-        truth[name] = motion.truth_of(way, height)
+        truth[name] = trajectories.truth_of(way, height)
         clocks[name] = fault_effects.clock_with(_clock(_rng(seed, "clock", k), k, noise), mine)
         robots[name] = sensors.robot_log(
             _rng(seed, "log", k), truth[name], way.yaw_rate, clocks[name], noise
@@ -134,7 +134,7 @@ def _start(rng: Generator, k: int, scenario: Scenario) -> Start:
         # Sunflower: neighbours stay about a spacing apart however many there are.
         place = SPACING_M * np.sqrt(k) * np.exp(1j * (rng.uniform(-0.2, 0.2) + 2.4 * k))
         return Start(samples, complex(place), yaw)
-    return Start(samples, complex(motion.view_points(rng, 1)[0]), yaw)
+    return Start(samples, complex(trajectories.view_points(rng, 1)[0]), yaw)
 
 
 def _height(rng: Generator, scenario: Scenario) -> Array:

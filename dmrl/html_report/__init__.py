@@ -5,7 +5,7 @@
 """
 
 from dmrl.html_report.collect import Found, gather
-from dmrl.html_report.sections import page
-from dmrl.html_report.write import write
+from dmrl.html_report.report_sections import page
+from dmrl.html_report.write_report import write
 
 __all__ = ["Found", "gather", "page", "write"]

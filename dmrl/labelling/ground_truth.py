@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.estimation.model.position_metrics import inside_truth
 from dmrl.geometry.frames import Array
-from dmrl.geometry.turns import euler_zyx
+from dmrl.geometry.rotations import euler_zyx
 from dmrl.recording import Contents
 
 UNIT = 0.1

@@ -16,7 +16,7 @@ from dmrl.estimation.signals.clock_alignment import Clock, estimate_clock
 from dmrl.estimation.signals.image_motion import rates, shift, small
 from dmrl.estimation.signals.ranging_clocks import estimate_from_exchanges
 from dmrl.geometry.frames import Array
-from dmrl.geometry.turns import euler_zyx
+from dmrl.geometry.rotations import euler_zyx
 from dmrl.images import codec
 from dmrl.recording import Contents, read
 from dmrl.terminal.progress import track

@@ -13,14 +13,14 @@ from pathlib import Path
 
 from dmrl.atomic_output import as_output_error, partial_of, rewritten_file
 from dmrl.errors import OutputError, SettingError
-from dmrl.evaluation.report import Done
+from dmrl.evaluation.pipeline_summary import Done
 from dmrl.guards.paths import refuse_no_text
 from dmrl.pipeline.build_cache import Memory
 from dmrl.pipeline.executor import executor
 from dmrl.pipeline.plan import DATA, RECIPE_FILE, STATE_FILE, UNFINISHED, Plan, Step, load, located
 from dmrl.pipeline.runner import Runner
 from dmrl.storage import Remote
-from dmrl.storage.whole import require_bucket
+from dmrl.storage.upload import require_bucket
 from dmrl.terminal.progress import say
 
 __all__ = ["Done", "Plan", "Step", "kept_recipe", "load", "run"]

@@ -11,7 +11,7 @@ from typing import Any
 from dmrl import recipe as recipes
 from dmrl.atomic_output import note, partial_of
 from dmrl.errors import DmrlError, OutputError
-from dmrl.evaluation.report import Done
+from dmrl.evaluation.pipeline_summary import Done
 from dmrl.pipeline.build_cache import Memory, key_of
 from dmrl.pipeline.executor import Executor
 from dmrl.pipeline.job import Answer, job

@@ -15,8 +15,8 @@ from cyclopts import Parameter, validators
 
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import SettingError, SourceError
+from dmrl.export.csv_parquet import write_tables
 from dmrl.export.ros2 import write_bag
-from dmrl.export.tables import write_tables
 from dmrl.formats.base import Content, Options
 from dmrl.formats.registry import format_of
 from dmrl.geometry.camera_file import camera_named

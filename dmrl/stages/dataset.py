@@ -14,19 +14,19 @@ from dmrl.card.facts import FILE as FACTS
 from dmrl.card.facts import merged, read_facts
 from dmrl.card.front_matter import check_license
 from dmrl.card.recording_facts import About, facts_of, read_about
+from dmrl.datasets.huggingface_metadata import fingerprint_of, rewrite, write_names
 from dmrl.datasets.layout import MANIFEST
 from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
-from dmrl.datasets.names import fingerprint_of, rewrite, write_names
 from dmrl.datasets.settings import Settings
 from dmrl.datasets.writing.append import Before, made_of, opened
 from dmrl.datasets.writing.builder import Wanted, explain, has_masks, rows, unused, warn_of_others
+from dmrl.datasets.writing.dataset_writer import write_shards
 from dmrl.datasets.writing.exclusions import read_flags
 from dmrl.datasets.writing.inputs import warn_of_lenses
 from dmrl.datasets.writing.near_duplicates import Seen
 from dmrl.datasets.writing.parts import splits_of
 from dmrl.datasets.writing.rows import Tally
 from dmrl.datasets.writing.splits import SplitOf
-from dmrl.datasets.writing.writer import write_shards
 from dmrl.errors import SettingError
 from dmrl.pipeline.batch import all_recordings, differing
 from dmrl.pipeline.process_pool import cores

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from dmrl.evaluation.report import report
+from dmrl.evaluation.pipeline_summary import report
 from dmrl.html_report import write
 from dmrl.pipeline import recipe_run as pipeline
 from dmrl.terminal.arguments import AsJson

@@ -16,7 +16,7 @@ from dmrl.atomic_output import partial_folder, refuse_existing
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detections import Pairs, join
-from dmrl.evaluation.tables import band_values, by_band_table, curve_values, finite
+from dmrl.evaluation.figure_tables import band_values, by_band_table, curve_values, finite
 from dmrl.learn.inference.detection_metrics import DEFINITIONS, BandFigures, Scored, by_band, score
 from dmrl.learn.inference.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
 from dmrl.pipeline.batch import all_recordings

@@ -16,8 +16,8 @@ from dmrl import topics
 from dmrl.deploy.detector import LIBRARIES, BackendName, Detector, fastest, open_detector
 from dmrl.errors import MissingTopic
 from dmrl.guards import limits
-from dmrl.images.ahead import ahead
 from dmrl.images.codec import Opened, Rgb, opened, size
+from dmrl.images.prefetch import ahead
 from dmrl.learn.inference.decode_grids import PER_DETECTION, Found, Grids
 from dmrl.learn.inference.decode_grids import decode as find
 from dmrl.learn.inference.test_time_augmentation import VIEWS, agreed, returned, shown

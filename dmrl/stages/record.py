@@ -26,7 +26,7 @@ from dmrl.live.status_table import LiveTable
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance
 from dmrl.terminal.arguments import AsJson, Flat
-from dmrl.terminal.ending import ended_by_signal
+from dmrl.terminal.signals import ended_by_signal
 from dmrl.terminal.tables import print_json, print_table
 
 FLUSH_S = 1.0

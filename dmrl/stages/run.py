@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter, validators
 
 from dmrl.errors import MissingExtra
-from dmrl.evaluation.report import report
+from dmrl.evaluation.pipeline_summary import report
 from dmrl.pipeline import recipe_run as pipeline
 from dmrl.terminal.arguments import AsJson, On
 from dmrl.terminal.progress import say

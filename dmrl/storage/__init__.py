@@ -5,6 +5,6 @@ as a path does. Who opens one by its name, as a library does, gets a copy on thi
 """
 
 from dmrl.storage.remote import SCHEMES, Remote, path_of
-from dmrl.storage.whole import added_files, uploaded_file, uploaded_folder
+from dmrl.storage.upload import added_files, uploaded_file, uploaded_folder
 
 __all__ = ["SCHEMES", "Remote", "added_files", "path_of", "uploaded_file", "uploaded_folder"]

@@ -18,7 +18,7 @@ from typing import Any
 from dmrl.errors import StorageError
 from dmrl.guards.paths import refuse_pipe
 from dmrl.guards.safe_names import inside
-from dmrl.storage.ranges import STEP_BYTES, Ranged
+from dmrl.storage.remote_stream import STEP_BYTES, Ranged
 from dmrl.storage.system import system, told
 
 SCHEMES = ("s3", "gs", "gcs", "az", "abfs", "http", "https")

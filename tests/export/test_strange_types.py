@@ -10,8 +10,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSe
 from rosbags.highlevel import AnyReader
 
 from dmrl.errors import RecordingError
+from dmrl.export.csv_parquet import write_tables
 from dmrl.export.ros2 import write_bag
-from dmrl.export.tables import write_tables
 from dmrl.recording import Channel, RawMessage, RecordingWriter, provenance
 
 OWN = {"type": F.TYPE_MESSAGE, "type_name": ".x.M"}

@@ -5,7 +5,7 @@ import pytest
 
 from dmrl.errors import SettingError
 from dmrl.flight import NOISE, TRAJECTORIES, Clock, Scenario, Trajectory, simulate
-from dmrl.flight.motion import GRAVITY_MPS2
+from dmrl.flight.trajectories import GRAVITY_MPS2
 from dmrl.geometry.frames import camera_from_horizontal
 
 SHORT = Scenario(duration_s=30.0)

@@ -15,7 +15,7 @@ from dmrl.errors import OutputError, SettingError
 from dmrl.html_report import gather, page, write
 from dmrl.images.codec import encode_png
 from dmrl.plots import charts
-from dmrl.plots.pictures import _text_places
+from dmrl.plots.image_figures import _text_places
 
 Evaluation = Callable[..., dict[str, Any]]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.geometry.turns import quaternion_zyx
+from dmrl.geometry.rotations import quaternion_zyx
 from dmrl.images.codec import encode_png
 from dmrl.labelling.time_alignment import (
     MOCAP_STEP_S,

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import DmrlError, OutputError, RecipeError, SettingError
-from dmrl.evaluation.report import report
+from dmrl.evaluation.pipeline_summary import report
 from dmrl.pipeline import job_worker as work
 from dmrl.pipeline import recipe_run as pipeline
 from dmrl.pipeline.job import job

@@ -12,7 +12,7 @@ import pytest
 
 from dmrl.atomic_output import partial_of
 from dmrl.errors import DmrlError, OutputError
-from dmrl.evaluation.report import Done
+from dmrl.evaluation.pipeline_summary import Done
 from dmrl.pipeline.build_cache import Memory
 from dmrl.pipeline.job import Answer
 from dmrl.pipeline.plan import Plan, Step

@@ -7,7 +7,7 @@ import pytest
 
 from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.evaluation import positions
-from dmrl.evaluation.report import Done, report
+from dmrl.evaluation.pipeline_summary import Done, report
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.evaluate import Settings, command, run

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from dmrl.flight.data import Flight, RobotLog
+from dmrl.flight.flight_arrays import Flight, RobotLog
 
 Array = NDArray[np.float64]
 Message = tuple[str, str, int, Any]

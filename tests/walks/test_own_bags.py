@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.flight.data import Flight
+from dmrl.flight.flight_arrays import Flight
 from dmrl.flight.noise import NOISE
 from dmrl.flight.simulate import Scenario, simulate
 from dmrl.recording import Contents, check, read_table, summary

@@ -7,12 +7,12 @@ from pathlib import Path
 from dmrl import topics
 from dmrl.datasets.manifest import Manifest
 from dmrl.datasets.settings import Settings
+from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.datasets.writing.exclusions import Flag, read_flags
 from dmrl.datasets.writing.rows import Tally, rows_of
 from dmrl.datasets.writing.splits import SplitOf
-from dmrl.datasets.writing.writer import Row
 from dmrl.errors import RecordingError
-from dmrl.images.ahead import ahead
+from dmrl.images.prefetch import ahead
 from dmrl.recording import Contents, summary
 from dmrl.terminal.progress import say, track
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.datasets.writing.writer import Row
+from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.errors import DatasetError
 
 FILE = "seen.bin"

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.datasets.layout import PEER
+from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.datasets.writing.exclusions import Flag
 from dmrl.datasets.writing.splits import SplitOf
-from dmrl.datasets.writing.writer import Row
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import STRIDE_PX, grid_label
 from dmrl.images.codec import decode

@@ -35,7 +35,7 @@ from dmrl.formats.crazyflie.state import (
     yaw_rate_of,
 )
 from dmrl.geometry.frames import Array
-from dmrl.geometry.turns import euler_zyx
+from dmrl.geometry.rotations import euler_zyx
 from dmrl.messages import LogType
 from dmrl.samples import flight
 from dmrl.samples.flight import Placed, Times

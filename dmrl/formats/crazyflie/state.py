@@ -6,7 +6,7 @@ import numpy as np
 
 from dmrl.formats.crazyflie.log_block import Block, Series, series, unpacked_quaternion
 from dmrl.geometry.frames import Array
-from dmrl.geometry.turns import euler_zyx, quaternion_zyx
+from dmrl.geometry.rotations import euler_zyx, quaternion_zyx
 
 ANGLES = ("roll", "pitch", "yaw")
 

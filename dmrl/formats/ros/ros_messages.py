@@ -11,7 +11,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.geometry.frames import Array
-from dmrl.geometry.turns import euler_zyx
+from dmrl.geometry.rotations import euler_zyx
 from dmrl.images import codec
 from dmrl.images.bayer import rgb_of
 from dmrl.messages import LogType, descriptor

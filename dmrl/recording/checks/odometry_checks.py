@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.geometry.frames import Array
-from dmrl.geometry.turns import euler_zyx
+from dmrl.geometry.rotations import euler_zyx
 
 STEP_S, SLOPE_S = 0.05, 0.3
 """Poses are looked at this often; speeds are slopes over this long."""

@@ -15,7 +15,7 @@ from mcap.stream_reader import CRCValidationError
 from dmrl.atomic_output import outputs_done
 from dmrl.errors import RecordingError
 from dmrl.storage import Remote
-from dmrl.storage.ranges import LEAST_BYTES
+from dmrl.storage.remote_stream import LEAST_BYTES
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")  # opcode, length

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.datasets import open_dataset
-from dmrl.datasets.writing import writer
+from dmrl.datasets.writing import dataset_writer
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message, schema_bytes
@@ -222,17 +222,19 @@ def test_of_large_images_few_are_in_memory(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
-    batch = writer._record_batch
+    batch = dataset_writer._record_batch
     monkeypatch.setattr(
-        writer, "_record_batch", lambda rows, *more: made.append(len(rows)) or batch(rows, *more)
+        dataset_writer,
+        "_record_batch",
+        lambda rows, *more: made.append(len(rows)) or batch(rows, *more),
     )
     flight = record(peers=[[peer()]] * 5)
     for name, pixels, wanted in (("a", 10**9, [5]), ("b", 2 * WIDTH_PX * HEIGHT_PX, [2, 2, 1])):
-        monkeypatch.setattr(writer, "BATCH_PIXELS", pixels)
+        monkeypatch.setattr(dataset_writer, "BATCH_PIXELS", pixels)
         made.clear()
         run([flight], tmp_path / name, Settings())
         assert made == wanted
-    monkeypatch.setattr(writer, "BATCH_PIXELS", 1)
+    monkeypatch.setattr(dataset_writer, "BATCH_PIXELS", 1)
     made.clear()
     run([flight], tmp_path / "c", Settings())
     assert made == [1] * 5

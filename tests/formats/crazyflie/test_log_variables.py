@@ -9,7 +9,7 @@ from dmrl.formats.crazyflie.log_block import Block, Series, series, unpacked_qua
 from dmrl.formats.crazyflie.log_variables import _pose, attitude_of, streams, yaw_rate_of
 from dmrl.formats.crazyflie.state import quaternions_of, scaled, turn_of
 from dmrl.geometry.frames import Array, camera_from_horizontal
-from dmrl.geometry.turns import euler_zyx, quaternion_zyx
+from dmrl.geometry.rotations import euler_zyx, quaternion_zyx
 from dmrl.samples.sample import Sample
 
 MS = 1_000_000

@@ -10,7 +10,7 @@ from dmrl.formats.base import Options
 from dmrl.formats.files import mapped_csv
 from dmrl.formats.files.column_map import QUANTITIES
 from dmrl.formats.registry import format_of
-from dmrl.geometry.turns import euler_zyx, quaternion_zyx
+from dmrl.geometry.rotations import euler_zyx, quaternion_zyx
 from dmrl.samples.sample import Sample
 
 TABLE = """

@@ -21,7 +21,7 @@ from dmrl.formats.ros.ros_messages import (
     _yaw_rate,
 )
 from dmrl.geometry.frames import camera_from_horizontal
-from dmrl.geometry.turns import quaternion_zyx
+from dmrl.geometry.rotations import quaternion_zyx
 from dmrl.images.bayer import rgb_of
 from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample

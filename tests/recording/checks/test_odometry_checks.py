@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.geometry.turns import quaternion_zyx
+from dmrl.geometry.rotations import quaternion_zyx
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, check
 from dmrl.recording.checks import odometry_checks as check_motion

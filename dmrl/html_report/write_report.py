@@ -7,7 +7,7 @@ from dmrl.atomic_output import partial_file, rewritten_file
 from dmrl.errors import OutputError
 from dmrl.html_report.collect import gather
 from dmrl.html_report.html import MARK
-from dmrl.html_report.sections import page
+from dmrl.html_report.report_sections import page
 
 NAME = "report.html"
 

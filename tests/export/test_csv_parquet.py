@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from dmrl.errors import OutputError, UnsafeName
-from dmrl.export import tables
-from dmrl.export.tables import write_tables
+from dmrl.export import csv_parquet
+from dmrl.export.csv_parquet import write_tables
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Channel, RawMessage, RecordingWriter, provenance
@@ -85,7 +85,7 @@ def test_topics_that_one_disk_would_put_into_one_table_are_refused(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As where A and a are one name of a file."""
-    monkeypatch.setattr(tables, "file_of_topic", lambda topic: topic[:4].strip("/"))
+    monkeypatch.setattr(csv_parquet, "file_of_topic", lambda topic: topic[:4].strip("/"))
     with pytest.raises(UnsafeName, match=r"/cf1/.* and another topic would both become"):
         write_tables(recording, tmp_path / "out", "csv")
     assert list(tmp_path.iterdir()) == [recording]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dmrl.flight.data import RATE_HZ, Signal, Truth, numbers, scanned
+from dmrl.flight.flight_arrays import RATE_HZ, Signal, Truth, numbers, scanned
 from dmrl.geometry.frames import Array
 
 Plane = NDArray[np.complex128]

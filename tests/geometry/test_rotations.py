@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.geometry.frames import Array
-from dmrl.geometry.turns import euler_zyx, quaternion_zyx
+from dmrl.geometry.rotations import euler_zyx, quaternion_zyx
 
 TILT = st.floats(-1.5, 1.5)
 TURN = st.floats(-3.1, 3.1)

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from dmrl.terminal.ending import ended_by_signal
+from dmrl.terminal.signals import ended_by_signal
 
 
 class Destroyed:

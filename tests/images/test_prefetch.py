@@ -2,7 +2,7 @@
 
 import pytest
 
-from dmrl.images.ahead import ahead
+from dmrl.images.prefetch import ahead
 
 
 @pytest.mark.parametrize("threads", [1, 3])

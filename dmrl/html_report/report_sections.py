@@ -14,11 +14,11 @@ from dmrl import __version__
 from dmrl.errors import DmrlError
 from dmrl.evaluation import positions, tracks
 from dmrl.html_report import html
+from dmrl.html_report.catalogue_tables import listed
 from dmrl.html_report.collect import Found
-from dmrl.html_report.figures import story
 from dmrl.html_report.html import WRONG, Pictures, chart, row, table, text
 from dmrl.html_report.lineage import ancestry
-from dmrl.html_report.tables import listed
+from dmrl.html_report.recipe_figures import story
 from dmrl.plots import charts
 from dmrl.topics import robots
 
