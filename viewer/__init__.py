@@ -12,8 +12,8 @@ try:
     from dmrl.viewer.flag import flag
     from dmrl.viewer.selection import Settings
     from dmrl.viewer.session import save
-    from dmrl.viewer.web import Page, Web, page, serve
-    from dmrl.viewer.window import screenshot, view
+    from dmrl.viewer.window.desktop import screenshot, view
+    from dmrl.viewer.window.web_page import Page, Web, page, serve
 except ImportError as e:
     raise MissingExtra("rerun-sdk", "view", "dmrl view") from e
 

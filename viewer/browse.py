@@ -19,13 +19,14 @@ from dmrl.colours import RGB
 from dmrl.datasets import layout, open_dataset
 from dmrl.errors import DatasetError, SettingError
 from dmrl.geometry.frames import STRIDE_PX
-from dmrl.viewer import entities, layouts, plots
-from dmrl.viewer.entities import Scale
-from dmrl.viewer.entity import Entity, image_frame
-from dmrl.viewer.found import Found, Key, errors_of_rows, find
-from dmrl.viewer.labels import labels
+from dmrl.viewer import layouts
+from dmrl.viewer.content.matched_detections import Found, Key, errors_of_rows, find
+from dmrl.viewer.drawing import archetypes, time_plots
+from dmrl.viewer.drawing.archetypes import Scale
+from dmrl.viewer.drawing.entity import Entity, image_frame
+from dmrl.viewer.drawing.label_overlay import labels
+from dmrl.viewer.drawing.legend import colour_bars, legend
 from dmrl.viewer.layouts import Eye, Plot
-from dmrl.viewer.legend import colour_bars, legend
 from dmrl.viewer.selection import Settings
 from dmrl.viewer.show import Logged, Show
 
@@ -87,7 +88,7 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
         raise SettingError(
             f"{folder} shows {len(ranked.rows)} rows. Give --rank 1 to {len(ranked.rows)}"
         )
-    scales = entities.scales(settings.depth_max_m)
+    scales = archetypes.scales(settings.depth_max_m)
     rows, cols = grid_shape(ranked.rows)
     eye = Eye(
         ROBOT,
@@ -205,7 +206,7 @@ def _logged(
         known = every[np.isfinite(ranked.error_px)]
         yield (
             _ranks(known),
-            plots.line(ERROR_PX, ranked.error_px[known], "worst label", RGB["detection"]),
+            time_plots.line(ERROR_PX, ranked.error_px[known], "worst label", RGB["detection"]),
         )
     named = {} if ranked.found is None else {"detection": RGB["detection"]}
     shown = {name: scales[name] for name in eye.channels}
@@ -244,9 +245,9 @@ def _drawn(
     maps = None
     if ranked.found is not None:
         mine = ranked.found.of(part)
-        yield from entities.detections(eye.detections, frame, mine.detections(), eye.width_px)
+        yield from archetypes.detections(eye.detections, frame, mine.detections(), eye.width_px)
         maps = mine.maps()
-    yield from entities.grids(
+    yield from archetypes.grids(
         eye.grid, frame, _true_maps(batch) if maps is None else maps, scales, smooth=smooth
     )
     words = [_facts(ranked, int(k)) for k in part]

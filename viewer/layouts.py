@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import rerun as rr
 import rerun.blueprint as rrb
 
-from dmrl.viewer.entities import Scale, channel_path, texts_path
-from dmrl.viewer.entity import escaped, image_frame
-from dmrl.viewer.legend import HEIGHT_PX, bar_path, legend_path
+from dmrl.viewer.drawing.archetypes import Scale, channel_path, texts_path
+from dmrl.viewer.drawing.entity import escaped, image_frame
+from dmrl.viewer.drawing.legend import HEIGHT_PX, bar_path, legend_path
 
 TIMELINE = "log_time"
 BACKGROUND = (24, 24, 24)

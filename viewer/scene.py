@@ -15,14 +15,14 @@ from dmrl.colours import RGB
 from dmrl.images import codec
 from dmrl.recording import stretches
 from dmrl.terminal.progress import track
-from dmrl.viewer import entities
-from dmrl.viewer.entities import Colour, Scale
-from dmrl.viewer.entity import Entity, image_frame
-from dmrl.viewer.follow import Follower
-from dmrl.viewer.labels import labels
+from dmrl.viewer.content.flight_streamer import Follower
+from dmrl.viewer.content.robot_motion import Times
+from dmrl.viewer.drawing import archetypes as entities
+from dmrl.viewer.drawing.archetypes import Colour, Scale
+from dmrl.viewer.drawing.entity import Entity, image_frame
+from dmrl.viewer.drawing.label_overlay import labels
+from dmrl.viewer.drawing.legend import colour_bars, legend
 from dmrl.viewer.layouts import TIMELINE, Eye
-from dmrl.viewer.legend import colour_bars, legend
-from dmrl.viewer.motion import Times
 from dmrl.viewer.selection import Selection
 from dmrl.viewer.show import Logged, time_column
 

@@ -7,8 +7,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from dmrl.viewer.entity import Entity, escaped
-from dmrl.viewer.motion import Times
+from dmrl.viewer.content.robot_motion import Times
+from dmrl.viewer.drawing.entity import Entity, escaped
 
 Logged = tuple[rr.TimeColumn | None, Entity]
 

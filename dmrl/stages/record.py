@@ -256,7 +256,7 @@ def command(
     with ExitStack() as window:
         show = None
         if view:
-            from dmrl.viewer.live import LiveWindow  # noqa: PLC0415 - an extra
+            from dmrl.viewer.window.live_view import LiveWindow  # noqa: PLC0415 - an extra
 
             cameras = [r.name for r in robots if r.camera]
             show = window.enter_context(LiveWindow([r.name for r in robots], cameras)).show

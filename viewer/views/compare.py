@@ -16,11 +16,12 @@ from dmrl.geometry.frames import Array
 from dmrl.learn.inference.matching import errors
 from dmrl.recording import Contents
 from dmrl.terminal.progress import say
-from dmrl.viewer import entities, layouts, plots
-from dmrl.viewer.entities import Colour
-from dmrl.viewer.entity import Entity
+from dmrl.viewer import layouts
+from dmrl.viewer.content.robot_motion import Times
+from dmrl.viewer.drawing import archetypes, time_plots
+from dmrl.viewer.drawing.archetypes import Colour
+from dmrl.viewer.drawing.entity import Entity
 from dmrl.viewer.layouts import Plot
-from dmrl.viewer.motion import Times
 from dmrl.viewer.scene import Scene, Still, bars, eyes_of, model_draws, picture_draws
 from dmrl.viewer.selection import Selection, Settings
 
@@ -53,7 +54,7 @@ def scene(selection: Selection, settings: Settings) -> Scene:
         If there are not two recordings with detections of one robot.
     """
     robot, models = _models(selection, settings.robot)
-    scales = entities.scales(settings.depth_max_m)
+    scales = archetypes.scales(settings.depth_max_m)
     eyes = [eye for path in models for eye in eyes_of(selection, [robot], scales, model=path)]
     judged = {path: found for path in models if (found := _judged(path, robot, selection))}
     scene = Scene(
@@ -137,7 +138,9 @@ def _lines(path: Path, judged: Judged, colour: Colour) -> Iterator[Entity]:
         worst = np.full(row.max() + 1, -np.inf)
         np.maximum.at(worst, row, np.nan_to_num(values, nan=np.inf))
         worst[~np.isfinite(worst)] = np.nan
-        yield plots.line(f"{_prefix(path)}/{name}", worst, path.stem, colour, plots.THIN_UI)
+        yield time_plots.line(
+            f"{_prefix(path)}/{name}", worst, path.stem, colour, time_plots.THIN_UI
+        )
 
 
 def _table(judged: dict[Path, Judged]) -> str:

@@ -9,11 +9,12 @@ from dmrl import topics
 from dmrl.colours import RGB
 from dmrl.terminal.progress import say
 from dmrl.topics import Topic
-from dmrl.viewer import layouts, plots, space
-from dmrl.viewer.entity import WORLD, Entity, camera_frame, horizontal_frame, optical_frame
-from dmrl.viewer.follow import Follower
+from dmrl.viewer import layouts
+from dmrl.viewer.content.flight_streamer import Follower
+from dmrl.viewer.content.robot_motion import Motion, Names, glimpse
+from dmrl.viewer.drawing import space, time_plots
+from dmrl.viewer.drawing.entity import WORLD, Entity, camera_frame, horizontal_frame, optical_frame
 from dmrl.viewer.layouts import Eye, Plot, Space
-from dmrl.viewer.motion import Motion, Names, glimpse
 from dmrl.viewer.scene import Draw, Scene, eyes_of, firsts, model_draws, picture_draws
 from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
 
@@ -85,7 +86,7 @@ def _robots(selection: Selection, pairs: Sequence[Names], only: str | None) -> l
 def _robot_draws(selection: Selection, motion: Motion, robot: str, *, own: bool) -> list[Draw]:
     attitude = topics.attitude(robot)
     draws = [
-        Draw(attitude, plots.Attitude(attitude, robot, own).draw),
+        Draw(attitude, time_plots.Attitude(attitude, robot, own).draw),
         *(_sensor_draw(row, robot, own=own) for row in topics.OWN_SENSORS),
         Draw(topics.tracks(robot), partial(space.tracks, topics.tracks(robot), robot)),
     ]
@@ -96,7 +97,7 @@ def _robot_draws(selection: Selection, motion: Motion, robot: str, *, own: bool)
 
 def _sensor_draw(row: Topic, robot: str, peer: str = "", *, own: bool) -> Draw:
     topic = row.pattern.format(robot=robot, peer=peer)
-    return Draw(topic, partial(plots.sensor, topic, row=row, robot=robot, own=own))
+    return Draw(topic, partial(time_plots.sensor, topic, row=row, robot=robot, own=own))
 
 
 def _stills(selection: Selection, seen: Motion, robots: Sequence[str]) -> Iterator[Entity]:

@@ -2,14 +2,15 @@
 
 from dmrl import topics
 from dmrl.colours import RGB
-from dmrl.viewer import entities, layouts
+from dmrl.viewer import layouts
+from dmrl.viewer.drawing import archetypes
 from dmrl.viewer.scene import Scene, bars, eyes_of, model_draws, picture_draws
 from dmrl.viewer.selection import Selection, Settings
 
 
 def scene(selection: Selection, settings: Settings) -> Scene:
     """Images and maps of every robot."""
-    scales = entities.scales(settings.depth_max_m)
+    scales = archetypes.scales(settings.depth_max_m)
     eyes = eyes_of(selection, sorted(selection.image_ns), scales)
     blueprint = layouts.image(eyes, scales, overlay=settings.overlay)
     shown = Scene(blueprint, [], [], eyes)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from dmrl.colours import RGB
 from dmrl.geometry.frames import inside
-from dmrl.viewer.entities import fields, points_px, rows_of
-from dmrl.viewer.entity import (
+from dmrl.viewer.drawing.archetypes import fields, points_px, rows_of
+from dmrl.viewer.drawing.entity import (
     ELLIPSE_SIGMAS,
     INVISIBLE,
     LINE_UI,

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.viewer.motion import poses_of, positions_of, ranges_of
+from dmrl.viewer.content.robot_motion import poses_of, positions_of, ranges_of
 
 HOSTILE = [float("nan"), float("inf"), -float("inf"), 1e300, -1e300]
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from dmrl.colours import OWN, RGB, STATUS_RGB
 from dmrl.geometry.frames import Array
 from dmrl.rendering.robots import crazyflie
-from dmrl.viewer.entity import (
+from dmrl.viewer.content.robot_motion import Names, Poses, Positions, Ranges, covariances, vectors
+from dmrl.viewer.drawing.entity import (
     ELLIPSE_SIGMAS,
     LINE_UI,
     POINT_UI,
@@ -25,7 +26,6 @@ from dmrl.viewer.entity import (
     image_frame,
     optical_frame,
 )
-from dmrl.viewer.motion import Names, Poses, Positions, Ranges, covariances, vectors
 
 FRUSTUM_M, AXES_M, NAME_ABOVE_M = 0.35, 0.12, 0.08
 TRAIL_UI, RANGE_UI = -1.0, -0.75

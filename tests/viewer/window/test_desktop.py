@@ -16,8 +16,9 @@ import pytest
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode
 from dmrl.stages import view as stage
-from dmrl.viewer import Page, Settings, Web, process, screenshot, view, window
+from dmrl.viewer import Page, Settings, Web, screenshot, view
 from dmrl.viewer.layouts import BACKGROUND, IMAGE_OPACITY
+from dmrl.viewer.window import desktop, viewer_process
 
 Make = Callable[..., Path]
 
@@ -71,7 +72,7 @@ def test_a_viewer_that_stops_is_reported_with_its_last_words(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code = "import sys; sys.exit('out of luck')"
-    monkeypatch.setattr(window, "command", lambda *_: [sys.executable, "-c", code])
+    monkeypatch.setattr(desktop, "command", lambda *_: [sys.executable, "-c", code])
     with pytest.raises(OutputError, match=r"viewer stopped: out of luck\. Try: dmrl view --save"):
         screenshot([make()], tmp_path / "picture.png", Settings())
     with pytest.raises(SettingError, match=r"viewer stopped: out of luck\. Use --save"):
@@ -91,7 +92,7 @@ def test_without_a_screen_the_window_says_what_else_there_is(make: Make) -> None
 
 
 def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
-    command, environment = process.command("127.0.0.1"), process.environment()
+    command, environment = viewer_process.command("127.0.0.1"), viewer_process.environment()
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert environment["CI"] == "1"
     assert {environment[name] for name in ("https_proxy", "HTTPS_PROXY")} == {"http://127.0.0.1:9"}

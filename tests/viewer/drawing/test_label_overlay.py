@@ -4,9 +4,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.viewer.entities import detections
-from dmrl.viewer.labels import _text_places
-from dmrl.viewer.legend import _fitting
+from dmrl.viewer.drawing.archetypes import detections
+from dmrl.viewer.drawing.label_overlay import _text_places
+from dmrl.viewer.drawing.legend import _fitting
 
 
 def test_a_text_stands_above_its_peer() -> None:

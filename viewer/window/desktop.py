@@ -15,7 +15,10 @@ from dmrl.atomic_output import partial_file
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode, encode_png
 from dmrl.terminal.signals import ended_by_signal
-from dmrl.viewer.process import (
+from dmrl.viewer.selection import Settings
+from dmrl.viewer.session import prepare, write
+from dmrl.viewer.show import Show
+from dmrl.viewer.window.viewer_process import (
     LOOPBACK,
     PATIENCE_S,
     Viewer,
@@ -28,9 +31,6 @@ from dmrl.viewer.process import (
     stream_to,
     url_of,
 )
-from dmrl.viewer.selection import Settings
-from dmrl.viewer.session import prepare, write
-from dmrl.viewer.show import Show
 
 # rerun keeps an empty bar above its panels, for the buttons of a window that a picture has not.
 BAR_PX = 36

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from dmrl.viewer.entity import escaped
+from dmrl.viewer.drawing.entity import escaped
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,7 @@ import pyarrow as pa
 
 from dmrl import topics
 from dmrl.geometry.frames import Array
-from dmrl.viewer import plots, space
-from dmrl.viewer.entity import WORLD, Entity, horizontal_frame
-from dmrl.viewer.motion import (
+from dmrl.viewer.content.robot_motion import (
     Motion,
     Names,
     Poses,
@@ -29,6 +27,8 @@ from dmrl.viewer.motion import (
     ranges_of,
     taken,
 )
+from dmrl.viewer.drawing import space, time_plots
+from dmrl.viewer.drawing.entity import WORLD, Entity, horizontal_frame
 
 Rows = tuple[Times, Entity]
 
@@ -135,7 +135,7 @@ class Follower:
                 self._positions[topic] = pair, source, known[topic]
                 self._derived.append(Derived(topic, around, Trail(topic, frame, source).draw))
         if len(known) == 2:
-            errors = partial(plots.errors, estimate)
+            errors = partial(time_plots.errors, estimate)
             self._derived.append(Derived(estimate, known[truth], errors))
         towards = known.get(estimate) or known.get(truth)
         measured = topics.uwb_range(*pair)
@@ -212,6 +212,6 @@ class Trail:
 def _own(topic: str, pair: Names, positions: Positions, source: str) -> Iterator[Entity]:
     """What positions say by themselves."""
     yield from space.seen(topic, pair, positions, source)
-    yield plots.distance(topic, positions, source)
+    yield time_plots.distance(topic, positions, source)
     if source == "estimate":
-        yield from plots.status(topic, positions)
+        yield from time_plots.status(topic, positions)

@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.viewer.entity import (
+from dmrl.viewer.drawing.entity import (
     DETECTION_TEXT_WIDTH,
     FAINT_POINT_UI,
     INVISIBLE,

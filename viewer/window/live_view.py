@@ -15,9 +15,9 @@ from dmrl import topics
 from dmrl.errors import SettingError
 from dmrl.live.queue import Received
 from dmrl.samples.sample import Sample
-from dmrl.viewer.entity import escaped
+from dmrl.viewer.drawing.entity import escaped
 from dmrl.viewer.layouts import BACKGROUND, TIMELINE
-from dmrl.viewer.window import open_window
+from dmrl.viewer.window.desktop import open_window
 
 PLOT_EVERY_NS = 100_000_000
 """Curves get a point ten times a second: more cannot be seen and costs the recorder."""

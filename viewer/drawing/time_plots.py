@@ -15,9 +15,9 @@ from dmrl.colours import OWN, PEER, RGB, STATUS_RGB
 from dmrl.geometry.frames import Array
 from dmrl.messages import descriptor
 from dmrl.topics import RANGE, Topic
-from dmrl.viewer.entities import Colour
-from dmrl.viewer.entity import Entity
-from dmrl.viewer.motion import Positions
+from dmrl.viewer.content.robot_motion import Positions
+from dmrl.viewer.drawing.archetypes import Colour
+from dmrl.viewer.drawing.entity import Entity
 
 BOUND_SIGMAS = 3.0
 NEES_95 = 5.991

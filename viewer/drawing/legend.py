@@ -6,8 +6,8 @@ from itertools import takewhile
 import numpy as np
 import rerun as rr
 
-from dmrl.viewer.entities import Colour, Scale, map_style
-from dmrl.viewer.entity import LINE_UI, Entity, image_frame
+from dmrl.viewer.drawing.archetypes import Colour, Scale, map_style
+from dmrl.viewer.drawing.entity import LINE_UI, Entity, image_frame
 
 HEIGHT_PX = 26
 """Room that the legend and the colour bars take below an image, pixels."""

@@ -11,7 +11,7 @@ from dmrl.images.codec import encode_png
 from dmrl.live.queue import Received
 from dmrl.samples.flight import ranges
 from dmrl.samples.sample import Sample, image
-from dmrl.viewer.live import LiveView, layout
+from dmrl.viewer.window.live_view import LiveView, layout
 
 MS = 1_000_000
 BASE_NS = 1_700_000_000_000_000_000

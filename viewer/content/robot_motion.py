@@ -13,7 +13,7 @@ from dmrl import topics
 from dmrl.estimation.model.position_metrics import GAP_S
 from dmrl.geometry.frames import Array
 from dmrl.recording import Summary, glance
-from dmrl.viewer.entity import WORLD, horizontal_frame
+from dmrl.viewer.drawing.entity import WORLD, horizontal_frame
 
 Times = NDArray[np.int64]
 Names = tuple[str, str]

@@ -16,7 +16,9 @@ from cyclopts import Parameter, validators
 from dmrl.errors import SettingError
 from dmrl.terminal.progress import say
 from dmrl.terminal.signals import ended_by_signal
-from dmrl.viewer.process import (
+from dmrl.viewer.selection import Settings
+from dmrl.viewer.session import prepare
+from dmrl.viewer.window.viewer_process import (
     LOOPBACK,
     Viewer,
     command,
@@ -26,8 +28,6 @@ from dmrl.viewer.process import (
     require_free,
     stream_to,
 )
-from dmrl.viewer.selection import Settings
-from dmrl.viewer.session import prepare
 
 ANYWHERE = ("0.0.0.0", "::")
 FRAME_PX = 700

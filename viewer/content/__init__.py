@@ -1,0 +1,1 @@
+"""Join the topics of a recording into what the layouts show."""

@@ -1,0 +1,1 @@
+"""Draw messages as rerun archetypes."""

@@ -1,0 +1,1 @@
+"""The rerun viewer as a process: desktop window, web page, live view."""
