@@ -26,8 +26,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from rerun.chunk import McapReader
 
 from dmrl.messages import message, schema_bytes
-from dmrl.recording import Provenance, RecordingWriter, columns, summary
-from dmrl.recording import rewrite
+from dmrl.recording import Provenance, RecordingWriter, columns, rewrite, summary
 from dmrl.stages import fly
 
 TOPIC, KIND = "/cf1/attitude", "dmrl.v1.Attitude"

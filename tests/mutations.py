@@ -181,7 +181,8 @@ def named(rooms: tuple[str, ...] = ()) -> tuple[list[tuple[Mutant, tuple[str, ..
     found, gone = [], []
     for where, changes in tomllib.loads(NAMED.read_text()).items():
         room = room_of(where)
-        tests = changes.pop("tests", [f"tests/{room}/test_{Path(where).stem}.py"])
+        mirror = Path("tests", *Path(where).parts[1:-1], f"test_{Path(where).stem}.py")
+        tests = changes.pop("tests", [str(mirror)])
         file = REPOSITORY / where
         source = file.read_bytes() if file.exists() else b""
         for what, (before, after) in changes.items() if room in rooms or not rooms else ():

@@ -140,11 +140,11 @@ def test_a_killed_process_leaves_only_the_partial_file(tmp_path: Path) -> None:
 
 WRITER = (
     "import pathlib, sys\n"
-    "from dmrl import output\n"
+    "from dmrl import atomic_output\n"
     "from dmrl.errors import OutputError\n"
     "kind, out, word = sys.argv[1:]\n"
     "try:\n"
-    "    with getattr(output, kind)(pathlib.Path(out)) as partial:\n"
+    "    with getattr(atomic_output, kind)(pathlib.Path(out)) as partial:\n"
     "        inner = partial / 'a' if kind == 'partial_folder' else partial\n"
     "        inner.write_text(word)\n"
     "        print('begun', flush=True); sys.stdin.read()\n"

@@ -224,7 +224,7 @@ def test_the_page_on_errors_has_words_of_the_errors() -> None:
     page = (ROOT / "docs/faq.md").read_text(encoding="utf-8")
     quoted = [h for h in re.findall(r"^## (.*)", page, re.MULTILINE) if h[0].islower()]
     sources = "".join(p.read_text(encoding="utf-8") for p in ROOT.glob("dmrl/**/*.py"))
-    sources += "".join(p.read_text(encoding="utf-8") for p in ROOT.glob("viewer/*.py"))
+    sources += "".join(p.read_text(encoding="utf-8") for p in ROOT.glob("viewer/**/*.py"))
     joined = re.sub(r'"\s*f?"', "", sources)
     parts = {part.strip() for heading in quoted for part in heading.split("...") if part.strip()}
     assert len(quoted) >= 8

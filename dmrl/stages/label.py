@@ -17,8 +17,7 @@ from dmrl.messages import message
 from dmrl.pipeline.batch import is_many, over_folder
 from dmrl.pipeline.parallel_map import spread
 from dmrl.pipeline.process_pool import cores
-from dmrl.recording import Contents, Timed, provenance
-from dmrl.recording import rewrite
+from dmrl.recording import Contents, Timed, provenance, rewrite
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table

@@ -20,7 +20,7 @@ from dmrl.images.codec import Opened, Rgb, opened, size
 from dmrl.images.prefetch import ahead
 from dmrl.learn.inference.decode_grids import PER_DETECTION, Found, Grids
 from dmrl.learn.inference.decode_grids import decode as find
-from dmrl.learn.inference.test_time_augmentation import VIEWS, agreed, returned, shown
+from dmrl.learn.inference.tta import VIEWS, agreed, returned, shown
 from dmrl.learn.pretrained import resolved
 from dmrl.messages import message
 from dmrl.pipeline.batch import is_many, over_folder
@@ -34,9 +34,9 @@ from dmrl.recording import (
     provenance,
     read,
     read_raw,
+    rewrite,
     summary,
 )
-from dmrl.recording import rewrite
 from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track

@@ -8,7 +8,7 @@ from dmrl.terminal.tables import print_json, print_line
 
 
 def run(folder: Path, out: Path | None = None) -> Path:
-    """Write the page of a folder, and say where; see `dmrl.html_report.write_report`."""
+    """Write the page of a folder, and say where; see `dmrl.html_report.write`."""
     return write(folder, out)
 
 

@@ -14,8 +14,7 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Camera
 from dmrl.messages import message
 from dmrl.pipeline.batch import is_many, over_folder
-from dmrl.recording import Contents, Timed, provenance, summary
-from dmrl.recording import rewrite
+from dmrl.recording import Contents, Timed, provenance, rewrite, summary
 from dmrl.terminal.arguments import AsJson, Flat, In, On, Workers
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_table

@@ -12,7 +12,7 @@ from dmrl.labelling.sensor_logs import read_logs
 from dmrl.recording import Contents
 
 from ..estimation.flights import flown, pair_of
-from .test_logs import flight, logs, ranges
+from .test_sensor_logs import flight, logs, ranges
 
 KNOWN = Sensors(
     {

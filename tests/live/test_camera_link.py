@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SettingError
+from dmrl.formats.aideck import cpx
 from dmrl.formats.aideck.cpx import Image
 from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_log import APP, GAP8, HOST, Packet, pack_packet
 from dmrl.formats.aideck.cpx_state import State
-from dmrl.formats.aideck import cpx
 from dmrl.live.camera_link import GARBAGE_BYTES, CameraClient, _Times, address
 from dmrl.live.queue import Feed, Received
 from dmrl.live.receive_clocks import HostTime

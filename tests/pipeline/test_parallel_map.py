@@ -18,7 +18,7 @@ pytestmark = pytest.mark.heavy  # a process takes half a second to begin
 WAITS = """
 import sys, time
 from pathlib import Path
-from test_spread import wait_there
+from test_parallel_map import wait_there
 from dmrl.pipeline.parallel_map import spread
 
 if __name__ == "__main__":

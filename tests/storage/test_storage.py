@@ -24,7 +24,7 @@ from dmrl.recording.provenance_inputs import input_of, sha256_of_file
 from dmrl.storage import Remote, path_of
 from dmrl.storage.remote import UNFINISHED
 
-from ..pipeline.test_folders import record
+from ..pipeline.test_batch import record
 from .conftest import _forget
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of botocore and aiohttp

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c.refinement_code import refinement
+from dmrl.deploy.c.self_test import MOST, vectors
 from dmrl.deploy.c.source_file import Source, source
 from dmrl.deploy.c.templating import c_name, fill, names_of
-from dmrl.deploy.c.test_vectors import MOST, vectors
 from dmrl.deploy.int8.network import IntegerNetwork
 
 __all__ = ["c_name", "write_c"]

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
+from dmrl.formats.aideck import cpx
 from dmrl.formats.aideck.cpx import Image, Layout
 from dmrl.formats.aideck.cpx_log import APP, GAP8, HOST, STREAMER, Packet, pack_packet
 from dmrl.formats.aideck.cpx_state import pack_state
-from dmrl.formats.aideck import cpx
 
 UINT32 = 1 << 32
 NO_STATE = (0,) * 14

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.aideck import published_firmware as aideck
+from dmrl.formats.aideck import published_firmware
 from dmrl.formats.base import Content, Format, Options
 from dmrl.geometry.frames import AIDECK
 from dmrl.images import codec
@@ -39,7 +39,7 @@ def recognises(source: Path) -> bool:
         values = np.frombuffer(stream.read(RECORD.itemsize - PIXELS), "<f4").tolist()
         stream.seek(source.stat().st_size // RECORD.itemsize * RECORD.itemsize)
         rest = stream.read().strip(b"\xff")
-    return aideck.is_plausible(values) and any(values) and not rest
+    return published_firmware.is_plausible(values) and any(values) and not rest
 
 
 def records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
@@ -81,7 +81,7 @@ def content(source: Path, options: Options) -> Content:
     if not source.is_file():
         raise SourceError(f"{source} is no file. Name the dump of a flash")
     with source.open("rb") as stream:
-        plausible = [aideck.is_plausible(r["values"].tolist()) for r in records(stream)]
+        plausible = [published_firmware.is_plausible(r["values"].tolist()) for r in records(stream)]
     if not plausible:
         raise SourceError(f"{source} holds no record of {RECORD.itemsize} bytes. Name another dump")
     if 2 * sum(plausible) <= len(plausible):
@@ -103,8 +103,8 @@ def _samples(source: Path, options: Options) -> Iterator[Sample]:
             png = codec.encode_png(rgb_of(record["raw"]))
             yield image(time_ns, options.robot, png, "png")
             values = record["values"].tolist()
-            odd += not aideck.is_plausible(values)
-            yield from aideck.samples(time_ns, options.robot, peer, values, camera)
+            odd += not published_firmware.is_plausible(values)
+            yield from published_firmware.samples(time_ns, options.robot, peer, values, camera)
     if odd:
         say(f"{source}: {odd} pictures have impossible numbers; their labels are left out")
 

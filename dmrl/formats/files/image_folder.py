@@ -26,8 +26,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from dmrl.errors import SettingError, SourceError
+from dmrl.formats.aideck import published_firmware
 from dmrl.formats.aideck.chip_outputs import chip_maps
-from dmrl.formats.aideck import published_firmware as aideck
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import LabelRow, read_labels
@@ -146,8 +146,8 @@ def _aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[float]]
             values = [float(word) for word in words]
         except ValueError:
             values = []
-        if len(values) != len(aideck.VARIABLES):
-            wanted = " ".join(aideck.VARIABLES)
+        if len(values) != len(published_firmware.VARIABLES):
+            wanted = " ".join(published_firmware.VARIABLES)
             raise SourceError(f"{path}:{number}: not a picture and {wanted}. Mend the line")
         if (name := name.rsplit("/", 1)[-1]) not in files:
             raise SourceError(f"{path}:{number}: no picture {name}. Add it, or delete the line")
@@ -177,7 +177,9 @@ def _samples(
             known = options.camera if path.name not in rows else None
             camera = _camera_after(crop, known) if known else None
             peer = options.names.get("0", "cf2")
-            yield from aideck.samples(time_ns, options.robot, peer, states[path.name], camera)
+            yield from published_firmware.samples(
+                time_ns, options.robot, peer, states[path.name], camera
+            )
 
 
 def _stored(path: Path, options: Options) -> tuple[Crop, bytes, str]:

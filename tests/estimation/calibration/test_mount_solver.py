@@ -37,7 +37,7 @@ from dmrl.estimation.calibration.observations import (
 )
 from dmrl.geometry.frames import AIDECK, Array
 
-from ..test_camera_pose import TRUE, flight
+from .test_extrinsics import TRUE, flight
 
 VALUES = np.array([*TRUE.mount_rad, TRUE.delay_s])
 NOISE = Noise(3.0, 0.02)

@@ -3,6 +3,7 @@ import struct
 import numpy as np
 import pytest
 
+from dmrl.formats.aideck import cpx
 from dmrl.formats.aideck.cpx import Image, ImageReader
 from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_log import (
@@ -15,9 +16,8 @@ from dmrl.formats.aideck.cpx_log import (
     pack_packet,
 )
 from dmrl.formats.aideck.cpx_state import State, compressed, quaternion
-from dmrl.formats.aideck import cpx
 
-from ..test_cpx_packets import app_packet
+from .test_cpx_log import app_packet
 
 RNG = np.random.default_rng(8)
 JPEG = b"\xff\xd8" + RNG.bytes(3000) + b"\xff\xd9"

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dmrl.formats.aideck import cpx
 from dmrl.formats.aideck.cpx import ImageReader
 from dmrl.formats.aideck.cpx_log import (
     APP,
@@ -17,7 +18,6 @@ from dmrl.formats.aideck.cpx_log import (
     PacketReader,
     pack_packet,
 )
-from dmrl.formats.aideck import cpx
 
 
 @pytest.mark.parametrize(("function", "counted"), [(APP, 2), (STREAMER, 0)])

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
+from dmrl.formats.aideck import wifi_stream
 from dmrl.formats.aideck.cpx import Image, Layout
 from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_state import State
-from dmrl.formats.aideck import wifi_stream
 from dmrl.formats.base import Options
 from dmrl.formats.registry import format_of
 from dmrl.geometry.frames import AIDECK

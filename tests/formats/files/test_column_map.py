@@ -9,7 +9,7 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.files.column_map import QUANTITIES, read_map
 
-from ..test_mapped_csv import TABLE
+from .test_mapped_csv import TABLE
 
 
 def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:

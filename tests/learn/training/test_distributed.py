@@ -21,7 +21,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     Those processes come of one that has loaded torch, as each of them would take seconds to.
     """
-    monkeypatch.syspath_prepend(Path(__file__).parent)
+    monkeypatch.syspath_prepend(Path(__file__).parents[1])
     forked = multiprocessing.get_context("forkserver")
     forked.set_forkserver_preload(["dmrl.learn.training.distributed"])
     monkeypatch.setattr(group, "SPAWN", forked)

@@ -24,7 +24,7 @@ from dmrl.pipeline.job import job
 from dmrl.pipeline.single_run import done_on
 from dmrl.stages import dataset, fly, trim
 
-from ..test_folders import bytes_in, record
+from ..test_batch import bytes_in, record
 
 pytestmark = [
     pytest.mark.slow,

@@ -13,7 +13,7 @@ from dmrl.pipeline.cluster import slurm
 from dmrl.pipeline.single_run import done_on
 from dmrl.stages import trim
 
-from ..test_folders import bytes_in, record
+from ..test_batch import bytes_in, record
 
 KEPT = trim.Settings(to_s=1.5)
 

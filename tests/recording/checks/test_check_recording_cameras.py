@@ -8,7 +8,7 @@ import pytest
 
 from dmrl.images.codec import encode_png
 
-from ..test_check import Write, calibrated, image, record
+from .test_check_recording import Write, calibrated, image, record
 
 
 def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path) -> None:

@@ -14,10 +14,10 @@ from dmrl.recording import (
     merge,
     read_raw,
     recover,
+    rewrite,
     summary,
     trim,
 )
-from dmrl.recording import rewrite
 from dmrl.recording.mcap import chunk_reader
 
 from ..records import channels, chunks, packed, unchanged

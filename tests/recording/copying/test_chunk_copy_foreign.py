@@ -11,8 +11,7 @@ from mcap.writer import ChunkBuilder, CompressionType, Writer
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message, schema_bytes
-from dmrl.recording import Provenance, read_raw, trim
-from dmrl.recording import rewrite
+from dmrl.recording import Provenance, read_raw, rewrite, trim
 
 from ..records import channels, chunks, packed, unchanged
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.learn.inference.decode_grids import PER_DETECTION, Found
-from dmrl.learn.inference.test_time_augmentation import VIEWS, View, agreed, returned, shown
+from dmrl.learn.inference.tta import VIEWS, View, agreed, returned, shown
 
 STRIDE_PX = 8
 
