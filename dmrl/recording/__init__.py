@@ -13,7 +13,7 @@ from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_w
 from dmrl.recording.loaded import Contents
 from dmrl.recording.log_times import log_times
 from dmrl.recording.mcap.channel import Channel, RawMessage
-from dmrl.recording.mcap.summary_index import SPLIT_METADATA, Summary, TopicInfo, summary
+from dmrl.recording.mcap.summary_index import TopicInfo
 from dmrl.recording.preview import glance
 from dmrl.recording.provenance import Input, Provenance
 from dmrl.recording.provenance_inputs import input_of, provenance
@@ -29,6 +29,7 @@ from dmrl.recording.reader import (
 )
 from dmrl.recording.recover import recover
 from dmrl.recording.recovery import Recovery
+from dmrl.recording.summary import SPLIT_METADATA, Summary, summary
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [

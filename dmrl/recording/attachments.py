@@ -6,8 +6,8 @@ from dmrl.errors import RecordingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.safe_names import split_name
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.summary_index import SPLIT_METADATA, Summary
 from dmrl.recording.provenance import METADATA_NAME
+from dmrl.recording.summary import SPLIT_METADATA, Summary
 from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from dmrl.recording.mcap.summary_index import summary
+from dmrl.recording.summary import summary
 
 LICENCES_METADATA = "dmrl.licences"
 NAMES = ("LICENSE", "LICENCE", "COPYING")

@@ -13,10 +13,11 @@ from dmrl.recording.log_times import log_times
 from dmrl.recording.mcap.batch_reader import blocks
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.message_batch import EMPTY, Block, Ints, joined
-from dmrl.recording.mcap.summary_index import TopicInfo, channel_on, summary
+from dmrl.recording.mcap.summary_index import TopicInfo, channel_on
 from dmrl.recording.protobuf.columns import apart, decoded
 from dmrl.recording.protobuf.message_types import descriptor_of, require_types
 from dmrl.recording.reader import Stamped, parsed
+from dmrl.recording.summary import summary
 
 PART = re.compile(r"\\{\w+\\}")
 """A part of a pattern that is left open, escaped."""

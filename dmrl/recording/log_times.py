@@ -13,8 +13,9 @@ from dmrl.recording.mcap.batch_reader import blocks
 from dmrl.recording.mcap.file import Bounded, damaged, opened
 from dmrl.recording.mcap.message_batch import EVER_NS, Ints
 from dmrl.recording.mcap.message_index import index_entries
-from dmrl.recording.mcap.summary_index import mcap_summary, metadata_of, summary
+from dmrl.recording.mcap.summary_index import mcap_summary, metadata_of
 from dmrl.recording.protobuf.message_types import require_types
+from dmrl.recording.summary import summary
 
 _NO_TIMES: Ints = np.empty(0, np.int64)
 

@@ -14,9 +14,10 @@ from dmrl.recording.mcap.chunk_reader import in_chunk
 from dmrl.recording.mcap.file import opened
 from dmrl.recording.mcap.message_batch import Block, joined
 from dmrl.recording.mcap.record_scan import channel_of
-from dmrl.recording.mcap.summary_index import mcap_summary, summary
+from dmrl.recording.mcap.summary_index import mcap_summary
 from dmrl.recording.protobuf.columns import by_topic
 from dmrl.recording.protobuf.message_types import require_types
+from dmrl.recording.summary import summary
 
 CHUNKS = 16
 """Chunks that are read of each topic: some 2 MB at most, wherever they lie in the file."""

@@ -11,8 +11,8 @@ from dmrl.errors import RecordingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipe
 from dmrl.recording.mcap.file import expect_unchanged
-from dmrl.recording.mcap.summary_index import summary
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
+from dmrl.recording.summary import summary
 from dmrl.storage import Remote
 
 NO_CONTENT = ("README.md", "figures", "tensorboard")

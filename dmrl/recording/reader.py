@@ -15,9 +15,10 @@ from dmrl.recording.mcap.batch_reader import blocks
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.file import damaged
 from dmrl.recording.mcap.message_batch import EMPTY, Block, joined
-from dmrl.recording.mcap.summary_index import channel_on, summary
+from dmrl.recording.mcap.summary_index import channel_on
 from dmrl.recording.protobuf.columns import batch_of, by_topic, decoded
 from dmrl.recording.protobuf.message_types import descriptor_of, require_types
+from dmrl.recording.summary import summary
 
 STRETCH_BYTES = 4 << 20
 """Bytes of messages that `stretches` decodes at once: few calls, little memory."""

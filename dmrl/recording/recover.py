@@ -38,11 +38,11 @@ from dmrl.recording.mcap.file import DAMAGE, MAGIC, RECORD, Bounded, too_large
 from dmrl.recording.mcap.message_batch import Block
 from dmrl.recording.mcap.message_index import ENTRY_BYTES
 from dmrl.recording.mcap.record_scan import channel_of
-from dmrl.recording.mcap.summary_index import Summary
 from dmrl.recording.mcap.summary_section import places, stated
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.recording.recovery import Recovery
+from dmrl.recording.summary import Summary
 from dmrl.recording.writer import RecordingWriter
 
 INDEX_HEAD = struct.Struct("<HI")  # of a message index: channel, bytes of entries

@@ -7,12 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.filters.camera_update import NOTHING, Glances, glanced
-from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.keyframes import Noise, Problem
 
-# d rotation / d angle = QUARTER @ rotation
-QUARTER: Array = np.array([[0.0, -1.0], [1.0, 0.0]])
 SIZE = 5
 SHADOWED_M = 0.3
 """Standard deviation of a range once its level is taken off."""
@@ -179,33 +177,29 @@ def _moved(state: Array, inputs: Inputs, k: int) -> tuple[Array, Array]:
     seconds = inputs.step_s[k]
     own_turn = inputs.own_turn_rad[k] - seconds * state[:, 3]
     peer_turn = inputs.peer_turn_rad[k] - seconds * state[:, 4]
-    turned = _apply(rotation(state[:, 2]), inputs.peer_shift_m[k])
+    turned = rotate(rotation(state[:, 2]), inputs.peer_shift_m[k])
     back = rotation(-own_turn)
     after = state.copy()
-    after[:, :2] = _apply(back, state[:, :2] + turned - inputs.own_shift_m[k])
+    after[:, :2] = rotate(back, state[:, :2] + turned - inputs.own_shift_m[k])
     after[:, 2] += peer_turn - own_turn
     step = np.zeros((len(state), SIZE, SIZE))
     step[:, :2, :2] = back
-    step[:, :2, 2] = _apply(back, turned @ QUARTER.T)
-    step[:, :2, 3] = seconds[:, None] * (after[:, :2] @ QUARTER.T)
+    step[:, :2, 2] = rotate(back, turned @ QUARTER_TURN.T)
+    step[:, :2, 3] = seconds[:, None] * (after[:, :2] @ QUARTER_TURN.T)
     step[:, [2, 3, 4], [2, 3, 4]] = 1.0
     step[:, 2, 3], step[:, 2, 4] = seconds, -seconds
     return after, step
 
 
-def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
-
-
 def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelihood: Array) -> None:
     """Put keyframe k's ranges in, in place; far innovations count less."""
     seen = np.isfinite(inputs.range_m[k])
-    peer = _apply(rotation(state[:, 2]), inputs.peer_to_range_m[k])
+    peer = rotate(rotation(state[:, 2]), inputs.peer_to_range_m[k])
     offset = state[:, :2] + peer - inputs.own_to_range_m[k]
     expected = np.sqrt((offset**2).sum(axis=1) + inputs.height_m[k] ** 2) + 1e-6
     towards = offset / expected[:, None]
-    row = np.column_stack([towards, np.einsum("bi,bi->b", towards, peer @ QUARTER.T)])
-    cross = _apply(covariance[..., :3], row)
+    row = np.column_stack([towards, np.einsum("bi,bi->b", towards, peer @ QUARTER_TURN.T)])
+    cross = rotate(covariance[..., :3], row)
     spread = np.einsum("bi,bi->b", row, cross[:, :3]) + inputs.range_var[k]
     innovation = np.where(seen, inputs.range_m[k] - expected, 0.0)
     size = np.abs(innovation) / np.sqrt(spread)
@@ -223,7 +217,7 @@ def smoothed(filtered: Filtered) -> tuple[Array, Array]:
     for k in range(len(state) - 2, -1, -1):
         ahead = np.linalg.inv(filtered.prior_covariance[k + 1])
         gain = filtered.covariance[k] @ filtered.step[k].swapaxes(1, 2) @ ahead
-        state[k] += _apply(gain, state[k + 1] - filtered.prior[k + 1])
+        state[k] += rotate(gain, state[k + 1] - filtered.prior[k + 1])
         change = covariance[k + 1] - filtered.prior_covariance[k + 1]
         covariance[k] += gain @ change @ gain.swapaxes(1, 2)
     return state, covariance

@@ -8,7 +8,8 @@ from scipy.ndimage import minimum_filter1d
 
 from dmrl.estimation.filters import keyframe_ekf
 from dmrl.estimation.filters.camera_update import NOTHING, Glances, repeated
-from dmrl.estimation.filters.keyframe_ekf import QUARTER, Inputs
+from dmrl.estimation.filters.keyframe_ekf import Inputs
+from dmrl.estimation.model.odometry import QUARTER_TURN
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.levenberg_marquardt import near
 
@@ -156,7 +157,7 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
     out = []
     for start, end in between[:MIRRORED]:
         way = state[min(end + second // 2, len(state) - 1), :2] - state[end - second // 2, :2]
-        aside = QUARTER @ way / max(float(np.hypot(*way)), 1e-6)
+        aside = QUARTER_TURN @ way / max(float(np.hypot(*way)), 1e-6)
         copy = state.copy()
         # p - 2 (n p) n, a mirror along the way: ranges stay as they are, odometry does not.
         copy[start:end, :2] -= 2 * np.outer(copy[start:end, :2] @ aside, aside)
@@ -181,7 +182,7 @@ def passed_by(state: Array, rate_hz: float) -> list[Array]:
         start = int(farther[farther < at].max(initial=-1)) + 1
         end = int(farther[farther > at].min(initial=len(state)))
         way = state[min(at + 2, len(state) - 1), :2] - state[max(at - 2, 0), :2]
-        aside = QUARTER @ way / max(float(np.hypot(*way)), 1e-6)
+        aside = QUARTER_TURN @ way / max(float(np.hypot(*way)), 1e-6)
         # Wholly mirrored where it is nearest, less and less from there on: a way without a jump.
         near = np.cos((distance[start:end] - distance[at]) / ROUND_M * np.pi / 2)
         copy = state.copy()

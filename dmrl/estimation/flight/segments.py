@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from dmrl.estimation.model.bearings import within
-from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.odometry import rotate, rotation
 from dmrl.estimation.model.pair import Array, Mask, Pair, Track
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.covariance import path_of
@@ -90,18 +90,18 @@ def joined(flight: Problem, parts: Sequence[Estimate]) -> Array:
         at = np.flatnonzero((key_s >= part.time_s[0]) & (key_s <= part.time_s[-1]))
         columns = (*part.state[:, :2].T, np.unwrap(part.state[:, 2]))
         known = np.column_stack([np.interp(key_s[at], part.time_s, c) for c in columns])
-        seen = _apply(rotation(heading[at]), known[:, :2]) + place[at]
+        seen = rotate(rotation(heading[at]), known[:, :2]) + place[at]
         # Before and after it, the peer goes on as its log says, from either end.
         near = np.clip(np.arange(len(key_s)), at[0], at[-1]) - at[0]
         turn = (heading[at] + known[:, 2] - turned[at])[near]
-        there = seen[near] + _apply(rotation(turn), way - way[at][near])
+        there = seen[near] + rotate(rotation(turn), way - way[at][near])
         ways.append((at[0], at[-1], np.column_stack([there, turn + turned - heading])))
     state = ways[0][2]
     for (_, last, _), (first, _, track) in pairwise(ways):
         track[:, 2] += 2 * np.pi * np.round((state[first, 2] - track[first, 2]) / (2 * np.pi))
         share = np.clip((np.arange(len(key_s)) - last) / (first - last), 0.0, 1.0)[:, None]
         state = (1 - share) * state + share * track
-    xy = _apply(rotation(-heading), state[:, :2] - place)
+    xy = rotate(rotation(-heading), state[:, :2] - place)
     return np.column_stack([xy, state[:, 2], np.zeros((len(key_s), 2)), _errors(key_s, parts)])
 
 
@@ -169,7 +169,3 @@ def _cut_track(track: Track, at: Mask) -> Track:
     vx, vy, yaw_rate, height = (signal[at] for signal in track.values())
     silent = None if track.height_gap is None else track.height_gap[at]
     return Track(vx, vy, yaw_rate, height, track.gap[at], silent)
-
-
-def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])

@@ -9,10 +9,9 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from dmrl.estimation.filters.keyframe_ekf import QUARTER
 from dmrl.estimation.flight.pairs import unmoved, with_status
 from dmrl.estimation.flight.segments import contradicts
-from dmrl.estimation.model.odometry import odometry, rotation
+from dmrl.estimation.model.odometry import QUARTER_TURN, odometry, rotate, rotation
 from dmrl.estimation.model.pair import SWAPPED, Array, Pair, Track
 from dmrl.estimation.model.status import GATE_M
 from dmrl.estimation.solver.covariance import RESTLESS_S, noise_energy, shrunk
@@ -172,7 +171,7 @@ def _start(flight: Flight, estimates: Mapping[Names, Estimate]) -> Array:
         found = estimates[one, other]
         columns = np.column_stack([found.state[:, :2], np.unwrap(found.state[:, 2])])
         x, y, psi = (np.interp(flight.key_s, found.time_s, column) for column in columns.T)
-        away = _apply(rotation(here[:, 2]), np.column_stack([x, y]))
+        away = rotate(rotation(here[:, 2]), np.column_stack([x, y]))
         there = flight.names.index(other)
         state[:, there, :2], state[:, there, 2] = here[:, :2] + away, here[:, 2] + psi
         done.add(other)
@@ -198,9 +197,9 @@ def _relative(state: Array, spread: Array, one: int, other: int) -> tuple[Array,
     """(K, 3) where a robot is in another's horizontal frame, and the covariance (K, 3, 3)."""
     here, there = state[:, one], state[:, other]
     back = rotation(-here[:, 2])
-    xy = _apply(back, there[:, :2] - here[:, :2])
+    xy = rotate(back, there[:, :2] - here[:, :2])
     by_both = np.zeros((len(state), 3, 6))
-    by_both[:, :2, :2], by_both[:, :2, 3:5], by_both[:, :2, 2] = -back, back, -xy @ QUARTER.T
+    by_both[:, :2, :2], by_both[:, :2, 3:5], by_both[:, :2, 2] = -back, back, -xy @ QUARTER_TURN.T
     by_both[:, 2, 2], by_both[:, 2, 5] = -1.0, 1.0
     at = np.concatenate([one * OWN + np.arange(3), other * OWN + np.arange(3)])
     covariance = by_both @ spread[:, at[:, None], at] @ by_both.swapaxes(1, 2)
@@ -223,7 +222,3 @@ def _constants(flight: Flight, found: Swarm, one: int, other: int) -> Array:
         if set(link.robots) == {one, other}:
             out[BIAS] = found.constants[len(flight.names) * ROBOT + number * SHARED]
     return out
-
-
-def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])

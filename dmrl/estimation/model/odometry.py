@@ -10,6 +10,9 @@ import numpy as np
 
 from dmrl.estimation.model.pair import Array, Track
 
+QUARTER_TURN: Array = np.array([[0.0, -1.0], [1.0, 0.0]])
+"""The derivative of a rotation by its angle is QUARTER_TURN @ rotation."""
+
 
 def rotation(angle_rad: Array) -> Array:
     """(..., 2, 2) rotations by angles, counter-clockwise."""
@@ -106,3 +109,8 @@ def odometry(track: Track, time_s: Array) -> Odometry:
     return Odometry(
         time_s, heading, integral(np.einsum("kij,kj->ki", turned, velocity)), integral(turned)
     )
+
+
+def rotate(matrices: Array, vectors: Array) -> Array:
+    """Apply (..., 2, 2) matrices to (..., 2) vectors, pair by pair."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

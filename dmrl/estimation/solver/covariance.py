@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from dmrl.estimation.model.odometry import Increments, rotation
+from dmrl.estimation.model.odometry import Increments, rotate, rotation
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import Normal, block_inverse, solve
 from dmrl.estimation.solver.camera_residuals import Looks, Seen, picked
@@ -110,7 +110,7 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
     """
     step_s = float(np.median(problem.steps_s))
     own_heading, own = path_of(problem.own)
-    relative = _apply(rotation(own_heading), state[:, :2])
+    relative = rotate(rotation(own_heading), state[:, :2])
     single = noise_energy(noise)
     own_steps = shrunk(np.diff(own, axis=0) / step_s, single, step_s) * step_s
     relative_steps = shrunk(np.diff(relative, axis=0) / step_s, 2 * single, step_s) * step_s
@@ -118,12 +118,12 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
     path += relative.mean(axis=0) - path.mean(axis=0)
 
     out = np.zeros_like(state)
-    out[:, :2] = _apply(rotation(-own_heading), path)
+    out[:, :2] = rotate(rotation(-own_heading), path)
     out[:, 2] = state[:, 2]
-    own_shift = _apply(rotation(-own_heading[:-1]), own_steps)
+    own_shift = rotate(rotation(-own_heading[:-1]), own_steps)
     # The peer's own way is the observer's and the relative one, turned into the peer's frame.
     peer_heading = own_heading[:-1] + state[:-1, 2]
-    peer_shift = _apply(rotation(-peer_heading), own_steps + relative_steps)
+    peer_shift = rotate(rotation(-peer_heading), own_steps + relative_steps)
     return replace(
         problem,
         own=replace(problem.own, shift_m=own_shift),
@@ -176,7 +176,7 @@ def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
     """
     step_s = float(np.median(problem.steps_s))
     heading, own = path_of(problem.own)
-    relative = _apply(rotation(heading), state[:, :2])
+    relative = rotate(rotation(heading), state[:, :2])
     energies = []
     for path in (own, path_of(problem.peer)[1], relative):
         velocity = np.diff(path, axis=0) / step_s
@@ -190,9 +190,5 @@ def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
 def path_of(moves: Increments) -> tuple[Array, Array]:
     """Heading (K,) and position (K, 2) of a robot in the frame of its first keyframe."""
     heading = np.concatenate([[0.0], np.cumsum(moves.turn_rad)])
-    steps = _apply(rotation(heading[:-1]), moves.shift_m)
+    steps = rotate(rotation(heading[:-1]), moves.shift_m)
     return heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-
-
-def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])

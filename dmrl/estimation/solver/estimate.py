@@ -5,8 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from dmrl.estimation.filters.keyframe_ekf import QUARTER
-from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation
 from dmrl.estimation.model.pair import SWAPPED, Array
 from dmrl.estimation.model.status import UNCONVERGED, Statuses
 from dmrl.estimation.solver.keyframes import Noise
@@ -74,7 +73,7 @@ class Estimate:
 def from_peer(state: Array) -> Array:
     """(K, 3) the same states seen from the peer."""
     out = -state
-    out[:, :2] = _apply(rotation(-state[:, 2]), out[:, :2])
+    out[:, :2] = rotate(rotation(-state[:, 2]), out[:, :2])
     return out
 
 
@@ -85,7 +84,7 @@ def swapped(estimate: Estimate) -> Estimate:
     # Q a quarter turn. First order: the covariance of the swapped state is J C J^T.
     by_state = np.zeros((len(state), 3, 3))
     by_state[:, :2, :2], by_state[:, 2, 2] = -rotation(-estimate.state[:, 2]), -1.0
-    by_state[:, :2, 2] = -state[:, :2] @ QUARTER.T
+    by_state[:, :2, 2] = -state[:, :2] @ QUARTER_TURN.T
     covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
     constants = estimate.constants[SWAPPED]
     constants[CLOCK] *= -1  # an offset between two clocks has the other sign from the other side
@@ -96,7 +95,3 @@ def swapped(estimate: Estimate) -> Estimate:
         constants=constants,
         constants_covariance=None,
     )
-
-
-def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.filters.keyframe_ekf import QUARTER
-from dmrl.estimation.model.odometry import Increments, rotation
+from dmrl.estimation.model.odometry import QUARTER_TURN, Increments, rotate, rotation
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import Normal, block_inverse, solve
 from dmrl.estimation.solver.keyframes import Noise
@@ -182,14 +181,14 @@ def _steps(flight: Flight, noise: Noise, robot: int, state: Array, constants: Ar
     half_s, kept = step_s[:, None] / 2, np.exp(-step_s / noise.velocity_tau_s)[:, None]
     gyro, gain, bias = constants[0], 1 + constants[1], constants[2:]
     back = rotation(-state[:-1, 2])
-    way = _apply(back, np.diff(state[:, :2], axis=0))
+    way = rotate(back, np.diff(state[:, :2], axis=0))
     out = np.zeros((len(step_s), OWN, 2 * OWN + ROBOT + 1))
     error, error_ahead = state[:-1, 3:], state[1:, 3:]
     shift = gain * way - moves.shift_m + moves.drift_s @ bias + half_s * (error + error_ahead)
     turn = np.diff(state[:, 2]) - moves.turn_rad + gyro * step_s
     out[..., -1] = np.column_stack([shift, turn, error_ahead - kept * error])
     out[:, :2, :2], out[:, :2, OWN : OWN + 2] = -gain * back, gain * back
-    out[:, :2, 2] = -gain * way @ QUARTER.T
+    out[:, :2, 2] = -gain * way @ QUARTER_TURN.T
     out[:, [0, 1], [3, 4]] = out[:, [0, 1], [OWN + 3, OWN + 4]] = half_s
     out[:, 2, 2], out[:, 2, OWN + 2] = -1.0, 1.0
     out[:, [3, 4], [3, 4]], out[:, [3, 4], [OWN + 3, OWN + 4]] = -kept, 1.0
@@ -205,15 +204,15 @@ def _steps(flight: Flight, noise: Noise, robot: int, state: Array, constants: Ar
 
 def _ranges(link: Link, noise: Noise, state: Array, constants: Array) -> Array:
     here, there = (state[link.key, robot] for robot in link.robots)
-    own = _apply(rotation(here[:, 2]), link.own_shift_m)
-    peer = _apply(rotation(there[:, 2]), link.peer_shift_m)
+    own = rotate(rotation(here[:, 2]), link.own_shift_m)
+    peer = rotate(rotation(there[:, 2]), link.peer_shift_m)
     offset = there[:, :2] + peer - here[:, :2] - own
     distance = np.sqrt((offset**2).sum(axis=1) + link.height_m**2) + 1e-6
     towards, gain = offset / distance[:, None], 1 + constants[1]
     out = np.empty((len(distance), 2 * 3 + SHARED + 1))
     out[:, :2], out[:, 3:5] = gain * towards, -gain * towards
-    out[:, 2] = gain * (towards * (own @ QUARTER.T)).sum(axis=1)
-    out[:, 5] = -gain * (towards * (peer @ QUARTER.T)).sum(axis=1)
+    out[:, 2] = gain * (towards * (own @ QUARTER_TURN.T)).sum(axis=1)
+    out[:, 5] = -gain * (towards * (peer @ QUARTER_TURN.T)).sum(axis=1)
     out[:, 6], out[:, 7] = -1.0, -distance
     out[:, 8] = link.range_m - gain * distance - constants[0]
     return out / noise.range_std_m
@@ -284,7 +283,3 @@ def _add_ranges(equations: Normal, link: Link, ranges: Array, weight: Array, sha
     rest = sums.sum(axis=0)
     equations.corner[shared, shared] += rest[6:8, 6:8]
     equations.corner_gradient[shared] += rest[6:8, 8]
-
-
-def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmrl.estimation.filters.keyframe_ekf import QUARTER
-from dmrl.estimation.model.odometry import rotation
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotation
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.camera_residuals import Seen, seen
 from dmrl.estimation.solver.keyframes import GLOBALS, Noise, Problem
@@ -170,7 +169,7 @@ def _residual(moves: _Steps, state: Array) -> Array:
 def _by_states(moves: _Steps, by_start: Array, by_end: Array) -> None:
     """Fill in (S, 6, 6) zeros each."""
     by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
-    by_start[:, :2, 2] = -moves.peer @ QUARTER.T
+    by_start[:, :2, 2] = -moves.peer @ QUARTER_TURN.T
     by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -moves.half_s, -moves.kept
     by_start[:, RANGE_ERROR, RANGE_ERROR] = -moves.range_kept[:, 0]
     by_end[:, :2, :2] = by_end[:, 3:5, 3:5] = moves.turned
@@ -182,8 +181,8 @@ def _by_globals(moves: _Steps, problem: Problem, out: Array) -> None:
     """Fill in (S, 6, G) zeros."""
     steps_s, heading = problem.steps_s, moves.heading
     moved = moves.ahead - moves.half_s * moves.error_ahead
-    out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER.T)
-    out[:, 3:5, OWN_GYRO] = -steps_s[:, None] * (moves.error_ahead @ QUARTER.T)
+    out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER_TURN.T)
+    out[:, 3:5, OWN_GYRO] = -steps_s[:, None] * (moves.error_ahead @ QUARTER_TURN.T)
     out[:, 2, OWN_GYRO], out[:, 2, PEER_GYRO] = -steps_s, steps_s
     out[:, :2, OWN_SCALE] = -moves.own_gain * moves.own
     out[:, :2, PEER_SCALE] = moves.peer_gain * moves.peer

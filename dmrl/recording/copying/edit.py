@@ -11,9 +11,9 @@ from dmrl.recording.attachments import copy_extras
 from dmrl.recording.copying.chunk_copy import Piece, Wanted, adopt, pieces, put
 from dmrl.recording.log_times import log_times
 from dmrl.recording.mcap.channel import RawMessage
-from dmrl.recording.mcap.summary_index import Summary, summary
 from dmrl.recording.provenance_inputs import provenance, refuse_twice
 from dmrl.recording.reader import matching, read_raw
+from dmrl.recording.summary import Summary, summary
 from dmrl.recording.writer import RecordingWriter
 from dmrl.terminal.progress import say
 from dmrl.topics import CALIBRATION, names, row_of

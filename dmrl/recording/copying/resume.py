@@ -9,10 +9,10 @@ from dmrl.atomic_output import partial_of
 from dmrl.errors import OutputError, RecordingError
 from dmrl.recording.log_times import log_times
 from dmrl.recording.mcap.channel import RawMessage, holds_pictures
-from dmrl.recording.mcap.summary_index import summary
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.reader import read_raw
 from dmrl.recording.recover import recover
+from dmrl.recording.summary import summary
 from dmrl.recording.writer import RecordingWriter
 
 

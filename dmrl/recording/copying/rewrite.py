@@ -13,9 +13,9 @@ from dmrl.recording.attachments import copy_extras
 from dmrl.recording.copying.chunk_copy import Wanted, adopt, copy, pieces, put
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import EVER_NS, ROWS, Ints
-from dmrl.recording.mcap.summary_index import summary
 from dmrl.recording.protobuf.encode import Value
 from dmrl.recording.provenance import Provenance
+from dmrl.recording.summary import summary
 from dmrl.recording.writer import RecordingWriter
 
 

@@ -1,9 +1,9 @@
-"""What a recording holds, from its summary, without reading its messages."""
+"""Read the summary section, metadata and attachments of an MCAP file, each verified."""
 
 import time
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,15 +14,11 @@ from mcap.records import Attachment, AttachmentIndex, MetadataIndex
 from mcap.records import Metadata as McapMetadata
 from mcap.summary import Summary as McapSummary
 
-from dmrl.errors import RecordingError
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.file import RECORD, Bounded, damaged, opened
 from dmrl.recording.mcap.record_scan import channel_of, walked
 from dmrl.recording.mcap.summary_section import Section, section
-from dmrl.recording.provenance import METADATA_NAME, Provenance
-
-SPLIT_METADATA = "dmrl.split"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,37 +27,6 @@ class TopicInfo:
 
     schema: str
     count: int
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a recording holds.
-
-    Parameters
-    ----------
-    topics
-        By name.
-    start_ns, end_ns
-        First and last log time, nanoseconds; both 0 where there are no messages.
-    metadata
-        Named strings; a name may occur more than once.
-    attachments
-        Named files.
-    provenance
-        How it was made, or None for a recording that dmrl did not write.
-    """
-
-    topics: dict[str, TopicInfo]
-    start_ns: int
-    end_ns: int
-    metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    provenance: Provenance | None = None
-
-    @property
-    def count(self) -> int:
-        """Number of messages."""
-        return sum(topic.count for topic in self.topics.values())
 
 
 SETTLED_NS, MOST_REMEMBERED = 1_000_000_000, 8
@@ -77,10 +42,10 @@ def mcap_summary(path: Path, stream: Bounded) -> Section | None:
     RecordingError
         If it contradicts itself or the file.
     """
-    return _remembered("raw", path, stream, lambda: section(path, stream))
+    return remembered("raw", path, stream, lambda: section(path, stream))
 
 
-def _remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made]) -> Made:
+def remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made]) -> Made:
     """What was made of a file, without making it again as long as it is the same file.
 
     A file that was written in the last second is read again: its time stamp might not tell
@@ -112,41 +77,6 @@ def channel_on(path: Path, topic: str) -> Channel:
         return channels[min(n for n, channel in channels.items() if channel.topic == topic)]
 
 
-def summary(path: Path) -> Summary:
-    """What a recording holds; reads its summary, metadata and attachments only.
-
-    Raises
-    ------
-    RecordingError
-        If the file is absent, not MCAP, cut short or damaged.
-    """
-    with opened(path) as stream:
-        return _remembered("summary", path, stream, lambda: _summary(path, stream))
-
-
-def _summary(path: Path, stream: Bounded) -> Summary:
-    found = mcap_summary(path, stream)
-    if found is None or found.statistics is None:
-        return _scanned(path, stream)
-    metadata = metadata_of(path, stream, found)
-    metadata.pop(checksums.METADATA_NAME, None)
-    statistics = found.statistics
-    topics: dict[str, TopicInfo] = {}
-    for number in sorted(found.channels):
-        channel = channel_of(number, found.channels, found.schemas)
-        before = topics[channel.topic].count if channel.topic in topics else 0
-        count = statistics.channel_message_counts.get(number, 0)
-        topics[channel.topic] = TopicInfo(channel.schema_name, before + count)
-    return Summary(
-        topics=dict(sorted(topics.items())),
-        start_ns=statistics.message_start_time,
-        end_ns=statistics.message_end_time,
-        metadata=metadata,
-        attachments=dict(_attachment(path, stream, at) for at in found.attachment_indexes),
-        provenance=_provenance(path, metadata),
-    )
-
-
 def metadata_of(path: Path, stream: Bounded, found: McapSummary) -> dict[str, list[dict[str, str]]]:
     """Metadata by name, held against its sum where the recording has one of its own.
 
@@ -173,7 +103,7 @@ def metadata_of(path: Path, stream: Bounded, found: McapSummary) -> dict[str, li
     return metadata
 
 
-def _attachment(path: Path, stream: Bounded, place: AttachmentIndex) -> tuple[str, bytes]:
+def read_attachment(path: Path, stream: Bounded, place: AttachmentIndex) -> tuple[str, bytes]:
     """Name and content of an attachment, held against its CRC."""
     body = _record(path, stream, place, Opcode.ATTACHMENT)
     crc = int.from_bytes(body[-4:], "little")
@@ -192,32 +122,3 @@ def _record(
     if len(body) < RECORD.size or RECORD.unpack_from(body) != (kind, len(body) - RECORD.size):
         raise damaged(path, f"no {kind.name.lower()} at byte {place.offset}")
     return body
-
-
-def _scanned(path: Path, stream: Bounded) -> Summary:
-    """The summary of a complete file that was written without one."""
-    walk = walked(path, stream)
-    walk.metadata.pop(checksums.METADATA_NAME, None)
-    counts = walk.counts()
-    topics: dict[str, TopicInfo] = {}
-    for number, channel in walk.channels.items():
-        before = topics[channel.topic].count if channel.topic in topics else 0
-        topics[channel.topic] = TopicInfo(channel.schema_name, before + counts[number])
-    held = [block.time_ns for block in walk.blocks if len(block)]
-    return Summary(
-        dict(sorted(topics.items())),
-        min((int(times.min()) for times in held), default=0),
-        max((int(times.max()) for times in held), default=0),
-        walk.metadata,
-        walk.attachments,
-        _provenance(path, walk.metadata),
-    )
-
-
-def _provenance(path: Path, metadata: dict[str, list[dict[str, str]]]) -> Provenance | None:
-    if METADATA_NAME not in metadata:
-        return None
-    try:
-        return Provenance.from_metadata(metadata[METADATA_NAME][-1])
-    except (ValueError, KeyError, TypeError, AttributeError) as e:
-        raise RecordingError(f"{path}: its provenance is damaged ({e}). Make it again") from e
