@@ -3,7 +3,9 @@
 
 VENV ?= .venv
 PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,$(shell command -v $(p) 2>/dev/null)))
-BIN := $(abspath $(VENV))/bin
+# Quoted wherever a path may hold a space; targets are relative, since make splits names at spaces.
+BIN := $(VENV)/bin
+ABSOLUTE_BIN := "$(if $(filter /%,$(VENV)),$(VENV),$(CURDIR)/$(VENV))/bin"
 LAYOUT := build/layout
 # One process for each core, each with one thread: more would take the cores from each other.
 # Tests of a file stay together, with what they share.
@@ -53,10 +55,10 @@ lint: $(VENV)/.dev ## Look for mistakes that a linter finds.
 	$(BIN)/ruff check .
 
 types: $(VENV)/.dev layout ## Check types, strictly.
-	cd $(LAYOUT) && $(BIN)/mypy --config-file $(CURDIR)/pyproject.toml
+	cd $(LAYOUT) && $(ABSOLUTE_BIN)/mypy --config-file "$(CURDIR)/pyproject.toml"
 
 imports: $(VENV)/.dev layout ## Check that imports go down only.
-	cd $(LAYOUT) && $(BIN)/lint-imports --config $(CURDIR)/pyproject.toml
+	cd $(LAYOUT) && $(ABSOLUTE_BIN)/lint-imports --config "$(CURDIR)/pyproject.toml"
 
 spell: $(VENV)/.dev ## Check spelling.
 	$(BIN)/codespell
@@ -84,7 +86,7 @@ clean: ## Remove what was built, .venv and demo/ as well.
 layout:
 	@rm -rf $(LAYOUT)
 	@mkdir -p $(LAYOUT)/dmrl
-	@ln -s $(CURDIR)/dmrl/* $(CURDIR)/viewer $(CURDIR)/schemas $(CURDIR)/recipes $(LAYOUT)/dmrl/
+	@for place in dmrl/* viewer schemas recipes; do ln -s "$(CURDIR)/$$place" $(LAYOUT)/dmrl/; done
 
 $(VENV)/.pip:
 	@test -n "$(PYTHON)" || { echo "dmrl needs Python 3.11 or newer; none was found" >&2; exit 1; }
