@@ -1,8 +1,8 @@
-"""Outputs that appear under their name only when they are whole, each written by one process.
+"""Write outputs atomically: each appears under its name only when it is complete.
 
-A killed process leaves ``<name>.partial`` behind and never ``<name>``. While it lives it holds a
-lock on ``<name>.partial``, which the system takes back when it dies: what is locked is being
-written, what is not is left over. The final name is linked, never replaced, after everything has
+A killed process leaves ``<name>.partial`` behind and never ``<name>``. While it runs it holds a
+lock on ``<name>.partial``, which the system releases when it ends. A locked file is being written,
+an unlocked one is left over. The final name is linked, never replaced, after all data have
 reached the disk.
 """
 
@@ -22,7 +22,7 @@ from dmrl.storage.upload import require_bucket
 
 SUFFIX = ".partial"
 MOST_NAME_BYTES = 255 - len(SUFFIX)
-"""Of an output's name: file systems take 255, and the unfinished one is called longer."""
+"""Length of an output's name, bytes. File systems allow 255, and ``.partial`` is added to it."""
 
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
 _begun: list[Path] = []
@@ -30,33 +30,36 @@ _ended: list[Path] = []
 
 
 def partial_of(path: Path) -> Path:
-    """``<name>.partial`` beside ``path``."""
+    """Return ``<name>.partial`` next to ``path``."""
     return path.with_name(path.name + SUFFIX)
 
 
 def note(path: Path) -> None:
-    """Note an output that another process makes for this one, for `standing`."""
+    """Register an output that another process writes for this one."""
     _begun.append(path)
 
 
 def standing() -> list[Path]:
-    """Outputs of this process that are whole and stand under their final name."""
+    """Return the outputs of this process that are complete and have their final name."""
     return [path for path in _begun if path.exists()]
 
 
 def outputs_done() -> int:
-    """How many outputs of this process are done with, whole or not; inputs may change then."""
+    """Return how many outputs of this process have ended, complete or not.
+
+    Inputs may change afterwards.
+    """
     return len(_ended)
 
 
 def refuse_existing(path: Path) -> None:
-    """Nothing, if ``path`` is free to be written.
+    """Raise OutputError if the path exists or cannot be written.
 
     Raises
     ------
     OutputError, UnsafeName
-        If something is there already, its folder is not, its name is too long or no text, or
-        another process is writing it.
+        If the path exists, its folder does not, its name is too long or not text, or another
+        process is writing it.
     """
     _refuse_taken(path)
     if not isinstance(path, Remote):
@@ -91,7 +94,7 @@ def _name_too_long(path: Path) -> OutputError:
 
 
 def as_output_error(path: Path, error: OSError) -> OutputError:
-    """The one-line error for a write to ``path`` that the system refused."""
+    """Return the one-line error for a write to ``path`` that the system refused."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return FullDisk(f"no space left for {path}. Free some, or write to another disk")
     if error.errno == errno.ENAMETOOLONG:
@@ -101,14 +104,14 @@ def as_output_error(path: Path, error: OSError) -> OutputError:
 
 @contextmanager
 def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
-    """Path to write to; it becomes ``path`` when the block ends without an error.
+    """Yield a path to write to; it becomes ``path`` if the block ends without an error.
 
     Parameters
     ----------
     path
         The final file.
     keep_on_error
-        Leave the partial file: for work that can be resumed.
+        Keep the partial file after an error, for work that can be resumed.
 
     Raises
     ------
@@ -124,7 +127,7 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
     with _refusals(path, partial):
         held, kept = None, keep_on_error
         try:
-            held = take_file(partial)  # in here, as Ctrl-C comes between any two lines
+            held = take_file(partial)  # inside try: Ctrl-C can come between any two lines
             _begin(path, partial)
             yield partial
             sync(partial)
@@ -135,7 +138,7 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
         finally:
             if held is not None:
                 if not kept or is_held(path, held):
-                    with suppress(OSError):  # it would hide the error that brought us here
+                    with suppress(OSError):  # it would hide the original error
                         partial.unlink(missing_ok=True)
                 os.close(held)
                 _ended.append(path)
@@ -143,9 +146,9 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def rewritten_file(path: Path) -> Iterator[Path]:
-    """Path to write to; it takes the place of ``path``, which may be edited by hand meanwhile.
+    """Yield a path to write to; it replaces ``path`` if the block ends without an error.
 
-    For the one file that is written again where it stands, a dataset's card.
+    Only for the dataset card, which is rewritten in place and may be edited by hand meanwhile.
 
     Raises
     ------
@@ -174,16 +177,16 @@ def rewritten_file(path: Path) -> Iterator[Path]:
 def partial_folder(
     path: Path, *, keep_on_error: bool = False, resume: bool = False
 ) -> Iterator[Path]:
-    """Folder to write in; it becomes ``path`` when the block ends without an error.
+    """Yield a folder to write in; it becomes ``path`` if the block ends without an error.
 
     Parameters
     ----------
     path
         The final folder.
     keep_on_error
-        Leave the partial folder: for work that can be resumed.
+        Keep the partial folder after an error, for work that can be resumed.
     resume
-        Go on in the partial folder that is there. Else it begins empty.
+        Continue in the existing partial folder. False: start with an empty one.
 
     Raises
     ------
@@ -217,15 +220,15 @@ def partial_folder(
 
 @contextmanager
 def grown_folder(path: Path, last: str) -> Iterator[Path]:
-    """Folder to write in; its files go into ``path``, which is there, when the block ends well.
+    """Yield a folder to write in; its files move into the existing ``path`` at the end.
 
-    They are brought to the disk and moved one by one, so what they are to others must hang on one
-    of them: a process that is killed leaves some of the others, and not that one.
+    The files are flushed to the disk and moved one by one. Their validity must depend on the file
+    ``last``: a killed process may have moved some of the others, but not that one.
 
     Parameters
     ----------
     path
-        A folder.
+        An existing folder.
     last
         Name of the file that is moved after all others.
 
@@ -267,7 +270,7 @@ def _move(partial: Path, path: Path, last: str) -> None:
 
 @contextmanager
 def _noted(path: Path) -> Iterator[None]:
-    """An output in a bucket, which is begun here and done with when the block ends."""
+    """Register an output in a bucket as started, and as ended after the block."""
     _begun.append(path)
     try:
         yield
@@ -276,11 +279,11 @@ def _noted(path: Path) -> Iterator[None]:
 
 
 def _begin(path: Path, partial: Path) -> None:
-    """Note an output that is now ours, unless another process has just finished it."""
+    """Register an output, unless another process has just finished one of that name."""
     try:
         _refuse_taken(path)
     except OutputError:
-        with suppress(OSError):  # ours is new; a folder is left if anything is in it
+        with suppress(OSError):  # the new file; a folder only if it is empty
             partial.rmdir() if partial.is_dir() else partial.unlink()
         raise
     _begun.append(path)
@@ -288,7 +291,7 @@ def _begin(path: Path, partial: Path) -> None:
 
 @contextmanager
 def _refusals(path: Path, partial: Path) -> Iterator[None]:
-    """What the system says against a write, as one line; errors of other files pass."""
+    """Turn system errors of this output into one line; pass on those of other files."""
     try:
         yield
     except OSError as e:
@@ -302,16 +305,16 @@ def _refusals(path: Path, partial: Path) -> Iterator[None]:
 
 
 class _CameBetween(OutputError):
-    """Somebody else has made what we were about to name."""
+    """The output's name was taken while it was written."""
 
     def __init__(self, partial: Path, path: Path) -> None:
         super().__init__(
-            f"{path} came into being while it was written. What was written is {partial}: rename it"
+            f"{path} was created by another program meanwhile. The output is {partial}: rename it"
         )
 
 
 def _link(partial: Path, path: Path) -> None:
-    """Give a whole file its name, which must be free."""
+    """Give a complete file its name, which must be free."""
     try:
         os.link(partial, path)
     except FileExistsError:
@@ -319,17 +322,17 @@ def _link(partial: Path, path: Path) -> None:
     except OSError as e:
         if e.errno not in _NO_LINKS:
             raise
-        _refuse_taken(path)  # FAT has no links: looked at, then renamed
+        _refuse_taken(path)  # FAT has no links: check, then rename
         partial.rename(path)
     try:
         sync_one(path.parent)
     except BaseException:
-        path.unlink()  # not sure to be there after a power loss, so not there at all
+        path.unlink()  # it might be lost in a power loss, so remove it
         raise
 
 
 def _rename(partial: Path, path: Path) -> None:
-    """Give a whole folder its name; the system refuses if a file or a folder with files has it."""
+    """Give a complete folder its name; the system refuses if that is taken."""
     try:
         partial.rename(path)
     except OSError as e:

@@ -1,6 +1,6 @@
-"""One colour per meaning, the same in every picture, plot and view."""
+"""Colours by meaning, the same in every image, plot and view."""
 
-# After Okabe and Ito, told apart by colour-blind eyes, but as bright as text on grey must be.
+# After Okabe and Ito, distinguishable with colour blindness, but bright enough for text on grey.
 RGB = {
     "truth": (60, 235, 160),
     "estimate": (110, 200, 255),
@@ -11,17 +11,17 @@ RGB = {
     "range": (185, 150, 255),
     "other": (200, 200, 200),
 }
-"""Sources of positions, and what was measured."""
+"""Colours of the sources of positions, and of other measurements."""
 
 SECOND_DETECTION = (170, 230, 60)
-"""A second model's detections, beside those of a first."""
+"""Colour of a second model's detections, beside those of a first."""
 
 OWN, PEER = (240, 240, 240), (150, 150, 150)
-"""A robot's own sensors, and its peer's."""
+"""Colours of a robot's own sensors, and of its peer's."""
 
 STATUS_RGB = {
     "OK": (70, 120, 175),
     "UNCONVERGED": (130, 130, 130),
     "AMBIGUOUS": (200, 60, 60),
 }
-"""Values of ``dmrl.v1.Status``, by name."""
+"""Colours of the values of ``dmrl.v1.Status``, by name."""

@@ -1,23 +1,23 @@
-"""Errors a user can act on. Every message is one line and ends with the way out.
+"""Define the errors that a user can act on. Each message is one line and ends with a way out.
 
 * DmrlError
   - OutputError       the output exists, cannot be written, or is another process's
     + BusyOutput
     + FullDisk
   - UnsafeName        a name from a file cannot become a path
-  - RecordingError    the file cannot be read, or lacks what was asked of it
+  - RecordingError    the file cannot be read, or lacks requested data
     + MissingTopic
-  - SourceError       a foreign file or folder is not what its format says
-  - DatasetError      a folder is not a dataset, or lacks what was asked of it
+  - SourceError       a foreign file or folder does not conform to its format
+  - DatasetError      a folder is not a dataset, or lacks requested data
   - ModelError        weights or a run folder cannot be used
   - RecipeError       the TOML does not describe a run
-  - SettingError      a setting cannot be met by this input
+  - SettingError      a setting does not fit the input
   - BlenderError      Blender cannot be set up, does not start, or cannot use a model
   - ToolError         a compiler or an emulator is missing, or fails
   - StorageError      a bucket or its server cannot be reached, or refuses
-  - ClusterError      a cluster does not answer, or its nodes are not alike
-  - MissingExtra      a package that an optional room needs is not installed
-  - PluginError       what another package adds to dmrl does not work
+  - ClusterError      a cluster does not answer, or its nodes differ in version
+  - MissingExtra      a package from an extra is not installed
+  - PluginError       a plug-in of another package does not work
 """
 
 import unicodedata
@@ -26,9 +26,9 @@ from difflib import get_close_matches
 
 
 def one_line(text: str) -> str:
-    r"""The text in one line: control characters as ``\x1b``, line ends as spaces.
+    r"""Return the text in one line: control characters as ``\x1b``, line ends as spaces.
 
-    What orders a terminal about, or turns a text's direction, is shown and not obeyed.
+    Characters that control a terminal or the direction of text are escaped.
     """
     return "".join(map(_shown, " ".join(text.splitlines())))
 
@@ -40,22 +40,22 @@ def _shown(character: str) -> str:
 
 
 def words_of(error: Exception) -> str | None:
-    """What is said of an error that is the user's, the disk's or the machine's; None: a bug."""
+    """Return the message for an error of the user, disk or machine; None for a bug."""
     match error:
         case DmrlError():
             return str(error)
         case UnicodeEncodeError():
-            return f"{ascii(error.object)[:80]} is no text that can be stored. Rename the file"
+            return f"{ascii(error.object)[:80]} cannot be stored as UTF-8. Rename the file"
         case MemoryError():
             kind = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
-            return f"this machine has not enough memory ({kind}). Give less at once"
+            return f"this machine has not enough memory ({kind}). Use less data at once"
         case OSError(errno=int()):
             named = error.filename
             where = "standard output, or a disk" if named is None else str(named)
             why = f"cannot read or write {where}: {error.strerror}"
-            return f"{why}. Check its name, its rights, its space"
+            return f"{why}. Check its name, permissions and free space"
         case RuntimeError() if str(error).startswith("Symlink loop"):  # Python before 3.13
-            return f"cannot read a link that leads to itself: {error}. Remove it"
+            return f"cannot read a link that points to itself: {error}. Remove it"
     return None
 
 
@@ -63,28 +63,28 @@ class DmrlError(Exception):
     """Base of every error that ``dmrl`` prints without a traceback."""
 
     def __str__(self) -> str:
-        """One line, whatever names of a file, or words of a library, stand in it."""
+        """Return one line, whatever the names and library messages in it contain."""
         return one_line(super().__str__())
 
 
 class OutputError(DmrlError):
-    """An output exists already, cannot be written, or is being written by another process."""
+    """An output exists, cannot be written, or is being written by another process."""
 
 
 class BusyOutput(OutputError):
-    """Another process is writing the output just now."""
+    """Another process is writing the output."""
 
 
 class FullDisk(OutputError):
-    """There is no space left where the output was to be written."""
+    """The disk of the output is full."""
 
 
 class UnsafeName(DmrlError):
-    """A name that stands in a file cannot be the name of a file."""
+    """A name from a file cannot be used as a file name."""
 
 
 class RecordingError(DmrlError):
-    """A recording cannot be used as asked."""
+    """A recording cannot be read, or lacks requested data."""
 
 
 class MissingTopic(RecordingError):
@@ -93,9 +93,9 @@ class MissingTopic(RecordingError):
     Parameters
     ----------
     topic
-        The topic, or pattern of topics, that was wanted.
+        The requested topic or pattern.
     present
-        Topics the recording has; the nearest is offered.
+        Topics of the recording. The message suggests the most similar one.
     where
         The recording.
     """
@@ -107,11 +107,11 @@ class MissingTopic(RecordingError):
 
 
 class SourceError(DmrlError):
-    """A foreign file or folder is not what its format says."""
+    """A foreign file or folder does not conform to its format."""
 
 
 class DatasetError(DmrlError):
-    """A folder is not a dataset, or lacks what was asked of it."""
+    """A folder is not a dataset, or lacks requested data."""
 
 
 class ModelError(DmrlError):
@@ -123,7 +123,7 @@ class RecipeError(DmrlError):
 
 
 class SettingError(DmrlError):
-    """A setting cannot be met by this input."""
+    """A setting does not fit the input."""
 
 
 class BlenderError(DmrlError):
@@ -131,11 +131,11 @@ class BlenderError(DmrlError):
 
 
 class ToolError(DmrlError):
-    """A compiler or an emulator is not installed, or cannot do its work."""
+    """A compiler or an emulator is not installed, or fails."""
 
 
 class StorageError(DmrlError):
-    """A bucket, or the server that has it, cannot be reached, or refuses."""
+    """A bucket or its server cannot be reached, or refuses."""
 
 
 class ClusterError(DmrlError):
@@ -150,9 +150,9 @@ class MissingExtra(DmrlError):
     package
         Name on PyPI.
     extra
-        The extra of dmrl that brings it.
+        The extra of dmrl that installs it.
     what
-        What needs it, as the user knows it.
+        The command or feature that needs it.
     """
 
     def __init__(self, package: str, extra: str, what: str) -> None:
@@ -160,4 +160,4 @@ class MissingExtra(DmrlError):
 
 
 class PluginError(DmrlError):
-    """What another package adds to dmrl cannot be loaded, or fails; the package is named."""
+    """A plug-in of another package cannot be loaded, or fails. The message names the package."""

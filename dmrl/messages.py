@@ -1,6 +1,6 @@
 """Message classes, built at run time from the committed descriptor set.
 
-There is no generated ``_pb2.py``: it would pin the protobuf runtime. ``schemas/`` holds the
+There is no generated ``_pb2.py``: it would pin the protobuf runtime. ``schemas/`` contains the
 definitions with their units and frames; ``make schemas`` rebuilds the set.
 """
 
@@ -32,7 +32,7 @@ def _pool() -> DescriptorPool:
 
 
 def pool_of(descriptor_set: bytes) -> DescriptorPool:
-    """A pool with every file of a serialized FileDescriptorSet.
+    """Build a pool with every file of a serialized FileDescriptorSet.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def pool_of(descriptor_set: bytes) -> DescriptorPool:
 
 @cache
 def descriptor(name: str) -> Descriptor:
-    """Descriptor of a message of dmrl or foxglove.
+    """Return the descriptor of a message of dmrl or foxglove.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def descriptor(name: str) -> Descriptor:
 
 
 def status_name(number: int) -> str:
-    """Name of a status of a label or position; one that dmrl does not know stays a number."""
+    """Return the name of a label's or position's status; the number if the status is unknown."""
     kind = descriptor("PeerLabel").fields_by_name["status"].enum_type
     known = kind.values_by_number if kind is not None else {}
     return str(known[number].name) if number in known else str(number)
@@ -76,17 +76,17 @@ def status_name(number: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LogType:
-    """A message type made for one block of log variables, whatever they are.
+    """Message type of one block of log variables.
 
-    Its full name is ``dmrl.log.<name>``, its fields are the variables with ``_`` for every
-    sign that protobuf does not take; the JSON names keep the variables' own.
+    Its full name is ``dmrl.log.<name>``. Its fields are the variables, with ``_`` for every
+    character that protobuf does not allow; the JSON names are those of the variables.
 
     Parameters
     ----------
     name
-        Of the event or block.
+        Name of the event or block.
     variables
-        Names and types, the latter in the letters of ``struct``: ``b B h H i I q e f d``.
+        Names and types, as letters of ``struct``: ``b B h H i I q e f d``.
 
     Raises
     ------
@@ -101,12 +101,12 @@ class LogType:
         if len(self.variables) > limits.VARIABLES:
             raise SourceError(
                 f"the log of {self.name[:40]} has {len(self.variables)} variables, more than "
-                f"{limits.VARIABLES}. Leave some out"
+                f"{limits.VARIABLES}. Remove some"
             )
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Field of each variable, no two the same."""
+        """Field of each variable, all different."""
         found: list[str] = []
         names = [variable for variable, _ in self.variables]
         for variable in names:
@@ -151,13 +151,12 @@ def _log_descriptor(kind: LogType) -> Descriptor:
 
 @cache
 def message(name: str | LogType) -> Any:
-    """Class of a message: ``message("Height")(height_m=0.4)``.
+    """Return the class of a message: ``message_class("Height")(height_m=0.4)``.
 
     Parameters
     ----------
     name
-        Short or full name, looked for in dmrl.v1 first, then in foxglove; or the variables
-        of a log.
+        Short or full name, first searched in dmrl.v1, then in foxglove; or the variables of a log.
 
     Raises
     ------
@@ -169,7 +168,7 @@ def message(name: str | LogType) -> Any:
 
 @cache
 def schema_bytes(name: str | Descriptor) -> bytes:
-    """Serialized FileDescriptorSet of a message and all it imports, as MCAP wants it."""
+    """Serialize the FileDescriptorSet of a message and all its imports, as MCAP requires."""
     found: dict[str, FileDescriptor] = {}
 
     def visit(file: FileDescriptor) -> None:
@@ -185,4 +184,4 @@ def schema_bytes(name: str | Descriptor) -> bytes:
 
 
 STATUS_OK, STATUS_UNCONVERGED, STATUS_AMBIGUOUS = range(3)
-"""Values of ``dmrl.v1.Status``; a test holds them to the schema."""
+"""Values of ``dmrl.v1.Status``; a test compares them with the schema."""

@@ -1,7 +1,7 @@
-"""Recipes: TOML files that describe a run, checked before anything is done.
+"""Recipes: TOML files with the settings of a run, checked before anything runs.
 
-A recipe of one stage holds ``kind`` and that stage's settings; of many, see `dmrl.pipeline`. A
-recipe with faults is refused whole, every fault named.
+A recipe of one stage has ``kind`` and that stage's settings; for several stages, see
+`dmrl.pipeline`. Errors name all wrong keys of a recipe.
 """
 
 import json
@@ -24,67 +24,74 @@ from dmrl.guards.paths import refuse_pipe
 
 Settings = TypeVar("Settings")
 MOST_BYTES = 4 * limits.TOML_CHARACTERS
-"""Of a recipe, before it is text."""
+"""Maximum size of a recipe file, bytes."""
+PRETRAINED = "pretrained"
+"""Folder of the recipes that trained the shipped networks, below the recipes for users."""
 
 
 def names() -> list[str]:
-    """Names of the recipes that ship with dmrl."""
-    return sorted(f.name[:-5] for f in _shipped().iterdir() if f.name.endswith(".toml"))
+    """Return the names of the shipped recipes for users."""
+    return _names_in(_shipped())
+
+
+def pretrained_names() -> list[str]:
+    """Return the names of the shipped recipes that trained the shipped networks."""
+    return _names_in(_shipped() / PRETRAINED)
 
 
 def read(name: str | Path) -> dict[str, Any]:
-    """Keys of a recipe, by path or by the name of a shipped one.
+    """Read the keys of a recipe, by path or by the name of a shipped one.
 
     Raises
     ------
     RecipeError
-        If there is no such recipe, or it is not TOML.
+        If the recipe does not exist, or is not TOML.
     """
     return _parse(name, text(name))
 
 
 def text(name: str | Path) -> str:
-    """Text of a recipe, by path or by the name of a shipped one.
+    """Read the text of a recipe, by path or by the name of a shipped one.
 
     Raises
     ------
     RecipeError
-        If there is no such recipe.
+        If the recipe does not exist.
     """
     path = Path(name)
     refuse_pipe(path)
-    source = path if path.suffix == ".toml" else _shipped() / f"{name}.toml"
+    source = path if path.suffix == ".toml" else _find_shipped(str(name))
     try:
         with source.open("rb") as stream:
             content = stream.read(MOST_BYTES + 1)
         if len(content) > MOST_BYTES:
-            raise RecipeError(f"{name} has more than {MOST_BYTES} bytes. That is no recipe")
+            raise RecipeError(f"{name} has more than {MOST_BYTES} bytes. Use a smaller recipe")
         return content.decode("utf-8")
     except (FileNotFoundError, IsADirectoryError):
-        near = get_close_matches(path.stem, names(), n=1)
-        hint = f"Did you mean {near[0]}?" if near else f"Shipped ones: {', '.join(names())}"
+        near = get_close_matches(path.stem, names() + pretrained_names(), n=1)
+        hint = f"Did you mean {near[0]}?" if near else _list_shipped()
         raise RecipeError(f"no recipe {name}. {hint}") from None
     except (UnicodeDecodeError, OSError) as e:
         raise RecipeError(f"{name} cannot be read: {e}. Give a TOML text file") from e
 
 
 def load(name: str | Path, kind: str, schema: type[Settings]) -> Settings:
-    """Settings of one stage, from a recipe.
+    """Load the settings of one stage from a recipe.
 
     Parameters
     ----------
     name
         Path, or the name of a shipped recipe.
     kind
-        What the recipe must describe, such as "train".
+        Required kind, such as "train".
     schema
-        The stage's settings dataclass.
+        Settings dataclass of the stage.
 
     Raises
     ------
     RecipeError
-        If there is no such recipe, it is not TOML, is of another kind, or any key is wrong;
-        names every wrong key.
+        If the recipe does not exist, is not TOML, has another kind, or any key is wrong. Names
+        all wrong keys.
     """
     keys = read(name)
     check_kind(name, keys, kind)
@@ -92,12 +99,12 @@ def load(name: str | Path, kind: str, schema: type[Settings]) -> Settings:
 
 
 def check(name: str | Path, keys: Mapping[str, Any], schema: type[Settings]) -> Settings:
-    """An instance of a settings dataclass from a recipe's keys.
+    """Create an instance of a settings dataclass from a recipe's keys.
 
     Raises
     ------
     RecipeError
-        Naming the recipe and every wrong key.
+        If keys are wrong. Names the recipe and all wrong keys.
     """
     if wrong := faults(keys, schema):
         raise faulty(name, wrong)
@@ -108,35 +115,51 @@ def _shipped() -> Traversable:
     return files("dmrl.recipes")
 
 
+def _names_in(folder: Traversable) -> list[str]:
+    return sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
+
+
+def _find_shipped(name: str) -> Traversable:
+    """Return the file of a shipped recipe, whether it exists or not."""
+    folder = _shipped() / PRETRAINED if name in pretrained_names() else _shipped()
+    return folder / f"{name}.toml"
+
+
+def _list_shipped() -> str:
+    """Return the names of all shipped recipes as one line for errors."""
+    others = ", ".join(pretrained_names())
+    return f"Shipped ones: {', '.join(names())}; those of the shipped networks: {others}"
+
+
 def _parse(name: str | Path, content: str) -> dict[str, Any]:
     try:
         return parse_toml(content)
     except ValueError as e:
-        raise RecipeError(f"{name} is not TOML: {e}. Mend that line") from e
+        raise RecipeError(f"{name} is not TOML: {e}. Fix that line") from e
 
 
 def check_kind(name: str | Path, keys: Mapping[str, Any], kind: str) -> None:
-    """Nothing, if a recipe is of this kind.
+    """Raise RecipeError unless a recipe has this kind.
 
     Raises
     ------
     RecipeError
-        If it is of another.
+        If it has another kind, or none.
     """
     if (found := keys.get("kind")) != kind:
         has = f"is of kind {found!r}" if found is not None else "has no kind"
-        raise RecipeError(f'{name} {has}. This command wants a recipe with: kind = "{kind}"')
+        raise RecipeError(f'{name} {has}. Use a recipe with: kind = "{kind}"')
 
 
 def faulty(name: str | Path, wrong: Iterable[str]) -> RecipeError:
-    """The one-line error that names all that is wrong with a recipe."""
+    """Return the one-line error that names all faults of a recipe."""
     lines = list(wrong)
     keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
-    return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Mend them all")
+    return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Fix them all")
 
 
 def argument_fault(value: Any, hint: Any) -> str:
-    """What is wrong with a value for an argument of this annotation; empty: nothing."""
+    """Return the fault of a value for an argument of this annotation, or an empty text."""
     try:
         argument(value, hint)
     except ValidationError as e:
@@ -145,18 +168,18 @@ def argument_fault(value: Any, hint: Any) -> str:
 
 
 def argument(value: Any, hint: Any) -> Any:
-    """A value of TOML as an argument of this annotation.
+    """Convert a TOML value to an argument of this annotation.
 
     Raises
     ------
     ValueError
-        If it cannot be one.
+        If the value does not fit the annotation.
     """
     return TypeAdapter(hint).validate_json(json.dumps(value, default=str), strict=True)
 
 
 def plain(values: Any) -> Any:
-    """Settings as values of JSON."""
+    """Convert settings to JSON values."""
     return json.loads(json.dumps(values, default=str))
 
 
@@ -167,21 +190,21 @@ def _model(schema: type[Any]) -> type[BaseModel]:
     keys = {n: (t, ... if n in required else None) for n, t in hints.items()}
     config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
     with warnings.catch_warnings():
-        # A setting may be called as a method of pydantic's is: only fields are asked for.
+        # A setting may have the name of a pydantic method: only the fields are read.
         warnings.filterwarnings("ignore", "Field name .* shadows an attribute")
         model: type[BaseModel] = create_model(schema.__name__, __config__=config, **keys)  # type: ignore[call-overload]
     return model
 
 
 def _validated(keys: Mapping[str, Any], schema: type[Any]) -> dict[str, Any]:
-    # JSON, because pydantic's strict mode takes lists for tuples and text for paths only there.
+    # JSON, because pydantic's strict mode accepts lists as tuples and text as paths only there.
     model = _model(schema)  # type: ignore[arg-type] # a class has a hash
     made = model.model_validate_json(json.dumps(keys, default=str))
     return {name: getattr(made, name) for name in keys}
 
 
 def faults(keys: Any, schema: type[Any]) -> list[str]:
-    """What is wrong with the keys of a settings dataclass, one line for each."""
+    """List the faults in keys of a settings dataclass, one line each."""
     try:
         values = _validated(keys, schema)
         schema(**values)
@@ -193,7 +216,7 @@ def faults(keys: Any, schema: type[Any]) -> list[str]:
 
 
 def _out_of_range(values: Mapping[str, Any], schema: type[Any]) -> Iterator[str]:
-    """What the validators say that a settings dataclass has for the command line."""
+    """Yield faults that a dataclass's command-line validators find."""
     hints = get_type_hints(schema, include_extras=True)
     for name, value in values.items():
         for note in getattr(hints[name], "__metadata__", ()):
@@ -205,7 +228,7 @@ def _out_of_range(values: Mapping[str, Any], schema: type[Any]) -> Iterator[str]
 
 
 def _said(message: str) -> str:
-    """What pydantic says, or what a nested dataclass said to it."""
+    """Convert a pydantic message to plain words."""
     return message.removeprefix("Value error, ") if "Value error" in message else message.lower()
 
 

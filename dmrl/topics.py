@@ -1,9 +1,9 @@
-"""The one table of topics: message, frame, units, rate, who writes it; of sensors, what is plotted.
+"""Table of topics: message, frame, units, rate, writers; for sensors also plots and CSV columns.
 
-A sensor is a message and a row here: conversion from CSV, views, plots while recording, merging,
-labelling and the table in README.md follow it.
+A sensor is a message and a row here. Conversion from CSV, views, plots while recording, merging,
+labelling and the table in README.md are derived from it.
 
-``<robot>`` carries the camera or sensor; ``<peer>`` is the robot it sees or ranges to.
+``<robot>`` carries the camera or sensor; ``<peer>`` is the robot in view or ranged to.
 """
 
 import re
@@ -16,18 +16,18 @@ from dmrl.guards.safe_names import topic_part
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """What of a sensor is plotted over time.
+    """Plot of a sensor over time.
 
     Parameters
     ----------
     title
-        Of the panel: what it is, a comma, the unit. Sensors with one title share a panel.
+        Title of the panel: the quantity, a comma, the unit. Sensors with one title share a panel.
     fields
-        Of the message, a line each.
+        Fields of the message, a line each.
     length
-        One line: the length of the vector whose components the fields are.
+        Plot one line: the length of the vector whose components are the fields.
     name
-        What the lines are called; empty: as the robot or, of a pair, the sensor.
+        Name of the lines; empty: that of the robot or, for a pair, of the sensor.
     """
 
     title: str
@@ -36,16 +36,17 @@ class Curve:
     name: str = ""
 
     def lines(self, topic: str) -> dict[str, tuple[str, ...]]:
-        """Where each line of a topic stands in a view, and the fields that it is made of."""
+        """Return the path of each line of a topic in a view, and the fields that it shows."""
         if self.length or len(self.fields) == 1:
             return {topic: self.fields}
         return {f"{topic}/{field}": (field,) for field in self.fields}
 
 
 class Doubt(NamedTuple):
-    """Values of which a tenth is too large for a small robot: ``perhaps`` of another unit.
+    """Check for values in a wrong unit: a tenth of them is too large for a small robot.
 
-    ``field`` of the message, in ``unit``; ``over`` that, plus or minus, it is doubted.
+    ``field`` of the message, in ``unit``; ``over`` is the largest plausible magnitude, and
+    ``perhaps`` the likely unit of larger ones.
     """
 
     field: str
@@ -61,27 +62,27 @@ class Topic:
     Parameters
     ----------
     pattern
-        Topic with ``{robot}`` and ``{peer}`` left open.
+        Topic with ``{robot}`` and ``{peer}`` as placeholders.
     message
-        Full name of its message; a final ``*`` stands for any ending.
+        Full name of its message; a final ``*`` matches any ending.
     frame
-        Frame its values are in.
+        Frame of its values.
     units
         Units of its values.
     rate
-        How often, as a rule.
+        Usual rate.
     written_by
-        Commands that write it, with commas between.
+        Commands that write it, separated by commas.
     sensor
-        Whether it is what a sensor of the robot says, as it says it: a robot has one stream of it,
-        and whoever has one flies.
+        Whether it contains the raw readings of a robot's sensor. A robot has one stream of it, and
+        a robot with such a topic counts as flying.
     curve
-        How it is plotted; None: not at all, or in a way of its own.
+        Plot of its values; None: no plot, or a special one.
     csv
-        Floating-point fields that a flight's CSV file may have, named as here; for a pair with the
-        peer before the unit: ``range_m`` is ``range_<peer>_m``.
+        Floating-point fields that a flight's CSV file may have, with the same names; for a pair
+        with the peer before the unit: ``range_m`` is ``range_<peer>_m``.
     doubts
-        Which of its values cannot be in its units.
+        Checks for values in a wrong unit.
     """
 
     pattern: str
@@ -97,33 +98,63 @@ class Topic:
 
     @property
     def of_pairs(self) -> bool:
-        """Whether it says something of a peer."""
+        """Whether it describes a peer."""
         return "{peer}" in self.pattern
 
     def carries(self, message: str) -> bool:
-        """Whether a message of this full name may be on the topic."""
+        """Return whether a message of this full name may be on the topic."""
         if self.message.endswith("*"):
             return message.startswith(self.message[:-1])
         return message == self.message
 
 
-CAMERA_IMAGE = "/{robot}/camera/image"
-CALIBRATION = "/{robot}/camera/calibration"
-ATTITUDE = "/{robot}/attitude"
-VELOCITY = "/{robot}/velocity"
-HEIGHT = "/{robot}/height"
-RANGE = "/{robot}/range/{peer}"
-POSITION = "/{robot}/peer/{peer}/position"
-TRUTH = "/{robot}/peer/{peer}/truth"
-LABELS = "/{robot}/labels"
-DETECTIONS = "/{robot}/detections"
-GRID = "/{robot}/detections/grid"
-TRACKS = "/{robot}/tracks"
-MASKS = "/{robot}/camera/masks"
-DEPTHS = "/{robot}/camera/depth"
-POSE = "/{robot}/pose"
-TRUE_POSE = "/{robot}/pose/truth"
-LOG = "/{robot}/log/{event}"
+class RobotTopic(str):
+    """Pattern of a robot's topic. Call it to fill it: ``HEIGHT("cf1")`` is ``/cf1/height``."""
+
+    __slots__ = ()
+
+    def __call__(self, robot: str) -> str:
+        """Return the topic of a robot."""
+        return filled(self, robot=robot)
+
+
+class PairTopic(str):
+    """Pattern of the topic of a pair: ``RANGE("cf1", "cf2")`` is ``/cf1/range/cf2``."""
+
+    __slots__ = ()
+
+    def __call__(self, robot: str, peer: str) -> str:
+        """Return the topic of a robot and its peer."""
+        return filled(self, robot=robot, peer=peer)
+
+
+class LogTopic(str):
+    """Pattern of the topic of logged variables: ``LOG("cf1", "state")`` is ``/cf1/log/state``."""
+
+    __slots__ = ()
+
+    def __call__(self, robot: str, event: str) -> str:
+        """Return the topic of a robot's log variables, as they were logged."""
+        return filled(self, robot=robot, event=event)
+
+
+CAMERA_IMAGE = RobotTopic("/{robot}/camera/image")
+CALIBRATION = RobotTopic("/{robot}/camera/calibration")
+ATTITUDE = RobotTopic("/{robot}/attitude")
+VELOCITY = RobotTopic("/{robot}/velocity")
+HEIGHT = RobotTopic("/{robot}/height")
+RANGE = PairTopic("/{robot}/range/{peer}")
+POSITION = PairTopic("/{robot}/peer/{peer}/position")
+TRUTH = PairTopic("/{robot}/peer/{peer}/truth")
+LABELS = RobotTopic("/{robot}/labels")
+DETECTIONS = RobotTopic("/{robot}/detections")
+GRID = RobotTopic("/{robot}/detections/grid")
+TRACKS = RobotTopic("/{robot}/tracks")
+MASKS = RobotTopic("/{robot}/camera/masks")
+DEPTHS = RobotTopic("/{robot}/camera/depth")
+POSE = RobotTopic("/{robot}/pose")
+TRUE_POSE = RobotTopic("/{robot}/pose/truth")
+LOG = LogTopic("/{robot}/log/{event}")
 TRANSFORMS = "/tf"
 
 TOPICS = (
@@ -223,99 +254,34 @@ TOPICS = (
 
 SENSORS = tuple(row for row in TOPICS if row.sensor)
 OWN_SENSORS = tuple(row for row in SENSORS if not row.of_pairs and row.pattern != CAMERA_IMAGE)
-"""What a robot measures of itself."""
+"""Sensors with which a robot measures itself."""
 PAIR_SENSORS = tuple(row for row in SENSORS if row.of_pairs)
-"""What a robot measures of a peer."""
+"""Sensors with which a robot measures a peer."""
 
 
 def filled(pattern: str, **parts: str) -> str:
-    """The topic. A part that holds a slash would be another topic, and another file's name."""
+    """Fill a pattern. A part with a slash is rejected: it would change the topic and file name."""
     return pattern.format(**{what: topic_part(name, what) for what, name in parts.items()})
 
 
-def camera_image(robot: str) -> str:
-    """Topic of a robot's images."""
-    return filled(CAMERA_IMAGE, robot=robot)
-
-
-def calibration(robot: str) -> str:
-    """Topic of a robot's camera calibration."""
-    return filled(CALIBRATION, robot=robot)
-
-
-def attitude(robot: str) -> str:
-    """Topic of a robot's attitude."""
-    return filled(ATTITUDE, robot=robot)
-
-
-def velocity(robot: str) -> str:
-    """Topic of a robot's velocity."""
-    return filled(VELOCITY, robot=robot)
-
-
-def height(robot: str) -> str:
-    """Topic of a robot's height."""
-    return filled(HEIGHT, robot=robot)
-
-
-def uwb_range(robot: str, peer: str) -> str:
-    """Topic of the distances that a robot measures to a peer."""
-    return filled(RANGE, robot=robot, peer=peer)
-
-
-def masks(robot: str) -> str:
-    """Topic of images whose values say which peer covers a pixel."""
-    return filled(MASKS, robot=robot)
-
-
-def depths(robot: str) -> str:
-    """Topic of images of the distance of peers' surfaces."""
-    return filled(DEPTHS, robot=robot)
-
-
-def labels(robot: str) -> str:
-    """Topic of the labels of a robot's images."""
-    return filled(LABELS, robot=robot)
-
-
-def detections(robot: str) -> str:
-    """Topic of what the network found in a robot's images."""
-    return filled(DETECTIONS, robot=robot)
-
-
-def grid(robot: str) -> str:
-    """Topic of the network's output maps for a robot's images."""
-    return filled(GRID, robot=robot)
-
-
-def tracks(robot: str) -> str:
-    """Topic of the peers that a robot's detections are followed as."""
-    return filled(TRACKS, robot=robot)
-
-
-def position(robot: str, peer: str) -> str:
-    """Topic of where a robot estimates a peer to be."""
-    return filled(POSITION, robot=robot, peer=peer)
-
-
-def truth(robot: str, peer: str) -> str:
-    """Topic of where a peer truly is, seen from a robot."""
-    return filled(TRUTH, robot=robot, peer=peer)
-
-
-def pose(robot: str) -> str:
-    """Topic of where a robot estimates itself to be."""
-    return filled(POSE, robot=robot)
-
-
-def true_pose(robot: str) -> str:
-    """Topic of where a robot truly is."""
-    return filled(TRUE_POSE, robot=robot)
-
-
-def log(robot: str, event: str) -> str:
-    """Topic of a robot's log variables, as they were logged."""
-    return filled(LOG, robot=robot, event=event)
+# Lower-case names of the patterns, for calls such as ``topics.height(robot)``.
+camera_image = CAMERA_IMAGE
+calibration = CALIBRATION
+attitude = ATTITUDE
+velocity = VELOCITY
+height = HEIGHT
+uwb_range = RANGE
+masks = MASKS
+depths = DEPTHS
+labels = LABELS
+detections = DETECTIONS
+grid = GRID
+tracks = TRACKS
+position = POSITION
+truth = TRUTH
+pose = POSE
+true_pose = TRUE_POSE
+log = LOG
 
 
 @cache
@@ -324,7 +290,7 @@ def _expression(pattern: str) -> re.Pattern[str]:
 
 
 def names(pattern: str, topic: str) -> dict[str, str] | None:
-    """What ``{robot}``, ``{peer}`` and ``{event}`` of a pattern are in a topic, or None.
+    """Return the values of a pattern's placeholders in a topic, or None if it does not match.
 
     Examples
     --------
@@ -339,11 +305,11 @@ def names(pattern: str, topic: str) -> dict[str, str] | None:
 
 @cache
 def row_of(topic: str) -> Topic | None:
-    """The table's row for a topic, or None for a topic that is not dmrl's."""
+    """Return the table's row for a topic, or None for a topic that is not dmrl's."""
     return next((row for row in TOPICS if names(row.pattern, topic) is not None), None)
 
 
 def robots(topics: list[str] | tuple[str, ...], pattern: str = CAMERA_IMAGE) -> list[str]:
-    """Robots that have a topic of this pattern, sorted."""
+    """Return the robots that have a topic of this pattern, sorted."""
     found = (names(pattern, topic) for topic in topics)
     return sorted({n["robot"] for n in found if n is not None})

@@ -1,1 +1,1 @@
-"""Recipes that ship with dmrl: TOML files, each runnable as it stands."""
+"""Recipes for users that ship with dmrl: TOML files, each runnable as it is."""

@@ -1,6 +1,6 @@
-"""Build ``dmrl.binpb`` from the .proto files and foxglove's own descriptors.
+"""Build ``dmrl.binpb`` from the .proto files and foxglove's descriptors.
 
-Run as ``python schemas/build.py [OUT]``; ``make schemas`` does. A developer's tool: the
+Run as ``python schemas/build.py [OUT]`` or ``make schemas``. This is a developer's tool: the
 package reads the committed result and needs neither protoc nor foxglove's classes.
 """
 
@@ -18,12 +18,12 @@ FOXGLOVE = ("CameraCalibration", "CompressedImage", "FrameTransforms", "Log", "P
 
 
 def own_files() -> list[FileDescriptorProto]:
-    """Descriptors of dmrl/v1/*.proto, compiled by protoc."""
+    """Compile dmrl/v1/*.proto with protoc and return their descriptors."""
     protos = sorted(str(p.relative_to(HERE)) for p in HERE.glob("dmrl/v1/*.proto"))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "own.binpb"
         if protoc.main(["protoc", f"-I{HERE}", f"--descriptor_set_out={out}", *protos]) != 0:
-            raise SystemExit("protoc refused the schemas; see above")
+            raise SystemExit("protoc rejected the schemas, see above")
         return list(FileDescriptorSet.FromString(out.read_bytes()).file)
 
 
@@ -37,7 +37,7 @@ def with_dependencies(file: FileDescriptor, found: dict[str, FileDescriptorProto
 
 
 def build() -> bytes:
-    """The serialized FileDescriptorSet, in one order always."""
+    """Build the serialized FileDescriptorSet, in a fixed order."""
     found: dict[str, FileDescriptorProto] = {}
     for name in FOXGLOVE:
         with_dependencies(import_module(f"foxglove_schemas_protobuf.{name}_pb2").DESCRIPTOR, found)

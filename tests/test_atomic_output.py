@@ -257,7 +257,7 @@ def test_a_link_in_place_of_the_partial_file_is_not_followed(
 def test_what_comes_between_is_not_replaced_and_the_work_is_kept(tmp_path: Path) -> None:
     for writer in (partial_file, partial_folder):
         out = tmp_path / writer.__name__
-        with pytest.raises(OutputError, match="came into being"), writer(out) as partial:
+        with pytest.raises(OutputError, match="created by another program"), writer(out) as partial:
             if partial.is_dir():
                 out.mkdir()
                 (out / "theirs").write_text("")

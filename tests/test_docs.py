@@ -20,7 +20,7 @@ PAGES = [
     *sorted(ROOT.glob("docs/*.md")),
 ]
 HAND_WRITTEN = [page for page in PAGES if page.name != "commands.md"]
-RECIPES = sorted(ROOT.glob("recipes/*.toml"))
+RECIPES = sorted(ROOT.glob("recipes/**/*.toml"))
 
 
 def command_lines(page: Path) -> list[str]:

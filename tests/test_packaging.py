@@ -113,7 +113,7 @@ def test_a_wheel_holds_every_module_and_data_file(wheel: zipfile.ZipFile) -> Non
     names = set(wheel.namelist())
     wanted = {"dmrl/py.typed", "dmrl/schemas/dmrl.binpb"}
     wanted |= {f"dmrl/{p.relative_to(ROOT)}" for p in ROOT.glob("schemas/dmrl/v1/*.proto")}
-    wanted |= {f"dmrl/{p.relative_to(ROOT)}" for p in ROOT.glob("recipes/*.toml")}
+    wanted |= {f"dmrl/{p.relative_to(ROOT)}" for p in ROOT.glob("recipes/**/*.toml")}
     for package in SETUPTOOLS["packages"]:
         place = package.replace(".", "/")
         wanted |= {f"{place}/{p.name}" for p in (ROOT / folder_of(package)).glob("*.py")}
@@ -131,6 +131,6 @@ def test_an_sdist_can_be_built_from(built: Path) -> None:
         names = {name.partition("/")[2] for name in archive.getnames()}
     wanted = {"pyproject.toml", "README.md", "LICENSE", "dmrl/py.typed", "schemas/dmrl.binpb"}
     wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("schemas/dmrl/v1/*.proto")}
-    wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("recipes/*.toml")}
+    wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("recipes/**/*.toml")}
     wanted |= {f"{FOLDER_OF[package]}/__init__.py" for package in MAPPED}
     assert wanted <= names

@@ -123,7 +123,7 @@ def test_names_of_plugins_are_offered_and_none_is_imported_before(
 ) -> None:
     install("alt-logs", "raise AssertionError('imported')", formats="altitudes = alt_logs:FORMAT")
     (tmp_path / "flight.bin").write_bytes(b"\0\1")
-    with pytest.raises(SourceError, match=r"Did you mean altitudes.* Kinds: .*images, altitudes"):
+    with pytest.raises(SourceError, match=r"Did you mean altitudes.* Formats: .*images, altitudes"):
         format_of(tmp_path / "flight.bin", "altitude")
     assert "alt_logs" not in sys.modules
 
@@ -144,7 +144,7 @@ def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
         ("FORMAT = 1", "is not a dmrl.formats.base.Format: alt_logs:FORMAT"),
         (
             FORMAT.replace("source.suffix", "source.missing"),
-            "fails to look at .*flight.alt: AttributeError",
+            "fails to check .*flight.alt: AttributeError",
         ),
         ("raise SystemExit(3)", "cannot be loaded: RuntimeError: it ends the program, with 3"),
     ],
@@ -158,7 +158,7 @@ def test_a_broken_format_is_said_and_passed_over(
     with pytest.raises(PluginError, match=f"of the package alt-logs, {said}.*uninstall alt-logs"):
         form = format_of(source, "altitudes")
         form.recognises(source)
-    with pytest.raises(SourceError, match="looks like no kind"):
+    with pytest.raises(SourceError, match="matches no known format"):
         format_of(source)
     (line,) = capsys.readouterr().err.splitlines()
     assert "of the package alt-logs" in line

@@ -147,7 +147,7 @@ def test_a_file_too_long_for_a_recipe_is_not_read_to_its_end(tmp_path: Path) -> 
         recipe.read(path)
 
 
-@pytest.mark.parametrize("name", recipe.names())
+@pytest.mark.parametrize("name", recipe.names() + recipe.pretrained_names())
 def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> None:
     head = recipe.text(name).partition("\n\n")[0].splitlines()
     assert all(line.startswith("# ") for line in head)
@@ -160,6 +160,18 @@ def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> N
 
 def test_shipped_recipes_are_those_of_the_folder() -> None:
     assert recipe.names() == sorted(path.stem for path in RECIPES.glob("*.toml"))
+    trained = sorted(path.stem for path in RECIPES.glob("pretrained/*.toml"))
+    assert recipe.pretrained_names() == trained
+    assert not set(trained) & set(recipe.names())
+
+
+def test_recipes_of_the_shipped_networks_are_found_by_name_and_listed_apart() -> None:
+    path = RECIPES / "pretrained/nano_clean.toml"
+    assert recipe.text("nano_clean") == recipe.text(path) == path.read_text(encoding="utf-8")
+    with pytest.raises(RecipeError, match=r"no recipe nano_claen\. Did you mean nano_clean\?"):
+        recipe.read("nano_claen")
+    with pytest.raises(RecipeError, match=r"week; those of the shipped networks: nano_clean, "):
+        recipe.read("zzz")
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,8 @@
-"""Recordings in rerun: a window, a file, a web page or a picture. The only home of rerun.
+"""Show recordings in rerun: a window, a file, a web page or an image. Only this package uses rerun.
 
-``entities`` (images), ``space`` (3D) and ``plots`` turn a topic's columns into archetypes,
-``layouts`` arranges them. Each file of ``views`` is a layout, and ``browse`` that of datasets;
-``follow`` joins what a flight's topics say together. ``session`` logs what ``selection`` chose;
-``window`` and ``web`` run rerun's viewer.
+* ``drawing`` converts the columns of a topic to archetypes; ``content`` joins several topics.
+* ``layouts`` arranges panels. Each file of ``views`` is a layout, ``browse`` the one of datasets.
+* ``session`` logs the images that ``selection`` chose. ``window`` runs rerun's viewer.
 """
 
 from dmrl.errors import MissingExtra

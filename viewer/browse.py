@@ -1,7 +1,7 @@
-"""Layout ``dataset``: the rows of a dataset, those first where a model is most wrong.
+"""Layout ``dataset``: the rows of a dataset, ordered by the error of a model.
 
-A model's detections come from recordings that ``dmrl predict`` wrote. A row is found in one by
-the recording it was made from, its robot and its log time.
+A model's detections come from recordings that ``dmrl predict`` wrote. A row and a message match
+by source recording, robot and log time.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,23 +36,23 @@ FACTS, ERROR_PX, ERROR_M = "/row/facts", "/row/error_px", "/row/error_m"
 ROWS_AT_ONCE = 32
 
 CHANNELS = {"confidence": layout.CONFIDENCE, "depth_m": layout.DEPTH}
-"""Channels of maps, and the columns with the maps that a network should give."""
+"""Channels of maps, and the columns with their ground truth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """Rows of a dataset in the order they are shown.
+    """Rows of a dataset in display order.
 
     Parameters
     ----------
     rows
         All columns.
     of
-        How many there would have been.
+        Number of rows before the limit.
     error_px, error_m
-        (N,) of the worst label of each row; NaN where there is nothing to judge.
+        (N,) of the worst label of each row; NaN where there is no error.
     found
-        What a model found in them; None without one.
+        Detections of a model; None without one.
     """
 
     rows: pa.Table
@@ -63,25 +63,25 @@ class Ranked:
 
 
 def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Show:
-    """A dataset, row by row.
+    """Show a dataset, row by row.
 
     Parameters
     ----------
     paths
-        The folder, and recordings with a model's detections, if any.
+        The folder, and optionally recordings with a model's detections.
     settings
-        How many rows, of which split, with which errors.
+        Selects the rows by number, split and error.
     rank
-        Only this one, from 1. None: all.
+        Only this row, from 1. None: all.
 
     Raises
     ------
     DatasetError
         If the folder is not a dataset.
     RecordingError
-        If a recording has no detections, or of other images.
+        If a recording has no detections, or only of other images.
     SettingError
-        If no row is left, or another layout was asked for.
+        If no row is left, or another layout was requested.
     """
     folder, ranked = ranked_of(paths, settings)
     if rank is not None and not 1 <= rank <= len(ranked.rows):
@@ -115,7 +115,7 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
 
 
 def ranked_of(paths: Sequence[Path], settings: Settings) -> tuple[Path, Ranked]:
-    """The folder of a dataset, and its rows in the order they are shown; see `browse`."""
+    """Return the folder of a dataset, and its rows in display order; see `browse`."""
     folder, recordings = _sorted_out(paths, settings)
     return folder, _ranked(folder, recordings, settings)
 
@@ -130,14 +130,14 @@ def _sorted_out(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[P
 
 
 def _ranked(folder: Path, recordings: Sequence[Path], settings: Settings) -> Ranked:
-    """The rows that are asked for: by error where a model is given, else as they stand."""
+    """Return the selected rows: by error if a model is given, else in their order."""
     rows = _rows(folder, settings)
     filtered = settings.error_from_px is not None or settings.error_to_px is not None
     if recordings:
         return _worst_first(folder, rows, recordings, settings, filtered=filtered)
     if filtered:
         raise SettingError(
-            "errors are those of a model: name its recording as well. "
+            "errors require a model: name its recording as well. "
             "Try: dmrl predict MODEL IN.mcap OUT.mcap"
         )
     chosen = np.arange(len(rows))[:: settings.every][: settings.most]
@@ -146,7 +146,7 @@ def _ranked(folder: Path, recordings: Sequence[Path], settings: Settings) -> Ran
 
 
 def _rows(folder: Path, settings: Settings) -> pa.Table:
-    """Rows of the split and the robot that are asked for; of all, where none is."""
+    """Read the rows of the selected split and robot; of all by default."""
     dataset = open_dataset(folder)
     splits = dataset.splits if settings.split is None else (settings.split,)
     tables = [dataset.split(name).table for name in splits]
@@ -165,13 +165,13 @@ def _worst_first(
     error_px, error_m = errors_of_rows(rows, found, image_size(rows))
     low = -1.0 if settings.error_from_px is None else settings.error_from_px
     high = np.inf if settings.error_to_px is None else settings.error_to_px
-    # Images that show nobody have no error; unless errors are asked for, they come last.
+    # Images without a peer have no error; unless a range of errors is requested, they come last.
     kept = (error_px >= low) & (error_px <= high) | (np.isnan(error_px) & (not filtered))
     order = np.argsort(np.nan_to_num(-error_px, nan=np.inf), kind="stable")
     order = order[kept[order]]
     if not len(order):
         raise SettingError(
-            f"no row of {folder} has such an error: they go from {np.nanmin(error_px):.2f} to "
+            f"no row of {folder} has such an error: errors are {np.nanmin(error_px):.2f} to "
             f"{np.nanmax(error_px):.2f} px. Change --error-from-px or --error-to-px"
         )
     chosen = order[:: settings.every][: settings.most]
@@ -181,19 +181,19 @@ def _worst_first(
 
 
 def keys(rows: pa.Table) -> list[Key]:
-    """What each row was made from: recording, robot, log time."""
+    """Return the source recording, robot and log time of each row."""
     names = ("source", "robot", "log_time")
     return list(zip(*(rows[name].to_pylist() for name in names), strict=True))
 
 
 def grid_shape(rows: pa.Table) -> tuple[int, int]:
-    """Rows and columns of the maps of a table of rows."""
+    """Return the rows and columns of the maps of a table of rows."""
     kind = rows.schema.field(layout.CONFIDENCE).type
     return kind.list_size, kind.value_type.list_size
 
 
 def image_size(rows: pa.Table) -> tuple[int, int]:
-    """Width and height, pixels."""
+    """Return width and height of the images, pixels."""
     high, wide = grid_shape(rows)
     return wide * STRIDE_PX, high * STRIDE_PX
 
@@ -271,7 +271,7 @@ def _pictures(eye: Eye, batch: pa.RecordBatch) -> Entity:
 
 
 def _true_maps(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """The maps that a network should give, as columns of GridMap."""
+    """Return the ground truth of the maps as columns of GridMap."""
     flat = [
         np.asarray(batch[column].flatten().flatten(), "<f4").reshape(batch.num_rows, -1)
         for column in CHANNELS.values()
@@ -290,19 +290,19 @@ def _true_maps(batch: pa.RecordBatch) -> pa.RecordBatch:
 
 
 def _facts(ranked: Ranked, row: int) -> str:
-    """What a row is, in Markdown."""
+    """Describe a row in Markdown."""
     one = {
         name: ranked.rows[name][row].as_py() for name in ("source", "robot", "log_time", "split")
     }
     lines = [f"# {row + 1} of {len(ranked.rows)}"]
     if ranked.found is None:
-        lines.append("Maps: what a network should give.")
+        lines.append("Maps: ground truth.")
     elif np.isnan(ranked.error_px[row]):
-        lines.append("Shows nobody: no error.")
+        lines.append("No peer in view: no error.")
     else:
         lines += [
-            f"**{ranked.error_px[row]:.1f} px** off",
-            f"**{ranked.error_m[row]:.2f} m** in depth",
+            f"**{ranked.error_px[row]:.1f} px** pixel error",
+            f"**{ranked.error_m[row]:.2f} m** depth error",
         ]
     lines += [
         f"recording {one['source']}",

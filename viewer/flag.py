@@ -1,7 +1,7 @@
-"""A page to mark rows of a dataset as bad: pictures to click, and a CSV file to save.
+"""Write a page to mark bad rows of a dataset: images to click, and a CSV file to save.
 
-rerun tells a program nothing of what is clicked in it, so this is a page of its own: one HTML file
-that opens offline, with the rows in the order of the layout ``dataset``.
+rerun reports no clicks to a program, so this is a separate page: one HTML file that opens offline,
+with the rows in the order of the layout ``dataset``.
 """
 
 import io
@@ -26,7 +26,7 @@ from dmrl.viewer.browse import Ranked, image_size, ranked_of
 from dmrl.viewer.selection import Settings
 
 WIDE_PX = 240
-"""Of a small picture."""
+"""Width of an image on the page, pixels."""
 STYLE = """
 :root { color-scheme: light dark; font: 15px/1.4 system-ui, sans-serif }
 body { margin: 0 auto; max-width: 80rem; padding: 0 1rem 4rem }
@@ -57,23 +57,23 @@ show();
 
 
 def flag(paths: Sequence[Path], out: Path, settings: Settings) -> int:
-    """Write the page of a dataset's rows; how many stand on it.
+    """Write the page of a dataset's rows, and return their number.
 
     Parameters
     ----------
     paths
-        The dataset, and recordings with a model's detections, if any: then worst first.
+        The dataset, and optionally recordings with a model's detections: then worst rows first.
     out
         Page to write. Must not exist.
     settings
-        Which rows, and how many.
+        Selects the rows and their number.
 
     Raises
     ------
     DatasetError
-        If there is no such dataset, or no such row.
+        If the dataset or the rows do not exist.
     SettingError
-        If something else than a dataset is named.
+        If the paths contain no dataset.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -84,7 +84,7 @@ def flag(paths: Sequence[Path], out: Path, settings: Settings) -> int:
 
 
 def page(name: str, ranked: Ranked) -> str:
-    """The page, HTML; names of files are shown as text, never as markup."""
+    """Build the page, HTML; file names are escaped."""
     policy = (
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
         f"script-src 'sha256-{_digest(SCRIPT)}'"
@@ -96,8 +96,8 @@ def page(name: str, ranked: Ranked) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{_text(name)}</title><style>{STYLE}</style></head><body><header>"
-        f"<b>{_text(name)}</b>: {len(ranked.rows)}{more} rows. Click those that are bad, "
-        "<output></output> marked: <button>save flags.csv</button> then "
+        f"<b>{_text(name)}</b>: {len(ranked.rows)}{more} rows. Click the bad ones. "
+        "<output></output> marked: <button>save flags.csv</button>, then run "
         f"<code>dmrl dataset ... --without flags.csv</code></header><main>{cells}</main>"
         f"<script>{SCRIPT}</script></body></html>\n"
     )
@@ -117,7 +117,7 @@ def _cells(ranked: Ranked) -> Iterator[str]:
         row = ranked.rows.slice(k, 1).to_pylist()[0]
         value = escape(json.dumps([row[name] for name in NEEDED]))
         error = ranked.error_px[k]
-        judged = f", {error:.1f} px off" if np.isfinite(error) else ""
+        judged = f", error {error:.1f} px" if np.isfinite(error) else ""
         words = f"{row['source']}, {row['robot']}, {row['log_time'] / 1e9:.2f} s{judged}"
         yield (
             f'<label><input type="checkbox" value="{value}">{_drawing(row, wide, high)}'
@@ -126,7 +126,7 @@ def _cells(ranked: Ranked) -> Iterator[str]:
 
 
 def _drawing(row: dict[str, object], wide: int, high: int) -> str:
-    """The picture, small, with a box or a ring around every labelled peer."""
+    """Draw a small image with a circle around every labelled peer."""
     size = (WIDE_PX, max(1, round(high * WIDE_PX / wide)))
     small = encode_jpeg(crop_and_scale(_pixels(row, wide, high), (0, 0, wide, high), *size), 80)
     marks = io.StringIO()

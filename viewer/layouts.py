@@ -1,6 +1,6 @@
 """Layouts of the viewer (rerun blueprints), in code.
 
-Panels of one robot have the same bounds, so a cell of a map stands where its pixels stand.
+Panels of one robot have equal bounds, so a map's cell has the same position as its pixels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,26 +15,27 @@ from dmrl.viewer.drawing.legend import HEIGHT_PX, bar_path, legend_path
 
 TIMELINE = "log_time"
 BACKGROUND = (24, 24, 24)
-# Texts stand on a translucent grey, on which they cannot be read over a bright image.
+# Labels have a translucent grey background and are unreadable over a bright image.
 IMAGE_OPACITY, BELOW_MAP_OPACITY = 0.75, 0.4
 MARGIN_PX = 4
 TRAIL_S = 4.0
+"""Length of a trail in a 3D view, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Eye:
-    """What is seen in the images of one camera, as far as a layout must know it.
+    """Content of the panels of one camera.
 
     Parameters
     ----------
     robot
-        Whose camera.
+        Robot that carries the camera.
     title
-        What its panels are called.
+        Start of the panels' titles.
     width_px, height_px
         Size of the images.
     picture, labels, detections, grid
-        Where they stand.
+        Entity paths.
     channels
         Channels of the grid that are shown.
     """
@@ -57,13 +58,13 @@ class Space:
     Parameters
     ----------
     frame
-        What stands still in it.
+        Fixed frame of the view.
     contents
         Entities.
     trails
-        Those of which the last seconds are shown.
+        Entities that show their last seconds.
     position, target
-        Where the eye is, and where it looks, metres.
+        Position of the eye, and the point that it faces, metres.
     """
 
     frame: str
@@ -80,13 +81,13 @@ class Plot:
     Parameters
     ----------
     title
-        What is plotted, with its unit.
+        Quantity and unit.
     contents
         Entities.
     range
-        Fixed ends of the vertical axis; None: as the data are.
+        Fixed limits of the vertical axis; None: limits of the data.
     band
-        States in place of numbers.
+        Show states in place of numbers.
     """
 
     title: str
@@ -96,13 +97,13 @@ class Plot:
 
 
 def image(eyes: Sequence[Eye], scales: Mapping[str, Scale], *, overlay: bool) -> rrb.Blueprint:
-    """Images with labels and detections; confidence and depth maps beside them.
+    """Build a layout of images with labels and detections, and their maps beside them.
 
     Parameters
     ----------
     eyes
-        A single one fills the window, with one panel more: confidence laid over the
-        image. Of several, each has a row.
+        A single camera fills the window and gets an extra panel: confidence laid over the image.
+        Several cameras get a row each.
     scales
         Colours of the channels of the grids.
     overlay
@@ -130,7 +131,7 @@ def compare(
     *,
     overlay: bool,
 ) -> rrb.Blueprint:
-    """A row for each model, below them their errors over time and a table of them."""
+    """Build a layout with a row per model; below them, their errors over time and a table."""
     rows = _rows(eyes, scales, overlay=overlay)
     if not plots:
         return window(rows)
@@ -144,7 +145,7 @@ def flight(
     eyes: Sequence[Eye],
     plots: Mapping[str, Sequence[Plot]],
 ) -> rrb.Blueprint:
-    """Space and images above, plots below.
+    """Build a layout with 3D views and images above, and plots below.
 
     Parameters
     ----------
@@ -173,7 +174,7 @@ def flight(
 
 
 def _columns(panels: int) -> int:
-    """Columns of a grid of plots, the more the fewer of its places stay empty."""
+    """Choose the number of columns that leaves the fewest places of a grid of plots empty."""
     return min((4, 3, 5), key=lambda columns: -panels % columns) if panels > 4 else panels
 
 
@@ -186,7 +187,7 @@ def dataset(
     timeline: str,
     overlay: bool,
 ) -> rrb.Blueprint:
-    """Row by row: image and maps, what the row is, and how large the errors are."""
+    """Build a layout for one row at a time: image and maps, facts about the row, and its error."""
     views = eye_views(eye, scales, both=not overlay, overlay=overlay)
     words = rrb.TextDocumentView(origin=escaped(facts), name="row")
     side = [words] if plot is None else [words, plot_view(plot)]
@@ -199,7 +200,7 @@ def dataset(
 
 
 def window(panels: rrb.Container, timeline: str = TIMELINE) -> rrb.Blueprint:
-    """Panels in a window that waits at the start."""
+    """Build a window with these panels, paused at the start."""
     return rrb.Blueprint(
         panels,
         rrb.TopPanel(state="hidden"),
@@ -214,7 +215,7 @@ def window(panels: rrb.Container, timeline: str = TIMELINE) -> rrb.Blueprint:
 def eye_views(
     eye: Eye, scales: Mapping[str, Scale], *, both: bool = False, overlay: bool = False
 ) -> list[rrb.View]:
-    """The image, and a panel for each map; ``both``: confidence also laid over the image."""
+    """Build views of the image and of each map; ``both``: also confidence over the image."""
     picture = escaped(eye.picture)
     found = [eye.detections, texts_path(eye.detections)]
     marks = [f"{escaped(eye.labels)}/**", *map(escaped, found)]
@@ -294,7 +295,7 @@ def _space_view(space: Space) -> rrb.View:
 
 
 def plot_view(plot: Plot) -> rrb.View:
-    """A panel over time; all of them show the same stretch of it."""
+    """Build a panel over time; all such panels share their time range."""
     contents = [escaped(path) for path in plot.contents]
     shared = rrb.archetypes.TimeAxis(link="LinkToGlobal")
     if plot.band:
@@ -308,6 +309,6 @@ def plot_view(plot: Plot) -> rrb.View:
         axis_x=shared,
         axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
         plot_legend=rrb.PlotLegend(corner="RightTop"),
-        # A browser may have a light theme, on which bright lines cannot be seen.
+        # A browser may have a light theme, on which bright lines are invisible.
         background=rrb.archetypes.PlotBackground(color=BACKGROUND),
     )

@@ -1,4 +1,4 @@
-"""Which topics of a selection are drawn, and by what: read in one pass, stretch by stretch."""
+"""Draw the topics of a selection in one pass over the recordings, batch by batch."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ Still = tuple[Times | None, Entity]
 Stretch = dict[str, pa.RecordBatch]
 
 ROWS_AT_ONCE = 20_000
-"""Messages that belong to no image are drawn so many at a time: half a minute of two robots."""
+"""Messages without an image are drawn in batches of this size: half a minute of two robots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +42,11 @@ class Draw:
     topic
         Topic.
     entities
-        From columns of its messages.
+        Converts columns of its messages to entities.
     robot
         Only messages with the log time of an image of this robot that is shown. None: all.
     recording
-        Only from this recording. None: from all.
+        Only messages of this recording. None: of all.
     """
 
     topic: str
@@ -66,15 +66,15 @@ class Scene:
     draws
         How topics are drawn, image by image or message by message.
     stills
-        What is known before: with log times, or for ever.
+        Entities that need no reading: with log times, or static.
     eyes
         Cameras that have a legend.
     sources
-        Robot to sources of its labels; grows as they are read.
+        Robot to sources of its labels; updated as they are read.
     named
-        Names and colours of what else the legends explain.
+        Names and colours of further entries of the legends.
     follower
-        Makes one that draws what several topics say together; None: nothing does.
+        Makes a streamer that draws the joined topics of a flight; None: not needed.
     """
 
     blueprint: rrb.Blueprint
@@ -86,13 +86,13 @@ class Scene:
     follower: Callable[[], Follower] | None = None
 
     def topics(self, path: Path) -> list[str]:
-        """What is read of a recording."""
+        """Return the topics that are read from a recording."""
         drawn = [draw.topic for draw in self.draws if draw.recording in (None, path)]
         return drawn + (self.follower().topics if self.follower else [])
 
 
 def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
-    """The whole scene: what stands still, then all that moves, by time, images first."""
+    """Yield the whole scene: static entities, then the others by time, images first."""
     yield from _timed(selection, scene.stills)
     follower = scene.follower() if scene.follower else None
     of_images = {draw.topic for draw in scene.draws if draw.robot is not None}
@@ -111,9 +111,9 @@ def logged(selection: Selection, scene: Scene) -> Iterator[Logged]:
 
 
 def _gathered(parts: Iterable[Stretch], of_images: Set[str]) -> Iterator[Stretch]:
-    """What belongs to images at once, of all else more at a time: each call of rerun costs.
+    """Yield images at once and all other messages in larger batches: each call of rerun is slow.
 
-    The first part comes whole.
+    The first part is yielded whole.
     """
     held: dict[str, list[pa.RecordBatch]] = {}
     count = ROWS_AT_ONCE
@@ -138,7 +138,7 @@ def _timed(selection: Selection, stills: Iterable[Still]) -> Iterator[Logged]:
 
 
 def _legends(scene: Scene, shown: dict[str, set[str]]) -> Iterator[Logged]:
-    """Legends that are not as they were ``shown``."""
+    """Yield the legends that differ from those already ``shown``."""
     for robot, eye in {eye.robot: eye for eye in scene.eyes}.items():
         sources = scene.sources.get(robot, set())
         if shown.get(robot) != sources and (sources or scene.named):
@@ -184,7 +184,7 @@ def _legend(eye: Eye, sources: set[str], named: Mapping[str, Colour]) -> Entity:
 def firsts(
     selection: Selection, wanted: Iterable[str], only: Path | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Fields of the first message of each of these topics, where there is one."""
+    """Read the first message of each of these topics, if any."""
     wanted, found = list(wanted), dict[str, dict[str, Any]]()
     for path, kept in selection.recordings.items():
         if only not in (None, path):
@@ -207,12 +207,12 @@ def eyes_of(
     *,
     model: Path | None = None,
 ) -> list[Eye]:
-    """Cameras of robots, with what one recording's model found, or any.
+    """Build the panels of robots' cameras, with detections of one recording's model or any.
 
     Raises
     ------
     SourceError
-        If a first image is none.
+        If a first image cannot be decoded.
     """
     first = firsts(selection, map(topics.camera_image, robots))
     grids = firsts(selection, map(topics.grid, robots), model) if scales else {}
@@ -239,7 +239,7 @@ def eyes_of(
 
 
 def picture_draws(eye: Eye, sources: set[str]) -> list[Draw]:
-    """A camera's images and their labels."""
+    """Return how a camera's images and their labels are drawn."""
     frame = image_frame(eye.robot)
     return [
         Draw(eye.picture, partial(entities.images, eye.picture, frame), eye.robot),
@@ -265,7 +265,7 @@ def model_draws(
     smooth: bool,
     recording: Path | None = None,
 ) -> list[Draw]:
-    """What a model found in a camera's images."""
+    """Return how the detections and maps of a camera are drawn."""
     frame, robot = image_frame(eye.robot), eye.robot
     shown = {name: scales[name] for name in eye.channels if name in scales}
     found = partial(
@@ -277,7 +277,7 @@ def model_draws(
 
 
 def bars(eye: Eye, scales: Mapping[str, Scale]) -> list[Still]:
-    """The colour bars of a camera's maps."""
+    """Return the colour bars of a camera's maps."""
     shown = {channel: scales[channel] for channel in eye.channels}
     drawn = colour_bars(eye.robot, shown, eye.width_px, eye.height_px)
     return [(None, entity) for entity in drawn]

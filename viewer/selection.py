@@ -1,4 +1,4 @@
-"""Which images and which stretch of which recordings are shown."""
+"""Select the recordings, images and time span that are shown."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,22 +15,23 @@ from dmrl.recording import Summary, log_times, summary
 from dmrl.terminal.progress import say
 from dmrl.viewer.views import NAMES
 
-# Log times below this do not count from 1970 but from the start of a simulation.
 DURATION_BELOW_NS = 10 * 365 * 86400 * 10**9
+"""Log times below this count from the start of a simulation, not from 1970."""
 
 LEAD_NS = 1_000_000_000
-"""Measurements so long before the first image are left out."""
+"""Longest lead of measurements before the first image that is left out."""
 
 MARKS = (topics.LABELS, topics.DETECTIONS, topics.GRID)
 MEASURED = tuple(row.pattern for row in topics.PAIR_SENSORS)
 PAIRWISE = (*MEASURED, topics.POSITION, topics.TRUTH)
 FLIGHT = (*PAIRWISE, topics.TRACKS, *(row.pattern for row in topics.OWN_SENSORS))
-"""Topics that the layout ``flight`` is for."""
+"""Topics that the layout ``flight`` shows."""
 
 OF_IMAGES = ("image", "compare")
-"""Layouts that are nothing without images."""
+"""Layouts that require images."""
 
 MANY_PAIRS = 6
+"""Largest number of pairs of robots that are shown without a choice."""
 
 if TYPE_CHECKING:
     Layout = str
@@ -43,27 +44,27 @@ Pixels = Annotated[float | None, Parameter(validator=validators.Number(gte=0))]
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is shown, and how.
+    """Images and layout of a viewer.
 
     Parameters
     ----------
     layout
         image: images and maps. flight: 3D, plots and images. compare: two models, one recording
-        each. dataset: a dataset, worst first. auto: what fits.
+        each. dataset: a dataset, worst first. auto: chosen by content.
     robot
-        Only what this robot sees. Without it: every robot, in compare the first.
+        Only images and measurements of this robot. Without it: every robot, in compare the first.
     from_s
         First image shown, seconds from the start of the earliest recording.
     to_s
         First image left out, seconds from the start.
     every
-        Show one image in so many, with what belongs to it.
+        Show one image in this many, with its labels and detections.
     depth_max_m
         Depth of the last colour of depth maps, metres. The first is 0 m.
     overlay
         Lay the maps over the image, scaled up smoothly.
     most
-        dataset: show so many rows at most.
+        dataset: largest number of rows shown.
     split
         dataset: only rows of this split.
     error_from_px
@@ -87,7 +88,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Recordings, and what of them is shown.
+    """Recordings, and the images and time span that are shown.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ class Selection:
     image_ns
         Robot to sorted log times of its images, at least one each.
     all_images
-        None between the first and the last is left out.
+        No image between the first and the last is left out.
     """
 
     recordings: Mapping[Path, Summary]
@@ -128,25 +129,25 @@ class Selection:
         return None if self.shown_ns[1] > DURATION_BELOW_NS else self.start_ns
 
     def found(self, pattern: str) -> list[dict[str, str]]:
-        """Robots and peers of the topics of a pattern that hold messages, sorted."""
+        """Return robots and peers of the topics of a pattern that have messages, sorted."""
         names = (topics.names(pattern, topic) for topic in _topics_of(self.recordings))
         return [n for n in names if n is not None]
 
     def pairs(self, robot: str | None) -> list[Names]:
-        """Who sees or measures whom; only what one robot sees, if one is named."""
+        """Return the pairs of observer and peer; of one observer, if one is named."""
         found = {(n["robot"], n["peer"]) for p in PAIRWISE for n in self.found(p)}
         return sorted(pair for pair in found if robot in (None, pair[0]))
 
 
 def select(paths: Sequence[Path], settings: Settings) -> Selection:
-    """What the settings ask for.
+    """Select recordings, images and time span by the settings.
 
     Raises
     ------
     RecordingError
-        If no recording has what the layout shows, or one cannot be read.
+        If no recording has data for the layout, or one cannot be read.
     SettingError
-        If nothing lies between ``from_s`` and ``to_s``, or the robot is not there.
+        If nothing lies between ``from_s`` and ``to_s``, or the robot is not in the recordings.
     """
     found = {path: summary(path) for path in dict.fromkeys(paths)}
     names = ", ".join(str(path) for path in found)
@@ -166,7 +167,7 @@ def select(paths: Sequence[Path], settings: Settings) -> Selection:
 
 
 def _layout(every: list[str], names: str, settings: Settings) -> tuple[Layout, list[str]]:
-    """How topics are shown, and of which robots the images."""
+    """Choose the layout, and the robots whose images are shown."""
     layout = settings.layout if settings.layout != "auto" else _fitting(every)
     if layout == "dataset":
         raise SettingError(f"{names}: layout dataset is for datasets. Make one: dmrl dataset")
@@ -181,18 +182,18 @@ def _layout(every: list[str], names: str, settings: Settings) -> tuple[Layout, l
 
 
 def _topics_of(found: Mapping[Path, Summary]) -> list[str]:
-    """Topics that hold messages, sorted."""
+    """Return the topics that have messages, sorted."""
     return sorted({t for kept in found.values() for t, info in kept.topics.items() if info.count})
 
 
 def _whole(found: Mapping[Path, Summary]) -> tuple[int, int]:
-    """Log times [first, end) of all that the recordings hold; one of them at least holds some."""
+    """Return the time span [first, end) of all recordings that have messages."""
     held = [kept for kept in found.values() if kept.count]
     return min(kept.start_ns for kept in held), max(kept.end_ns for kept in held) + 1
 
 
 def _asked(settings: Settings, whole: tuple[int, int]) -> tuple[int, int]:
-    """Log times that the flags ask for, [from, to); where they say nothing, all there are."""
+    """Return the requested time span [from, to); by default, that of the recordings."""
     seconds = settings.from_s, settings.to_s
     lower, upper = (
         edge if s is None else whole[0] + _nanoseconds(s)
@@ -204,27 +205,27 @@ def _asked(settings: Settings, whole: tuple[int, int]) -> tuple[int, int]:
 def _shown(
     layout: Layout, image_ns: Mapping[str, Times], asked: tuple[int, int], whole: tuple[int, int]
 ) -> tuple[int, int]:
-    """Log times [first, end) of what is shown, images and all else."""
+    """Return the time span [first, end) of images and all other data that are shown."""
     lower, upper = max(asked[0], whole[0]), min(asked[1], whole[1])
     if not image_ns:
         return lower, upper
     first_image = min(int(times[0]) for times in image_ns.values())
     if layout in OF_IMAGES:
-        # What lies before the first image and after the last belongs to none.
+        # Messages before the first image or after the last belong to no image.
         return first_image, max(int(times[-1]) for times in image_ns.values()) + 1
-    # A viewer opens at the start, where it should have something to show.
+    # A viewer opens at the start, which should not be empty.
     return (first_image if first_image - lower <= LEAD_NS else lower), upper
 
 
 def _nanoseconds(seconds: float) -> int:
     if not np.isfinite(seconds):
-        raise SettingError(f"{seconds} s is no time. Give seconds from the start")
+        raise SettingError(f"{seconds} s is not a time. Give seconds from the start")
     return round(seconds * 1e9)
 
 
 def _fitting(every: Sequence[str]) -> Layout:
     measured = _of(every, (*MEASURED, topics.POSITION, topics.TRACKS))
-    # Labels and detections are nothing without their images, which somebody forgot.
+    # Labels and detections need their images, which are in another recording.
     blind = not topics.robots(list(every)) and not _of(every, MARKS)
     return "flight" if measured or (blind and _of(every, FLIGHT)) else "image"
 
@@ -234,7 +235,7 @@ def _of(every: Iterable[str], patterns: Sequence[str]) -> bool:
 
 
 def _robots(every: list[str], names: str, wanted: str | None) -> list[str]:
-    """Robots with images, or the one that is wanted."""
+    """Return the robots with images, or the requested one."""
     robots = topics.robots(every)
     if wanted is None:
         return robots
@@ -251,7 +252,7 @@ def _say_blind(every: list[str]) -> None:
 
 
 def at_time(selection: Selection, time_s: float | None) -> Selection:
-    """One image of each robot: the one nearest to a time. Plots stay whole around it.
+    """Select one image of each robot, the nearest to a time. Plots keep the whole time span.
 
     Parameters
     ----------
@@ -268,7 +269,7 @@ def at_time(selection: Selection, time_s: float | None) -> Selection:
         for robot, times in selection.image_ns.items()
     }
     moment = replace(selection, image_ns=nearest, all_images=False)
-    # Of layouts with plots a picture shows all of them.
+    # A screenshot of a layout with plots shows their whole time span.
     if selection.layout != "image":
         return moment
     first = min(int(times[0]) for times in nearest.values())
@@ -276,7 +277,7 @@ def at_time(selection: Selection, time_s: float | None) -> Selection:
 
 
 def moment_ns(selection: Selection, time_s: float | None) -> int:
-    """Log time that a picture shows: of the image that was chosen, or the time asked for."""
+    """Return the log time of a screenshot: of the chosen image, or the requested time."""
     if selection.image_ns or time_s is None:
         return selection.last_image_ns
     first, end = selection.shown_ns

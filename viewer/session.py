@@ -1,4 +1,4 @@
-"""Log what is asked for into a rerun stream or file."""
+"""Log a selection into a rerun stream or file."""
 
 import os
 import shutil
@@ -19,11 +19,11 @@ from dmrl.viewer.selection import Settings, at_time, moment_ns, select
 from dmrl.viewer.show import Logger, Show, cursor_at, stream_of
 
 PIECE_BYTES = 1 << 20
-"""Of an .rrd file, written at once."""
+"""Size of the pieces in which an .rrd file is written."""
 
 
 def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
-    """Write what would be shown, with its layout, as an .rrd file.
+    """Write the selected images, with their layout, as an .rrd file.
 
     Returns
     -------
@@ -37,9 +37,9 @@ def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
     OutputError
         If ``out`` exists or cannot be written.
     RecordingError
-        If no recording has what the layout shows, or one cannot be read.
+        If no recording has data for the layout, or one cannot be read.
     SettingError
-        If nothing lies in the time asked for, or the layout does not fit.
+        If the recordings are empty at the requested time, or the layout does not fit.
     """
     show = prepare(paths, settings)
     with partial_file(out) as unfinished:
@@ -55,7 +55,7 @@ def prepare(
     time_s: float | None = None,
     rank: int = 1,
 ) -> Show:
-    """What the settings ask for; ``picture``: one image only, at a time or of a rank.
+    """Prepare a show from the settings; ``picture``: one image only, by time or rank.
 
     Raises
     ------
@@ -80,12 +80,12 @@ def prepare(
 
 
 def write(show: Show, path: Path) -> None:
-    """Write an .rrd file, whatever stands at ``path``.
+    """Write an .rrd file, and replace any file at ``path``.
 
     Raises
     ------
     OSError
-        If the disk refuses.
+        If writing fails.
     """
     with _written_here(path) as (pipe, still_written):
         stream = stream_of()
@@ -99,10 +99,10 @@ def write(show: Show, path: Path) -> None:
 
 @contextmanager
 def _written_here(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
-    """A pipe to write to, by name, and whether what comes through still reaches ``path``.
+    """Yield a pipe that is copied to a file, and a function that is False after an error.
 
-    rerun tells of a failed write by a word on standard error, and then may wait for its writer
-    for ever (0.41). So it never sees the disk: the pipe takes everything, to its end.
+    rerun reports a failed write only on standard error, and may then wait for its writer for ever
+    (0.41). So it never writes to the disk itself: the pipe accepts everything, to its end.
     """
     refused: list[OSError] = []
     ear, mouth = os.pipe()
@@ -139,8 +139,7 @@ def log(show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lam
         logger.log(times, entity)
 
 
-# Loaded when they are shown: the picture waits for what is imported, and compare and dataset
-# judge models.
+# Imported when they are shown: compare and dataset import model evaluation, which takes time.
 _DATASET = "dmrl.viewer.browse:browse"
 
 

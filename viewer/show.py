@@ -1,4 +1,4 @@
-"""A show: entities to log, their timeline and their layout; and how a stream logs them."""
+"""Entities to log with their timeline and layout, and the stream that logs them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ Logged = tuple[rr.TimeColumn | None, Entity]
 
 @dataclass(frozen=True, slots=True)
 class Show:
-    """Everything that a viewer is given.
+    """Input of a viewer.
 
     Parameters
     ----------
@@ -24,13 +24,13 @@ class Show:
     blueprint
         Its layout.
     logged
-        Rows with their times, in the order in which they are to be seen; None: never changes.
+        Yields rows with their times, in display order; time None: static.
     images
         Number of images.
     cursor
-        Timeline and place in it that a picture shows.
+        Timeline and position on it, for a screenshot.
     moment
-        The same in words.
+        The same position in words.
     """
 
     title: str
@@ -43,13 +43,13 @@ class Show:
 
 @dataclass(slots=True)
 class Logger:
-    """Logs entities to a stream, the style of each once."""
+    """Log entities to a stream, the style of each once."""
 
     stream: rr.RecordingStream
     styled: set[str] = field(default_factory=set)
 
     def log(self, times: rr.TimeColumn | None, entity: Entity) -> None:
-        """Send some rows, or what never changes."""
+        """Log some rows, or a static entity."""
         path = escaped(entity.path)
         if times is None or entity.path not in self.styled:
             self.styled.add(entity.path)
@@ -62,8 +62,8 @@ class Logger:
 
 
 def stream_of() -> rr.RecordingStream:
-    """A stream without a sink yet. Misuse of rerun is an error from here on."""
-    # It would log a warning and go on.
+    """Open a stream without a sink. From then on, misuse of rerun raises an error."""
+    # The default logs a warning and continues.
     rr.set_strict_mode(True)
     stream = rr.RecordingStream("dmrl")
     # rerun's own log_time is the time of the call.
@@ -73,14 +73,14 @@ def stream_of() -> rr.RecordingStream:
 
 
 def time_column(timeline: str, time_ns: Times, start_ns: int | None) -> rr.TimeColumn:
-    """Log times as seconds from a start, as ``--time`` has them; without one, as dates."""
+    """Convert log times to seconds from a start, as in ``--time``; without a start, to dates."""
     if start_ns is None:
         return rr.TimeColumn(timeline, timestamp=time_ns.astype("datetime64[ns]"))
     return rr.TimeColumn(timeline, duration=(time_ns - start_ns).astype("timedelta64[ns]"))
 
 
 def cursor_at(timeline: str, time_ns: int, start_ns: int | None) -> tuple[str, np.generic]:
-    """A log time as `Show` wants it."""
+    """Convert a log time to the cursor of a `Show`."""
     if start_ns is None:
         return timeline, np.datetime64(time_ns, "ns")
     return timeline, np.timedelta64(time_ns - start_ns, "ns")

@@ -1,7 +1,8 @@
-"""The card of a dataset: README.md, croissant.json and figures/ in its folder.
+"""Write the card of a dataset: README.md, croissant.json and figures/ in its folder.
 
-Everything on it is counted from the data or read from provenance.json, so it can be written
-again at any time. Kept from the card before: title, license, and what stands below ``YOURS``.
+All its content is counted from the data or read from provenance.json, so the card can be written
+again at any time. From the old card these are kept: title, license, and the text below the line
+``USER_TEXT_MARK``.
 """
 
 from pathlib import Path
@@ -26,6 +27,7 @@ from dmrl.recording.provenance import FILE_NAME
 from dmrl.terminal.progress import say
 
 YOURS = "<!-- What you write below this line stays when dmrl writes the card again. -->"
+"""Last line of the generated card. Cards written before contain it, so it never changes."""
 
 plots: ModuleType | None
 try:
@@ -41,23 +43,23 @@ def write_card(
     license_id: str | None = None,
     into: Path | None = None,
 ) -> Path:
-    """Path of the README.md that was written into a dataset's folder.
+    """Write the README.md of a dataset, and return its path.
 
     Parameters
     ----------
     folder
         A dataset.
     title, license_id
-        None: as the card before has them, or as the dataset was made.
+        None: those of the old card, or of the dataset's settings.
     into
-        Another folder to write it into. None: the dataset's, in place of the card before.
+        Another folder for the card. None: the dataset's own, where it replaces the old card.
 
     Raises
     ------
     DatasetError
-        If the folder is not a dataset, lacks a shard, or its provenance.
+        If the folder is not a dataset, or lacks a shard or its provenance.
     SettingError
-        If the licence is not known.
+        If the licence is unknown.
     """
     if license_id is not None:
         check_license(license_id)
@@ -100,7 +102,7 @@ def write_card(
 
 
 def _yours(readme: Path) -> str:
-    """What a hand has written below the line of a card; empty where there is none."""
+    """Return the text that a person wrote below the last line of the card; empty without any."""
     try:
         return readme.read_text(encoding="utf-8").partition(YOURS)[2] if readme.is_file() else ""
     except UnicodeDecodeError as e:
@@ -115,7 +117,7 @@ def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> 
         raise DatasetError(f"{folder} is a link to another folder. Remove it")
     folder.mkdir(exist_ok=True)
     for old in folder.iterdir():
-        if old.is_symlink():  # it would be written through
+        if old.is_symlink():  # writing would change the file that it points to
             raise DatasetError(f"{old} is a link to another file. Remove it")
     height_px, width_px = next(iter(splits.values())).image_shape
     every = np.concatenate([c.uv_px for c in counts.values()])

@@ -1,4 +1,4 @@
-"""Croissant: what a dataset is, for the search engines and loaders that read its JSON-LD.
+"""Describe a dataset in Croissant, the JSON-LD that search engines and loaders read.
 
 Version 1.0 of MLCommons' vocabulary, https://docs.mlcommons.org/croissant/docs/croissant-spec.html.
 """
@@ -49,18 +49,18 @@ def croissant(
     files: Mapping[str, Sequence[Path]],
     parquet: bool,
 ) -> str:
-    """The JSON document of a dataset.
+    """Build the JSON document of a dataset.
 
     Parameters
     ----------
     splits
         By name.
     made
-        How it was made.
+        Provenance of the dataset.
     title, license_id
         As on the card.
     licences
-        Licences of what it was made from, by the name of the asset.
+        Licences of the source files, by name of the file.
     files
         Shards of each split, relative to the document.
     parquet
@@ -137,7 +137,7 @@ def _source(split: str, column: str, path: str) -> dict[str, Any]:
 
 
 def _peer(split: str, column: pa.Field, sizes: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """The fields of what stands several times in a row, one list each."""
+    """Yield the fields of a column with several peers per row, each as a list."""
     for inner in column.type.value_type:
         where = f"{column.name}.{inner.name}"
         field = _field(f"{split}/{column.name}/{inner.name}", inner.name, "")
@@ -149,7 +149,7 @@ def _peer(split: str, column: pa.Field, sizes: Mapping[str, int]) -> Iterator[di
 
 
 def _kind(column: pa.Field) -> str:
-    """Its type in words of schema.org; of what is nested, that of the values within."""
+    """Return the schema.org type of a column; for nested columns, of the values inside."""
     if column.name in (layout.IMAGE, layout.PIXELS):
         return "sc:ImageObject" if column.name == layout.IMAGE else "sc:Text"
     inner = column.type

@@ -1,4 +1,4 @@
-"""What a card says that its dataset's columns do not tell: kept beside them, as JSON."""
+"""Facts for the card that the columns of a dataset do not contain, stored beside them as JSON."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,37 +13,37 @@ from dmrl.guards.safe_names import code, markdown
 
 FILE = "facts.json"
 LISTED = 20
-"""Lines of a kind on a card, which people read; facts.json has all."""
+"""Lines of one kind on a card, at most; facts.json has all."""
 NAMED = 3
-"""Names on a line."""
+"""Names on a line, at most."""
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What was known when a dataset was made.
+    """Facts from the creation of a dataset.
 
     Parameters
     ----------
     left_out
-        Images that were left out, by the reason.
+        Number of images left out, by reason.
     used
         Source of labels that was used, by recording.
     beside
-        Sources that stood in a recording besides, by recording.
+        Other sources of labels in a recording, by recording.
     findings
-        What ``dmrl check`` says of labels, by recording.
+        Findings of ``dmrl check`` about labels, by recording.
     licences
-        Licences that were found beside what recordings were made from, by name.
+        Licences that were found beside the source files, by name.
     twins
-        Images of test splits whose pixels stand in train too.
+        Images of test splits whose pixels are in train too.
     near
-        Images of test splits that look like one in train, by a perceptual hash; the twins too.
+        Images of test splits with a near duplicate in train by perceptual hash, ``twins`` included.
     compared
         Images of test splits that were compared for ``near``. 0: all of them.
     sensors
-        Patterns of topics that the recordings have besides images and labels.
+        Patterns of the recordings' topics other than images and labels.
     cameras
-        Words for the calibration of cameras, by recording and robot.
+        Calibration of the cameras in words, by recording and robot.
     """
 
     left_out: Mapping[str, int] = field(default_factory=dict)
@@ -58,18 +58,18 @@ class Facts:
     cameras: Mapping[str, str] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
-        """Write them into the folder of a dataset."""
+        """Write the facts into the folder of a dataset."""
         text = json.dumps(asdict(self), indent=1, sort_keys=True)
         (folder / FILE).write_text(text + "\n", encoding="utf-8")
 
 
 _NOTHING = Facts()
 KINDS: Mapping[type, type | tuple[type, ...]] = {dict: dict, int: int, tuple: (list, tuple)}
-"""What JSON makes of a value of each kind."""
+"""JSON types that are accepted for a field of each type."""
 
 
 def read_facts(folder: Path) -> Facts | None:
-    """Facts of a dataset; None for one that was made before they were kept.
+    """Read the facts of a dataset; None if an older dmrl made it without.
 
     Raises
     ------
@@ -83,9 +83,9 @@ def read_facts(folder: Path) -> Facts | None:
         facts = Facts(**parse_json(path.read_text(encoding="utf-8")))
         for part in fields(Facts):
             if not isinstance(getattr(facts, part.name), KINDS[type(getattr(_NOTHING, part.name))]):
-                raise ValueError(f"{part.name} is of another kind")
+                raise ValueError(f"{part.name} has the wrong type")
         if facts.beside.keys() - facts.used.keys():
-            raise ValueError("labels beside none that are used")
+            raise ValueError("a recording has other sources of labels, but no source that is used")
         list(told(facts))
         list(equipment(facts))
         return facts
@@ -96,22 +96,22 @@ def read_facts(folder: Path) -> Facts | None:
 def cautions(
     facts: Facts | None, sigmas: Mapping[str, Any], leaks: Iterable[str] = ()
 ) -> Iterator[str]:
-    """Lines of Markdown: what to know before learning from a dataset.
+    """Yield Markdown lines with the uncertainty of labels, warnings and leaks.
 
     Parameters
     ----------
     facts
-        Of the dataset.
+        Facts of the dataset.
     sigmas
         By source of labels: (labels with a sigma, all labels, their median u, v, px, depth, m).
     leaks
-        Lines on what test splits share with train.
+        Lines about images and poses that test splits share with train.
     """
-    yield from ("## What to know", "")
+    yield from ("## Before you train", "")
     for source, (known, total, u_px, v_px, depth_m) in sorted(sigmas.items()):
         spread = f"median {u_px:.1f} px in u, {v_px:.1f} px in v, {depth_m:.2f} m in depth"
         words = f"{known} of {total} have a sigma, {spread}" if known else "none has a sigma"
-        yield f"- How sure labels of {code(source)} are: {words}."
+        yield f"- Uncertainty of labels from {code(source)}: {words}."
     if facts is not None:
         yield from told(facts)
     yield from leaks
@@ -119,7 +119,7 @@ def cautions(
 
 
 def merged(parts: Sequence[Facts]) -> Facts:
-    """Facts of a dataset from those of its parts; of leaks the last knows all."""
+    """Merge the facts of all parts; the leaks of the last part cover the whole dataset."""
     reasons = dict.fromkeys(why for part in parts for why in part.left_out)
     by_recording: dict[str, Any] = {
         name: {key: value for part in parts for key, value in getattr(part, name).items()}
@@ -134,13 +134,13 @@ def merged(parts: Sequence[Facts]) -> Facts:
 
 
 def _compared(facts: Facts) -> str:
-    return f"of {facts.compared} that were compared " if facts.compared else ""
+    return f" of {facts.compared} compared images" if facts.compared else ""
 
 
 def equipment(facts: Facts) -> Iterator[str]:
-    """Lines of Markdown: which sensors and cameras the recordings have."""
+    """Yield Markdown lines with the sensors and cameras of the recordings."""
     known = ", ".join(code(str(pattern)) for pattern in facts.sensors)
-    yield f"- Besides images and labels the recordings have: {known or 'nothing'}."
+    yield f"- Other topics of the recordings: {known or 'none'}."
     alike: dict[str, list[str]] = {}
     for name, words in sorted(facts.cameras.items()):
         alike.setdefault(words, []).append(name)
@@ -148,36 +148,36 @@ def equipment(facts: Facts) -> Iterator[str]:
         [f"- Camera of {_named(names)}: {markdown(words)}." for words, names in alike.items()]
     )
     if not facts.cameras:
-        yield "- No recording has the calibration of a camera."
+        yield "- No recording has a camera calibration."
 
 
 def told(facts: Facts) -> Iterator[str]:
-    """Lines of Markdown: sources, findings, what was left out, leaks of pixels, licences."""
+    """Yield Markdown lines: sources, findings, images left out, duplicates, licences."""
     beside = sorted(facts.beside.items())
     yield from _listed([_beside(facts.used[name], name, others) for name, others in beside])
     found = [(name, words) for name, all_of in sorted(facts.findings.items()) for words in all_of]
     yield from _listed([f"- {code(name)}: {markdown(words)}." for name, words in found])
     if not facts.findings:
-        yield "- `dmrl check` finds no bias in the labels, as far as they have boxes to tell."
+        yield "- `dmrl check` finds no bias in the labels. It can check those with boxes only."
     reasons = [
         f"{count:d} images {markdown(why)}" for why, count in facts.left_out.items() if count
     ]
     yield f"- Left out: {'; '.join(reasons) or 'no image'}."
     yield (
         f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train, "
-        f"{facts.near or 'none'} {_compared(facts)}look like one in train: their perceptual hashes "
-        f"(64 bits) differ "
-        f"in {NEAR_BITS} at most, as those of pictures before one background do."
+        f"{facts.near or 'none'}{_compared(facts)} are near duplicates of one in train: their "
+        f"64-bit perceptual hashes differ by at most {NEAR_BITS} bits. Images with the same "
+        "background often do."
     )
     licences = sorted(facts.licences.items())
-    yield from _listed([f"- Licence beside {code(n)}: {markdown(words)}." for n, words in licences])
+    yield from _listed([f"- Licence of {code(n)}: {markdown(words)}." for n, words in licences])
     if not facts.licences:
-        yield "- No licence was found beside what the recordings were made from."
+        yield "- No licence was found beside the source files of the recordings."
 
 
 def _beside(used: str, name: str, others: Sequence[str]) -> str:
     more = ", ".join(map(code, others))
-    return f"- {code(name)}: labels of {code(used)} are used; there were labels of {more} too."
+    return f"- {code(name)}: labels from {code(used)} are used. It also has labels from {more}."
 
 
 def _named(names: Sequence[str]) -> str:
@@ -188,4 +188,4 @@ def _named(names: Sequence[str]) -> str:
 def _listed(lines: Sequence[str]) -> Iterator[str]:
     yield from lines[:LISTED]
     if len(lines) > LISTED:
-        yield f"- {len(lines) - LISTED} more lines like these: see `{FILE}`."
+        yield f"- {len(lines) - LISTED} more lines of this kind are in `{FILE}`."

@@ -1,4 +1,4 @@
-"""The YAML front matter of a card, as the Hugging Face Hub reads it."""
+"""The YAML front matter of a card, in the form that the Hugging Face Hub reads."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,13 +13,13 @@ from dmrl.errors import SettingError
 from dmrl.guards.bounded_parsing import parse_json
 
 HUB_LICENSES = ("unknown", "other", "odc-by", "odbl", "pddl", "c-uda")
-"""Words of the Hub's for licences of data that are no SPDX identifiers."""
+"""Names of data licences that the Hub accepts and SPDX does not define."""
 
 SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
 
 
 def read_front(readme: Path) -> dict[str, str]:
-    """Plain values of the front matter of a card, by key; empty where there is no card."""
+    """Read the plain values of a card's front matter, by key; empty without a card."""
     if not readme.is_file():
         return {}
     lines = readme.read_text(encoding="utf-8").split("\n---\n")[0].splitlines()
@@ -28,7 +28,7 @@ def read_front(readme: Path) -> dict[str, str]:
 
 
 def _scalar(text: str) -> str:
-    # We write JSON strings; a hand may have written a bare word.
+    # dmrl writes JSON strings; a person may have written a bare word.
     try:
         return str(parse_json(text))
     except ValueError:
@@ -36,12 +36,12 @@ def _scalar(text: str) -> str:
 
 
 def check_license(text: str) -> None:
-    """Nothing, if a licence is one that others know.
+    """Raise SettingError unless SPDX or the Hugging Face Hub knows a licence.
 
     Parameters
     ----------
     text
-        An SPDX expression in any case, or a word of `HUB_LICENSES`.
+        An SPDX expression in any case, or one of `HUB_LICENSES`.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def check_license(text: str) -> None:
         canonicalize_license_expression(text)
     except InvalidLicenseExpression:
         raise SettingError(
-            f"--license {text}: no licence that SPDX or the Hugging Face Hub know. Try: "
+            f"--license {text}: neither SPDX nor the Hugging Face Hub has this licence. Try: "
             "cc-by-4.0, cc0-1.0, mit, other"
         ) from None
 
@@ -62,7 +62,7 @@ def check_license(text: str) -> None:
 def front_matter(
     splits: dict[str, Split], title: str, license_id: str, files: Mapping[str, Sequence[Path]]
 ) -> Iterator[str]:
-    """Lines of the front matter, with the dashes around it.
+    """Yield the lines of the front matter, with the dashes around it.
 
     Parameters
     ----------
@@ -71,9 +71,8 @@ def front_matter(
     title, license_id
         For ``pretty_name`` and ``license``.
     files
-        Parquet files of each split, relative to the card, so that ``datasets.load_dataset`` finds
-        these and no others: ``--add`` that was killed leaves some that do not belong to it yet.
-        Empty: there are none.
+        Parquet files of each split, relative to the card. ``datasets.load_dataset`` then ignores
+        other files, such as those of an interrupted ``--add``. Empty: Arrow dataset.
     """
     total = sum(map(len, splits.values()))
     size = next((name for limit, name in SIZES.items() if total < limit), "n>1M")

@@ -1,4 +1,4 @@
-"""What a test split shares with train, counted from the columns: recordings, moments, poses."""
+"""Count the content that a test split shares with train: recordings, moments, poses."""
 
 from collections.abc import Iterator, Mapping
 from itertools import product
@@ -12,13 +12,13 @@ from dmrl.datasets import Split
 from dmrl.guards.safe_names import code, markdown
 
 NEAR_S = 1.0
-"""Images of one camera that are closer than this look alike."""
+"""Two images of one camera within this time count as similar, seconds."""
 POSE = (1.0, 1.0, 0.01)
-"""Pixels, pixels and metres that make a pose the same."""
+"""Largest difference of equal poses: u and v, pixels, and depth, metres."""
 
 
 def leaks(splits: Mapping[str, Split]) -> Iterator[str]:
-    """Lines of Markdown: for each split but train, what of it train has seen."""
+    """Yield Markdown lines on the content that each other split shares with train."""
     train = splits.get("train")
     for name, split in splits.items():
         if name == "train" or train is None or not len(split):
@@ -26,8 +26,8 @@ def leaks(splits: Mapping[str, Split]) -> Iterator[str]:
         shared = sorted(set(_texts(split, "source")) & set(_texts(train, "source")))
         place = ", ".join(map(code, shared)) or "no recording"
         yield (
-            f"- {markdown(name)} and train share {place}: places, light and backgrounds of one "
-            "recording are alike."
+            f"- {markdown(name)} and train share {place}: images of one recording have similar "
+            "places, light and backgrounds."
         )
         yield (
             f"- {near_in_time(split, train)} of {len(split)} images of {markdown(name)} were taken "
@@ -45,7 +45,7 @@ def _texts(split: Split, column: str) -> list[str]:
 
 
 def near_in_time(split: Split, train: Split) -> int:
-    """Images of a split within a second of one in train, of the same recording and robot."""
+    """Count the images of a split within `SIMILAR_WITHIN_S` of one in train, by the same camera."""
     count = 0
     known = _times(train)
     for who, times in _times(split).items():
@@ -59,7 +59,7 @@ def near_in_time(split: Split, train: Split) -> int:
 
 
 def _times(split: Split) -> dict[tuple[str, str], NDArray[np.int64]]:
-    """Ascending times by recording and robot."""
+    """Return sorted log times by recording and robot."""
     names = list(zip(*(split.table[c].to_pylist() for c in ("source", "robot")), strict=True))
     times = split.table["log_time"].to_numpy()
     rows: dict[tuple[str, str], list[int]] = {}
@@ -69,10 +69,11 @@ def _times(split: Split) -> dict[tuple[str, str], NDArray[np.int64]]:
 
 
 def same_poses(split: Split, train: Split) -> tuple[int, int]:
-    """Labels of a split whose pixel and depth one in train has too, and all of its labels."""
+    """Count the labels of a split whose pose is also in train, and all of its labels."""
     mine, theirs = _values(split), _values(train)
     seen = np.zeros(len(mine), bool)
-    # Two of a pose may fall on two sides of an edge: edges half a step away are looked at, too.
+    # Two equal poses may lie on two sides of a cell's edge, so a grid shifted by half a cell counts
+    # too.
     for shift in product((0.0, 0.5), repeat=3):
         known, asked = (_boxes(values, shift) for values in (theirs, mine))
         seen |= np.isin(asked, known)
@@ -80,12 +81,12 @@ def same_poses(split: Split, train: Split) -> tuple[int, int]:
 
 
 def _boxes(values: NDArray[np.float64], shift: tuple[float, ...]) -> NDArray[np.str_]:
-    """Names of the boxes of a grid of poses that values lie in."""
+    """Return the names of the cells that poses fall into, in a shifted grid."""
     boxes = np.floor(values / POSE + shift).astype(np.int64)
     return np.array([f"{u} {v} {depth}" for u, v, depth in boxes.tolist()], np.str_)
 
 
 def _values(split: Split) -> NDArray[np.float64]:
-    """(M, 3) u, v and depth of all labels."""
+    """Return u, v and depth of all labels, (M, 3)."""
     flat = pa.chunked_array(split.table["peers"]).combine_chunks().flatten()
     return np.column_stack([pc.struct_field(flat, n) for n in ("u_px", "v_px", "depth_m")])

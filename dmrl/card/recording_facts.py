@@ -1,4 +1,4 @@
-"""What is said of the recordings of a dataset once their labels are no longer in memory."""
+"""Collect facts about the recordings of a dataset before their labels leave memory."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from dmrl.recording import Contents, label_findings, licences
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What the stage and the card need of one recording: a few short strings; see `Facts`."""
+    """Facts about one recording for the stage and the card: a few short strings; see `Facts`."""
 
     source: str
     others: Sequence[str]
@@ -28,21 +28,21 @@ class About:
 
 
 def read_about(path: Path, wanted: str) -> tuple[About, Contents]:
-    """What is said of a recording, and its labels, which may be needed again soon.
+    """Read the facts of a recording, and its labels, which may be needed again soon.
 
     Parameters
     ----------
     path
-        With images and labels.
+        Recording with images and labels.
     wanted
-        Whose labels; see `label_source`.
+        Source of the labels; see `choose_label_source`.
 
     Raises
     ------
     RecordingError
-        If it cannot be read, or lacks images or labels.
+        If the recording cannot be read, or lacks images or labels.
     SettingError
-        If it has no labels from the source asked for.
+        If the recording has no labels from that source.
     """
     held = Contents(path, topics.LABELS, topics.CALIBRATION)
     images = count_images(path)
@@ -61,7 +61,7 @@ def read_about(path: Path, wanted: str) -> tuple[About, Contents]:
 
 
 def facts_of(known: Mapping[Path, About], tally: Tally, seen: Seen) -> Facts:
-    """What the card says beside the counts: what is left out, and what to be careful of."""
+    """Build the facts of a dataset from its recordings, exclusions and image hashes."""
     near, compared, outside = seen.near()
     sensors = {pattern for one in known.values() for pattern in one.sensors}
     return Facts(

@@ -1,4 +1,4 @@
-"""The text of a card, section by section, as lines of Markdown."""
+"""Sections of a card, as lines of Markdown."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -15,30 +15,31 @@ from dmrl.recording import Provenance
 MEANING = {
     layout.PIXELS: "image, {height} x {width} x 3 bytes, RGB, row by row from the top left",
     layout.IMAGE: "image, {height} x {width} px, PNG, RGB",
-    layout.MASKS: "what each of {height} x {width} pixels shows: 0, or a place in `peers` from 1",
+    layout.MASKS: "index of the peer in {height} x {width} pixels, from 1 in `peers`; 0: no peer",
     "peers": "every labelled peer; it may lie outside the image",
-    "peers.peer": "name of the robot that is seen",
+    "peers.peer": "name of the peer",
     "peers.u_px": "px, right from the left edge; pixel-edge coordinates: [0, {width}]",
     "peers.v_px": "px, down from the top edge: [0, {height}]",
     "peers.depth_m": "m, along the optical axis (camera x), not the range",
-    "peers.sigma_u_px": "px, one standard deviation; 0: exact or not known",
-    "peers.sigma_v_px": "px, likewise",
-    "peers.sigma_depth_m": "m, likewise",
+    "peers.sigma_u_px": "px, one standard deviation; 0: exact or unknown",
+    "peers.sigma_v_px": "px, one standard deviation; 0: exact or unknown",
+    "peers.sigma_depth_m": "m, one standard deviation; 0: exact or unknown",
     "peers.box_px": "px: left, top, right, bottom of the visible part; empty: none",
-    "peers.visible_share": "share of the peer that nothing hides, 0 to 1; 0: not known",
+    "peers.visible_share": "visible share of the peer, 0 to 1; 0: unknown",
     "peers.status": "OK, UNCONVERGED or AMBIGUOUS",
     "peers.source": "truth, estimate, hand or published",
     layout.CONFIDENCE: "1 in the cell (v, u) // {stride} of a peer's centre, else 0",
     layout.DEPTH: "m, depth of the peer in that cell, the nearest of several; else 0",
-    "robot": "whose camera took the image",
+    "robot": "robot whose camera took the image",
     "source": "file name of the recording that the row comes from",
     "log_time": "ns, time of exposure in that recording",
     "split": "train or test",
 }
+"""Meaning and unit of each column."""
 
 
 def about(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
-    """What the dataset is."""
+    """Return the title and a summary of the dataset."""
     height_px, width_px = next(iter(splits.values())).image_shape
     rows, cols = next(iter(splits.values())).grid_shape
     return [
@@ -56,7 +57,7 @@ def about(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
 
 
 def loading(splits: dict[str, Split], *, parquet: bool) -> list[str]:
-    """How to open the dataset, three ways; DATASET stands for its folder."""
+    """Return code that opens the dataset with three packages; DATASET stands for its folder."""
     name, split = next(iter(splits.items()))
     png = layout.IMAGE in split.table.schema.names
     ways = {
@@ -108,7 +109,7 @@ table = pa.ipc.open_stream(pa.memory_map(shard)).read_all()  # no copy"""
 
 
 def numbers(counts: dict[str, Counts]) -> list[str]:
-    """Tables of images, peers and label sources, by split and by recording."""
+    """Return tables of images, peers and label sources, by split and by recording."""
     lines = ["## Numbers", "", "| split | images | with a peer | peers | depth, m | labels from |"]
     lines.append("|---|--:|--:|--:|--:|---|")
     for name, c in counts.items():
@@ -120,7 +121,7 @@ def numbers(counts: dict[str, Counts]) -> list[str]:
             f"| {markdown(name)} | {c.images} | {int((c.peers > 0).sum())} | {int(c.peers.sum())} "
             f"| {low:.2f} to {high:.2f} | {sources} |"
         )
-    lines += ["", "Peers and depths: inside the image. Labels: all of them.", ""]
+    lines += ["", "Peers and depths count peers inside the image, labels all of them.", ""]
     lines += ["| recording | split | images |", "|---|---|--:|"]
     rows = sorted((r, name, n) for name, c in counts.items() for r, n in c.recordings.items())
     return [*lines, *(f"| {markdown(r)} | {markdown(name)} | {n} |" for r, name, n in rows), ""]
@@ -128,15 +129,15 @@ def numbers(counts: dict[str, Counts]) -> list[str]:
 
 FRAMES = (
     "- Frames are right-handed. `image`: u right, v down, from the top-left edge. `camera`: x "
-    "along the optical axis, y left, z up; depth is its x. Pixel = focal length * (y, z) / x away "
-    "from the centre of the lens, before its distortion.",
+    "along the optical axis, y left, z up; depth is its x. Without distortion, a point lies focal "
+    "length * (y, z) / x pixels from the centre of the lens.",
 )
-MADE_UP = {"render": "rendered", "sketch": "drawn by code", "fly": "of simulated flights"}
-"""Stages that make images without a camera."""
+MADE_UP = {"render": "rendered", "sketch": "drawn by code", "fly": "from simulated flights"}
+"""Stages that make images without a camera, in words."""
 
 
 def limits(counts: dict[str, Counts], made: Provenance) -> list[str]:
-    """What a network that learns from the dataset has not seen."""
+    """Return the limits of a network that learns from the dataset."""
     depth_m = np.concatenate([c.depth_m for c in counts.values()])
     images = sum(c.images for c in counts.values())
     empty = sum(int((c.peers == 0).sum()) for c in counts.values())
@@ -146,22 +147,22 @@ def limits(counts: dict[str, Counts], made: Provenance) -> list[str]:
     if depth_m.size:
         low, middle, high = np.percentile(depth_m, (5, 50, 95))
         lines.append(
-            f"- Nine in ten peers are {low:.2f} to {high:.2f} m away, half of them nearer than "
-            f"{middle:.2f} m: beyond, nothing can be learned."
+            f"- 90 % of the peers are {low:.2f} to {high:.2f} m away, the median {middle:.2f} m. "
+            "Depths outside that range cannot be learned."
         )
     lines.append(
-        f"- {empty} of {images} images show nobody: what teaches a network not to see peers that "
-        f"are not there. No image shows more than {most}."
+        f"- {empty} of {images} images show no peer. They train a network to avoid false alarms. "
+        f"The largest number of peers in one image is {most}."
     )
     stages = {one.stage for _, source in made.ancestry() if (one := source.provenance)}
     if simulated := [words for stage, words in MADE_UP.items() if stage in stages]:
-        lines.append(f"- Images are {', or '.join(simulated)}: a real camera's look different.")
+        lines.append(f"- Images are {', or '.join(simulated)}. Those of a real camera differ.")
     told = ", ".join(f"{markdown(name)} {n}" for name, n in sorted(statuses.items()))
     return [*lines, f"- Labels by status: {told or 'none'}.", ""]
 
 
 def features(splits: dict[str, Split]) -> list[str]:
-    """Table of the columns with type, unit and meaning."""
+    """Return a table of the columns with type, unit and meaning."""
     split = next(iter(splits.values()))
     height_px, width_px = split.image_shape
     rows, cols = split.grid_shape
@@ -183,7 +184,7 @@ def _columns(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
 
 
 def ancestry(made: Provenance) -> Iterator[str]:
-    """Nested list of stages: settings, versions, and the hash of every input."""
+    """Yield a nested list of the stages: settings, versions, and the hash of every input."""
     yield from _stage(made, "")
     for depth, source in made.ancestry():
         pad = "  " * (2 * depth + 1)

@@ -1,4 +1,4 @@
-"""What recordings hold besides pictures, and which cameras took those: words for a card."""
+"""Describe the sensors and cameras of recordings in words for a card."""
 
 from collections.abc import Iterable
 from itertools import islice
@@ -8,18 +8,18 @@ from dmrl import topics
 from dmrl.recording import Contents
 
 NEVER = (topics.CAMERA_IMAGE, topics.LABELS, topics.DETECTIONS, topics.GRID, topics.TRACKS)
-"""What a dataset is made of, or what was made of it: no sensors."""
+"""Topics that a dataset consists of, or that models compute: no sensors."""
 
 
 def sensors_of(names: Iterable[str]) -> list[str]:
-    """Rows of the table of topics that recordings with these topics have, in its order."""
+    """Return the patterns of sensor topics among these topics, in the order of the table."""
     names = set(names)
     patterns = (row.pattern for row in topics.TOPICS if row.pattern not in NEVER)
     return [p for p in patterns if any(topics.names(p, name) is not None for name in names)]
 
 
 def cameras_of(held: Iterable[Contents]) -> dict[str, str]:
-    """Words for the first calibration of each robot's camera, by recording and robot."""
+    """Describe the first calibration of each robot's camera, by recording and robot."""
     found = {}
     for one in held:
         for topic in one.topics:
@@ -32,7 +32,7 @@ def cameras_of(held: Iterable[Contents]) -> dict[str, str]:
 
 
 def _camera(calibration: Any) -> str:
-    """Words for a CameraCalibration; empty where its K is no 3 x 3 matrix, row by row."""
+    """Describe a CameraCalibration in words; empty unless K is a row-major 3 x 3 matrix."""
     if len(calibration.K) != 9:
         return ""
     fx, _, cx, _, fy, cy, *_ = calibration.K

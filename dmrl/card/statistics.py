@@ -1,4 +1,4 @@
-"""Numbers for a card, counted from the columns of a dataset; pixels are not touched."""
+"""Count the numbers of a card from the columns of a dataset; no pixel is read."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -45,7 +45,14 @@ class Counts:
 
 
 def sigmas_of(splits: Mapping[str, Split]) -> dict[str, tuple[int, int, float, float, float]]:
-    """By source: labels with a sigma, all labels, and the median u, v (px) and depth (m) of it."""
+    """Summarize the sigmas of labels by source.
+
+    Returns
+    -------
+    dict
+        By source: labels with a sigma, all labels, and the median sigma of u and v, pixels, and of
+        depth, metres.
+    """
     flat = pa.concat_arrays(
         [pa.chunked_array(s.table["peers"]).combine_chunks().flatten() for s in splits.values()]
     )
@@ -62,7 +69,7 @@ def sigmas_of(splits: Mapping[str, Split]) -> dict[str, tuple[int, int, float, f
 
 
 def count(split: Split) -> Counts:
-    """Numbers of one split."""
+    """Count images, peers, sources, recordings and statuses of one split."""
     peers = pa.chunked_array(split.table["peers"]).combine_chunks()
     flat = peers.flatten()
     uv_px = np.column_stack([pc.struct_field(flat, name) for name in ("u_px", "v_px")])

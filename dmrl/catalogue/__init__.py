@@ -1,7 +1,7 @@
-"""A folder of recordings as one Parquet table: what each holds, what is wrong with it, queries.
+"""Catalogue of a folder of recordings, as one Parquet table with SQL queries.
 
-`describe` looks at one recording, `table` keeps the rows of a folder beside its recordings, and
-`query` asks them in SQL.
+`describe` describes one recording, `table` stores the rows of a folder beside its recordings, and
+`query` filters them with SQL.
 """
 
 from dmrl.catalogue.describe import Row, describe, unread

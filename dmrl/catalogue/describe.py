@@ -1,4 +1,4 @@
-"""What one recording comes to, as a row of the catalogue."""
+"""Description of one recording as a row of the catalogue."""
 
 import json
 import math
@@ -17,11 +17,11 @@ from dmrl.recording import Contents, Provenance, check
 from dmrl.recording.provenance_inputs import sha256_of_file
 
 Row = dict[str, Any]
-"""Values of `table.COLUMNS` by name, but for what only the file system says."""
+"""Values of `table.COLUMNS` by name, without those of the file system."""
 
 
 def describe(path: Path) -> Row:
-    """What a recording holds, where it comes from, and what `dmrl check` says of it.
+    """Describe a recording: its contents, its provenance and the findings of `dmrl check`.
 
     Parameters
     ----------
@@ -56,19 +56,19 @@ def describe(path: Path) -> Row:
 
 
 def unread(why: str) -> Row:
-    """The row of a recording that cannot be read."""
+    """Return the row of an unreadable recording."""
     return {"error": why}
 
 
 def _robots(held: Contents) -> list[str]:
-    """Every robot that one of dmrl's topics names first."""
+    """List the robots in dmrl's topics."""
     rows = ((topics.row_of(topic), topic) for topic in held.topics)
     named = (topics.names(row.pattern, topic) for row, topic in rows if row is not None)
     return sorted({found["robot"] for found in named if found and "robot" in found})
 
 
 def _cameras(held: Contents) -> Iterator[Row]:
-    """Every camera: its pictures, and what it is calibrated for."""
+    """Yield the image count, size and focal length of every camera."""
     for camera in topics.robots(list(held.topics)):
         row = {"camera": camera, "images": held.topics[topics.camera_image(camera)].count}
         if topics.calibration(camera) in held.topics:
@@ -81,7 +81,7 @@ def _cameras(held: Contents) -> Iterator[Row]:
 
 
 def _labels(held: Contents) -> Iterator[Row]:
-    """Labels by camera, source and status."""
+    """Yield the label counts by camera, source and status."""
     for topic in held.topics:
         if not (named := topics.names(topics.LABELS, topic)):
             continue
@@ -95,7 +95,7 @@ def _labels(held: Contents) -> Iterator[Row]:
 
 
 def _origin(made: Provenance | None) -> Row:
-    """Which stage made it, of what, with which settings."""
+    """Return the columns of the stage, inputs and settings that made a recording."""
     if made is None:
         return {}
     return {

@@ -1,7 +1,7 @@
-"""Questions to a catalogue, in the SQL of DuckDB: what stands after WHERE.
+"""Queries of a catalogue: the WHERE clause of DuckDB's SQL.
 
-There is a row for each recording, camera and source of its labels; a recording is found if one of
-its rows is. The query reads nothing but these columns: no file, no other table.
+There is one row per recording, camera and label source. A recording matches if any of its rows
+does. A query can read only these columns: no files and no other tables.
 """
 
 import re
@@ -42,27 +42,27 @@ QUOTED = re.compile(r"""'(?:[^']|'')*'|"((?:[^"]|"")*)\"""")
 
 
 def find(catalogue: Catalogue, query: str) -> pa.Table:
-    """Rows of the recordings that a query is true of, in the order of their names.
+    """Return the rows of matching recordings, in the order of their names.
 
     Parameters
     ----------
     catalogue
-        Of a folder.
+        Catalogue of a folder.
     query
-        Such as ``camera = 'cf1' and ok_labels > 100``. A text in double quotes that is no
-        column's name is a text as well, so that a shell needs no more quotes.
+        Condition, such as ``camera = 'cf1' and ok_labels > 100``. Text in double quotes that is
+        no column name counts as text, so that a shell needs no further quotes.
 
     Raises
     ------
     SettingError
-        If the query cannot be answered: says what DuckDB says.
+        If DuckDB rejects the query. Contains DuckDB's message.
     """
     own: dict[str, bool | str] = {
         "enable_external_access": False,
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,
         "python_enable_replacements": False,
-        # Else it takes most of the memory, then writes into the folder that it is called in.
+        # By default it uses most of the memory, then writes to the working directory.
         "memory_limit": f"{limits.MEMORY_BYTES}B",
         "temp_directory": "",
         "lock_configuration": True,
@@ -79,14 +79,14 @@ def find(catalogue: Catalogue, query: str) -> pa.Table:
 
 
 def found_in(folder: Path, query: str) -> list[Path]:
-    """Recordings of a folder that a query is true of, in the order of their names.
+    """Return the matching recordings of a folder, in the order of their names.
 
     Raises
     ------
     RecordingError
-        If the folder has no catalogue, or one of them is not as it was when that was made.
+        If the folder has no catalogue, or a recording changed after it was indexed.
     SettingError, MissingExtra
-        As `find`.
+        As `find_rows`.
     """
     found = find(open_catalogue(folder), query)
     rows = zip(found["recording"].to_pylist(), found["stamp"].to_pylist(), strict=True)
@@ -107,7 +107,7 @@ def _as_it_was(folder: Path, name: str, was: str) -> Path:
 
 
 def _quoted(query: str, columns: list[str]) -> str:
-    """The query with texts in single quotes, as SQL has them."""
+    """Convert texts in double quotes to SQL's single quotes."""
 
     def single(found: re.Match[str]) -> str:
         name = found[1]

@@ -1,7 +1,7 @@
-"""The rows of a folder, in ``catalogue.parquet`` beside its recordings.
+"""Table of a folder's recordings, in ``catalogue.parquet`` beside them.
 
-A row is known by its recording's place below the folder, and stays as it is while the file's size
-and times are the same. So to index a folder again costs a look at each file's name.
+A row is identified by its recording's path below the folder. It stays valid while the file's size
+and times are unchanged, so indexing a folder again only reads the metadata of unchanged files.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,7 +19,7 @@ from dmrl.guards.memory import Bounded
 
 NAME = "catalogue.parquet"
 MARK = {b"dmrl.catalogue": b"1"}
-"""Says in the file's metadata that it is one, and of which form."""
+"""Metadata of the file that identifies a catalogue and its version."""
 SHA256 = ("sha256", pa.string())
 COLUMNS = pa.schema(
     [
@@ -80,24 +80,24 @@ COLUMNS = pa.schema(
     ],
     metadata=MARK,
 )
-"""A row for each recording; lists of structs for what it has several of."""
+"""One row per recording, with lists of structs for repeated items."""
 
 ALWAYS = ("recording", "bytes", "stamp")
-"""Columns that every row has a value in."""
+"""Columns without nulls."""
 PERHAPS = ("width_px", "height_px", "focal_px")
-"""Of a camera, where they are known."""
+"""Fields of a camera that may be null."""
 
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:
-    """The rows of a folder.
+    """Catalogue of a folder.
 
     Parameters
     ----------
     folder
-        Of the recordings.
+        Folder of the recordings.
     table
-        With `COLUMNS`, sorted by recording.
+        Rows with `COLUMNS`, sorted by recording.
     """
 
     folder: Path
@@ -105,65 +105,65 @@ class Catalogue:
 
     @property
     def file(self) -> Path:
-        """Where it is kept."""
+        """Path of the Parquet file."""
         return self.folder / NAME
 
     def unchanged(self, stamps: Mapping[str, str]) -> set[str]:
-        """Recordings whose row still holds; those that could not be read are looked at again.
+        """Return the recordings with valid rows. Unreadable ones are never valid.
 
         Parameters
         ----------
         stamps
-            `stamp` of each file that is there now, by name below the folder.
+            `file_stamp` of each present file, by name below the folder.
         """
         columns = (self.table[name].to_pylist() for name in ("recording", "stamp", "error"))
         rows = zip(*columns, strict=True)
         return {name for name, stamp, e in rows if e is None and stamps.get(name) == stamp}
 
     def with_rows(self, kept: Iterable[str], fresh: pa.Table) -> "Catalogue":
-        """The same with fresh rows beside those that are kept."""
+        """Return a catalogue with the kept rows and fresh rows."""
         kept_names = set(kept)
         mask = pa.array([name in kept_names for name in self.table["recording"].to_pylist()])
         old = self.table.filter(mask.cast(pa.bool_()))
         return Catalogue(self.folder, pa.concat_tables([old, fresh]).sort_by("recording"))
 
     def save(self) -> None:
-        """Write it, whole or not at all.
+        """Write the file atomically.
 
         Raises
         ------
         OutputError
-            If the system refuses.
+            If the file system rejects it.
         """
         with rewritten_file(self.file) as partial:
             pq.write_table(self.table.combine_chunks(), partial, compression="zstd")
 
 
 def stamp(path: Path) -> str:
-    """Size and times of a file: another file of that name has another."""
+    """Return size and times of a file, which change with its content."""
     found = path.stat()
     return f"{found.st_size} {found.st_mtime_ns} {found.st_ctime_ns}"
 
 
 def rows_table(rows: Iterable[Row]) -> pa.Table:
-    """Rows as a table; what they lack is null."""
+    """Convert rows to a table. Missing values are null."""
     return pa.Table.from_pylist(list(rows), schema=COLUMNS)
 
 
 def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
-    """The catalogue of a folder.
+    """Open the catalogue of a folder.
 
     Parameters
     ----------
     folder
-        Of recordings.
+        Folder of recordings.
     new
-        Without a catalogue, an empty one.
+        Whether to return an empty catalogue if there is none.
 
     Raises
     ------
     RecordingError
-        If there is no such folder or no catalogue in it, or the file is another's or damaged.
+        If the folder or its catalogue does not exist, or the file is damaged or of another version.
     """
     file = folder / NAME
     if not folder.is_dir():
@@ -184,14 +184,14 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
         ) from None
     if not table.schema.equals(COLUMNS) or (table.schema.metadata or {}).items() < MARK.items():
         raise RecordingError(
-            f"{file} is no catalogue of this version of dmrl. Move it away, then: "
+            f"{file} is not a catalogue of this version of dmrl. Move it away, then: "
             f"dmrl index {folder}"
         )
     return Catalogue(folder, table)
 
 
 def _lacks_inner(column: pa.Array) -> bool:
-    """Whether a list of the column lacks a value, or a field that each of its values has."""
+    """Return whether a list of the column, or a required field of its structs, has a null."""
     if not pa.types.is_list(column.type):
         return False
     inner = column.flatten()
@@ -201,15 +201,15 @@ def _lacks_inner(column: pa.Array) -> bool:
 
 
 def _refuse_odd(table: pa.Table) -> None:
-    """Nothing, if what every row has is there, and names lead to files of the folder.
+    """Raise ValueError unless required values exist and names stay inside the folder.
 
     Raises
     ------
     ValueError
-        If it is not as `Catalogue.save` writes it.
+        If the table is not as `Catalogue.save` writes it.
     """
     if not table.schema.equals(COLUMNS):
-        return  # another version's
+        return  # written by another version
     for name in table.column_names:
         column = table[name].combine_chunks()
         if (name in ALWAYS and column.null_count) or _lacks_inner(column):

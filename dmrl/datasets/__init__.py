@@ -1,7 +1,7 @@
-"""Arrow datasets: what trainers see of recordings.
+"""Read, write and describe Arrow datasets, the input of training.
 
-`layout` says what a dataset looks like, `rows` and `splits` make rows from recordings,
-`write` and `read` store and open them.
+`layout` defines the columns and files. `writing` builds rows from recordings and stores them;
+`read` opens the result.
 """
 
 from dmrl.datasets.read import Dataset, Split, is_dataset, open_dataset

@@ -1,7 +1,7 @@
-"""What is put behind rendered robots: a folder of photos, rooms, or the images of a dataset.
+"""Backgrounds for rendered robots: a folder of photos, rooms, or the images of a dataset.
 
-Images of a dataset are where its robots fly, as their camera sees it; the robots in them are
-painted over.
+Images of a dataset show the place where robots fly, through their own camera. The robots in them
+are painted over.
 """
 
 from collections.abc import Sequence
@@ -19,27 +19,29 @@ from dmrl.rendering.backgrounds.photos import Photos, photos_in
 from dmrl.rendering.backgrounds.rooms import ROOMS, rooms
 
 MOST_HIDDEN = 0.15
-"""Share of an image that may be painted over; of more, too little is left to be a background."""
+"""Largest share of an image that may be painted over. Beyond it, too little background is left."""
 BEYOND_BOX = 0.15
-"""How far a robot is painted over beyond its box, over the box's greater side."""
+"""Margin around a robot's box that is painted over as well, as a share of the box's longer side."""
 BEYOND_PX = 3.0
-"""And as much for its blurred edge."""
+"""Further margin, pixels, for the robot's blurred edge."""
 REACH_PX = 5.0
-"""How far around a hidden pixel is looked for what to paint it with."""
+"""Radius around a hidden pixel from which the inpainting takes colours."""
 
 Ellipse = tuple[float, float, float, float]
-"""Centre and half axes, u and v, pixels."""
+"""Centre u, v and half axes u, v, pixels."""
 
 
 def photos_of(folder: Path) -> Photos:
-    """Photos of a folder, rooms, or images of the train split of a dataset, without their robots.
+    """Open the backgrounds of a folder, the built-in rooms, or the train split of a dataset.
+
+    Robots in the images of a dataset are painted over.
 
     Raises
     ------
     SettingError
-        If it holds no photo that can be read, or no image of which enough is left.
+        If the folder has no readable photo, or the dataset no image with enough background.
     DatasetError
-        If it is a dataset without a train split, or a damaged one.
+        If the dataset has no train split or is damaged.
     """
     if str(folder) == ROOMS:
         return rooms()
@@ -59,7 +61,7 @@ def photos_of(folder: Path) -> Photos:
 
 
 def _robots(peers: Sequence[dict[str, Any]]) -> list[Ellipse] | None:
-    """What hides the robots of an image; None if the extent of one is not known."""
+    """Return an ellipse around every robot of an image; None if a robot has no box."""
     boxes = [peer["box_px"] for peer in peers]
     return [_about(box) for box in boxes] if all(boxes) else None
 
@@ -67,7 +69,7 @@ def _robots(peers: Sequence[dict[str, Any]]) -> list[Ellipse] | None:
 def _about(box_px: Sequence[float]) -> Ellipse:
     left, top, right, bottom = box_px
     more = BEYOND_BOX * max(right - left, bottom - top) + BEYOND_PX
-    # Corners of a box are rarely robot: an ellipse, somewhat wider, hides less of what is behind.
+    # The corners of a box rarely show the robot. A slightly wider ellipse hides less background.
     half_u, half_v = (right - left) / 2 + more, (bottom - top) / 2 + more
     return (left + right) / 2, (top + bottom) / 2, half_u, half_v
 
@@ -86,14 +88,14 @@ def _without(split: Split, row: int, robots: Sequence[Ellipse]) -> Rgb:
 
 
 def painted_over(rgb: Rgb, hidden: NDArray[np.bool_]) -> Rgb:
-    """A picture with what is hidden painted over by what is around it (Telea 2004).
+    """Fill the hidden pixels of an image from their surroundings (Telea 2004).
 
     Parameters
     ----------
     rgb
         (H, W, 3), uint8.
     hidden
-        (H, W), True where to paint.
+        (H, W), True where the image is painted over.
 
     Raises
     ------

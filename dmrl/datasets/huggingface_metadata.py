@@ -1,4 +1,4 @@
-"""What ``datasets`` wants to know of a dataset: JSON files beside the shards, by the manifest."""
+"""Metadata files for the Hugging Face ``datasets`` library: JSON beside the shards."""
 
 import hashlib
 import json
@@ -22,11 +22,11 @@ def write_names(
     Parameters
     ----------
     folder
-        Of the dataset. Parquet files need no such files, and get none.
+        Folder of the dataset. A Parquet dataset needs no such files and gets none.
     manifest
-        Its own.
+        Its manifest.
     fingerprint
-        Names the content; ``datasets`` keys its cache with it.
+        Identifies the content; ``datasets`` uses it as the key of its cache.
     about
         ``description`` and ``license`` for dataset_info.json.
     """
@@ -41,7 +41,7 @@ def write_names(
 
 
 def rewrite(path: Path, document: Any) -> None:
-    """Write a JSON file, whole, if it does not say so already."""
+    """Write a JSON file atomically, unless it has this content already."""
     text = layout.json_text(document)
     if not (path.is_file() and path.read_text(encoding="utf-8") == text):
         with rewritten_file(path) as partial:
@@ -49,7 +49,7 @@ def rewrite(path: Path, document: Any) -> None:
 
 
 def fingerprint_of(document: Any) -> str:
-    """A hash of what a dataset was made from."""
+    """Return the SHA-256 hash of a JSON document."""
     return hashlib.sha256(json.dumps(document).encode()).hexdigest()
 
 

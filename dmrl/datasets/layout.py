@@ -1,17 +1,17 @@
-"""The layout of a dataset: columns, Arrow types, files, and what ``datasets`` reads them as.
+"""Layout of a dataset: columns, Arrow types, files, and their features in ``datasets``.
 
-An Arrow dataset is a folder that ``datasets.load_from_disk`` opens, written without it::
+``datasets.load_from_disk`` opens an Arrow dataset, which is written without that library::
 
     OUT/dataset_dict.json                 names of the splits
     OUT/train/state.json                  names of the shards
     OUT/train/dataset_info.json           features, rows per shard
     OUT/train/data-00000-of-00002.arrow   uncompressed Arrow IPC stream
     OUT/README.md, figures/               the card
-    OUT/provenance.json                   how it was made
-    OUT/manifest.json, parts/             the shards, and what each time of adding brought
+    OUT/provenance.json                   inputs, settings and versions
+    OUT/manifest.json, parts/             the shards, and metadata of every --add
 
 A Parquet dataset has ``OUT/data/train-00000-of-00002.parquet`` in place of the first four. A shard
-is numbered among those that were there when it was added: ``data-00002-of-00003`` comes after
+counts the shards that existed when it was added: ``data-00002-of-00003`` follows
 ``data-00001-of-00002``.
 """
 
@@ -44,14 +44,14 @@ PEER = pa.struct(
         ("source", pa.string()),
     ]
 )
-"""One peer of one image: the fields of ``dmrl.v1.PeerLabel``, status by name."""
+"""One peer of one image: the fields of ``dmrl.v1.PeerLabel``, with the name of the status."""
 
 PNG = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-"""Storage of the Image feature of ``datasets``."""
+"""Storage type of the Image feature of ``datasets``."""
 
 
 def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = False) -> pa.Schema:
-    """Arrow schema of a dataset of images of one size.
+    """Build the Arrow schema of a dataset; all images have one size.
 
     Parameters
     ----------
@@ -60,14 +60,14 @@ def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = Fa
     png
         Column ``image`` with PNG bytes in place of ``pixels`` with raw RGB.
     masks
-        With a column ``masks``: what every pixel shows, one byte each, 0 or the place of the
-        peer in ``peers``, from 1.
+        Add a column ``masks``: one byte per pixel, 0 for the background or the index of the peer in
+        ``peers``, from 1.
 
     Returns
     -------
     pa.Schema
-        With the features under the key ``huggingface``, so that ``datasets`` reads
-        shards and Parquet files as they are meant.
+        With the features under the metadata key ``huggingface``, from which ``datasets`` takes the
+        types of shards and Parquet files.
     """
     picture = (IMAGE, PNG) if png else (PIXELS, pa.binary(height_px * width_px * 3))
     row = pa.list_(pa.float32(), width_px // STRIDE_PX)
@@ -91,11 +91,11 @@ def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = Fa
 
 
 def features(columns: pa.Schema) -> dict[str, Any]:
-    """The columns as ``datasets`` writes them in dataset_info.json.
+    """Return the columns as ``datasets`` writes them in dataset_info.json.
 
-    Fixed-size lists are spelled "Sequence" and lists as ``[item]``, which ``datasets`` 3.6 reads
-    as well as 5; "List" came with 4. Raw pixels need ``datasets`` 5.1 all the same: earlier ones
-    do not know fixed_size_binary.
+    Fixed-size lists are written as "Sequence" and lists as ``[item]``, which ``datasets`` 3.6 and 5
+    both read; "List" came with 4. Raw pixels require ``datasets`` 5.1, since earlier versions lack
+    fixed_size_binary.
     """
     return {f.name: {"_type": "Image"} if f.name == IMAGE else _feature(f.type) for f in columns}
 
@@ -112,12 +112,12 @@ def _feature(kind: pa.DataType) -> Any:
 
 
 def dtype_name(kind: pa.DataType) -> str:
-    """Name that ``datasets`` gives a plain Arrow type: ``float32``, not ``float``."""
+    """Return the name that ``datasets`` gives a plain Arrow type: ``float32``, not ``float``."""
     return {"float": "float32", "double": "float64"}.get(str(kind), str(kind))
 
 
 def shard_path(folder: Path, split: str, index: int, count: int, *, parquet: bool) -> Path:
-    """File of one shard, named as ``datasets`` and the Hub name it."""
+    """Return the path of a shard, named as ``datasets`` and the Hub name it."""
     number = f"{index:05d}-of-{count:05d}"
     split = split_name(split, f"{folder}: a split")
     if parquet:
@@ -126,5 +126,5 @@ def shard_path(folder: Path, split: str, index: int, count: int, *, parquet: boo
 
 
 def json_text(document: Any) -> str:
-    """A small JSON file, keys sorted so that equal content is equal bytes."""
+    """Format a small JSON document with sorted keys, so that equal content gives equal bytes."""
     return json.dumps(document, indent=1, sort_keys=True) + "\n"

@@ -1,8 +1,8 @@
-"""The manifest of a dataset: its shards, in the order of its rows, and how often it was added to.
+"""The manifest of a dataset: its shards in the order of the rows, and the number of its parts.
 
-A file that it does not name is not there. So a dataset grows by new shards, then the manifest in
-place of the one before, and nothing else of what is there is written again. For each time there
-is a folder as well, ``parts/00001``: how its rows were made, and what is known of them.
+Readers ignore files that the manifest does not list. A dataset therefore grows by new shards and
+then by a new manifest; no other existing file is written again. Every addition also gets a folder
+such as ``parts/00001`` with its provenance and the hashes of its images.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ PARTS = "parts"
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """One file of a split: its name, and how many rows and bytes it has."""
+    """One file of a split: its name, number of rows and size in bytes."""
 
     file: str
     rows: int
@@ -29,14 +29,14 @@ class Shard:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a dataset consists of.
+    """The contents of a dataset.
 
     Parameters
     ----------
     splits
         Shards by split, train first.
     parts
-        How often it was written to: once when it was made, and once each time it grew.
+        Number of times that rows were written: one for the creation, one for each addition.
     parquet
         Shards are Parquet files in ``data``, else Arrow streams in a folder of their split.
     """
@@ -46,22 +46,22 @@ class Manifest:
     parquet: bool = False
 
     def with_part(self, added: Mapping[str, Sequence[Shard]]) -> "Manifest":
-        """The same, grown by some shards."""
+        """Return a manifest with some shards added and one part more."""
         names = sorted({*self.splits, *added}, key=lambda name: (name != "train", name))
         grown = {name: [*self.splits.get(name, ()), *added.get(name, ())] for name in names}
         return Manifest(grown, self.parts + 1, self.parquet)
 
     def rows(self, split: str) -> int:
-        """How many rows a split has."""
+        """Count the rows of a split."""
         return sum(shard.rows for shard in self.splits.get(split, ()))
 
     def place(self, folder: Path, split: str, shard: Shard) -> Path:
-        """Where a shard lies in the dataset's folder."""
+        """Return the path of a shard in the dataset's folder."""
         own = "data" if self.parquet else split
         return inside(inside(folder, own, f"{folder}: a split"), shard.file, f"{folder}: a shard")
 
     def write(self, folder: Path) -> None:
-        """Write it into the folder of a dataset."""
+        """Write the manifest into the folder of a dataset."""
         splits = [
             {"split": name, "shards": [_plain(shard) for shard in shards]}
             for name, shards in self.splits.items()
@@ -71,19 +71,19 @@ class Manifest:
 
 
 def part_folder(folder: Path, number: int) -> Path:
-    """What is kept of the time that a dataset was made (0) or added to."""
+    """Return the folder of a part: 0 for the creation, then one for each addition."""
     return folder / PARTS / f"{number:05d}"
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """The manifest of a dataset; None, if it has none: others than dmrl write none.
+    """Read the manifest of a dataset; None if there is none, as in datasets of other programs.
 
     Raises
     ------
     DatasetError
-        If it is damaged.
+        If the manifest is damaged.
     UnsafeName
-        If a split or a shard is called what could not be a file's name.
+        If the name of a split or a shard is not a valid file name.
     """
     path = folder / layout.MANIFEST
     if not path.is_file():
@@ -102,7 +102,7 @@ def read_manifest(folder: Path) -> Manifest | None:
             raise ValueError("a shard is named twice")
         return Manifest(splits, _count(said["parts"]), said["parquet"] is True)
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as e:
-        raise DatasetError(f"{path} is not what it should be ({e}). Make the dataset again") from e
+        raise DatasetError(f"{path} is damaged ({e}). Make the dataset again") from e
 
 
 def _plain(shard: Shard) -> dict[str, Any]:
@@ -116,5 +116,5 @@ def _shard(said: Mapping[str, Any], path: Path) -> Shard:
 
 def _count(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**60:
-        raise ValueError(f"{value!r} is no count")
+        raise ValueError(f"{value!r} is not a count")
     return value

@@ -1,4 +1,4 @@
-"""Open datasets: shards are mapped into memory, never read as a whole."""
+"""Open datasets. Shards are mapped into memory; no split is read as a whole."""
 
 import re
 from bisect import bisect_right
@@ -37,7 +37,7 @@ class Split:
     name
         ``train`` or ``test``.
     table
-        All columns; ``layout.schema`` has their types. Memory-mapped for Arrow shards.
+        All columns, with the types of ``layout.build_schema``. Memory-mapped for Arrow shards.
     """
 
     name: str
@@ -62,15 +62,15 @@ class Split:
     def pixels(self) -> list[NDArray[np.uint8]]:
         """Images, one (n_i, H, W, 3) RGB array per record batch, in the order of ``table``.
 
-        Read-only views of the mapped files for raw pixels: nothing is read before it is
-        used. A dataset of PNGs is decoded here, once, as a whole, into memory.
+        For raw pixels these are read-only views of the mapped files, which load on use. A dataset
+        of PNGs is decoded once, as a whole, into memory.
         """
         if layout.PIXELS in self.table.schema.names:
             return [self._view(chunk) for chunk in self.table[layout.PIXELS].chunks]
         return [self._decoded(chunk) for chunk in self.table[layout.IMAGE].chunks]
 
     def images(self, rows: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-        """The images of these rows, (H, W, 3) each; PNGs of other rows are not decoded."""
+        """Yield the images of these rows, (H, W, 3) each; PNGs of other rows are not decoded."""
         packed = layout.IMAGE in self.table.schema.names and "pixels" not in self.__dict__
         for chunk, place in map(self._place, rows):
             if packed:
@@ -79,14 +79,14 @@ class Split:
                 yield self.pixels[chunk][place]
 
     def grids(self, name: str, rows: Sequence[int]) -> NDArray[np.float32]:
-        """(n, rows, cols) grid labels of these rows, and no others."""
+        """Return the grid labels of these rows alone, (n, rows, cols)."""
         out = np.empty((len(rows), *self.grid_shape), np.float32)
         for grid, (chunk, place) in zip(out, map(self._place, rows), strict=True):
             grid[:] = self._grids[name][chunk][place]
         return out
 
     def _place(self, row: int) -> tuple[int, int]:
-        """Number of a row's batch, and its place there."""
+        """Return the batch of a row, and the index of the row in that batch."""
         chunk = bisect_right(self._ends, row)
         return chunk, row - (self._ends[chunk - 1] if chunk else 0)
 
@@ -110,9 +110,9 @@ class Split:
 
     @cached_property
     def masks(self) -> list[NDArray[np.uint8]]:
-        """What the pixels of ``pixels`` show, (n_i, H, W): 0 or the place of a peer, from 1.
+        """Masks of ``pixels``, (n_i, H, W): 0 for the background or the index of a peer, from 1.
 
-        Empty where the dataset has no masks.
+        Empty if the dataset has no masks.
         """
         if layout.MASKS not in self.table.schema.names:
             return []
@@ -166,7 +166,7 @@ class Dataset:
     parquet
         Parquet files in place of Arrow shards.
     manifest
-        What it says of its shards. None: it was not written by dmrl, or by an earlier one.
+        Its manifest. None if another program, or an older dmrl, wrote the dataset.
     """
 
     path: Path
@@ -175,12 +175,12 @@ class Dataset:
     manifest: Manifest | None = None
 
     def split(self, name: str) -> Split:
-        """One split, mapped into memory.
+        """Open one split, mapped into memory.
 
         Raises
         ------
         DatasetError
-            If there is no such split, or a shard is missing or cut short.
+            If the split does not exist, or a shard is missing or truncated.
         """
         if name not in self.splits:
             present = ", ".join(self.splits)
@@ -195,11 +195,11 @@ class Dataset:
         return Split(name, pa.concat_tables(tables))
 
     def files(self, name: str) -> list[Path]:
-        """The shards of a split, in the order of its rows."""
+        """Return the shards of a split, in the order of its rows."""
         return [path for path, _ in self._shards(name)]
 
     def _shards(self, name: str) -> list[tuple[Path, int | None]]:
-        """Files and their rows, where these are known."""
+        """Return the shards of a split and their numbers of rows, None where not stored."""
         if self.manifest is not None:
             own = self.manifest.splits[name]
             return [(self.manifest.place(self.path, name, shard), shard.rows) for shard in own]
@@ -217,7 +217,7 @@ class Dataset:
                 raise ValueError("a shard is named twice")
         except (KeyError, TypeError, AttributeError, ValueError) as e:
             raise DatasetError(
-                f"{state} or {about} is not what it should be ({e}). Make the dataset again"
+                f"{state} or {about} is damaged ({e}). Make the dataset again"
             ) from None
         return [(inside(folder, file, f"{folder}: a shard"), count) for file, count in named]
 
@@ -229,12 +229,12 @@ class Dataset:
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a folder looks like a dataset; it may be damaged all the same."""
+    """Return whether a folder has the files of a dataset; it may still be damaged."""
     return (path / "dataset_dict.json").is_file() or bool(_parquet_names(path))
 
 
 def open_dataset(path: Path) -> Dataset:
-    """A dataset that ``dmrl dataset`` wrote, or ``datasets`` saved with the same columns.
+    """Open a dataset that ``dmrl dataset`` wrote, or ``datasets`` saved with the same columns.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def open_dataset(path: Path) -> Dataset:
     DatasetError
         If it is not a dataset.
     UnsafeName
-        If a split is called what could not be a folder's name, or the path is no text.
+        If the name of a split is not a valid folder name, or the path is not valid text.
     """
     refuse_no_text(path)
     refuse_pipes(path)

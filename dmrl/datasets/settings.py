@@ -1,4 +1,4 @@
-"""What a person chooses of a dataset."""
+"""Settings of ``dmrl dataset``."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,44 +12,44 @@ Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How recordings become a dataset.
+    """Settings that turn recordings into a dataset.
 
     Parameters
     ----------
     labels
-        Whose labels. "auto" takes, for each recording, the first of estimate, truth, hand and
-        published that it has: what dmrl label made goes before the truth. "best" takes the truth
-        before estimates.
+        Source of the labels. "auto" takes, for each recording, the first of estimate, truth, hand
+        and published that it has: labels from dmrl label go before the truth. "best" takes the
+        truth before estimates.
     keep_all
-        Use labels that are not OK as well. Without it, images with such a label are left out.
+        Also use labels that are not OK. Without it, images with such a label are left out.
     split
-        "auto": as the source says, where it does, else whole recordings. "recordings": whole
+        "auto": the split that the source defines, else whole recordings. "recordings": whole
         recordings. "none": everything is train.
     test_share
         Share of the recordings that become the test split, 0 to 1.
     val
-        Pattern of the recordings' names that become the split val, on which a training chooses its
-        threshold and never learns, such as "held*". Empty: none.
+        Pattern of the names of recordings that become the split val, such as "held*". A training
+        chooses its threshold on it and never learns from it. Empty: none.
     seed
         Another seed holds out other recordings.
     masks
-        Keep the masks of rendered robots: a training can then paste robots without what was
-        around them. Images that show a peer and have no mask are left out.
+        Keep the masks of rendered robots. A training can then paste robots without their
+        surroundings. Images that show a peer and have no mask are left out.
     png
-        Store PNG images in place of raw pixels: less disk, but decoded at each opening.
+        Store PNG images in place of raw pixels: smaller on disk, but decoded at each opening.
     parquet
-        Write Parquet files in place of Arrow shards: for publishing. Images are PNG then, which
-        others show as images.
+        Write Parquet files in place of Arrow shards, for publishing. Images are PNG then, which
+        other tools display.
     without
         CSV file of images to leave out: source, robot, log_time. dmrl view DATASET --flag helps
         to write one.
     shard_images
         Images per shard, at most.
     title
-        Name of the dataset on its card. Empty: made from the recordings' names.
+        Name of the dataset on its card. Empty: made from the names of the recordings.
     license
-        License on the card: an SPDX identifier such as cc-by-4.0, or a word of the Hugging Face
-        Hub's: unknown, other.
+        License on the card: an SPDX identifier such as cc-by-4.0, or one of the Hugging Face
+        Hub's names: unknown, other.
     """
 
     labels: Literal["auto", "best", "truth", "estimate", "hand", "published"] = "auto"

@@ -1,7 +1,7 @@
-"""Shards of a dataset, opened and held against the layout before anything looks at their values.
+"""Open the shards of a dataset and validate them before any value is read.
 
-Arrow's own reader believes a file: an offset beyond a buffer is read all the same. So every
-shard is validated, and what is not laid out as `dmrl.datasets.layout` says is refused.
+Arrow's own reader trusts a file: it follows an offset beyond a buffer. Every shard is therefore
+validated, and a shard that does not follow `dmrl.datasets.layout` is rejected.
 """
 
 import os
@@ -18,26 +18,27 @@ from dmrl.guards import limits
 from dmrl.guards.memory import Bounded
 
 AGAIN = "Make the dataset again, or copy it whole"
+"""Way out at the end of every error about a shard."""
 
 
 def open_shard(path: Path, rows: int | None) -> pa.Table:
-    """The columns of the layout in a shard; memory-mapped for Arrow.
+    """Open the layout's columns of a shard; memory-mapped for Arrow.
 
     Parameters
     ----------
     path
         An Arrow stream, or a ``.parquet`` file.
     rows
-        How many it has; None: not known.
+        Expected number of rows. None: not checked.
 
     Raises
     ------
     DatasetError
-        If it is missing, damaged, asks for more memory than its size explains, or is not laid out
-        as a dataset.
+        If the shard is missing, damaged, unpacks to far more memory than its size explains, or does
+        not follow the layout.
     """
     if path.exists() and not path.is_file():
-        raise DatasetError(f"shard {path} is no file. {AGAIN}")
+        raise DatasetError(f"shard {path} is not a file. {AGAIN}")
     try:
         with Bounded(path.stat().st_size):
             table = _mapped(path)
@@ -51,7 +52,7 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
     except (pa.ArrowException, OSError, ValueError) as e:
         why = " ".join(str(e).split())
         raise DatasetError(f"shard {path} is cut short or damaged: {why}. {AGAIN}") from None
-    # A stream cut between two batches reads without an error.
+    # A stream that ends between two batches reads without an error.
     if rows is not None and table.num_rows != rows:
         found = f"{table.num_rows} of {rows} rows"
         raise DatasetError(f"shard {path} is cut short: {found}. {AGAIN}")
@@ -61,12 +62,12 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
 
 
 def schema_of(path: Path) -> pa.Schema:
-    """The columns of a shard, from its head alone.
+    """Read the columns of a shard from its header alone.
 
     Raises
     ------
     DatasetError
-        If it is missing or damaged.
+        If the shard is missing or damaged.
     """
     try:
         with path.open("rb") as stream:
@@ -88,7 +89,7 @@ def _mapped(path: Path) -> pa.Table:
 
 
 def _not_laid_out(table: pa.Table) -> str:
-    """What of a table is not as the layout has it; empty: nothing."""
+    """Return the first difference between a table and the layout; empty if there is none."""
     names = table.schema.names
     if len(set(names)) < len(names):
         return "has a column twice"
@@ -112,7 +113,7 @@ def _not_laid_out(table: pa.Table) -> str:
 
 
 def _wrong_column(table: pa.Table, height_px: int, width_px: int) -> str:
-    """Which column is not as the layout has it for images of that size; empty: none."""
+    """Return an error if a column has the wrong type or nulls; empty if all are right."""
     names = table.schema.names
     known = layout.schema(height_px, width_px, masks=layout.MASKS in names)
     packed = layout.schema(height_px, width_px, png=True).field(layout.IMAGE)
@@ -127,7 +128,7 @@ def _wrong_column(table: pa.Table, height_px: int, width_px: int) -> str:
 
 
 def _has_nulls(values: pa.Array) -> bool:
-    """Whether a value is missing, or one in it. A picture needs no path."""
+    """Return whether a value, or a value nested in it, is null. An image needs no path."""
     if values.null_count:
         return True
     if pa.types.is_struct(values.type):

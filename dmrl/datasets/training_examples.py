@@ -1,4 +1,4 @@
-"""Datasets to what a training learns from: images with their robots, some of them held out."""
+"""Load training data from datasets: images, their robots, and the validation part."""
 
 import fnmatch
 from collections.abc import Sequence
@@ -16,17 +16,18 @@ from dmrl.learn.training.config import FitSettings
 
 
 class Material(NamedTuple):
-    """Images to learn from, and what else a training needs.
+    """Images to train on, images to validate on, and sampling weights.
 
     Parameters
     ----------
     examples
-        To learn from.
+        Training images.
     held_out
-        To look at and to choose the threshold on: the split named val or, where there is none,
-        a share of the train split. None: nothing is held out.
+        Validation images, on which the threshold is chosen: the split val or, without one, a share
+        of the train split. None: nothing is held out.
     shares
-        (N,) how often each of ``examples`` shall come in an epoch, 1 on average. None: once.
+        (N,) mean number of times that each of ``examples`` is drawn in an epoch, 1 on average.
+        None: each once.
     """
 
     examples: Examples
@@ -35,22 +36,22 @@ class Material(NamedTuple):
 
 
 def material(data: Dataset, settings: FitSettings) -> Material:
-    """What a training with these settings learns from, and what it is watched on.
+    """Load the training and the validation images that these settings choose.
 
     Raises
     ------
     DatasetError
-        If there is no train split, or no robot in it.
+        If the dataset has no train split, or that split no robot.
     SettingError
-        If the shares do not fit the recordings, or the classes the peers.
+        If the shares do not match the recordings, or the classes the peers.
     """
     train = data.split("train")
     every = examples_of(train, settings.classes)
     if not np.isfinite(every.robots).any():
         raise DatasetError(
-            f"{data.path} shows no robot in any of the {len(every)} images of its train split: of "
-            "them alone a network learns that nobody is ever there. Add images with robots: dmrl "
-            f"dataset ROBOTS.mcap {data.path} --add"
+            f"{data.path} shows no robot in any of the {len(every)} images of its train split: a "
+            "network would learn to detect none. Add images with robots: dmrl dataset "
+            f"ROBOTS.mcap {data.path} --add"
         )
     _require_classes(train, every, settings.classes)
     sources = np.array(train.table.column("source").to_pylist())
@@ -69,13 +70,13 @@ def _require_classes(train: Split, every: Examples, classes: Sequence[str]) -> N
             peers = pc.list_flatten(train.table.column("peers"))
             names = pc.unique(pc.struct_field(peers, "peer")).to_pylist()
             raise SettingError(
-                f"classes: {pattern} is left no peer by the patterns before it. Choose among "
-                f"{', '.join(sorted(names))}"
+                f"classes: {pattern} matches no peer that the patterns before it leave. Choose "
+                f"among {', '.join(sorted(names))}"
             )
 
 
 def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
-    """The last share of the images of each recording."""
+    """Select the last share of the images of each recording."""
     held = np.zeros(len(sources), bool)
     for source in np.unique(sources):
         mine = np.flatnonzero(sources == source)
@@ -84,12 +85,12 @@ def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
 
 
 def _shares(sources: NDArray[np.str_], wanted: dict[str, float]) -> NDArray[np.float64] | None:
-    """How often each image shall come in an epoch, by the shares of the recordings.
+    """Return how often each image is drawn in an epoch, from the shares of the recordings.
 
     Raises
     ------
     SettingError
-        If a pattern fits no recording, or a recording fits none.
+        If a pattern matches no recording, or no pattern matches a recording.
     """
     if not wanted:
         return None
@@ -112,7 +113,7 @@ def _shares(sources: NDArray[np.str_], wanted: dict[str, float]) -> NDArray[np.f
 
 
 def examples_of(split: Split, classes: Sequence[str] = ()) -> Examples:
-    """Images of a split with the robots in them; ``classes`` are patterns of peer names."""
+    """Build training examples from a split; ``classes`` are patterns of peer names."""
     column = split.table.column("peers").combine_chunks()
     counts = pc.list_value_length(column).to_numpy(zero_copy_only=False).astype(np.int64)
     peers = column.flatten()
@@ -132,7 +133,7 @@ def examples_of(split: Split, classes: Sequence[str] = ()) -> Examples:
 
 
 def _class_ids(names: pa.Array, classes: Sequence[str]) -> NDArray[np.float32]:
-    """(n,) number of the first pattern that fits a peer's name, NaN where none does."""
+    """Return the first matching pattern of each peer's name, (n,); NaN without a match."""
     known = pc.unique(names).to_pylist()
     place = np.array(pc.index_in(names, pa.array(known, names.type)).to_pylist(), np.int64)
     of_name = np.full(len(known), np.nan, np.float32)

@@ -1,4 +1,4 @@
-"""From a trained network to int8: quantiser, integer reference, ONNX and C, on arrays.
+"""Deployment of a trained network: int8 quantization, integer reference, ONNX and C, on arrays.
 
-``integer`` is what the C is generated from, ``reference`` is how it computes, bit for bit.
+The C code is generated from ``int8.network``. ``int8.reference`` computes the same, bit for bit.
 """

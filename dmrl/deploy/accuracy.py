@@ -1,4 +1,4 @@
-"""Detections of a backend, and how good they are against labels."""
+"""Detections of a backend, and their metrics against labels."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from dmrl.learn.inference.matching import Points
 
 
 def points_of(outputs: Outputs, stride_px: int) -> Points:
-    """Detections in N images."""
+    """Decode the detections in N images."""
     found = decode(*grids_of(outputs), stride_px=stride_px)
     kept = np.arange(found.u_px.shape[1]) < found.count[:, None]
     return Points(
@@ -24,7 +24,10 @@ def points_of(outputs: Outputs, stride_px: int) -> Points:
 def figures_of(
     images: int, labels: Points, detections: Points, threshold: float
 ) -> dict[str, float | None]:
-    """Figures over all distances, by the names in ``metrics.DEFINITIONS``; None: not measured."""
+    """Compute the metrics over all distances; None: not measured.
+
+    ``METRIC_DEFINITIONS`` of `detection_metrics` defines them.
+    """
     overall, *_ = by_band(score(images, labels, detections), threshold=threshold, draws=1)
     return {
         name: figure.value if np.isfinite(figure.value) else None
@@ -33,7 +36,7 @@ def figures_of(
 
 
 def argmax_kept(wanted: Outputs, got: Outputs) -> float:
-    """Share of images whose most confident cell is the same in both."""
+    """Return the fraction of images whose most confident cell is the same in both outputs."""
     best = [
         each["confidence"].reshape(len(each["confidence"]), -1).argmax(1) for each in (wanted, got)
     ]

@@ -1,4 +1,4 @@
-"""Backends: the ways to compute a network's output without torch, all with one interface."""
+"""Backends: ways to compute a network's output without torch, behind one interface."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -15,21 +15,21 @@ from dmrl.learn.inference.decode_grids import Grids
 Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 """(N, height, width, 3) RGB, or N images of one size."""
 Outputs = dict[str, Float32]
-"""(N, rows, cols) by the names that the network's class gives its ``channels``."""
+"""(N, rows, cols) by channel name, as in ``channels`` of the network's class."""
 Levels = dict[str, NDArray[np.int8]]
 """(rows, cols) by the name of the head."""
 
 
 class Backend(Protocol):
-    """What computes."""
+    """Protocol of a backend."""
 
     def outputs(self, images: Images) -> Outputs:
-        """Output for (N, height, width, 3) RGB images of the network's size."""
+        """Compute the output for (N, height, width, 3) RGB images of the network's size."""
 
 
 def grids_of(outputs: Outputs) -> Grids:
-    """What an output says of N images."""
-    # Clipped far beyond what means anything, so that exp does not overflow.
+    """Convert the output for N images to `Grids`."""
+    # Clip far beyond meaningful values, so that exp does not overflow.
     logit = np.clip(outputs["confidence"].astype(np.float64), -60, 60)
     depth_m = np.exp(np.minimum(outputs["log_depth"], 60))
     offset = None
@@ -39,14 +39,14 @@ def grids_of(outputs: Outputs) -> Grids:
 
 
 class Float:
-    """The float network in NumPy, its normalisation folded.
+    """Float network in NumPy, batch normalisation folded.
 
     Parameters
     ----------
     graph
         The network.
     channels
-        What each channel of its output is.
+        Names of the channels of its output.
     """
 
     def __init__(self, graph: Graph, channels: tuple[str, ...]) -> None:
@@ -54,7 +54,7 @@ class Float:
         self.channels = channels
 
     def outputs(self, images: Images) -> Outputs:
-        """Output for (N, height, width, 3) RGB images."""
+        """Compute the output for (N, height, width, 3) RGB images."""
         stacked = np.asarray(images)
         seen = grey_of(stacked) if self.graph.channels == 1 else stacked
         output = outputs_of(self.graph, tensors_of(self.graph, to_input(seen)))
@@ -62,14 +62,15 @@ class Float:
 
 
 class OnLevels:
-    """An int8 network, computed image by image.
+    """Int8 network, computed image by image.
 
     Parameters
     ----------
     network
-        What is computed.
+        The network.
     run
-        From a (height, width, channels) image, as the network takes it, to its heads' grids.
+        Function from a (height, width, channels) image, in the network's format, to the heads' int8
+        grids.
     """
 
     def __init__(self, network: IntegerNetwork, run: Callable[[NDArray[np.uint8]], Levels]) -> None:
@@ -77,23 +78,23 @@ class OnLevels:
         self.run = run
 
     def outputs(self, images: Images) -> Outputs:
-        """Output for (N, height, width, 3) RGB images: real values of the heads."""
+        """Compute the dequantized heads for (N, height, width, 3) RGB images."""
         seen = [seen_by(self.network, image) for image in images]
         return real_outputs(self.network, [self.run(image) for image in seen])
 
 
 def integer(network: IntegerNetwork) -> OnLevels:
-    """The int8 network in NumPy: the reference."""
+    """Return the backend of the integer reference, in NumPy."""
     return OnLevels(network, lambda image: reference.run(network, image))
 
 
 def seen_by(network: IntegerNetwork, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A (height, width, 3) RGB image as the network takes it: RGB, or grey."""
+    """Convert a (height, width, 3) RGB image to the network's format: RGB, or grey."""
     return grey_of(image[None])[0] if network.channels == 1 else image
 
 
 def real_outputs(network: IntegerNetwork, levels: list[Levels]) -> Outputs:
-    """Real values of the int8 grids of N images."""
+    """Dequantize the int8 grids of N images."""
     return {
         channel: reference.real(
             network.heads[head], np.stack([grids[head] for grids in levels])

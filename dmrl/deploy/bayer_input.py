@@ -1,4 +1,4 @@
-"""Raw images of colour cameras, as the C takes them; NumPy, bit for bit what it computes."""
+"""Raw Bayer images of colour cameras, the input of the C; NumPy, bit-identical to it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,12 +7,12 @@ Image = NDArray[np.uint8]
 
 
 def mosaic(image: Image, *, red_row: int = 0, red_col: int = 0) -> Image:
-    """(H, W) what a colour sensor would give of an (H, W, 3) RGB image, or of (H, W, 1) grey.
+    """Simulate the (H, W) Bayer mosaic of an (H, W, 3) RGB image, or of (H, W, 1) grey.
 
     Parameters
     ----------
     image
-        What is seen.
+        Source image.
     red_row, red_col
         0 or 1: the rows and columns, modulo 2, of the red pixels. Both 0: RGGB.
     """
@@ -24,15 +24,15 @@ def mosaic(image: Image, *, red_row: int = 0, red_col: int = 0) -> Image:
 
 
 def demosaic(raw: Image, *, channels: int = 3, red_row: int = 0, red_col: int = 0) -> Image:
-    """(H, W, channels) image of an (H, W) mosaic: RGB, or grey.
+    """Demosaic an (H, W) Bayer image to (H, W, channels): RGB, or grey.
 
-    What a pixel did not measure is the mean of its two or four nearest neighbours that did,
-    halves going up; the border is mirrored.
+    A missing colour is the mean of the two or four nearest neighbours that measured it, halves
+    rounded up; the border is mirrored.
 
     Parameters
     ----------
     raw
-        What the sensor gave, at least 2 x 2.
+        Bayer mosaic, at least 2 x 2.
     channels
         3, or 1 for (77 R + 150 G + 29 B + 128) >> 8.
     red_row, red_col

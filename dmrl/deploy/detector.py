@@ -1,6 +1,6 @@
-"""A model, opened for one of the ways to compute it.
+"""Opens a model for one of the backends.
 
-Rooms are loaded by name when they are asked for: each needs packages that the others do not.
+Modules are imported by name on demand: each requires packages that the others do not.
 """
 
 import math
@@ -40,27 +40,27 @@ LIBRARIES: dict[BackendName, tuple[str, ...]] = {
     "c": ("numpy",),
     "riscv32": ("numpy",),
 }
-"""Packages whose version can change what a backend gives."""
+"""Packages whose version can change the output of a backend."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detector:
-    """What turns images into grids.
+    """Function from images to grids, with its properties.
 
     Parameters
     ----------
     name
-        Of the model.
+        Name of the model.
     grids
-        What the model says of (N, height, width, 3) RGB images, or of a list of N.
+        Function from (N, height, width, 3) RGB images, or a list of N, to output grids.
     stride_px
         Side of a grid cell.
     threshold
-        Confidence from which a detection is to be believed, 0 to 1.
+        Confidence from which a detection is reported, 0 to 1.
     size_px
-        Width and height of the images that it takes; None: any whole number of cells.
+        Required width and height of the images; None: any whole number of cells.
     file
-        What alone decides the result; None: the model as a whole.
+        The file that alone determines the result; None: the whole model does.
     """
 
     name: str
@@ -71,12 +71,12 @@ class Detector:
     file: Path | None = None
 
     def require_size(self, width_px: int, height_px: int, what: object) -> None:
-        """Nothing, if images of this size can be taken.
+        """Raise SettingError unless the detector accepts images of this size.
 
         Raises
         ------
         SettingError
-            If not.
+            If it requires another size or a whole number of cells.
         """
         if self.size_px is None and (width_px % self.stride_px or height_px % self.stride_px):
             raise SettingError(
@@ -86,28 +86,28 @@ class Detector:
         if self.size_px not in (None, (width_px, height_px)):
             taken = "{} x {}".format(*self.size_px or ())
             raise SettingError(
-                f"{what}: images of {width_px} x {height_px} px, {self.name} takes {taken} alone. "
+                f"{what}: images of {width_px} x {height_px} px, {self.name} takes only {taken}. "
                 "Crop or scale the images, or quantise the model for images of this size"
             )
 
 
 def open_detector(model: Path, backend: BackendName) -> Detector:
-    """A model for a backend.
+    """Open a model with a backend.
 
     Parameters
     ----------
     model
         Run folder, .safetensors, Keras .h5, quantised model or export folder.
     backend
-        "torch" and "onnx" are float; "integer" (NumPy), "onnx-int8", "c" and "riscv32" (the C,
-        emulated) are int8, and need a quantised model or an export folder.
+        "torch" and "onnx" are float. "integer" (NumPy), "onnx-int8", "c" and "riscv32" (the C,
+        emulated) are int8 and require a quantised model or an export folder.
 
     Raises
     ------
     ModelError
-        If the model cannot be used, or is not what the backend needs.
+        If the model cannot be used, or not with this backend.
     MissingExtra
-        If the backend needs a package that is not installed.
+        If the backend requires a package that is not installed.
     SettingError
         If there is no such backend.
     """
@@ -124,12 +124,12 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
 
 
 def fastest(model: Path, size_px: tuple[int, int]) -> BackendName:
-    """The fastest float backend that is installed and gives all that a model says of images.
+    """Return the fastest installed float backend that supports all outputs of a model.
 
     Parameters
     ----------
     model
-        As `open_detector` takes it.
+        As in `open_detector`.
     size_px
         Width and height of the images.
     """
@@ -140,7 +140,7 @@ def fastest(model: Path, size_px: tuple[int, int]) -> BackendName:
         written = import_module("dmrl.deploy.onnx.graph_writer").OUTPUT_OF
         learned = import_module("dmrl.learn.inference.loaded_model").load_model(model)
     except (MissingExtra, ModuleNotFoundError, ModelError):
-        return "torch"  # which says what is wrong
+        return "torch"  # which then reports the error
     told = set(learned.network.channels) <= set(written)
     return "onnx" if told and size_px == (learned.width_px, learned.height_px) else "torch"
 
@@ -233,7 +233,7 @@ def _grids(runs: Backend) -> Callable[[Images], Grids]:
 
 
 def _described(file: Path) -> tuple[int, float]:
-    """Stride and threshold that the description of an export folder says."""
+    """Read stride and threshold from the description of an export folder."""
     try:
         said = parse_json(file.read_text(encoding="utf-8"))
         stride_px, threshold = int(said["stride_px"]), float(said["threshold"])

@@ -1,4 +1,4 @@
-"""A few images that go along with an int8 model: what its C is checked on."""
+"""Sample images stored with an int8 model, on which its C is verified."""
 
 import zipfile
 from pathlib import Path
@@ -11,6 +11,7 @@ from dmrl.guards.bounded_parsing import load_npz
 
 SAMPLES_NAME = "samples.npz"
 SAMPLES = 4
+"""Number of images stored."""
 
 
 def save_samples(images: NDArray[np.uint8], folder: Path) -> None:
@@ -19,7 +20,7 @@ def save_samples(images: NDArray[np.uint8], folder: Path) -> None:
 
 
 def load_samples(folder: Path) -> NDArray[np.uint8]:
-    """The (N, height, width, 3) RGB images of a folder.
+    """Read the (N, height, width, 3) RGB images of a folder.
 
     Raises
     ------

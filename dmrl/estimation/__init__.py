@@ -1,7 +1,7 @@
-"""Relative positions from ranges, velocities and yaw rates; clocks, tracks, calibration. No files.
+"""Estimate relative positions, clocks, tracks and camera calibrations from arrays.
 
-Arrays in, arrays out: nothing here knows recordings.
+No module here reads or writes files, and none imports the recording package.
 
-Frames and signs are those of ``geometry``: horizontal has x forward, y left, z up. The state
-is (x, y, psi): where the peer is in the observer's horizontal frame, and its heading there.
+Frames and signs are those of ``geometry``: the horizontal frame has x forward, y left, z up. The
+state of a pair is (x, y, psi): position and heading of the peer in the observer's horizontal frame.
 """

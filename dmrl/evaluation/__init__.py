@@ -1,1 +1,1 @@
-"""Detections, positions and tracks, joined with the ground truth and judged."""
+"""Evaluate detections, positions and tracks against the ground truth."""

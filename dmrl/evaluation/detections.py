@@ -1,7 +1,7 @@
-"""Labels and detections of recordings, joined by robot and log time.
+"""Join the labels and detections of recordings by robot and log time.
 
-The images are those that a dataset would take: with labels from the source that is asked
-for, all of them OK, or without any, if it looked. See ``dmrl.datasets.writing.rows``.
+The images are those of a dataset. They have labels from the chosen source, all of them OK, or that
+source labelled them as empty. See ``dmrl.datasets.writing.rows``.
 """
 
 from collections import Counter
@@ -32,7 +32,7 @@ Times = NDArray[np.int64]
 
 
 class At(NamedTuple):
-    """Which image: of whom, and its log time, nanoseconds."""
+    """Identifies an image: recording, robot, and log time in nanoseconds."""
 
     recording: Path
     robot: str
@@ -46,17 +46,17 @@ class Pairs:
     Parameters
     ----------
     at
-        Which images.
+        Identities of the images.
     labels
-        Those inside the image, from one source.
+        Labels inside the image, from one source.
     detections
-        All of them, best first within an image.
+        All detections, best first within an image.
     threshold
-        Confidence from which they are to be believed, as the detector says; 0: not known.
+        The detector's own threshold on the confidence; 0: not stored.
     left_out
-        Why images and labels were left out, and how many.
+        Number of images and labels left out, by reason.
     unseen
-        Images without a Detections message, judged as ones in which nothing was found.
+        Images without a Detections message, evaluated as images without detections.
     """
 
     at: list[At]
@@ -75,15 +75,15 @@ class Pairs:
 def join(
     recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
 ) -> Pairs:
-    """Labels and detections of every image that can be judged, one recording after another.
+    """Join labels and detections of every image that can be evaluated, recording by recording.
 
-    In an image without a Detections message nothing was found: what a detector leaves out counts
-    against it.
+    An image without a Detections message counts as one without detections: images that a detector
+    skips count against it.
 
     Parameters
     ----------
     recordings
-        With labels and detections.
+        Recordings with labels and detections.
     against
         Source of the labels.
     split
@@ -96,7 +96,7 @@ def join(
     RecordingError
         If a recording cannot be read, has no detections, labels or images, or is given twice.
     SettingError
-        If one has no labels of that source, no such split, or no image to judge.
+        If a recording has no labels from that source, no such split, or no image to evaluate.
     """
     refuse_twice(recordings)
     return _together(
@@ -129,7 +129,7 @@ def _join(recording: Path, against: str, split: str | None, partial: bool) -> Pa
 
 
 def labels_of_split(split: Split, rows: Sequence[int]) -> Points:
-    """Labels inside the images of some rows of a dataset's split, numbered by their place."""
+    """Read the labels inside some images of a split; images are numbered by their position."""
     height_px, width_px = split.image_shape
     entries = _column(split.table, "peers")
     labels = _points(entries, None, np.array(rows, np.int64), np.arange(len(rows)))
@@ -199,7 +199,7 @@ def _join_robot(
 
 
 def _detected(held: Contents, robot: str) -> pa.Table:
-    """A robot's detections; no row where it has none."""
+    """Read a robot's detections; an empty table if it has none."""
     topic = topics.detections(robot)
     if topic in held.topics:
         return held.table(topic)
@@ -208,7 +208,7 @@ def _detected(held: Contents, robot: str) -> pa.Table:
 
 
 def _by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
-    """Log times, each once, and what all messages of a time say, by `LOOKED`."""
+    """Merge messages of equal log time; return the times and the merged columns of `LOOKED`."""
     times, first = np.unique(_column(labelled, "log_time").to_numpy(), return_index=True)
     found = []
     for name in LOOKED:
@@ -222,7 +222,7 @@ def _by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
 def _usable(
     peers: pa.Array, looked: pa.Array, against: str, within: Mask, left_out: Counter[str]
 ) -> tuple[Mask, Mask]:
-    """Which peers are from the source, and which of the images can be judged by them."""
+    """Select the peers from one source, and the images that they can evaluate."""
     image = _image_of(peers)
     flat = peers.flatten()
     mine = pc.equal(flat.field("source"), against).to_numpy(zero_copy_only=False)
@@ -240,7 +240,7 @@ def _usable(
 
 
 def _points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -> Points:
-    """Entries of the chosen rows of a list column, as of images with these numbers."""
+    """Build points from the entries of chosen rows of a list column, with these image numbers."""
     place = np.full(len(entries), -1, np.int64)
     place[rows] = numbers
     image = place[_image_of(entries)]
@@ -254,13 +254,13 @@ def _points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -
     }
     image = image[keep]
     values.setdefault("confidence", np.ones(len(keep)))
-    # By image, and best first: a foreign detector may not have sorted them.
+    # By image, and best first: a detector of another program may not sort them.
     order = np.lexsort((-values["confidence"], image))
     return Points(image[order], **{name: value[order] for name, value in values.items()})
 
 
 def _together(parts: list[Pairs]) -> Pairs:
-    """The images of several robots or recordings, one after another."""
+    """Concatenate the images of several robots or recordings."""
     first = np.cumsum([0, *(part.images for part in parts)])
     left_out: Counter[str] = Counter()
     for part in parts:
@@ -285,7 +285,7 @@ def _within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
 
 
 def _image_of(entries: pa.Array) -> Times:
-    """(M,) row of a list column that each of its M entries belongs to."""
+    """Return the row of a list column that each of its M entries belongs to, (M,)."""
     return np.repeat(np.arange(len(entries)), np.diff(entries.offsets.to_numpy()))
 
 

@@ -1,6 +1,7 @@
-"""What a recipe wants its page to begin with: figures and numbers, beside published ones.
+"""Figures and numbers that a recipe defines for the top of its report.
 
-``[[figure]]`` tables of a pipeline recipe. They name outputs of steps; `dmrl.html_report` draws them.
+``[[figure]]`` tables of a pipeline recipe. They name outputs of steps; `dmrl.html_report` draws
+them.
 """
 
 import re
@@ -13,28 +14,28 @@ from dmrl import recipe as recipes
 
 KEY, TITLE = "figure", "title"
 MOST = 40
-"""Figures of one recipe."""
+"""Figures of one recipe, at most."""
 _FORM = re.compile(r",?(\.\d{1,2})?[efg%]")
-"""Of a number: no width, which could be a gigabyte of spaces."""
+"""Allowed number formats: no width, since a large one would need gigabytes of spaces."""
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A figure of ours beside a published one.
+    """A measured value beside a published one.
 
     Parameters
     ----------
     what
-        What is measured, in words.
+        Name of the value.
     published
-        As it was published, in words; empty: it was not.
+        The published value, as text; empty: not published.
     of
-        A JSON document: an output of a step, and a file in it where it is a folder.
+        A JSON document: an output of a step, or a file in it if the output is a folder.
     at
-        Where it stands there: keys and places with dots between, such as
-        overall.median_px.value. In a list, a word finds the table that has it as a value.
+        Path of the value in it: keys and indices separated by dots, such as
+        overall.median_px.value. In a list, a word selects the table that has it as a value.
     form
-        Python's format of it, such as .1%.
+        Python format of the value, such as .1%.
     """
 
     what: str
@@ -46,24 +47,24 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A figure of a recipe's page.
+    """A figure of a recipe's report.
 
     Parameters
     ----------
     title
         Its heading.
     shows
-        losses: curves of trainings. images: images with what was found. errors: violins.
-        maps: maps of confidence and depth, computed in several ways. numbers: a table.
+        losses: loss curves of trainings. images: images with detections. errors: violin plots.
+        maps: maps of confidence and depth from several computations. numbers: a table.
     of
         Outputs of steps: of train for losses, of evaluate for images and errors; recordings of
         the same images, by predict, for maps.
     named
-        Words for each of them. Without: their names.
+        A label for each of them. Default: their names.
     words
-        What was published, or what to see in it.
+        Text above the figure, such as the published result.
     rows
-        Of numbers.
+        Rows of numbers.
     """
 
     title: str
@@ -75,21 +76,21 @@ class Shown:
 
     @property
     def outputs(self) -> list[str]:
-        """What it reads."""
+        """Outputs of steps that the figure reads."""
         return [*self.of, *(row.of for row in self.rows)]
 
     def label(self, place: int) -> str:
-        """Words for one of its outputs."""
+        """Return the label of one of its outputs."""
         return self.named[place] if place < len(self.named) else self.of[place]
 
 
 def told(name: str | Path, recipe: Mapping[str, Any]) -> list[Shown]:
-    """The figures of a recipe; none where it names none.
+    """Read the figures of a recipe; empty if it defines none.
 
     Raises
     ------
     RecipeError
-        If a table is not as it should be.
+        If a table is invalid.
     """
     if wrong := list(faults(recipe)):
         raise recipes.faulty(name, wrong)
@@ -97,14 +98,14 @@ def told(name: str | Path, recipe: Mapping[str, Any]) -> list[Shown]:
 
 
 def faults(recipe: Mapping[str, Any], outs: Set[str] | None = None) -> Iterator[str]:
-    """What is wrong with the figures of a recipe.
+    """Yield the errors in the figures of a recipe.
 
     Parameters
     ----------
     recipe
         Its keys.
     outs
-        What its steps write. None: not known.
+        Outputs of its steps. None: unknown.
     """
     if not isinstance(recipe.get(TITLE, ""), str):
         yield f"{TITLE}: must be a text"
@@ -135,18 +136,18 @@ def _slips(shown: Shown, outs: Set[str] | None) -> Iterator[str]:
             yield f"of: no step writes {name}. Name a step's out"
     for row in shown.rows:
         if not _FORM.fullmatch(row.form):
-            yield f"rows: {row.form} is no format of a number. Try: .2f, .1%"
+            yield f"rows: {row.form} is not a number format. Try: .2f, .1%"
 
 
 def value_at(document: Any, at: str) -> float | int | str | None:
-    """What stands at a place of a JSON document; None where it has no such place.
+    """Return the value at a path of a JSON document; None if the path does not exist.
 
     Parameters
     ----------
     document
         A document.
     at
-        See `Number`.
+        See `ReportedValue`.
     """
     for part in at.split("."):
         try:

@@ -1,4 +1,4 @@
-"""Figures of detections: rows of a table, a column for each range of depth; and JSON values."""
+"""Format the metrics of detections: a table with a column per range of depth, and JSON values."""
 
 import math
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ ROWS = (
 
 
 def by_band_table(bands: Sequence[BandFigures]) -> tuple[list[str], list[list[object]]]:
-    """Headers and rows: all labels, then each band that holds any.
+    """Build headers and rows: all labels, then each band of depth that has labels.
 
     Parameters
     ----------
     bands
-        All distances first.
+        Metrics by band, all distances first.
     """
     overall, *others = bands
     shown = [overall, *(band for band in others if band.labels)]
@@ -56,7 +56,7 @@ def _cell(figure: Figure, form: str) -> str:
 
 
 def band_values(band: BandFigures) -> dict[str, Any]:
-    """Figures of one range of depth, as JSON values."""
+    """Return the metrics of one range of depth as JSON values."""
     return {
         "from_m": band.from_m,
         "to_m": finite(band.to_m),
@@ -71,11 +71,11 @@ def band_values(band: BandFigures) -> dict[str, Any]:
 
 
 def curve_values(scored: Scored) -> dict[str, list[float | None]]:
-    """Precision, recall and the like over the confidence, as JSON values."""
+    """Return precision, recall and other curves over the confidence as JSON values."""
     found = asdict(curves(scored))
     return {name: [finite(value) for value in values.tolist()] for name, values in found.items()}
 
 
 def finite(value: float) -> float | None:
-    """The number, if it is one: JSON has neither NaN nor infinity."""
+    """Return a number if it is finite, else None: JSON has neither NaN nor infinity."""
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: its errors, and a few images to be looked at."""
+"""Draw the figures of an evaluation: error plots, and a few example images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,25 +19,25 @@ from dmrl.recording import read, summary
 
 Array = NDArray[np.float64]
 
-# Places in the order of the error, 0 to 1: what most images look like, and the tail.
 SHARES = (0.2, 0.5, 0.8, 0.95)
-
+"""Quantiles of the error at which examples are drawn: typical images, and the tail."""
 
 PLOTTED = 12
+"""Pairs or observers whose errors are plotted, at most."""
 GALLERY = 6
-"""Images with circles."""
+"""Images in the figure with circles."""
 
 
 class HasErrors(Protocol):
-    """Estimated or tracked positions beside true ones."""
+    """Estimated or tracked positions with their errors against the truth."""
 
     @property
     def trace(self) -> ErrorTrace:
-        """Their errors over time."""
+        """Errors over time."""
 
 
 def draw_errors(folder: Path, judged: Sequence[HasErrors]) -> None:
-    """Write the errors of the first twelve pairs or observers, over time, into a folder."""
+    """Write error plots of the first `MAX_ERROR_PLOTS` pairs or observers into a folder."""
     for one in judged[:PLOTTED]:
         trace = one.trace
         stem = inside(folder, trace.name, "a trace")
@@ -45,20 +45,20 @@ def draw_errors(folder: Path, judged: Sequence[HasErrors]) -> None:
 
 
 def draw(folder: Path, pairs: Pairs, scored: Scored, source: str, threshold: float) -> None:
-    """Write every figure of an evaluation into a folder.
+    """Write every figure of an evaluation of detections into a folder.
 
     Parameters
     ----------
     folder
-        Gets error-violins, error-by-distance, examples and circles, as PNG and SVG.
+        Receives error-violins, error-by-distance, examples and circles, as PNG and SVG.
     pairs
-        The judged images.
+        Labels and detections of the evaluated images.
     scored
-        Their labels and detections, matched.
+        The same labels and detections, matched.
     source
         Source of the labels.
     threshold
-        Detections below this confidence are drawn over images only where a label needs them.
+        Detections below this confidence are drawn over images only if a label is matched with them.
     """
     error, depth_m = scored.label_error, scored.labels.depth_m
     plots.error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
@@ -70,7 +70,7 @@ def draw(folder: Path, pairs: Pairs, scored: Scored, source: str, threshold: flo
 
 
 def _spread(pairs: Pairs, threshold: float) -> list[Circled]:
-    """Images evenly spread over all, whatever was found in them, with what is believed."""
+    """Return images evenly spread over all, with their detections above the threshold."""
     places = np.unique(np.linspace(0, pairs.images - 1, GALLERY + 2)[1:-1].astype(int)).tolist()
     mine = pairs.detections.select(pairs.detections.confidence >= threshold)
     shown = []
@@ -89,7 +89,7 @@ def _spread(pairs: Pairs, threshold: float) -> list[Circled]:
 
 
 def _moment(at: At) -> str:
-    """When an image was taken, as ``dmrl view --time`` finds it."""
+    """Return the time of an image in the form of ``dmrl view --time``."""
     return f"{(at.time_ns - summary(at.recording).start_ns) / 1e9:.2f} s"
 
 
@@ -101,7 +101,7 @@ def _picture(at: At) -> NDArray[np.uint8]:
 
 
 def _examples(pairs: Pairs, error_px: Array, source: str, threshold: float) -> list[Example]:
-    """Images whose worst label has an error at fixed places of the order, best first."""
+    """Return the images at fixed quantiles of their largest label error, best first."""
     worst_px = np.full(pairs.images, -1.0)
     np.maximum.at(worst_px, pairs.labels.image, error_px)
     labelled = np.flatnonzero(worst_px >= 0)
@@ -132,7 +132,7 @@ def _example(pairs: Pairs, image: int, worst_px: float, source: str, threshold: 
 
 
 def _maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
-    """Grid maps by channel; all NaN where the recording has none."""
+    """Read the grid maps by channel; all NaN if the recording has none."""
     out = {name: np.full((1, 1), np.nan) for name in ("confidence", "depth_m")}
     topic = topics.grid(robot)
     if topic not in summary(recording).topics:
@@ -145,7 +145,7 @@ def _maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
 
 
 def _detected(points: Points, image: int, least: int, threshold: float) -> Array:
-    """(N, 2) pixels of an image's believed detections, and of those the labels are held to."""
+    """Return the pixels of detections above the threshold or among the first ``least``."""
     mine = points.select(points.image == image)
     mine = mine.select((mine.confidence >= threshold) | (np.arange(len(mine)) < least))
     return np.column_stack([mine.u_px, mine.v_px])

@@ -1,4 +1,4 @@
-"""What a pipeline came to: a table of its evaluations, and where its pictures are."""
+"""Print the results of a pipeline: tables of its evaluations, and the paths of its images."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +12,7 @@ from dmrl.terminal.tables import print_json, print_line, print_table
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What became of a step: made, up to date already, or left out for it could not be made."""
+    """Outcome of a step: made, up to date already, or left out because it could not be made."""
 
     stage: str
     out: Path
@@ -33,14 +33,14 @@ COLUMNS = {
 
 
 def report(done: Sequence[Done], *, as_json: bool = False) -> None:
-    """Print what a pipeline came to: a row per evaluation, and where the pictures are.
+    """Print the results of a pipeline: a row per evaluation, and the paths of its images.
 
     Parameters
     ----------
     done
-        What ``run`` gave.
+        Outcomes of the steps, from ``run``.
     as_json
-        Print one JSON document instead: seconds per step, evaluations, pictures.
+        Print one JSON document instead: seconds per step, evaluations, images.
     """
     evaluations, judged = _documents(done, EVALUATION_NAME), _documents(done, POSITIONS_NAME)
     pictures = [picture for d in done if _is_result(d) for picture in _pictures(d.out)]
@@ -67,7 +67,7 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
 
 
 def _documents(done: Sequence[Done], name: str) -> dict[str, dict[str, Any]]:
-    """JSON documents of this name, by the output they stand in."""
+    """Read the JSON documents of this name, by output folder."""
     return {
         d.out.name: parse_json((d.out / name).read_text(encoding="utf-8"))
         for d in done
@@ -83,7 +83,7 @@ def _row(document: dict[str, Any]) -> list[str]:
 
 
 def _is_result(done: Done) -> bool:
-    # What a stage drew for training is data, not a picture of the result.
+    # Images that sketch draws for training are data, not results.
     return done.stage != "sketch" and not done.left_out
 
 

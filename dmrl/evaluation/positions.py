@@ -1,4 +1,4 @@
-"""Estimated positions of a recording against the ground truth, pair by pair."""
+"""Evaluate the estimated positions of a recording against the ground truth, pair by pair."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -30,27 +30,28 @@ from dmrl.recording import Contents, input_of, summary
 TITLE, EACH = "estimated positions against truth", "pair"
 Times = NDArray[np.int64]
 COVERED = (
-    "share of the true positions that lie between two estimates close to each other; all other "
-    "figures are of the estimates that are there"
+    "share of the true positions that lie between two estimates close in time; all other metrics "
+    "use the existing estimates only"
 )
+"""Definition of the metric ``covered``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Estimates of one robot about one peer, judged.
+    """Evaluated estimates of one robot about one peer.
 
     Parameters
     ----------
     robot, peer
         Names.
     judged
-        The estimates that there is truth for.
+        The estimates with ground truth.
     without_truth
-        How many there is none for.
+        Number of estimates without ground truth.
     true
-        Samples of the truth.
+        Number of samples of the truth.
     covered
-        How many of them lie between two estimates that are close: what is not told counts.
+        Number of them between two estimates that are close in time. Dropouts lower it.
     """
 
     robot: str
@@ -62,12 +63,12 @@ class Pair:
 
     @property
     def name(self) -> str:
-        """Words for a table."""
+        """Label for a table."""
         return f"{self.robot} sees {self.peer}"
 
     @property
     def trace(self) -> ErrorTrace:
-        """Errors over time, what the estimator believes apart from the rest."""
+        """Errors over time, with the kept estimates apart from the rejected ones."""
         kept = self.judged.kept[:, None]
         return ErrorTrace(
             f"{self.name}: estimate minus truth",
@@ -82,7 +83,7 @@ class Pair:
 
 
 def has_positions(recording: Path) -> bool:
-    """Whether a recording holds estimated positions."""
+    """Return whether a recording has estimated positions."""
     return bool(_estimated(summary(recording).topics))
 
 
@@ -92,17 +93,18 @@ def _estimated(held: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def judge(recording: Path) -> list[Pair]:
-    """Every pair with estimates and truth.
+    """Evaluate every pair with estimates and truth.
 
     Parameters
     ----------
     recording
-        With ``/<robot>/peer/<peer>/position`` and the truth; see `labelling.truth`.
+        Recording with ``/<robot>/peer/<peer>/position`` and the truth; see
+        `labelling.ground_truth`.
 
     Raises
     ------
     RecordingError
-        If it cannot be read, or has no pair with both.
+        If the recording cannot be read, or has no pair with both.
     """
     held = Contents(recording, topics.POSITION, *TOLD)
     estimated, known = _estimated(held.topics), true_pairs(held.topics)
@@ -112,17 +114,17 @@ def judge(recording: Path) -> list[Pair]:
     pairs = [pair for pair in pairs if len(pair.judged.time_s)]
     if not pairs:
         raise RecordingError(
-            f"{recording} has no true position for any estimated one. Judge a simulated flight, "
+            f"{recording} has no true position for any estimated one. Use a simulated flight, "
             "or one with motion capture"
         )
     return pairs
 
 
 class Paths(NamedTuple):
-    """Estimates of one robot about one peer that there is truth for.
+    """Estimates of one robot about one peer, at times with ground truth.
 
     ``time_ns`` (N,) log times, ``estimate_m`` and ``true_m`` (N, 2) in the robot's horizontal
-    frame, ``covariance`` (N, 2, 2) square metres, ``kept`` (N,) whether the estimator believes it,
+    frame, ``covariance`` (N, 2, 2) square metres, ``kept`` (N,) True where the status is OK,
     ``started_ns`` the first log time of all its estimates.
     """
 
@@ -135,12 +137,12 @@ class Paths(NamedTuple):
 
 
 def paths(recording: Path) -> dict[tuple[str, str], Paths]:
-    """Of every pair with estimates and truth, where the peer was and was estimated to be.
+    """Read the estimated and the true path of every pair that has both.
 
     Raises
     ------
     RecordingError
-        If it cannot be read.
+        If the recording cannot be read.
     """
     held = Contents(recording, topics.POSITION, *TOLD)
     known = true_pairs(held.topics)
@@ -190,19 +192,19 @@ def _column(table: pa.Table, name: str) -> Array:
 
 
 def _covariance(table: pa.Table) -> Array:
-    """(N, 2, 2) of x and y; NaN where it is not given."""
+    """Read the covariances of x and y, (N, 2, 2); NaN where missing."""
     rows = table.column("covariance").to_pylist()
     full = np.array([row if len(row) == 9 else [np.nan] * 9 for row in rows]).reshape(-1, 3, 3)
     return np.asarray(full[:, :2, :2], float)
 
 
 def lasts_s(pairs: list[Pair]) -> float:
-    """Seconds from the first estimate to the last of the longest pair."""
+    """Return the time from the first to the last estimate of the longest pair, seconds."""
     return max(float(pair.judged.time_s[-1]) for pair in pairs)
 
 
 def document(recording: Path, pairs: list[Pair], settle_s: float) -> dict[str, Any]:
-    """Everything that was measured, as JSON values; null where there was nothing to measure."""
+    """Return all metrics as JSON values; null where a metric is undefined."""
     source = input_of(recording)
     each = [figures(pair.judged, settle_s) for pair in pairs]
     return {
@@ -249,18 +251,18 @@ COLUMNS = (
 
 
 def note(made: Mapping[str, Any]) -> str:
-    """What the words above the table of a ``document`` mean."""
+    """Describe the columns of the table of a ``document``."""
     return (
         "errors are horizontal; covered: share of the truth that has an estimate; kept: status "
-        f"OK; good: off by {GOOD_M:g} m at most; these are of the whole flight. "
-        f"From {made['settle_s']:g} s on: RMSE; 95 %: of errors, so many are smaller; wrong: pairs "
-        "that are off by half their distance; NEES: squared error over covariance, honest at 2; "
-        "in 95 %: share of the truth inside the 95 % ellipse"
+        f"OK; good: error of {GOOD_M:g} m at most; these cover the whole flight. From "
+        f"{made['settle_s']:g} s on: RMSE; 95 %: 95th percentile of the error; wrong: share of "
+        "pairs with an error of half their distance; NEES: squared error over covariance, 2 if "
+        "the covariance is right; in 95 %: share of the truth inside the 95 % ellipse"
     )
 
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:
-    """One row per pair of a ``document``, and one for all where there are several."""
+    """Return one row per pair of a ``document``, and one for all if there are several."""
     named = [(f"{pair['robot']} sees {pair['peer']}", pair) for pair in made["pairs"]]
     if len(named) > 1:
         named.append(("all", made["overall"]))

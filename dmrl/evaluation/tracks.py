@@ -1,4 +1,4 @@
-"""Tracks of a recording beside the true positions, and beside what single images said."""
+"""Evaluate the tracks of a recording against true positions, beside the detections alone."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -27,11 +27,11 @@ from dmrl.recording import Contents, input_of, summary
 
 TITLE, EACH = "tracks against truth", "observer"
 CAMERAS_METADATA = "dmrl.cameras"
-"""Metadata of tracks: by robot, the camera that they were made with, as TOML."""
+"""Metadata record of a recording with tracks: the tracker's camera of each robot, as TOML."""
 
 
 def can_judge(recording: Path) -> bool:
-    """Whether a recording holds tracks, and the truth about them."""
+    """Return whether a recording has tracks and true positions of their peers."""
     held = list(summary(recording).topics)
     return any(_peers(held, robot) for robot in topics.robots(held, topics.TRACKS))
 
@@ -41,17 +41,18 @@ def _peers(held: list[str], robot: str) -> list[str]:
 
 
 def judge(recording: Path) -> list[Judged]:
-    """Every observer with tracks and true positions.
+    """Evaluate every observer with tracks and true positions.
 
     Parameters
     ----------
     recording
-        With ``/<robot>/tracks``, what they were made from, and the truth; see `labelling.truth`.
+        Recording with ``/<robot>/tracks``, their inputs, and the truth; see
+        `labelling.ground_truth`.
 
     Raises
     ------
     RecordingError
-        If it cannot be read, or has no robot with both.
+        If the recording cannot be read, or has no robot with both.
     """
     held = list(summary(recording).topics)
     robots = topics.robots(held, topics.TRACKS)
@@ -61,14 +62,14 @@ def judge(recording: Path) -> list[Judged]:
     judged = [_judge(contents, robot, peers) for robot in robots if (peers := _peers(held, robot))]
     if not judged:
         raise RecordingError(
-            f"{recording} has no true position of any peer. Judge a simulated flight, or one with "
+            f"{recording} has no true position of any peer. Use a simulated flight, or one with "
             "motion capture"
         )
     return judged
 
 
 def _camera(held: Contents, robot: str) -> Camera:
-    """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
+    """Return the tracker's camera, whose mount, delay and lens may differ from the recording's."""
     used = held.summary.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
     camera = parse_camera(used, held.path) if used else camera_of(held, robot)
     if camera is None:
@@ -88,9 +89,9 @@ class _Row(NamedTuple):
 
 
 def _judge(held: Contents, robot: str, peers: list[str]) -> Judged:
-    """Tracks of one observer. A track is false if for most of its life it is at no peer.
+    """Evaluate the tracks of one observer. A track is false if it is near no peer most of its life.
 
-    A track's life is counted in images. In an image, a track is astray if it is near no peer.
+    The life of a track is counted in images. In an image, a track is astray if it is near no peer.
     """
     sight = read_sight(held, robot, _camera(held, robot), 0.0)
     truth, shown = _truth(held, sight, peers)
@@ -107,7 +108,7 @@ def _judge(held: Contents, robot: str, peers: list[str]) -> Judged:
 
 
 def _by_image(held: Contents, sight: Sight) -> Iterator[tuple[int, list[Any]]]:
-    """Number of an image, and the tracks at its time; times without an image are left out."""
+    """Yield the index of an image and its tracks; times without an image are skipped."""
     number = {int(time_ns): k for k, time_ns in enumerate(sight.logged_ns)}
     for stamped in held.messages(topics.tracks(sight.robot)):
         if (k := number.get(stamped.time_ns)) is not None:
@@ -115,7 +116,7 @@ def _by_image(held: Contents, sight: Sight) -> Iterator[tuple[int, list[Any]]]:
 
 
 def _judged(sight: Sight, rows: list[_Row], false_tracks: int) -> Judged:
-    """Rows as columns."""
+    """Convert rows to columns."""
     time_s = (sight.time_ns - sight.time_ns[:1]) * 1e-9
     return Judged(
         sight.robot,
@@ -138,7 +139,7 @@ def _rows(
     peers: Mapping[int, str],
     shown: NDArray[np.bool_],
 ) -> list[_Row]:
-    """The peers in view of image k, with their tracks and detections."""
+    """Return the peers in view of image k, with their tracks and detections."""
     seen = np.flatnonzero(shown)
     view = sight.view(k)
     uv, depth_m = view.uv[: len(seen)], view.depth_m[: len(seen)]
@@ -163,12 +164,18 @@ def _rows(
 
 
 def _places(tracks: list[Any]) -> Array:
-    """(D, 3) positions of Track messages, metres."""
+    """Return the positions of Track messages, (D, 3), metres."""
     return np.array([[t.x, t.y, t.z] for t in tracks]).reshape(-1, 3)
 
 
 def _truth(held: Contents, sight: Sight, peers: list[str]) -> tuple[Array, NDArray[np.bool_]]:
-    """(J, K, 3) true positions at the images, NaN where unknown; (J, K) whether in the image."""
+    """Interpolate the true positions at the images.
+
+    Returns
+    -------
+    tuple[Array, NDArray[np.bool_]]
+        (J, K, 3) positions, metres, NaN where unknown; (J, K) True where inside the image.
+    """
     xyz = np.full((len(peers), len(sight.time_ns), 3), np.nan)
     shown = np.zeros(xyz.shape[:2], bool)
     for j, peer in enumerate(peers):
@@ -183,12 +190,12 @@ def _truth(held: Contents, sight: Sight, peers: list[str]) -> tuple[Array, NDArr
 
 
 def lasts_s(judged: list[Judged]) -> float:
-    """Seconds from the first image to the last of the observer that looked longest."""
+    """Return the time from the first to the last image of the longest observer, seconds."""
     return max(one.length_s for one in judged)
 
 
 def document(recording: Path, judged: list[Judged], settle_s: float) -> dict[str, Any]:
-    """Everything that was measured, as JSON values; null where there was nothing to measure."""
+    """Return all metrics as JSON values; null where a metric is undefined."""
     source = input_of(recording)
     return {
         "recording": {"name": source.name, "sha256": source.sha256},
@@ -215,16 +222,16 @@ COLUMNS = (
 
 
 def note(made: Mapping[str, Any]) -> str:
-    """What the words above the table of a ``document`` mean."""
+    """Describe the columns of the table of a ``document``."""
     return (
-        "3D errors of the peers in view; of images: of the detections in single images; followed, "
-        f"detected: a track, a detection within {NEAR_M:g} m; false: tracks of nobody; "
-        f"all but false from {made['settle_s']:g} s on"
+        "3D errors of the peers in view; of images: errors of the detections in single images; "
+        f"followed, detected: share of peers with a track, a detection within {NEAR_M:g} m; "
+        f"false: tracks near no peer; all but false from {made['settle_s']:g} s on"
     )
 
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:
-    """One row per observer of a ``document``."""
+    """Return one row per observer of a ``document``."""
     return [
         [one["robot"], *(_cell(one[key], form) for key, _, form in COLUMNS)]
         for one in made["robots"]

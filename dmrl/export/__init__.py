@@ -1,1 +1,1 @@
-"""Recordings as files of other programs: tables, ROS 2 bags."""
+"""Export of recordings to files of other programs: tables, ROS 2 bags."""

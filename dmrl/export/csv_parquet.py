@@ -1,13 +1,14 @@
-"""Every topic of a recording as a table, CSV or Parquet, and its pictures as files.
+"""Export of every topic of a recording as a table, CSV or Parquet, and of images as files.
 
-``/cf1/attitude`` becomes ``cf1.attitude.csv``; a dot in a topic is written ``%2E``. The
-first columns are ``log_time`` and ``publish_time``, nanoseconds. A field of a sub-message is
-``pose.position.x``. Of a list of sub-messages, such as the peers of ``PeerLabels``, each is a
-row; a message without any has one row with empty cells. Pictures lie in
-``cf1.camera.image/<log_time>.png``, the second of a time in ``<log_time>-2.png``, and ``data``
-names them.
-In CSV, lists are JSON and other bytes base64, and a text that a spreadsheet would run as a formula
-has an apostrophe in front; in Parquet all stay what they are.
+``/cf1/attitude`` becomes ``cf1.attitude.csv``; a dot in a topic is written ``%2E``. The first
+columns are ``log_time`` and ``publish_time``, nanoseconds. A field of a sub-message is
+``pose.position.x``. Each item of a list of sub-messages, such as the peers of ``PeerLabels``, is
+a row; a message without items has one row with empty cells. Images are files
+``cf1.camera.image/<log_time>.png``, the second of a time ``<log_time>-2.png``, and ``data``
+contains their names.
+
+In CSV, lists are JSON, other bytes are base64, and a text that a spreadsheet would run as a
+formula gets an apostrophe in front. In Parquet all values keep their types.
 """
 
 import base64
@@ -28,14 +29,15 @@ from dmrl.recording import columns, read_table, summary
 from dmrl.terminal.progress import track
 
 Kind = Literal["csv", "parquet"]
-TIME_DIGITS = 12  # as a folder of pictures wants its names
+TIME_DIGITS = 12  # as image_folder requires
 _FORMULA = "^(['=+@\t\r\n\uff1d\uff0b\uff0d\uff20-])"
-"""What a spreadsheet runs (OWASP, CSV injection). With the apostrophe itself among them, to take
-one away from every text that begins with one gives back what was there."""
+"""Texts that a spreadsheet runs (OWASP, CSV injection). The apostrophe is among them, so that
+removing one from every text that begins with one restores the original.
+"""
 
 
 def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
-    """Rows per topic of the tables written to the folder ``out``.
+    """Write the tables to the folder ``out``; return rows per topic.
 
     Parameters
     ----------
@@ -74,15 +76,15 @@ def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
 
 
 def _refuse_taken(path: Path, topic: str) -> None:
-    """Refuse two topics in one file, as on a disk that does not tell A from a."""
+    """Raise UnsafeName if two topics share a file, as on a disk that ignores case."""
     if path.exists():
         raise UnsafeName(
-            f"{topic} and another topic would both become {path.name}. Leave one out: dmrl trim"
+            f"{topic} and another topic would both become {path.name}. Remove one: dmrl trim"
         )
 
 
 def _pictures(recording: Path, topic: str, folder: Path) -> pa.Table:
-    """Pictures to files; the table names them in place of their bytes."""
+    """Write images to files; return the table with their names in place of their bytes."""
     _refuse_taken(folder, topic)
     folder.mkdir()
     batches, seen = [], Counter[str]()
@@ -108,7 +110,7 @@ def _suffix(kind: str) -> str:
 
 
 def flat(table: pa.Table) -> pa.Table:
-    """Lists of structs as rows, structs as columns, until there are none."""
+    """Convert lists of structs to rows and structs to columns, until none remain."""
     while True:
         lists = [f.name for f in table.schema if _holds_structs(f.type)]
         if lists:
@@ -124,7 +126,7 @@ def _holds_structs(kind: pa.DataType) -> bool:
 
 
 def _rows(table: pa.Table, name: str) -> pa.Table:
-    """One row per item of a list, and one, empty, of a list without items."""
+    """Return one row per item of a list, and one empty row per list without items."""
     column = table[name].combine_chunks()
     empty = pc.equal(pc.list_value_length(column), 0)
     filled = pc.if_else(empty, pa.scalar([None], column.type), column)
@@ -148,12 +150,12 @@ def _write(table: pa.Table, path: Path, kind: Kind) -> None:
             shown = pc.replace_substring_regex(table[field.name], _FORMULA, r"'\1")
             frame[field.name] = shown.to_pandas(types_mapper=_nullable)
             if pc.any(pc.match_substring(shown, "\r")).as_py():
-                ends = "\r\n"  # only then does csv quote a cell with \r, which ends a line as well
+                ends = "\r\n"  # only then does csv quote a cell with \r, which also ends a line
     frame.to_csv(path, index=False, lineterminator=ends)
 
 
 def _nullable(kind: pa.DataType) -> Any:
-    """Types of pandas that hold an empty cell beside whole numbers and nested values."""
+    """Return a pandas type that supports empty cells beside integers and nested values."""
     import pandas as pd  # noqa: PLC0415
 
     return pd.ArrowDtype(kind)

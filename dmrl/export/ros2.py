@@ -1,8 +1,8 @@
-"""A recording as a rosbag2 folder, messages in CDR, types in the bag.
+"""Export of a recording as a rosbag2 folder, messages in CDR, types in the bag.
 
-Pictures, calibrations, poses and transforms become messages that every ROS 2 has. All others
-become ``dmrl_msgs/msg/<Name>`` with the fields of dmrl's own, which are made up here from their
-protobuf types; ``dmrl convert`` reads all of them back. Bag times are log times.
+Images, calibrations, poses and transforms become messages of the standard ROS 2 packages. All
+others become ``dmrl_msgs/msg/<Name>`` with the fields of dmrl's own; these types are generated
+from protobuf. ``dmrl convert`` reads all of them back. Bag times are log times.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ NUMPY |= {"uint64": "u8", "bool": "?"}
 
 
 def write_bag(recording: Path, out: Path) -> dict[str, int]:
-    """Messages per topic of the bag written to the folder ``out``.
+    """Write the bag to the folder ``out``; return messages per topic.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     MissingExtra
         If rosbags is not installed.
     RecordingError
-        If the recording cannot be read, or a type has no form in ROS 2.
+        If the recording cannot be read, or a type has no equivalent in ROS 2.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -68,7 +68,7 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     found = summary(recording)
     types = _Types(recording)
     counts = dict.fromkeys(found.topics, 0)
-    connections: dict[str, Any] = {}  # by topic; a bag names a topic's type once, before its data
+    connections: dict[str, Any] = {}  # by topic; a bag defines a topic's type once, before its data
     with partial_folder(out) as folder:
         writer = Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
         with writer:
@@ -91,11 +91,11 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
 
 
 class _NoForm(ValueError):
-    """A type that no type of ROS 2 can be made of."""
+    """A type without an equivalent in ROS 2."""
 
 
 class _Types:
-    """Types of ROS 2 for those of a recording, made up where there is none."""
+    """ROS 2 types of a recording's messages, generated where no standard one exists."""
 
     def __init__(self, recording: Path) -> None:
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
@@ -106,7 +106,7 @@ class _Types:
         self._fields: dict[Descriptor, dict[str, FieldDescriptor]] = {}
 
     def converted(self, sample: Stamped) -> tuple[str, Any]:
-        """Name and message of a sample."""
+        """Return the type name and message of a sample."""
         kind = sample.message.DESCRIPTOR
         standard = STANDARD.get(kind.full_name)
         if standard is not None:
@@ -116,12 +116,12 @@ class _Types:
             return self._name(kind), self._message(sample.message)
         except _NoForm as e:
             raise RecordingError(
-                f"{self._recording}: {sample.topic}: {e}, which ROS 2 cannot say. Leave it out: "
+                f"{self._recording}: {sample.topic}: {e}, which ROS 2 does not support. Remove it: "
                 "dmrl trim"
             ) from None
 
     def _name(self, kind: Descriptor) -> str:
-        """Name of a type, after it and those it holds are registered."""
+        """Register a type and its nested types; return its name."""
         from rosbags.typesys import get_types_from_msg  # noqa: PLC0415
 
         if found := self._names.setdefault(kind, ""):
@@ -157,7 +157,7 @@ class _Types:
             name: self._value(field, getattr(message, field.name))
             for name, field in self._fields[kind].items()
         }
-        # A message without fields has one that nobody sees, as ROS 2 wants it.
+        # ROS 2 requires a hidden field in a message without fields.
         return make(**values) if values else make(structure_needs_at_least_one_member=0)
 
     def _value(self, field: FieldDescriptor, value: Any) -> Any:
@@ -172,9 +172,10 @@ class _Types:
 
 
 def _field_name(name: str) -> str:
-    """As ROS 2 wants it: lower case, a letter in front, no two underscores in a row, none behind.
+    """Convert a field name to the rules of ROS 2.
 
-    Nor a word of Python, which rosbags makes of it.
+    They are lower case, a letter in front, no double and no trailing underscore. Python keywords
+    are changed too, since rosbags uses field names as identifiers.
     """
     plain = "_".join(part for part in name.lower().split("_") if part)
     fits = plain[:1].isalpha() and not iskeyword(plain)
@@ -219,7 +220,7 @@ def _camera_info(types: Any, message: Any, time_ns: int) -> Any:
     if sizes != (9, 9, 12):
         raise RecordingError(
             f"a camera calibration at {time_ns} ns has {sizes} numbers in K, R and P, not 9, 9 and "
-            "12, as a bag wants. Leave its topic out: dmrl trim"
+            "12. Remove its topic: dmrl trim"
         )
     k, p = np.array(message.K), np.array(message.P)
     k[[2, 5]] -= HALF_PX

@@ -1,8 +1,8 @@
-"""Simulated flights: how robots move, and what their sensors make of it. Arrays only.
+"""Simulation of flights: motion of robots and measurements of their sensors, as arrays.
 
-``simulate(scenario, noise, seed, faults)`` gives every robot's log, the ranges between them and
-the truth. A robot's own randomness depends on the seed and its number alone, so adding robots
-changes nothing for those already there.
+``simulate(scenario, noise, seed, faults)`` returns every robot's log, the ranges between robots
+and the ground truth. A robot's randomness depends only on the seed and its number. Adding robots
+does not change the others.
 """
 
 from dmrl.flight.faults import Fault

@@ -1,7 +1,6 @@
-"""What faults do to a flight: to its motion, its clocks, logs and ranges.
+"""Effects of faults on motion, clocks, logs and ranges of a flight.
 
-A fault changes what it names and nothing else: every other number of the flight stays as it was
-without the fault.
+A fault changes only the signals it names. All other numbers of the flight stay the same.
 """
 
 from collections.abc import Sequence
@@ -16,29 +15,29 @@ from dmrl.flight.trajectories import Motion
 from dmrl.geometry.frames import Array
 
 COAST_S = 0.3
-"""Time constant with which it comes to rest."""
+"""Time constant of the deceleration after a landing or crash begins."""
 SINK_MPS, FALL_MPS2 = 0.4, 5.0
 FLOOR_M = 0.02
 RUNAWAY_S = 2.0
-"""Time constant with which the estimate of a crashed robot runs away."""
+"""Time constant of the diverging velocity estimate of a crashed robot."""
 OUTLIER_M = (-1.0, 3.0)
-"""What is added to an outlier, uniform."""
+"""Range of the uniform error of an outlier."""
 SHORTEST_RANGE_M = 0.01
 
 
 def brought_down(way: Motion, height_m: Array, end: Happened) -> tuple[Motion, Array]:
-    """A robot's motion and height with a landing or a crash.
+    """Return a robot's motion and height with a landing or a crash.
 
-    It flies its way ever slower and comes to rest: the way is the same, the pace is not.
+    The robot decelerates along its path and comes to rest. The path stays the same.
 
     Parameters
     ----------
-    way
-        Over the floor.
+    motion
+        Motion over the floor.
     height_m
-        (N,) above the floor.
+        (N,) height above the floor, metres.
     end
-        When it lands or crashes.
+        Landing or crash.
     """
     time_s, start_s = np.arange(len(height_m)) / RATE_HZ, end.windows_s[0, 0]
     since = np.maximum(time_s - start_s, 0.0)
@@ -59,7 +58,7 @@ def brought_down(way: Motion, height_m: Array, end: Happened) -> tuple[Motion, A
 
 
 def clock_with(clock: Clock, faults: Sequence[Happened]) -> Clock:
-    """A robot's clock with the faults of it."""
+    """Apply clock faults to a robot's clock."""
     for one in faults:
         if one.fault.kind == "clock_drift":
             clock = replace(clock, drift=clock.drift + one.fault.amount * 1e-6)
@@ -69,7 +68,7 @@ def clock_with(clock: Clock, faults: Sequence[Happened]) -> Clock:
 
 
 def log_with(rng: Generator, log: RobotLog, truth: Truth, one: Happened) -> RobotLog:
-    """A robot's log with a fault of its sensors; NaN where a sensor is silent."""
+    """Apply a sensor fault to a robot's log. Missing measurements are NaN."""
     at, amount = one.during(truth.time_s), one.fault.amount
     match one.fault.kind:
         case "yaw_rate_bias":
@@ -100,7 +99,7 @@ def log_with(rng: Generator, log: RobotLog, truth: Truth, one: Happened) -> Robo
 
 
 def ranges_with(rng: Generator, ranges: Ranges, clock: Clock, one: Happened) -> Ranges:
-    """The ranges of one robot to another with a fault of their link."""
+    """Apply a range fault to the ranges from one robot to another."""
     at, amount = one.during(clock.true_time(ranges.time_s)), one.fault.amount
     if one.fault.kind == "range_gap":
         return Ranges(ranges.time_s[~at], ranges.range_m[~at])

@@ -1,4 +1,4 @@
-"""What goes wrong in a flight, and when. Times are true time, seconds from the flight's start."""
+"""Faults of a flight and their times, in true time, seconds from the start of the flight."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ SIZES: dict[FaultKind, float] = {
     "clock_offset": 0.05,
     "crash": 9.0,
 }
-"""Size where none is given: metres, rad/s, seconds; outliers a share of the ranges, scale one of
-the velocity, drift in ppm, a crash the speed in m/s that the robot's estimate runs away to. Other
-kinds have none."""
+"""Default sizes. Unit by kind: metres, rad/s, seconds; a share of the ranges for outliers; a
+share of the velocity for its scale; ppm for drift. A crash has the speed in m/s that the robot's
+velocity estimate diverges to. Other kinds have no size."""
 WINDOWS_S: dict[FaultKind, float] = {
     "nlos": 3.0,
     "range_gap": 30.0,
@@ -52,42 +52,42 @@ WINDOWS_S: dict[FaultKind, float] = {
     "velocity_gap": 5.0,
     "attitude_gap": 5.0,
 }
-"""How long each lasts where nothing is said; other kinds last for the whole flight."""
+"""Default durations. Other kinds last for the whole flight."""
 LINKS = ("nlos", "range_offset", "range_outliers", "range_gap")
-"""Kinds that befall the ranges between two robots, both ways."""
+"""Kinds that affect the ranges between two robots, in both directions."""
 CLOCKS = ("clock_drift", "clock_offset")
 ENDS = ("landing", "crash")
 """Kinds after which a robot lies on the floor."""
 
 END_S = 10.0
-"""Before the end of a flight a robot lands or crashes, where nothing is said."""
+"""Default time from a landing or crash to the end of the flight, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that goes wrong, once or several times.
+    """A fault that happens once or several times.
 
     Parameters
     ----------
     kind
-        What; docs/flights.md has the table.
+        Kind of the fault, see the table in docs/flights.md.
     robot
-        Whom it befalls.
+        Affected robot.
     peer
-        Faults of ranges: the other end. Empty: every link of the robot.
+        For faults of ranges: the other robot. Empty: all links of the robot.
     start_s
-        When it begins. Without it, drawn; a landing or a crash comes 10 s before the end.
+        Start. Default: random; 10 s before the end for a landing or a crash.
     duration_s
-        How long it lasts each time. Without it, as long as is usual for the kind.
+        Duration of each occurrence. Default: that of the kind.
     size
-        How large it is, in the unit of its kind. Without it, a usual size.
+        Size in the unit of the kind. Default: that of the kind.
     number
-        How many times, spread over the flight, at times that are drawn.
+        Number of occurrences at random times, spread over the flight.
 
     Raises
     ------
     ValueError
-        If these do not go together.
+        If the parameters contradict each other.
     """
 
     kind: FaultKind
@@ -124,23 +124,23 @@ class Fault:
 
     @property
     def amount(self) -> float:
-        """Its size, or the usual one."""
+        """Size, or the default of the kind."""
         return self.size if self.size is not None else SIZES.get(self.kind, 0.0)
 
     @property
     def lasts_s(self) -> float | None:
-        """How long it lasts each time; None: to the end."""
+        """Duration of each occurrence, or None to last until the end."""
         return self.duration_s if self.duration_s is not None else WINDOWS_S.get(self.kind)
 
 
 @dataclass(frozen=True, slots=True)
 class Happened:
-    """A fault and when it happened.
+    """A fault with its times.
 
     Parameters
     ----------
     fault
-        What.
+        The fault.
     windows_s
         (W, 2) starts and ends, true time, seconds.
     """
@@ -149,32 +149,32 @@ class Happened:
     windows_s: Array
 
     def during(self, true_time_s: Array) -> Mask:
-        """(N,) whether it goes on at these times."""
+        """Return (N,) whether the fault is active at these times."""
         start, end = self.windows_s.T[..., None]
         return np.asarray(((true_time_s >= start) & (true_time_s < end)).any(axis=0))
 
     def befalls(self, link: tuple[str, str]) -> bool:
-        """Whether it is one of the ranges between these two, whichever of them ranges."""
+        """Return whether the fault affects the ranges between two robots, in either direction."""
         fault = self.fault
         return fault.kind in LINKS and fault.robot in link and fault.peer in ("", *link)
 
 
 def check(faults: Sequence[Fault], names: Sequence[str], flight_s: float) -> None:
-    """Refuse what cannot befall a flight.
+    """Raise SettingError unless all faults fit the flight.
 
     Parameters
     ----------
     faults
-        What shall go wrong.
+        Faults of the flight.
     names
-        The robots.
+        Names of the robots.
     flight_s
-        Length of the flight.
+        Length of the flight, seconds.
 
     Raises
     ------
     SettingError
-        If a robot is none of the flight's, or a fault does not fit into it.
+        If a fault names an unknown robot or does not fit into the flight.
     """
     for fault in faults:
         for name in (fault.robot, *([fault.peer] if fault.peer else [])):
@@ -195,7 +195,7 @@ def check(faults: Sequence[Fault], names: Sequence[str], flight_s: float) -> Non
 
 
 def happened(rng: Generator, fault: Fault, flight_s: float) -> Happened:
-    """When a fault happens: its start, or one drawn in each of as many parts of the flight."""
+    """Schedule a fault: at its start, or once at random in each equal part of the flight."""
     lasts_s = fault.lasts_s
     if fault.kind in ENDS:
         start = max(flight_s - END_S, 0.0) if fault.start_s is None else fault.start_s

@@ -1,4 +1,4 @@
-"""What a flight is: each robot's log on its own clock, ranges, and the truth."""
+"""Arrays of a simulated flight: logs on each robot's clock, ranges and ground truth."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
 def numbers(values: NDArray[Any]) -> Iterator[Any]:
-    """Python's numbers of an array, one at a time: as such they take five times the memory."""
+    """Iterate over an array as Python numbers, which take five times the memory in a list."""
     return map(values.item, range(len(values)))
 
 
 def scanned(step: Callable[[Any, Any], Any], values: Signal) -> Signal:
-    """(N,) what a step makes, from zero on, of what it made before and the next value."""
+    """Apply a step to each value and the previous result, from zero. Return (N,) results."""
     made = accumulate(numbers(values), step, initial=values.dtype.type(0).item())
     next(made)
     return np.fromiter(made, values.dtype, len(values))
@@ -31,42 +31,42 @@ def scanned(step: Callable[[Any, Any], Any], values: Signal) -> Signal:
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A robot's clock against true time.
+    """Clock of a robot relative to true time.
 
     Parameters
     ----------
     offset_s
-        What it shows at true time zero.
+        Clock time at true time zero.
     drift
-        Seconds it gains per true second.
+        Seconds gained per true second.
     """
 
     offset_s: float = 0.0
     drift: float = 0.0
 
     def shows(self, true_time_s: Array) -> Array:
-        """What the clock shows at true times, seconds."""
+        """Convert true times to clock times, seconds."""
         return self.offset_s + (1.0 + self.drift) * true_time_s
 
     def true_time(self, time_s: Array) -> Array:
-        """True times at which the clock shows ``time_s``, seconds."""
+        """Convert clock times to true times, seconds."""
         return (time_s - self.offset_s) / (1.0 + self.drift)
 
 
 @dataclass(frozen=True, slots=True)
 class RobotLog:
-    """What one robot measured of itself, (N,) each, on its own clock, 100 Hz; NaN where silent.
+    """Measurements of one robot, (N,) each, on its own clock, 100 Hz. NaN where missing.
 
     Parameters
     ----------
     time_s
-        The robot's clock.
+        Clock of the robot.
     roll_rad, pitch_rad
         Attitude Rz(yaw) Ry(pitch) Rx(roll), z up: pitch positive nose down.
     yaw_rate_radps
         Positive to the left.
     vx_mps, vy_mps
-        Velocity in the robot's own horizontal frame: x forward, y left, turning with its yaw.
+        Velocity in the robot's horizontal frame: x forward, y left, turning with its yaw.
     height_m
         Above the floor.
     """
@@ -82,7 +82,7 @@ class RobotLog:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Where one robot truly is, world frame (z up), true time, 100 Hz.
+    """Ground truth of one robot, world frame (z up), true time, 100 Hz.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class Truth:
     velocity
         (N, 3) metres per second.
     yaw, roll, pitch
-        (N,) radians; yaw is not wrapped.
+        (N,) radians. Yaw is not wrapped.
     """
 
     time_s: Array
@@ -104,11 +104,11 @@ class Truth:
     pitch: Array
 
     def position_at(self, time_s: Array) -> Array:
-        """(M, 3) position at true times, metres, linear between samples."""
+        """Return (M, 3) positions at true times, metres, linear between samples."""
         return np.stack([np.interp(time_s, self.time_s, axis) for axis in self.position.T], axis=1)
 
     def yaw_at(self, time_s: Array) -> Array:
-        """(M,) yaw at true times, radians, linear between samples."""
+        """Return (M,) yaws at true times, radians, linear between samples."""
         return np.interp(time_s, self.time_s, self.yaw)
 
 
@@ -121,7 +121,7 @@ class Ranges:
     time_s
         (M,) clock of the robot that ranges.
     range_m
-        (M,) distances as measured: no bias removed.
+        (M,) measured distances, with bias.
     """
 
     time_s: Array
@@ -130,20 +130,20 @@ class Ranges:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Everything that happened, and what was measured of it.
+    """A simulated flight: logs, ranges and ground truth.
 
     Parameters
     ----------
     robots
         Log of each robot.
     truth
-        Truth of each robot.
+        Ground truth of each robot.
     ranges
-        By (robot that ranges, robot that answers); both ways of each pair.
+        By (robot that ranges, robot that answers), both directions of each pair.
     clocks
         Clock of each robot.
     faults
-        What went wrong, and when.
+        Faults with their times.
     """
 
     robots: dict[str, RobotLog]
@@ -153,12 +153,12 @@ class Flight:
     faults: tuple[Happened, ...] = ()
 
     def peer_in_horizontal(self, i: str, j: str, time_s: Array) -> Array:
-        """(N, 3) where robot ``j`` is in ``i``'s horizontal frame, metres.
+        """Return (N, 3) positions of robot ``j`` in ``i``'s horizontal frame, metres.
 
         Parameters
         ----------
         i, j
-            Names of the robot that looks, and of its peer.
+            Names of the observer and of its peer.
         time_s
             (N,) true times, seconds.
         """

@@ -1,28 +1,28 @@
-"""How wrong sensors are: one number per kind of error, and named presets."""
+"""Sensor noise: one number per kind of error, and named presets."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Errors of every sensor, standard deviations where nothing else is said.
+    """Errors of every sensor, as standard deviations unless noted.
 
-    What is "per flight" is drawn once for a robot, or for a pair of robots.
+    Errors "per flight" are drawn once per robot, or once per pair of robots.
 
     Parameters
     ----------
     uwb_white_m
-        Of each range.
+        Noise of each range.
     uwb_bias_m, uwb_scale
-        Per flight and pair: added, and share of the range.
+        Bias and relative scale error, per flight and pair.
     nlos_share, nlos_mean_m
-        Share of ranges whose signal took a detour, 0 to 1; mean of its exponential length.
+        Share of ranges without line of sight, 0 to 1; mean of the exponential detour.
     ranging_rate_hz, ranging_loss
-        Ranges per second and direction, before a share of them, 0 to 1, is lost.
+        Ranges per second and direction before losses; share of lost ranges, 0 to 1.
     velocity_white_mps, velocity_coloured_mps, velocity_tau_s
-        Of each sample at 100 Hz, per axis; the coloured part fades with this time constant.
+        Noise of each sample at 100 Hz, per axis; coloured noise and its time constant.
     velocity_scale, velocity_bias_mps
-        Per flight: share of the velocity, one for both axes; added, per axis.
+        Per flight: relative scale error of both axes; bias per axis.
     yaw_rate_white_radps, yaw_rate_bias_radps
         Of each sample; per flight.
     height_white_m, height_bias_m
@@ -30,9 +30,9 @@ class Noise:
     attitude_white_rad, attitude_bias_rad
         Of roll and pitch, each sample; per flight.
     clock_offset_s
-        Largest offset of a robot's clock against the first robot's, either way, uniform.
+        Maximum offset of a robot's clock relative to the first robot's, uniform in both directions.
     clock_drift_ppm
-        Of a robot's clock against the first robot's.
+        Drift of a robot's clock relative to the first robot's.
     """
 
     uwb_white_m: float = 0.0
@@ -117,8 +117,8 @@ HARSH = Noise(
     clock_drift_ppm=20.0,
 )
 
-# Li et al. 2020, the simulation that the paper's filter was tuned on: white noise only, a
-# range at every step.
+# Li et al. 2020, the simulation on which the paper's filter was tuned: white noise only, one
+# range per step.
 PUBLISHED = Noise(
     uwb_white_m=0.1,
     ranging_rate_hz=100.0,
@@ -133,4 +133,4 @@ NOISE: dict[str, Noise] = {
     "harsh": HARSH,
     "published": PUBLISHED,
 }
-"""Presets by name. Attitude and clock drift are ours; the rest is measured or published."""
+"""Presets by name. Attitude and clock drift are assumed, the rest is measured or published."""

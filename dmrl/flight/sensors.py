@@ -1,4 +1,4 @@
-"""What sensors make of the truth."""
+"""Simulated sensor measurements of a robot's true motion."""
 
 import numpy as np
 from numpy.random import Generator
@@ -9,7 +9,7 @@ from dmrl.geometry.frames import Array
 
 
 def coloured(rng: Generator, samples: int, std: float, tau_s: float) -> Array:
-    """(samples,) noise of one standard deviation throughout that fades with ``tau_s``."""
+    """Draw (samples,) stationary first-order noise with time constant ``tau_s``."""
     keep = float(np.exp(-1.0 / (RATE_HZ * tau_s)))
     steps = rng.normal(0.0, std, samples)
     steps[1:] *= np.sqrt(1.0 - keep**2)
@@ -19,20 +19,20 @@ def coloured(rng: Generator, samples: int, std: float, tau_s: float) -> Array:
 def robot_log(
     rng: Generator, truth: Truth, yaw_rate: Array, clock: Clock, noise: Noise
 ) -> RobotLog:
-    """What a robot measures of itself.
+    """Simulate the log of a robot.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
+        Random generator.
     truth
-        Of this robot.
+        Ground truth of the robot.
     yaw_rate
         (N,) its true yaw rate, radians per second.
     clock
         Its clock.
     noise
-        How wrong its sensors are.
+        Errors of its sensors.
     """
     samples = len(truth.time_s)
 
@@ -52,7 +52,7 @@ def robot_log(
 
 
 def _velocity(rng: Generator, truth: Truth, noise: Noise) -> Array:
-    """(2, N) velocity from flow, in the robot's horizontal frame."""
+    """Simulate (2, N) velocities from optical flow, in the robot's horizontal frame."""
     samples = len(truth.time_s)
     x, y, _ = truth.velocity.T
     c, s = np.cos(truth.yaw), np.sin(truth.yaw)
@@ -66,7 +66,7 @@ def _velocity(rng: Generator, truth: Truth, noise: Noise) -> Array:
 
 
 def pair_errors(rng: Generator, noise: Noise) -> tuple[float, float]:
-    """Bias (metres) and scale (a factor) of the ranges of one pair of robots, for a flight."""
+    """Draw bias (metres) and scale (a factor) of one pair's ranges, for a flight."""
     return float(rng.normal(0.0, noise.uwb_bias_m)), float(1 + rng.normal(0.0, noise.uwb_scale))
 
 
@@ -78,20 +78,20 @@ def ranges(
     noise: Noise,
     errors: tuple[float, float],
 ) -> Ranges:
-    """Distances that one robot measures to another.
+    """Simulate the ranges from one robot to another.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
-    here, peer
-        Truth of the robot that ranges, and of the one that answers.
+        Random generator.
+    observer, peer
+        Ground truth of the robot that ranges, and of the one that answers.
     clock
-        Of the robot that ranges.
+        Clock of the robot that ranges.
     noise
-        How wrong its ranges are, and how many there are.
+        Errors and rate of the ranges.
     errors
-        Bias and scale of this pair.
+        Bias and scale of the pair.
     """
     period_s = 1.0 / noise.ranging_rate_hz
     time_s = np.arange(rng.uniform(0.0, period_s), here.time_s[-1], period_s)

@@ -1,4 +1,4 @@
-"""A whole flight from a scenario, a noise preset and a seed."""
+"""Simulation of a whole flight from a scenario, a noise preset and a seed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,18 +23,18 @@ SPACING_M = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Who flies, for how long, and how.
+    """Robots, duration and trajectory of a flight.
 
     Parameters
     ----------
     robots
-        2 to 20, named cf1, cf2, ...; cf1 leads where a trajectory has a leader.
+        2 to 20, named cf1, cf2, ... cf1 leads where a trajectory has a leader.
     duration_s
-        Length of the flight.
+        Length of the flight, seconds.
     trajectory
         One of ``TRAJECTORIES``.
     yaw_spread_rad
-        Robots start with a yaw within plus and minus this, uniform; the first one with 0.
+        Initial yaws are uniform within plus and minus this. That of the first robot is 0.
     """
 
     robots: int = 2
@@ -49,23 +49,23 @@ class Scenario:
 
 
 def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault] = ()) -> Flight:
-    """A flight: logs, ranges and truth. The same arguments give the same flight.
+    """Simulate a flight. The same arguments give the same flight.
 
     Parameters
     ----------
     scenario
-        Who flies, for how long, and how.
+        Robots, duration and trajectory.
     noise
-        How wrong the sensors are.
+        Errors of the sensors.
     seed
-        Another seed gives another flight.
+        Seed of all random draws.
     faults
-        What goes wrong besides. What they do not touch is as it is without them.
+        Additional faults. They change only the signals they name.
 
     Raises
     ------
     SettingError
-        If the scenario cannot be flown, or a fault does not fit into it.
+        If the scenario is impossible, or a fault does not fit into it.
     """
     _check(scenario)
     flight_s, names = scenario.duration_s, scenario.names
@@ -101,7 +101,7 @@ def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault
 
 
 def _flown(way: Motion, height_m: Array, events: Sequence[Happened]) -> tuple[Motion, Array]:
-    """A robot's motion and height, to the landing or crash that ends them."""
+    """Apply the landing or crash that ends a robot's motion."""
     for event in (event for event in events if event.fault.kind in ENDS):
         way, height_m = fault_effects.brought_down(way, height_m, event)
     return way, height_m
@@ -125,20 +125,20 @@ def _motions(scenario: Scenario, seed: int) -> list[Motion]:
 
 
 def _start(rng: Generator, k: int, scenario: Scenario) -> Start:
-    """The first robot starts at the origin; others in front of it, or spread on a spiral."""
+    """Draw a start: the origin for the first robot; others in front of it, or on a spiral."""
     samples = round(scenario.duration_s * RATE_HZ) + 1
     if k == 0:
         return Start(samples, 0j, 0.0)
     yaw = float(rng.uniform(-1.0, 1.0) * scenario.yaw_spread_rad)
     if scenario.trajectory in ("random", "lawn_mower"):
-        # Sunflower: neighbours stay about a spacing apart however many there are.
+        # Sunflower spiral: neighbours are about one spacing apart for any number of robots.
         place = SPACING_M * np.sqrt(k) * np.exp(1j * (rng.uniform(-0.2, 0.2) + 2.4 * k))
         return Start(samples, complex(place), yaw)
     return Start(samples, complex(trajectories.view_points(rng, 1)[0]), yaw)
 
 
 def _height(rng: Generator, scenario: Scenario) -> Array:
-    """(N,) height of one robot, slowly varying, metres."""
+    """Draw the (N,) slowly varying height of one robot, metres."""
     time_s = np.arange(round(scenario.duration_s * RATE_HZ) + 1) / RATE_HZ
     base = HEIGHT_M + rng.uniform(-HEIGHT_SPREAD_M, HEIGHT_SPREAD_M)
     swing = 2 * np.pi * time_s / rng.uniform(15.0, 30.0) + rng.uniform(0, 2 * np.pi)

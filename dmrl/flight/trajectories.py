@@ -1,6 +1,6 @@
-"""How robots move: commands, a lag in velocity and yaw rate, tilt from acceleration.
+"""Motion of robots: commands, lag in velocity and yaw rate, and tilt from acceleration.
 
-The plane is complex inside this file: x is the real part, y the imaginary one, and a turn by
+The plane is complex in this file: x is the real part, y the imaginary part. A rotation by
 ``yaw`` is a product with exp(1j yaw).
 """
 
@@ -42,7 +42,7 @@ ROW_M, ROW_GAP_M, ROWS = 2.0, 0.4, 5
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One robot's way over the floor, (N,) each, 100 Hz.
+    """Motion of one robot over the floor, (N,) each, 100 Hz.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where a robot is when the flight begins.
+    """State of a robot at the start of the flight.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Start:
     position
         World frame, metres, complex.
     yaw_rad
-        Against world x.
+        Angle from world x.
     """
 
     samples: int
@@ -83,26 +83,26 @@ Mover = Callable[[Generator, Start, "Motion | None"], Motion]
 
 
 def lagged(commands: Signal, lag_s: float) -> Signal:
-    """(N,) what becomes of piecewise constant commands behind a first-order lag, from rest."""
+    """Filter piecewise constant commands (N,) with a first-order lag, from rest."""
     share = 1.0 - np.exp(-1.0 / (RATE_HZ * lag_s))
     return scanned(lambda v, u: v + share * (u - v), commands)
 
 
 def _integrated(rate: Signal, start: complex) -> Signal:
-    """(N,) integral by the trapezoid rule: its central differences are the mean rates."""
+    """Integrate (N,) rates by the trapezoid rule, whose central differences are the mean rates."""
     steps = (rate[1:] + rate[:-1]) / (2 * RATE_HZ)
     return np.concatenate([[start], start + np.cumsum(steps)]).astype(rate.dtype)
 
 
 def _motion(start: Start, velocity_own: Plane, yaw_rate: Array) -> Motion:
-    """The motion of a robot that flies these velocities in its own horizontal frame."""
+    """Integrate velocities in the robot's horizontal frame to a motion."""
     yaw = np.real(_integrated(yaw_rate, start.yaw_rad))
     velocity = velocity_own * np.exp(1j * yaw)
     return Motion(_integrated(velocity, start.position), velocity, yaw, yaw_rate)
 
 
 def _held(draws: Signal, hold_s: float, samples: int) -> Signal:
-    """(samples,) each draw held for a while."""
+    """Repeat each draw for ``hold_s``, up to (samples,)."""
     held: Signal = draws[(np.arange(samples) / (RATE_HZ * hold_s)).astype(int)]
     return held
 
@@ -112,16 +112,16 @@ def _draws(hold_s: float, samples: int) -> int:
 
 
 def back_and_forth(speed_mps: float, yaw_rate_radps: float, hold_s: float) -> Mover:
-    """A robot that flies a random velocity for a while, and then back the same way.
+    """Return a mover that flies a random velocity for a while, and then back.
 
     Parameters
     ----------
     speed_mps
-        Each axis is uniform within plus and minus this, in the robot's own frame.
+        Each axis is uniform within plus and minus this, in the robot's horizontal frame.
     yaw_rate_radps
         Uniform within plus and minus this.
     hold_s
-        Seconds one way.
+        Duration of one direction, seconds.
     """
 
     def move(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
@@ -140,12 +140,12 @@ def back_and_forth(speed_mps: float, yaw_rate_radps: float, hold_s: float) -> Mo
 
 
 def in_view(yaw_rate_radps: float) -> Mover:
-    """A robot that keeps to changing points in front of the leader.
+    """Return a mover that follows changing points in front of the leader.
 
     Parameters
     ----------
     yaw_rate_radps
-        Its own yaw rate is uniform within plus and minus this, redrawn with each point.
+        Its yaw rate is uniform within plus and minus this, drawn anew with each point.
     """
 
     def move(rng: Generator, start: Start, leader: Motion | None) -> Motion:
@@ -165,14 +165,14 @@ def in_view(yaw_rate_radps: float) -> Mover:
 
 
 def view_points(rng: Generator, count: int) -> Plane:
-    """(count,) points in front of a robot, in its horizontal frame, metres."""
+    """Draw (count,) points in front of a robot, in its horizontal frame, metres."""
     distance = rng.uniform(*VIEW_DISTANCE_M, count)
     bearing = rng.uniform(-VIEW_BEARING_RAD, VIEW_BEARING_RAD, count)
     return np.asarray(distance * np.exp(1j * bearing))
 
 
 def _following(target: Plane, carried: Plane) -> Plane:
-    """(N,) world velocity of a robot that starts on a moving target and stays near it."""
+    """Return the (N,) world velocity of a robot that starts on a moving target and follows it."""
     share = 1.0 - np.exp(-1.0 / (RATE_HZ * VELOCITY_LAG_S))
     position, velocity = complex(target[0]), 0j
 
@@ -190,14 +190,14 @@ def _following(target: Plane, carried: Plane) -> Plane:
 
 
 def still(_rng: Generator, start: Start, _leader: Motion | None) -> Motion:
-    """A robot that does not move at all."""
+    """Return the motion of a robot that does not move."""
     return _motion(start, np.zeros(start.samples, complex), np.zeros(start.samples))
 
 
 def hover(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
-    """A robot that holds its place as well as a small drone does: a few centimetres."""
+    """Return the motion of a hovering robot, with the drift of a small drone: a few centimetres."""
     pushes = rng.normal(0.0, HOVER_SPEED_MPS, (2, _draws(1.0, start.samples)))
-    # Differences, so that the pushes cancel and the robot stays.
+    # Differences, so that the pushes cancel and the robot stays in place.
     velocity = np.diff(pushes[0] + 1j * pushes[1], prepend=0.0)
     return _motion(
         start,
@@ -207,14 +207,14 @@ def hover(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
 
 
 def parallel(_rng: Generator, start: Start, leader: Motion | None) -> Motion:
-    """A robot that flies exactly as the leader does, beside it."""
+    """Return the motion of a robot that copies the leader's motion beside it."""
     assert leader is not None
     position = leader.position + (start.position - leader.position[0])
     return Motion(position, leader.velocity, leader.yaw, leader.yaw_rate)
 
 
 def lawn_mower(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
-    """A robot that flies rows up and down in its own frame, and then the same field back."""
+    """Return the motion of a robot that flies rows in its own frame, then the same rows back."""
     speed = rng.uniform(0.3, 0.6)
     row, gap = ROW_M / speed, ROW_GAP_M / speed
     legs = [(row, (-1) ** k * 1.0) for k in range(ROWS)]
@@ -237,21 +237,21 @@ TRAJECTORIES: dict[Trajectory, tuple[Mover, Mover]] = {
     "no_yaw": (back_and_forth(0.5, 0.0, 1.5), in_view(0.0)),
     "both_static": (still, still),
 }
-"""How the first robot moves, and how every other one does."""
+"""Mover of the first robot, and mover of all others."""
 
 
 def truth_of(motion: Motion, height_m: Array) -> Truth:
-    """The truth of a robot: its motion, its height, and the tilt that its motion takes.
+    """Build the ground truth of a robot from its motion and height, with the resulting tilt.
 
-    Thrust points along the body's z, so a robot that accelerates forward pitches nose down
-    and one that accelerates to the left rolls left side down.
+    Thrust points along the body's z axis. A robot that accelerates forward pitches nose down, and
+    one that accelerates to the left rolls left side down.
 
     Parameters
     ----------
     motion
-        Over the floor.
+        Motion over the floor.
     height_m
-        (N,) above the floor.
+        (N,) height above the floor, metres.
     """
     pull_xy = np.gradient(motion.velocity) * RATE_HZ * np.exp(-1j * motion.yaw)
     climb = np.gradient(height_m) * RATE_HZ
@@ -260,7 +260,7 @@ def truth_of(motion: Motion, height_m: Array) -> Truth:
     roll = -np.arctan2(pull_xy.imag, np.hypot(pull_xy.real, pull_z))
     return Truth(
         time_s=np.arange(len(height_m)) / RATE_HZ,
-        # Axis by axis in memory: what is asked for at a time is interpolated without a copy.
+        # Axis by axis in memory, so that position_at interpolates without a copy.
         position=np.stack([motion.position.real, motion.position.imag, height_m]).T,
         velocity=np.stack([motion.velocity.real, motion.velocity.imag, climb], axis=1),
         yaw=motion.yaw,

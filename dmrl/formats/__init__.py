@@ -1,1 +1,1 @@
-"""Foreign formats, one file each: bytes in, samples out. Stages write these; nothing here does."""
+"""Foreign formats, one file each: they convert bytes to samples. Stages write the samples."""

@@ -1,7 +1,8 @@
-"""What a format is: how to know it, what a user says of it, and the samples it gives.
+"""The interface of a format: how to recognise a source, the user's options, and the samples.
 
-A format is one file with two functions, ``recognises(source) -> bool`` and
-``content(source, options) -> Content``, and a ``FORMAT``, by which `dmrl.formats.registry` finds it.
+A format is one file with two functions, ``can_read(source) -> bool`` and
+``load_content(source, options) -> Content``, and a ``FORMAT``, by which `dmrl.formats.registry`
+finds it.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,19 +16,19 @@ from dmrl.samples.sample import Columns, Intervals, Sample
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """Everything a source holds.
+    """All samples of a source.
 
     Parameters
     ----------
     samples
-        All of it, in log-time order.
+        All samples, in log-time order.
     total
-        Number of samples; None where it is not known beforehand.
+        Number of samples; None if it is unknown before they are read.
     split
-        Inclusive intervals of log time by split name; empty where the source has no split.
+        Inclusive intervals of log time by split name; empty if the source has no split.
     series, others
-        The same once more, for whoever writes it fast: topics as columns, and what is not among
-        them, in log-time order.
+        The same samples for fast writing: topics as columns, and the remaining samples in log-time
+        order.
     """
 
     samples: Iterator[Sample]
@@ -38,7 +39,10 @@ class Content:
 
 
 def content_of(streams: Iterable[Iterable[Sample]]) -> Content:
-    """What streams hold, of which some may be columns. One of both ways to read it can be taken."""
+    """Build the content of several streams, of which some may be columns.
+
+    The content can be iterated once: either ``samples``, or ``series`` and ``others``.
+    """
     held = list(streams)
     series = tuple(stream for stream in held if isinstance(stream, Columns))
     others = in_order(stream for stream in held if not isinstance(stream, Columns))
@@ -47,26 +51,26 @@ def content_of(streams: Iterable[Iterable[Sample]]) -> Content:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What the user says of a source. A format takes what it has use for.
+    """Options of a source, given by the user. A format uses those that apply to it.
 
     Parameters
     ----------
     robot
-        Robot that carries the camera, or whose log it is.
+        Robot that carries the camera, or that wrote the log.
     names
-        Names of robots by those, or the numbers, that the source has for them.
+        Names of robots by the names, or numbers, that the source uses for them.
     rate_hz
-        Pictures per second where the source has no times.
+        Images per second, for a source without times.
     labels
         CSV file with labels; None: the source's own.
     camera
-        Camera that took the pictures as they are stored; None: the source's own.
+        Camera that took the images as they are stored; None: the source's own.
     size_px
-        Width and height to crop and scale pictures to; None: they stay as they are.
+        Width and height to crop and scale images to; None: no change.
     raw
-        Grey pictures are as a colour sensor gave them (RGGB).
+        Grey images are raw images of a colour sensor (RGGB).
     columns
-        TOML file that says what the columns of a CSV file are; None: none is given.
+        TOML file that maps the columns of a CSV file; None: not given.
     """
 
     robot: str = "cf1"
@@ -81,18 +85,18 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """One foreign format: how to know it, how to read it.
+    """One foreign format: how to recognise it, and how to read it.
 
     Parameters
     ----------
     name
-        As ``--from`` takes it.
+        Value of ``--from``.
     what
-        What it is, in a few words: an article and a noun.
+        Description in a few words: an article and a noun.
     recognises
-        Whether a file or folder looks like it; looks at a few bytes only.
+        Return whether a file or folder appears to have this format. Reads a few bytes only.
     content
-        Samples of a source.
+        Return the samples of a source.
     """
 
     name: str

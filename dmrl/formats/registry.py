@@ -1,6 +1,6 @@
-"""The one table of formats, in the order in which a source is held against them.
+"""Table of all formats, in the order in which a source is tested against them.
 
-A new format is one file beside this one with a ``FORMAT``, or a plug-in of another package: see
+A new format is one file in this package with a ``FORMAT``, or a plug-in of another package: see
 docs/add-a-format.md.
 """
 
@@ -23,14 +23,14 @@ FIRST = (
     *("locanet", "csv", "uwb-tiers", "rosbag2", "nanocockpit", "cfclient"),
     *("cfusdlog", "aideck-stream", "hyperflash"),
 )
-"""Their order matters: the sources of some hold files that others know."""
+"""Formats to try first. The order matters: sources of some contain files that match later ones."""
 
 
 @cache
 def own() -> dict[str, Format]:
-    """The ``FORMAT`` of every file here, by name: those of ``FIRST``, then the others in order.
+    """Return the ``FORMAT`` of every file of this package by name: ``GUESS_ORDER``, then by name.
 
-    Plain pictures come last, as any folder with pictures is a folder of pictures.
+    Plain images come last, since any folder with images matches them.
     """
     walked = walk_packages(formats.__path__, f"{formats.__name__}.")
     modules = [import_module(m.name) for m in walked if m.name != __name__]
@@ -45,26 +45,26 @@ def own() -> dict[str, Format]:
 
 
 def format_of(source: Path, name: str | None = None) -> Format:
-    """The row of ``own`` or of a plug-in for a source.
+    """Return the built-in or plug-in format of a source.
 
     Parameters
     ----------
     source
         A file or folder.
     name
-        Its format; None: guess.
+        Name of its format; None: guess.
 
     Raises
     ------
     SourceError
-        If there is no such source or format, or none fits: lists the formats.
+        If the source or the format does not exist, or no format matches: lists the formats.
     PluginError
-        If a plug-in that is asked for by name cannot be loaded.
+        If the plug-in with the given name cannot be loaded.
     """
     added = {n: p for n, p in plugins.found(plugins.FORMATS).items() if n not in own()}
     known = ", ".join([*own(), *added])
     if not source.exists():
-        raise SourceError(f"no file or folder {source}. Name one to convert")
+        raise SourceError(f"no file or folder {source}. Pass one that exists")
     if not (source.is_file() or source.is_dir()):
         raise SourceError(f"{source} is neither a file nor a folder. Save it to a file first")
     if odd := next((p for p in _within(source) if _is_neither(p)), None):
@@ -74,18 +74,18 @@ def format_of(source: Path, name: str | None = None) -> Format:
     if name is not None and name not in own():
         near = get_close_matches(name, [*own(), *added], n=1)
         hint = f"Did you mean {near[0]}? " if near else ""
-        raise SourceError(f"--from {name}: no such kind. {hint}Kinds: {known}")
+        raise SourceError(f"--from {name}: no such format. {hint}Formats: {known}")
     if name is not None:
         return own()[name]
     if source.is_file() and source.stat().st_size == 0:
-        raise SourceError(f"{source} is empty, 0 bytes. Name another file")
+        raise SourceError(f"{source} is empty, 0 bytes. Pass another file")
     if source.is_dir() and not any(source.iterdir()):
-        raise SourceError(f"{source} is an empty folder. Name one with files in it")
+        raise SourceError(f"{source} is an empty folder. Pass one with files in it")
     if guess := _guess(source, added.values()):
         return guess
     if source.suffix == ".mcap":
-        raise SourceError(f"{source} is a recording already. Say --to: csv, parquet, ros2")
-    raise SourceError(f"{source} looks like no kind that is known. Say --from: {known}")
+        raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
+    raise SourceError(f"{source} matches no known format. Pass --from: {known}")
 
 
 def _within(source: Path) -> Iterator[Path]:
@@ -93,12 +93,12 @@ def _within(source: Path) -> Iterator[Path]:
 
 
 def _is_neither(path: Path) -> bool:
-    """Whether something there would keep who opens it waiting, such as a pipe."""
+    """Return whether a path is a pipe, device or socket, which would block its reader."""
     return path.exists() and not (path.is_file() or path.is_dir())
 
 
 def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:
-    """The first format that knows a source: plug-ins after dmrl's own, before plain pictures."""
+    """Return the first format that matches a source. Plug-ins follow dmrl's own, before images."""
     *first, pictures = own().values()
     if found := next((f for f in first if f.recognises(source)), None):
         return found
@@ -113,13 +113,13 @@ def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:
 
 
 def _plugged(plugin: Plugin) -> Format:
-    """A format of another package; what fails in it names the package."""
+    """Load the format of another package. Its failures become errors that name the package."""
     loaded = plugin.load()
     form = getattr(loaded, "FORMAT", loaded)
     plugin.require(isinstance(form, Format), "a dmrl.formats.base.Format")
 
     def recognises(source: Path) -> bool:
-        with plugin.blamed(f"fails to look at {source}"):
+        with plugin.blamed(f"fails to check {source}"):
             return bool(form.recognises(source))
 
     def content(source: Path, options: Options) -> Content:

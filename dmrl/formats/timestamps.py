@@ -1,7 +1,7 @@
-"""Counters that wrap, and times of arrival that jitter, made into times.
+"""Unwrapping of counters, and removal of jitter from times of arrival.
 
-Each in two forms: ``unwrap`` and ``dejitter`` for all of a file at once, which know what comes
-after; ``Unwrapped`` and ``SteadySender`` for one value after the other, as they arrive.
+Each comes in two forms. ``unwrap`` and ``dejitter`` process a whole file at once.
+``CounterUnwrapper`` and ``SteadyRateFilter`` process one value after the other, as they arrive.
 """
 
 from collections import deque
@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 Ints = NDArray[np.int64]
 
 EARLY = 0.3
-"""Share of a period by which an arrival may come before it is due."""
+"""Largest earliness of an arrival, as a share of the period."""
 EARLIER, LATER = 0.3, 0.01
-"""Shares of an arrival's distance to when it was due by which the next is due earlier, later."""
+"""Shares of an early and of a late arrival's deviation by which the next due time is corrected."""
 
 
 def unwrap(values: ArrayLike, bits: int) -> Ints:
-    """(N,) counts that go on where the counter began again at 0.
+    """Return (N,) counts that continue where the counter wrapped to 0.
 
-    A step is taken to be the nearest one, back or forth, that gives the next value: values a
-    little out of order stay so, and a gap of half the counter's range or more is not seen.
+    Each step is the smallest one, forward or back, that gives the next value. So values slightly
+    out of order stay so, and a gap of half the counter's range or more is not detected.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def unwrap(values: ArrayLike, bits: int) -> Ints:
     Returns
     -------
     Ints
-        (N,) int64; the first is as it was.
+        (N,) int64; the first value is unchanged.
 
     Examples
     --------
@@ -47,15 +47,15 @@ def unwrap(values: ArrayLike, bits: int) -> Ints:
 
 
 class Unwrapped:
-    """A counter of few bits as one that does not wrap.
+    """Unwrapper of a counter with few bits, one value at a time.
 
     Parameters
     ----------
     bits
-        Of the counter.
+        Width of the counter.
     forward
-        True: it never steps back, so that up to 2**bits - 1 may be missing. False: the
-        nearest value counts, before or after.
+        True: the counter never steps back, so up to 2**bits - 1 values may be missing. False: take
+        the nearest value, before or after.
     """
 
     def __init__(self, bits: int, *, forward: bool = False) -> None:
@@ -64,7 +64,7 @@ class Unwrapped:
         self._last: int | None = None
 
     def __call__(self, value: int) -> int:
-        """The counter's value with its wraps added.
+        """Return the unwrapped value of the counter.
 
         Examples
         --------
@@ -76,27 +76,27 @@ class Unwrapped:
         return self._last
 
     def near(self, value: int) -> int:
-        """The same, but the value is not remembered, and may have bits more than the counter."""
+        """Return the unwrapped value without storing it. It may have more bits than the counter."""
         if self._last is None:
             return value
         return self._last + (value - self._last + self._back) % self._period - self._back
 
 
 def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:
-    """(N,) regular times just early enough that nothing arrives before it was sent.
+    """Return (N,) regular times, as late as possible with none after its arrival.
 
-    A sender with a steady clock makes number n at a + b n; the way to the receiver adds a
-    delay that is never negative. The line that lies under all arrivals, and nearest to them
-    on average, is an edge of their lower hull. What stays is the shortest delay, which no
-    arrival shows.
+    A sender with a steady clock emits number n at a + b n. Transmission adds a delay that is never
+    negative. The line below all arrivals and nearest to them on average is an edge of their lower
+    hull. The shortest delay remains, since no arrival reveals it.
 
     Parameters
     ----------
     arrival_ns
         (N,) times of arrival, nanoseconds.
     count
-        (N,) the sender's numbers, unwrapped, increasing. None: numbered here, with gaps where
-        the arrivals leave a hole; where that cannot be told from jitter, the arrivals stand.
+        (N,) the sender's numbers, unwrapped, increasing. None: numbers are assigned, with gaps
+        where arrivals are missing. If gaps cannot be distinguished from jitter, the arrivals are
+        returned.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:
     if len(arrival) < 3:
         return arrival.copy()
     number = _numbered(arrival) if count is None else np.asarray(count, np.int64)
-    # Small numbers: float64 holds nanoseconds since 1970 to a quarter of a microsecond only.
+    # Relative: float64 resolves nanoseconds since 1970 to a quarter of a microsecond only.
     x, y = (number - number[0]).astype(float), (arrival - arrival[0]).astype(float)
     hull = _lower_hull(x, y)
     edge = min(max(int(np.searchsorted(x[hull], x.mean())), 1), len(hull) - 1)
@@ -125,7 +125,7 @@ def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:
 
 
 def _numbered(arrival: Ints) -> Ints:
-    """Numbers of a steady sender: one more each time, and more where there is a hole."""
+    """Assign numbers to the arrivals of a steady sender, with gaps for missing samples."""
     steps = np.diff(arrival)
     period = max(float(np.median(steps)), 1.0)
     period = float(steps[steps < 1.5 * period].mean())
@@ -133,14 +133,14 @@ def _numbered(arrival: Ints) -> Ints:
     for moment in arrival[1:].tolist():
         passed = max(int((moment - due) / period + EARLY), 1)
         number, due = number + passed, due + passed * period
-        # Follows the earliest arrivals at once, and a slower clock by and by.
+        # Adapts fast to early arrivals, and slowly to a slower clock.
         due += (moment - due) * (EARLIER if moment < due else LATER)
         numbers.append(number)
     return np.array(numbers, np.int64)
 
 
 def _lower_hull(x: NDArray[np.float64], y: NDArray[np.float64]) -> list[int]:
-    """Indices of the lower convex hull of points in order of x (Andrew's monotone chain)."""
+    """Return indices of the lower convex hull of points sorted by x (Andrew's monotone chain)."""
     hull: list[int] = []
     for k in range(len(x)):
         while len(hull) > 1:
@@ -157,27 +157,27 @@ def _lower_hull(x: NDArray[np.float64], y: NDArray[np.float64]) -> list[int]:
 
 
 class SteadySender:
-    """Times of a sender without a clock that sends at an even pace.
+    """Filter of arrival times from a sender that sends at a steady rate and has no clock.
 
-    When the next sample is due follows early arrivals at once and late ones slowly, as only
-    lateness has other reasons than the sender. A pause of some samples' length starts anew.
+    The next due time follows early arrivals at once and late ones slowly, since transmission only
+    adds delay. A pause of several samples restarts the filter.
     """
 
     MEMORY = 64
-    """Arrivals from which the pace is known."""
+    """Number of arrivals over which the period is measured."""
     LEAST = 8
-    """Arrivals before which they stand as they are."""
+    """Number of arrivals before the filter starts; earlier ones are returned unchanged."""
     LATE = 0.02
-    """Share of its lateness by which a late arrival puts off the next."""
+    """Share of its lateness by which a late arrival delays the next due time."""
     PAUSE = 4.0
-    """Lateness, in paces, that is no jitter."""
+    """Lateness that restarts the filter, in periods."""
 
     def __init__(self) -> None:
         self._arrivals: deque[int] = deque(maxlen=self.MEMORY)
         self._due_ns = 0.0
 
     def __call__(self, arrival_ns: int) -> int:
-        """When what arrived now was sent; never later than now."""
+        """Return the send time of a sample that arrives now; never later than now."""
         self._arrivals.append(arrival_ns)
         if len(self._arrivals) < self.LEAST:
             self._due_ns = arrival_ns

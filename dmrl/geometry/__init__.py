@@ -1,1 +1,1 @@
-"""Frames, lenses and the camera file."""
+"""Coordinate frames, lens distortion and the camera file."""

@@ -1,25 +1,25 @@
-"""Whether the numbers of a calibration message are those of a camera."""
+"""Validation of the numbers of a calibration message."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 LARGEST = 1e6
-"""Pixels of a focal length or a principal point, and a coefficient, at most."""
+"""Maximum of a focal length and a principal point, pixels, and of a coefficient."""
 
 
 def no_camera(width_px: int, height_px: int, k: Sequence[float], d: Sequence[float]) -> str:
-    """Why no camera has this calibration; empty if one can.
+    """Return the fault of a camera calibration, or an empty text if it is valid.
 
     Parameters
     ----------
     width_px, height_px
         Size of its images, pixels.
     k
-        K of ``foxglove.CameraCalibration``: 9 numbers, row by row, pixels. All zero, or none:
-        the camera is not calibrated.
+        K of ``foxglove.CameraCalibration``: 9 numbers, row by row, pixels. All zero or empty for
+        an uncalibrated camera.
     d
-        D: coefficients of the lens.
+        D: distortion coefficients.
     """
     if not any(k):
         return "is not calibrated: K is zero or missing"
@@ -30,5 +30,5 @@ def no_camera(width_px: int, height_px: int, k: Sequence[float], d: Sequence[flo
     if min(k[0], k[4]) <= 0:
         return "has a focal length that is not above 0"
     if min(width_px, height_px) <= 0:
-        return f"is of images of {width_px} x {height_px} px"
+        return f"has images of {width_px} x {height_px} px"
     return ""

@@ -1,4 +1,4 @@
-"""A camera's calibration in a TOML file."""
+"""TOML file of a camera's calibration."""
 
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
@@ -9,20 +9,20 @@ from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
 
 KNOWN = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
-"""Cameras that have a name."""
+"""Built-in cameras by name."""
 
 INTEGERS = ("width_px", "height_px")
 POSITIVE = (*INTEGERS, "fx_px", "fy_px")
 NEEDED = tuple(field.name for field in fields(Camera) if field.default is MISSING)
 LISTS = ("distortion", "mount_rad")
 COEFFICIENTS = 5
-"""Of the lens at most: k1, k2, p1, p2, k3."""
+"""Maximum number of distortion coefficients: k1, k2, p1, p2, k3."""
 
 KEYS = (*NEEDED, *LISTS, "delay_s")
 
 
 def write_camera(camera: Camera) -> str:
-    """A TOML document that ``read_camera`` reads."""
+    """Format a camera as a TOML document that ``read_camera`` can read."""
     values = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(camera).items()}
     lines = [f"{key} = {value}" for key, value in values.items()]
     return "\n".join(
@@ -31,12 +31,12 @@ def write_camera(camera: Camera) -> str:
 
 
 def camera_named(name: Path) -> Camera:
-    """The camera of that name, or that a TOML file describes.
+    """Return the built-in camera with this name, or read a TOML file.
 
     Parameters
     ----------
     name
-        One of `KNOWN`, or a file.
+        One of `NAMED_CAMERAS`, or a file.
 
     Raises
     ------
@@ -47,25 +47,25 @@ def camera_named(name: Path) -> Camera:
 
 
 def read_camera(path: Path) -> Camera:
-    """The camera that a TOML file describes.
+    """Read a camera from a TOML file.
 
     Raises
     ------
     SourceError
-        If the file is not TOML, or a key is unknown, missing or of the wrong kind.
+        If the file is not TOML, or a key is unknown, missing or of the wrong type.
     """
     refuse_pipe(path)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise SourceError(f"no calibration {path}. Name a TOML file, aideck or published") from None
+        raise SourceError(f"no calibration {path}. Use a TOML file, aideck or published") from None
     except (OSError, UnicodeDecodeError) as e:
         raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
     return parse_camera(text, path)
 
 
 def parse_camera(text: str, path: Path) -> Camera:
-    """The camera that a TOML document describes; ``path`` is where it stands, for errors.
+    """Parse a camera from a TOML document. ``path`` is its name in errors.
 
     Raises
     ------

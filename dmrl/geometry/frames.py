@@ -1,14 +1,14 @@
-"""Frames, cameras, projection and grid labels. Pure NumPy: no files, no topics, no state.
+"""Coordinate frames, cameras, projection and grid labels. Pure NumPy, without files or state.
 
 Frames, all right-handed, metres and radians:
 
 * ``horizontal``  origin at the robot, x forward, y left, z up against gravity.
 * ``camera``      origin at the optical centre, x forward, y left, z up; horizontal
-  turned by roll and pitch.
+  rotated by roll and pitch.
 * ``image``       pixels from the top-left corner, u right, v down, pixel-edge
   coordinates: an image covers [0, width] x [0, height].
 
-A matrix that turns ``b`` coordinates into ``a`` coordinates is named ``a_from_b``.
+A matrix that converts ``b`` coordinates to ``a`` coordinates is named ``a_from_b``.
 A grid cell is (row, col) = (v, u) // stride; the paper writes (x_p / 8, y_p / 8).
 """
 
@@ -22,7 +22,7 @@ from dmrl.geometry.lens import distort, undistort
 Array = NDArray[np.float64]
 
 STRIDE_PX = 8
-"""Image pixels per grid cell, both ways."""
+"""Image pixels per grid cell, in both directions."""
 
 # camera (x forward, y left, z up) -> optical (x right, y down, z forward); paper eq. 1.
 OPTICAL_FROM_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -43,10 +43,10 @@ class Camera:
     distortion
         k1, k2, p1, p2, k3 of the plumb-bob model; empty for none.
     mount_rad
-        Roll, pitch and yaw of the camera against the body of its robot, signs as those of
-        ``camera_from_horizontal`` and yaw positive to the left.
+        Roll, pitch and yaw of the camera relative to the robot's body. Signs as in
+        ``camera_from_horizontal``, yaw positive to the left.
     delay_s
-        How much later than the exposure the log time of an image is.
+        Delay of an image's log time after its exposure, seconds.
     """
 
     width_px: int
@@ -61,7 +61,7 @@ class Camera:
 
     @property
     def camera_from_body(self) -> Array:
-        """(3, 3) rotation: how the camera is mounted."""
+        """(3, 3) rotation of the camera's mount."""
         roll, pitch, yaw = self.mount_rad
         c, s = np.cos(yaw), np.sin(yaw)
         turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -79,17 +79,17 @@ AIDECK = Camera(320, 224, 183.73, 184.12, 166.90, 77.51, (-0.0957, 0.0211, 0.0, 
 """The AI-deck camera of the paper (eq. 1): 324x244 cropped to 320x224."""
 
 AIDECK_SENSOR_PX, AIDECK_CORNER_PX = (324, 244), (2, 10)
-"""Width and height of all that the AI-deck's sensor sees, and where in it that camera begins."""
+"""Width and height of the AI-deck's whole sensor, and the corner of `AIDECK` in it."""
 
 AIDECK_PINHOLE = replace(AIDECK, distortion=())
-"""The same without its distortion: what flights and sketches are seen with."""
+"""`AIDECK` without distortion. Used for flights and sketches."""
 
 PUBLISHED_RENDER = Camera(320, 224, 120.0, 120.0, 160.0, 112.0)
-"""The camera that the published synthetic images were rendered with."""
+"""Camera of the published synthetic images."""
 
 
 def camera_from_horizontal(roll_rad: float, pitch_rad: float) -> Array:
-    """(3, 3) rotation that turns horizontal into camera coordinates.
+    """Return the (3, 3) rotation from horizontal to camera coordinates.
 
     The body's attitude is Rz(yaw) Ry(pitch) Rx(roll), z up: roll positive right side down,
     pitch positive nose down. The paper's eq. 2, Rx(phi) Ry(theta), is this matrix with
@@ -108,7 +108,7 @@ def camera_from_horizontal(roll_rad: float, pitch_rad: float) -> Array:
 
 
 def project(xyz_camera: Array, image_from_optical: Array) -> tuple[Array, Array]:
-    """Pixel and depth of points in front of the camera, without distortion (paper eq. 1).
+    """Project points in front of the camera, without distortion (paper eq. 1).
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def project(xyz_camera: Array, image_from_optical: Array) -> tuple[Array, Array]
 
 
 def inside(uv: Array, width_px: int, height_px: int) -> NDArray[np.bool_]:
-    """(N,) whether pixels lie in the image, [0, width) x [0, height).
+    """Return (N,) whether pixels are in the image, [0, width) x [0, height).
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def inside(uv: Array, width_px: int, height_px: int) -> NDArray[np.bool_]:
 def grid_label(
     uv: Array, depth_m: Array, *, shape: tuple[int, int] = (28, 40), stride_px: int = STRIDE_PX
 ) -> NDArray[np.float32]:
-    """Confidence and depth maps for one image (paper eq. 4).
+    """Build confidence and depth maps of one image (paper eq. 4).
 
     Parameters
     ----------
@@ -172,14 +172,14 @@ def grid_label(
     shape
         Rows and columns of the grid.
     stride_px
-        Pixels per cell, both ways.
+        Pixels per cell, in both directions.
 
     Returns
     -------
     Array
-        (2, rows, cols). Channel 0 is confidence, 0 or 1; channel 1 is depth in metres,
-        0 where the confidence is 0. Robots outside the image are dropped. Of two robots
-        in one cell the nearer wins, since it hides the other.
+        (2, rows, cols). Channel 0 is confidence, 0 or 1. Channel 1 is depth in metres, 0 where the
+        confidence is 0. Robots outside the image are ignored. Of two robots in one cell, the nearer
+        one is used because it hides the other.
     """
     rows, cols = shape
     grid = np.zeros((2, rows, cols), np.float32)
@@ -200,7 +200,7 @@ def pixels_from_horizontal(
     *,
     distorted: bool = True,
 ) -> tuple[Array, Array, Array]:
-    """Pixels and depths of points in the horizontal frame, with their derivatives.
+    """Project points in the horizontal frame, and return pixels, depths and derivatives.
 
     Paper eq. 2 with the sign rule of ``camera_from_horizontal``, then eq. 1.
 
@@ -213,7 +213,7 @@ def pixels_from_horizontal(
     camera
         Intrinsics and distortion.
     distorted
-        Whether the image still has the lens's distortion.
+        Whether the image has the lens's distortion.
 
     Returns
     -------
@@ -239,12 +239,11 @@ def pixels_from_horizontal(
     point = xyz_horizontal[:, :, None]
     by_state = np.concatenate([turn, by_roll @ point, by_pitch @ point], axis=2)
     depth, left, up = (turn @ point)[..., 0].T
-    # What lies behind has no pixel. A division by its depth would give one, upside down.
+    # Points behind the camera have no pixel. Division by their depth would give a false one.
     ahead = np.where(depth > 0, depth, np.nan)
     plane = np.stack([-left / ahead, -up / ahead], axis=-1)
 
-    # The chain rule, from the inside: state to camera, to the plane at unit depth, through the
-    # lens, to pixels.
+    # Chain rule: state to camera, to the plane at unit depth, through the lens, to pixels.
     by_camera = np.zeros((len(plane), 2, 3))
     by_camera[:, :, 0] = -plane / ahead[:, None]
     by_camera[:, 0, 1] = by_camera[:, 1, 2] = -1 / ahead
@@ -266,7 +265,7 @@ def horizontal_from_pixels(
     *,
     distorted: bool = True,
 ) -> Array:
-    """(N, 3) points in the horizontal frame, metres: ``pixels_from_horizontal`` turned round.
+    """Return (N, 3) points in the horizontal frame, metres. Inverse of ``pixels_from_horizontal``.
 
     Parameters
     ----------
@@ -279,12 +278,12 @@ def horizontal_from_pixels(
     camera
         Intrinsics and distortion.
     distorted
-        Whether the image still has the lens's distortion.
+        Whether the image has the lens's distortion.
     """
     plane = (uv - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
     plane = undistort(plane, camera.distortion if distorted else ())
     ahead = np.column_stack([np.ones(len(plane)), -plane]) * depth_m[:, None]
     turns = [camera_from_horizontal(r, p) for r, p in zip(roll_rad, pitch_rad, strict=True)]
-    # Points are rows, so a product from the right turns by the transpose, back to the body.
+    # Points are rows: a product from the right applies the transpose, from camera to body.
     ahead = ahead @ camera.camera_from_body
     return np.asarray(np.einsum("nji,nj->ni", np.reshape(turns, (-1, 3, 3)), ahead))

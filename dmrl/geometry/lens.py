@@ -1,7 +1,7 @@
-"""What a lens does to the plane at unit depth: the plumb-bob model, both ways. Pure NumPy.
+"""Plumb-bob lens distortion of the plane at unit depth, and its inverse. Pure NumPy.
 
 Brown (1966), in the order of OpenCV and of ``foxglove.CameraCalibration``: k1, k2, p1, p2, k3.
-Places are right and down over depth.
+Places are right and down, divided by depth.
 """
 
 import numpy as np
@@ -10,23 +10,23 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 ROUNDS = 8
-"""Newton steps; the lenses of small cameras settle in 4 to 1e-9."""
+"""Newton steps of the inverse. Lenses of small cameras converge to 1e-9 in 4."""
 
 
 def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Where a lens puts places of the plane, and the derivatives.
+    """Map places of the plane through the lens, and return the derivatives.
 
     Parameters
     ----------
     plane
         (..., 2) right and down over depth.
     distortion
-        k1, k2, p1, p2, k3 of the plumb-bob model; fewer: the rest are zero.
+        k1, k2, p1, p2, k3 of the plumb-bob model. Missing ones are zero.
 
     Returns
     -------
     bent : Array
-        (..., 2) in the same plane; NaN so far out that the model folds back.
+        (..., 2) in the same plane. NaN so far out that the model folds back.
     jacobian : Array
         (..., 2, 2).
     """
@@ -35,7 +35,7 @@ def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
     square = x**2 + y**2
     radial = 1 + square * (k1 + square * (k2 + square * k3))
     slope = k1 + square * (2 * k2 + square * 3 * k3)
-    # Below 0, places further out appear further in: the derivative of r * radial(r^2) by r.
+    # Derivative of r * radial(r^2) by r. Below 0, places further out appear further in.
     radial = np.where(radial + 2 * square * slope > 0, radial, np.nan)
     bent = np.stack(
         [
@@ -44,7 +44,7 @@ def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
         ],
         axis=-1,
     )
-    # Both mixed derivatives are the same, so the Jacobian is symmetric.
+    # Both mixed derivatives are equal, so the Jacobian is symmetric.
     across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
     along_x = radial + 2 * x**2 * slope + 2 * p1 * y + 6 * p2 * x
     along_y = radial + 2 * y**2 * slope + 6 * p1 * y + 2 * p2 * x
@@ -53,21 +53,21 @@ def distort(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
 
 
 def undistort(bent: Array, distortion: tuple[float, ...]) -> Array:
-    """(..., 2) places of the plane that ``distort`` takes to ``bent``.
+    """Return the (..., 2) places of the plane that ``distort`` maps to ``bent``.
 
     Parameters
     ----------
     bent
-        (..., 2) right and down over depth, as the lens shows them.
+        (..., 2) distorted places, right and down over depth.
     distortion
         As in ``distort``.
 
     Returns
     -------
     Array
-        NaN where the lens shows nothing: beyond the fold of its model.
+        NaN beyond the fold of the lens model.
     """
-    # Newton, from where the lens shows the place: lenses move places by little.
+    # Newton's method starts at the distorted place, because distortion is small.
     plane = np.array(bent, float)
     for _ in range(ROUNDS if any(distortion) else 0):
         shown, jacobian = distort(plane, distortion)

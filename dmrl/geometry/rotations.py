@@ -1,4 +1,4 @@
-"""How a body is turned: angles of Rz(yaw) Ry(pitch) Rx(roll), z up, and quaternions.
+"""Conversion between quaternions and the angles of Rz(yaw) Ry(pitch) Rx(roll), z up.
 
 Pitch is positive nose down. Frames of cameras are in ``geometry.frames``.
 """
@@ -9,7 +9,7 @@ from dmrl.geometry.frames import Array
 
 
 def euler_zyx(quaternion: Array) -> Array:
-    """(N, 3) roll, pitch, yaw of Rz(yaw) Ry(pitch) Rx(roll) from (N, 4) x, y, z, w."""
+    """Convert (N, 4) x, y, z, w to (N, 3) roll, pitch, yaw of Rz(yaw) Ry(pitch) Rx(roll)."""
     x, y, z, w = quaternion.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
@@ -18,7 +18,7 @@ def euler_zyx(quaternion: Array) -> Array:
 
 
 def quaternion_zyx(angles: Array) -> Array:
-    """(N, 4) x, y, z, w from (N, 3) roll, pitch, yaw; the inverse of ``euler_zyx``."""
+    """Convert (N, 3) roll, pitch, yaw to (N, 4) x, y, z, w."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles / 2).T, np.sin(angles / 2).T
     xyzw = (
         cy * cp * sr - sy * sp * cr,

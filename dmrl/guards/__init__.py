@@ -1,5 +1,5 @@
-"""What stands between dmrl and files of strangers or of other processes.
+"""Protect against untrusted files and concurrent processes.
 
-Names that come from files, how much a file may ask for, documents of bounded depth, and the
-lock that keeps one output to one writer. Nothing here knows what dmrl does.
+Checks of names from files, limits on resources, parsers of bounded depth, and locks that give
+each output one writer. These modules do not depend on the rest of dmrl.
 """

@@ -1,4 +1,4 @@
-"""JSON, TOML and NumPy archives of strangers, read within their budgets."""
+"""Parse JSON, TOML and NumPy archives from untrusted files within limits."""
 
 import json
 import lzma
@@ -16,12 +16,12 @@ from dmrl.guards import limits
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The value that a JSON document holds.
+    """Return the value of a JSON document.
 
     Raises
     ------
     ValueError
-        If it is no JSON, nests deeper than the budget, or holds a whole number of over 64 bits.
+        If it is not JSON, nests deeper than the limit, or contains an integer over 64 bits.
     """
     try:
         return _modest(json.loads(text))
@@ -30,13 +30,13 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table that a TOML document holds.
+    """Return the table of a TOML document.
 
     Raises
     ------
     ValueError
-        If it is no TOML, is longer than a recipe, nests deeper than the budget, or holds a whole
-        number of over 64 bits.
+        If it is not TOML, exceeds the limit of characters or depth, or contains an integer over
+        64 bits.
     """
     if len(text) > limits.TOML_CHARACTERS:
         raise ValueError(f"it has {len(text)} characters, more than {limits.TOML_CHARACTERS}")
@@ -51,19 +51,19 @@ LEAKS = (
     *(MemoryError, RuntimeError, LookupError, SyntaxError),
     *(struct.error, zlib.error, lzma.LZMAError),
 )
-"""What NumPy and zipfile let through of a damaged archive, beside what they say."""
+"""Errors that NumPy and zipfile raise on corrupt archives beside the documented ones."""
 _TOO_DEEP = f"it nests deeper than {limits.DEPTH}"
 
 
 def _modest(value: Any) -> Any:
-    """The value, if it nests no deeper than the budget and its numbers are those of a machine.
+    """Return the value if its depth and its integers are within the limits.
 
     Later code recurses into it, and makes arrays of it.
     """
     level = [value]
     for _ in range(limits.DEPTH):
         if huge := [one for one in level if type(one) is int and one.bit_length() > 64]:
-            raise ValueError(f"it holds a whole number of {huge[0].bit_length()} bits")
+            raise ValueError(f"it contains an integer of {huge[0].bit_length()} bits")
         containers = [one for one in level if isinstance(one, dict | list)]
         if not containers:
             return value
@@ -76,14 +76,14 @@ def _modest(value: Any) -> Any:
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a ``.npz`` file, by name; nothing is unpickled.
+    """Return the arrays of a ``.npz`` file by name, without unpickling.
 
     Raises
     ------
     OSError, ValueError, EOFError, zipfile.BadZipFile
-        If it is none, or damaged.
+        If it is not an archive, or is corrupt.
     ValueError
-        If it unpacks to more than the budget.
+        If it decompresses to more than the limit.
     """
     with path.open("rb") as stream:
         with zipfile.ZipFile(stream) as archive:

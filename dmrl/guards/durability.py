@@ -1,4 +1,4 @@
-"""Bringing files to the disk, so that a power loss does not take them back."""
+"""Flush files to the disk, so that they survive a power loss."""
 
 import os
 import shutil
@@ -8,12 +8,12 @@ from dmrl.guards.locks import UNSUPPORTED
 
 
 def sync(path: Path) -> None:
-    """Bring a file, or a folder with everything in it, to the disk.
+    """Flush a file, or a folder with everything in it, to the disk.
 
     Raises
     ------
     OSError
-        If the disk refuses.
+        If the disk reports an error.
     """
     if path.is_dir():
         for inner in sorted(path.iterdir()):
@@ -23,7 +23,7 @@ def sync(path: Path) -> None:
 
 
 def sync_one(path: Path) -> None:
-    """Bring a file to the disk, or the names in a folder."""
+    """Flush a file, or the list of names in a folder, to the disk."""
     held = os.open(path, os.O_RDONLY)
     try:
         os.fsync(held)
@@ -35,7 +35,7 @@ def sync_one(path: Path) -> None:
 
 
 def empty(folder: Path) -> None:
-    """Remove everything in a folder; links in it, not what they lead to."""
+    """Remove everything in a folder. Links are removed, not their targets."""
     for inner in folder.iterdir():
         if inner.is_dir() and not inner.is_symlink():
             shutil.rmtree(inner)

@@ -1,4 +1,4 @@
-"""Files and folders that one process takes for itself, by a lock that dies with it."""
+"""Lock files and folders for one process, with locks that end with the process."""
 
 import errno
 import fcntl
@@ -10,20 +10,14 @@ from pathlib import Path
 from dmrl.errors import BusyOutput, OutputError
 
 PATIENCE_S = 0.25
-"""How long a lock is waited for: another process may just be looking whether it is held."""
+"""Time to wait for a lock. Another process may be testing it at this moment."""
 UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EBADF)
-"""What a file system says that knows no locks, or cannot sync a folder."""
+"""Error numbers of file systems without locks, or that cannot sync a folder."""
 
 
 def refuse_locked(path: Path) -> None:
-    """Nothing, if no living process has taken ``path``.
-
-    Raises
-    ------
-    OutputError
-        If one has.
-    """
-    with suppress(OSError):  # nothing there, or nothing that could be locked
+    """Raise OutputError if a living process has locked ``path``."""
+    with suppress(OSError):  # nothing exists, or it cannot be locked
         held = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
             _lock(held, path)
@@ -32,7 +26,7 @@ def refuse_locked(path: Path) -> None:
 
 
 def take_file(partial: Path) -> int:
-    """Descriptor of a new file that is locked by this process."""
+    """Create a file locked by this process, and return its descriptor."""
     while True:
         try:
             held = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -48,7 +42,7 @@ def take_file(partial: Path) -> int:
 
 
 def take_folder(partial: Path) -> int:
-    """Descriptor of a folder, new or left over, that is locked by this process."""
+    """Lock a folder, new or left over, and return its descriptor."""
     while True:
         with suppress(FileExistsError):
             partial.mkdir()
@@ -57,17 +51,17 @@ def take_folder(partial: Path) -> int:
         except FileNotFoundError:
             continue  # finished by another process just now
         except NotADirectoryError:
-            raise OutputError(f"{partial} is in the way, and no folder. Remove it") from None
+            raise OutputError(f"{partial} exists and is not a folder. Remove it") from None
         except OSError:
             with suppress(OSError):
-                partial.rmdir()  # if it is ours it is empty
+                partial.rmdir()  # a folder that was just created is empty
             raise
         if _locked_still(held, partial):
             return held
 
 
 def _locked_still(held: int, partial: Path) -> bool:
-    """Whether the lock is ours and on what has the name; else the descriptor is closed."""
+    """Lock the descriptor; return whether it still has the name, else close it."""
     try:
         _lock(held, partial)
     except BaseException:
@@ -80,28 +74,28 @@ def _locked_still(held: int, partial: Path) -> bool:
 
 
 def _remove_left_over(partial: Path) -> None:
-    """Remove what a killed process left. Not emptied: it may have got another name since."""
+    """Remove a file of a killed process. It is not emptied: it may have another name by now."""
     try:
         held = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
         return
     except OSError as e:
         if e.errno == errno.ELOOP:
-            raise OutputError(f"{partial} is in the way, a symbolic link. Remove it") from None
+            raise OutputError(f"{partial} exists and is a symbolic link. Remove it") from None
         raise
     if _locked_still(held, partial):
         try:
             if partial.is_dir():
-                raise OutputError(f"{partial} is in the way, a folder. Remove it")
+                raise OutputError(f"{partial} exists and is a folder. Remove it")
             partial.unlink()
         finally:
             os.close(held)
 
 
 def _lock(held: int, partial: Path) -> None:
-    """Lock an open file or folder until it is closed or this process dies.
+    """Lock an open file or folder until it is closed or this process ends.
 
-    A file system without locks lets everybody through; see docs/reliability.md.
+    On a file system without locks this always succeeds; see docs/reliability.md.
     """
     until = time.monotonic() + PATIENCE_S
     while True:
@@ -126,7 +120,7 @@ def _busy(held: int, partial: Path) -> BusyOutput:
 
 
 def _owner(held: int) -> int | None:
-    """Number of the process that holds the lock, where the system tells."""
+    """Return the id of the process with the lock, if the system lists it."""
     found = os.fstat(held)
     device = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}"
     place = f"{device}:{found.st_ino}"
@@ -139,7 +133,7 @@ def _owner(held: int) -> int | None:
 
 
 def is_held(path: Path, held: int) -> bool:
-    """Whether the name is that of the open file or folder."""
+    """Return whether the path is that of the open file or folder."""
     try:
         return os.path.samestat(os.lstat(path), os.fstat(held))
     except OSError:

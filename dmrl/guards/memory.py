@@ -1,7 +1,7 @@
-"""What a foreign file may take while a library reads it, held by the system itself.
+"""Limit the memory that a library uses to read an untrusted file.
 
-Sizes that a file states can be false, and libraries believe them. Where dmrl does not unpack by
-its own hands, the system refuses what goes beyond the budget.
+Sizes that a file states can be false, and libraries allocate them. Where dmrl does not decompress
+itself, the operating system enforces the limit.
 """
 
 import re
@@ -15,21 +15,21 @@ _HELD = re.compile(r"VmData:\s*(\d+) kB")
 
 
 class Bounded:
-    """Blocks in which this process gets no more memory than ``size`` bytes of a file explain.
+    """Limit the memory of this process within a block, by the size of the file that is read.
 
-    Mapped files do not count. Nor can a file be written that is larger, as by a library that
-    unpacks into the temporary folder. All threads are held, so blocks should only parse. Where the
-    system does not tell what a process holds (macOS) memory is not bounded.
+    Mapped files do not count. Written files have the same limit, as a library may unpack into the
+    temporary folder. The limit applies to all threads, so blocks should only parse. On systems
+    that do not report the memory of a process (macOS) it is not limited.
 
     Parameters
     ----------
     size
-        Of the file, bytes.
+        Size of the file, bytes.
 
     Raises
     ------
     MemoryError, OSError
-        From the block, or what the library in it makes of it.
+        From the block, or another error that the library turns them into.
     """
 
     def __init__(self, size: int) -> None:
@@ -52,12 +52,12 @@ class Bounded:
 
 
 def size_of(path: Path) -> int:
-    """Bytes of a file, or of the files in a folder and its folders.
+    """Return the size of a file, or of all files in a folder, bytes.
 
     Raises
     ------
     OSError
-        If it is not there.
+        If it does not exist.
     """
     if not path.is_dir():
         return path.stat().st_size

@@ -1,4 +1,4 @@
-"""What stands in a folder of a stranger, and under a name that somebody gives."""
+"""Check the paths that a user names, and the content of untrusted folders."""
 
 import os
 import stat
@@ -9,47 +9,36 @@ from dmrl.errors import UnsafeName
 
 
 def refuse_no_text(path: Path) -> None:
-    """Nothing, if every library can be given a path: it is text, and holds no NUL.
+    """Raise UnsafeName unless a path is valid UTF-8 without NUL.
 
-    File systems take any bytes. What writes tables, figures and logs of a training takes text, and
-    some of it fails in the middle of the work.
-
-    Raises
-    ------
-    UnsafeName
-        If one cannot.
+    File systems accept any bytes. Libraries that write tables, figures and training logs need text,
+    and some of them would fail in the middle of the work.
     """
     name = str(path)
     try:
         name.encode("utf-8")
     except UnicodeEncodeError:
         raise UnsafeName(
-            f"{name[:80]} is no text, and not every program reads it. Rename it"
+            f"{name[:80]} is not valid UTF-8, which some programs cannot read. Rename it"
         ) from None
     if "\0" in name:
         raise UnsafeName(f"no file can be called {name[:80]!r}. Check the name")
 
 
 def refuse_pipe(path: Path) -> None:
-    """Nothing, if a path is a file or a folder, or nothing is there.
-
-    Raises
-    ------
-    UnsafeName
-        If it is a pipe, a socket or a device, or no path at all.
-    """
+    """Raise UnsafeName if a path is a pipe, a socket or a device, or contains NUL."""
     if "\0" in str(path):
         raise UnsafeName(f"no file can be called {str(path)[:80]!r}. Check the name")
-    with suppress(OSError):  # who opens it says so
-        mode = os.stat(str(path)).st_mode  # noqa: PTH116 - a bucket is not asked
+    with suppress(OSError):  # opening it will report the error
+        mode = os.stat(str(path)).st_mode  # noqa: PTH116 - no request to a bucket
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise UnsafeName(f"{path} is a pipe or a device, no file. Name a file")
+            raise UnsafeName(f"{path} is a pipe or a device, not a file. Name a file")
 
 
 def refuse_pipes(folder: Path) -> None:
-    """Nothing, if a folder and its folders hold files and folders alone; or if it is a file.
+    """Raise UnsafeName if a folder contains pipes, sockets or devices, at any depth.
 
-    Archives can hold named pipes and devices. Who opens one waits for ever, or reads without end.
+    Archives can contain named pipes and devices, where a read could block or never end.
 
     Raises
     ------
@@ -65,6 +54,6 @@ def refuse_pipes(folder: Path) -> None:
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
                     to_do.append(entry.path)
-                # A link that leads nowhere cannot be opened, and is no harm.
+                # A dangling link cannot be opened, so it does no harm.
                 elif not (entry.is_file() or entry.is_dir()) and Path(entry.path).exists():
-                    raise UnsafeName(f"{entry.path} is a pipe or a device, no file. Remove it")
+                    raise UnsafeName(f"{entry.path} is a pipe or a device, not a file. Remove it")

@@ -1,8 +1,8 @@
-"""Names that come from files and from the network, made safe before they become anything else.
+"""Make names from files and from the network safe before they are used.
 
-A recording, a model, a recipe or a packet may come from a stranger, and so does every name in
-it: of a robot, topic, split, step, network, layer, class or event. Before such a name becomes a
-path, a comment of C, Markdown, or a line on a terminal, it goes through one of these functions.
+A recording, a model, a recipe or a packet may be untrusted, and so is every name in it: of a
+robot, topic, split, step, network, layer, class or event. Before a name becomes a path, a C
+comment, Markdown or terminal output, it passes through one of these functions.
 """
 
 import re
@@ -13,77 +13,77 @@ from urllib.parse import quote
 from dmrl.errors import UnsafeName, one_line
 
 MOST_BYTES = 200
-"""Of a name: with ``-00000-of-00001.parquet`` it still fits a file system's 255."""
+"""Length of a name, bytes. With ``-00000-of-00001.parquet`` it fits a file system's 255."""
 
 LINE_MAX = 480
-"""Of an error: a few lines of a terminal."""
+"""Length of an error message, characters: a few lines of a terminal."""
 
 _PLAIN = re.compile(r"[^A-Za-z0-9 ._,:+()=-]")
 _SPLIT = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
 _MARKUP = re.compile(r"([\\`\[\]<>|]|(?<=:)/|(?<=www)\.)", re.IGNORECASE)
-"""What is markup, and what makes a link of ``https://x`` or ``www.x``."""
+"""Characters of markup, and those that make a link of ``https://x`` or ``www.x``."""
 _TAKEN = (
     *("data", "figures", "parts", "readme.md", "croissant.json", "facts.json"),
     *("manifest.json", "provenance.json", "dataset_dict.json"),
 )
-"""What a dataset's folder holds beside its splits; many disks take ``Data`` for ``data``."""
+"""Names in a dataset's folder beside the splits. Many disks do not distinguish upper case."""
 _DEVICE = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
-"""Names that Windows keeps for devices: no folder of a dataset that is copied there has one."""
+"""Names that Windows reserves for devices. A dataset must be copyable to Windows."""
 
 
 def inside(folder: Path, name: str, what: str, *, suffix: str = "") -> Path:
-    """The file or folder ``name + suffix`` in ``folder``: in it, whatever the name is.
+    """Return the path ``folder / (name + suffix)``, which is inside ``folder`` for every name.
 
     Parameters
     ----------
     folder
-        Where it shall lie.
+        Parent folder.
     name
-        From a file: one part of a path, no more.
+        Untrusted name: a single part of a path.
     what
-        What is named so, and where, for the error: ``"flight.mcap: the split"``.
+        Description of the named object for the error: ``"flight.mcap: the split"``.
     suffix
-        Our own ending.
+        Trusted suffix.
 
     Raises
     ------
     UnsafeName
-        If the name is no plain name of a file.
+        If the name is not a plain file name.
     """
     return folder / (file_name(name, what) + suffix)
 
 
 def file_name(name: str, what: str) -> str:
-    """The name, if it can be that of a file in any folder and is nothing else.
+    """Return the name if it is a valid file name in any folder.
 
     Raises
     ------
     UnsafeName
-        If it is empty, too long, begins with a dot, or holds a slash or a control character.
+        If it is empty, too long, begins with a dot, or contains a slash or a control character.
     """
     if not name:
         raise UnsafeName(f"{what} has an empty name. Give it one")
     shown = shortened(name)
     if "/" in name or "\\" in name or name.startswith("."):
         raise UnsafeName(
-            f"{what} is called {shown!r}, which leads out of its folder or hides in it. "
-            "Names have no slashes and no dot in front"
+            f"{what} is called {shown!r}, which is a path or a hidden file. "
+            "Use a name without slashes and leading dots"
         )
     if not name.isprintable() or len(name.encode("utf-8", "replace")) > MOST_BYTES:
         raise UnsafeName(
-            f"{what} is called {shown!r}, which no file can be called everywhere. "
+            f"{what} is called {shown!r}, which is not a valid file name everywhere. "
             f"Use up to {MOST_BYTES} letters, digits and signs"
         )
     return name
 
 
 def split_name(name: str, what: str) -> str:
-    """The name, if a split can be called so: letters, digits, ``_`` and ``-``, and dots between.
+    """Return the name if it is valid for a split: letters, digits, ``_``, ``-``, inner dots.
 
     Raises
     ------
     UnsafeName
-        If it cannot on every disk, or a part of every dataset is called so.
+        If the name is not valid on every disk, or is reserved in a dataset's folder.
     """
     if not isinstance(name, str) or not _SPLIT.fullmatch(name) or len(name) > MOST_BYTES:
         raise UnsafeName(
@@ -91,34 +91,34 @@ def split_name(name: str, what: str) -> str:
             "digits, _ and -"
         )
     if _DEVICE.fullmatch(name):
-        raise UnsafeName(f"{what} is called {name}, as devices of Windows are. Rename it")
+        raise UnsafeName(f"{what} is called {name}, which Windows reserves for a device. Rename it")
     if name.casefold() in _TAKEN:
-        raise UnsafeName(f"{what} is called {name}, as a part of every dataset is. Rename it")
+        raise UnsafeName(f"{what} is called {name}, which is reserved in a dataset. Rename it")
     return name
 
 
 @cache
 def topic_part(name: str, what: str) -> str:
-    """The name, if it can stand between two slashes of a topic.
+    """Return the name if it is valid between two slashes of a topic.
 
     Raises
     ------
     UnsafeName
-        If it is empty, too long, or holds a slash or a control character.
+        If it is empty, too long, or contains a slash or a control character.
     """
     if not name or "/" in name or not name.isprintable() or len(name) > MOST_BYTES:
         raise UnsafeName(
-            f"a {what} is called {shortened(name)!r}, which cannot be part of a topic. Names have "
-            "no slashes and no control characters"
+            f"a {what} is called {shortened(name)!r}, which cannot be part of a topic. Use a name "
+            "without slashes and control characters"
         )
     return name
 
 
 def file_of_topic(topic: str) -> str:
-    """A file name for a topic, another for every other: ``/cf1/height`` is ``cf1.height``.
+    """Return a unique file name for a topic: ``/cf1/height`` becomes ``cf1.height``.
 
-    A dot of the topic itself, and what is not safe in a file's name, is written ``%2E``; a topic
-    without a slash in front begins with ``=``.
+    Dots and unsafe characters of the topic are percent-encoded (``%2E``). A topic without a leading
+    slash gets the prefix ``=``.
     """
     parts = topic.removeprefix("/").split("/")
     name = ".".join(quote(part, safe=" +,@()").replace(".", "%2E") for part in parts)
@@ -126,21 +126,21 @@ def file_of_topic(topic: str) -> str:
 
 
 def plain(text: str) -> str:
-    """The text for comments of C and of Makefiles: what could end one becomes ``_``.
+    """Replace characters that could end a comment in C or a Makefile by ``_``.
 
-    Letters, digits, spaces and a few signs stay: no ``*/``, no line end, no backslash, no
-    trigraph, no quote and no ``$`` can be written with them.
+    Letters, digits, spaces and a few signs stay. They cannot form ``*/``, a line end, a backslash,
+    a trigraph, a quote or ``$``.
     """
     return _PLAIN.sub("_", shortened(text))
 
 
 def markdown(text: str) -> str:
-    """The text for a line of Markdown or a cell of its tables: no link, no HTML, no new cell."""
+    """Escape text for a line of Markdown or a table cell: no link, no HTML, no new cell."""
     return _MARKUP.sub(r"\\\1", one_line(text))
 
 
 def code(text: str) -> str:
-    """The text as a code span of Markdown, which nothing in it can end."""
+    """Return the text as a Markdown code span that its content cannot end."""
     line = one_line(text)
     fence = "`" * (1 + max((len(run) for run in re.findall("`+", line)), default=0))
     pad = " " if line.startswith("`") or line.endswith("`") else ""
@@ -148,14 +148,14 @@ def code(text: str) -> str:
 
 
 def shortened(text: str) -> str:
-    """The text, cut where it is longer than any honest name."""
+    """Truncate text that is longer than any honest name."""
     return text if len(text) <= MOST_BYTES else f"{text[:MOST_BYTES]}..."
 
 
 def without_middle(line: str) -> str:
-    """A line that a person reads: of a very long one the middle is left out.
+    """Remove the middle of a very long line for people.
 
-    The file at fault stands at its beginning, the way out at its end.
+    The beginning names the file at fault, the end the way out.
     """
     if len(line) <= LINE_MAX:
         return line

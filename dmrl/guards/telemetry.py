@@ -18,5 +18,5 @@ OPT_OUT = {
 
 
 def disable_telemetry() -> None:
-    """Set the opt-out variable of every dependency, whatever the environment says."""
+    """Set the opt-out variable of every dependency, overriding the environment."""
     os.environ.update(OPT_OUT)

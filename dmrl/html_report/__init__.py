@@ -1,7 +1,7 @@
-"""A folder of outputs as one page: what is there, how good it is, where it comes from.
+"""Report a folder of outputs as one HTML page: contents, metrics and provenance.
 
-`gather` finds recordings, datasets, models and evaluations, `sections` says what each comes to,
-`document` makes HTML of it that needs nothing else, and `write` one file.
+`collect` finds recordings, datasets, models and evaluations. `report_sections` summarizes them,
+`html` builds a self-contained page, and `write_report` writes the file.
 """
 
 from dmrl.html_report.collect import Found, gather

@@ -1,4 +1,4 @@
-"""What a catalogue comes to: how much there is of each camera and source, what is wrong."""
+"""Summarize a catalogue: recordings by camera and source of labels, and their errors."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -9,11 +9,11 @@ import pyarrow as pa
 from dmrl.html_report.html import table, text
 
 MOST_WRONG = 12
-"""Recordings that are named with what is wrong with them."""
+"""Recordings that are listed with their errors, at most."""
 
 
 def listed(name: str, catalogue: pa.Table) -> str:
-    """The section of one catalogue, HTML."""
+    """Build the section of one catalogue, HTML."""
     return "".join(
         (
             f"<h3>{text(name)}</h3><p>{text(_total(catalogue))}</p>",
@@ -58,7 +58,7 @@ def _each(rows: pa.ChunkedArray) -> Iterable[dict[str, Any]]:
 
 
 def _counted(column: pa.ChunkedArray) -> list[tuple[str, int]]:
-    return Counter(value or "not known" for value in column.to_pylist()).most_common()
+    return Counter(value or "unknown" for value in column.to_pylist()).most_common()
 
 
 def _wrong(catalogue: pa.Table) -> str:

@@ -1,4 +1,4 @@
-"""What stands in a folder: recordings, datasets, models, evaluations, pictures."""
+"""Collect the outputs in a folder: recordings, datasets, models, evaluations, images."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -27,41 +27,42 @@ DOCUMENTS = {
     "quantisation.json": "int8",
     "model.json": "models",
 }
-"""Names of files that say what an output folder is, and what it is here."""
+"""Files that identify an output folder, and its kind in a report."""
 MOST_FILES, MOST_BYTES, DEEPEST = 20_000, 16 << 20, 6
+"""Limits of a search: files of a folder, bytes of a document, levels of folders."""
 MANY = 100
-"""Recordings of a catalogue from which on they are told of together, and not opened."""
+"""Largest number of recordings in a catalogue that are opened one by one."""
 RECIPE = "recipe.toml"
-"""What `dmrl.pipeline` leaves beside its outputs."""
+"""The recipe that `dmrl.pipeline` leaves beside its outputs."""
 PICTURE_KINDS = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What stands in a folder, by its name in there.
+    """Contents of a folder, by path relative to it.
 
     Parameters
     ----------
     folder
         The folder.
     recordings
-        Whole recordings, and what they hold.
+        Complete recordings and their summaries.
     datasets
         Their folders.
     documents
-        Of each kind of `DOCUMENTS`: the document of an output.
+        By kind of `DOCUMENT_KINDS`: the document of each output.
     pictures
-        Pictures that lie beside outputs rather than in one.
+        Images in the folder itself, outside outputs.
     catalogues
-        Their tables, of `dmrl.catalogue`.
+        Their tables, from `dmrl.catalogue`.
     made
-        How each output was made, where it says so.
+        Provenance of the outputs that have one.
     unread
-        What could not be read, and why.
+        Files that cannot be read, with the reason.
     story
-        Figures that the recipe of the folder wants shown first.
+        Figures that the folder's recipe puts first.
     title
-        What that recipe calls them.
+        Heading of these figures.
     """
 
     folder: Path
@@ -76,20 +77,22 @@ class Found:
     title: str = "The recipe's figures"
 
     def of(self, kind: str) -> dict[str, Mapping[str, Any]]:
-        """Documents of one kind."""
+        """Return the documents of one kind."""
         return self.documents.get(kind, {})
 
 
 def gather(folder: Path) -> Found:
-    """Everything in a folder that a page can tell of; links are not followed.
+    """Collect the contents of a folder for its report; links are not followed.
 
     Raises
     ------
     SettingError
-        If it is no folder, or holds nothing of the kind.
+        If it is not a folder, or contains no output.
     """
     if not folder.is_dir():
-        raise SettingError(f"{folder} is no folder. Name one with recordings, models, evaluations")
+        raise SettingError(
+            f"{folder} is not a folder. Name one with recordings, models, evaluations"
+        )
     refuse_pipes(folder)
     found = _told(folder)
     files = list(_files(folder))
@@ -104,13 +107,13 @@ def gather(folder: Path) -> Found:
             found.unread[_name(found, path)] = str(e)
     if not (found.recordings or found.datasets or found.documents or found.catalogues):
         raise SettingError(
-            f"{folder} holds no recording, dataset, model or evaluation. Try: dmrl demo"
+            f"{folder} contains no recording, dataset, model or evaluation. Try: dmrl demo"
         )
     return found
 
 
 def _told(folder: Path) -> Found:
-    """A folder, with what its recipe wants shown."""
+    """Read the figures that the folder's recipe defines."""
     recipe = folder / RECIPE
     if not recipe.is_file() or recipe.is_symlink():
         return Found(folder)
@@ -123,7 +126,7 @@ def _told(folder: Path) -> Found:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Files below a folder, by name, but what is unfinished."""
+    """Yield the finished files below a folder, by name."""
     seen = 0
     for place, below, names in os.walk(folder):
         inside = Path(place)
@@ -159,7 +162,7 @@ def _take(found: Found, path: Path) -> None:
 
 
 def _listed(found: Found, path: Path) -> set[Path]:
-    """Keep a catalogue; its recordings, if they are many."""
+    """Store a catalogue, and return its recordings if they are too many to open."""
     table = open_catalogue(path.parent).table
     found.catalogues[_name(found, path)] = table
     names = table["recording"].to_pylist() if table.num_rows > MANY else []
@@ -167,7 +170,7 @@ def _listed(found: Found, path: Path) -> set[Path]:
 
 
 def _remember(found: Found, output: Path) -> None:
-    """Keep how an output folder was made."""
+    """Store the provenance of an output folder."""
     made = provenance_of(output)
     if made is not None:
         found.made[_name(found, output)] = made
@@ -178,7 +181,7 @@ def _document(path: Path) -> Mapping[str, Any]:
         raise ValueError(f"{path.name} is larger than {MOST_BYTES >> 20} MB")
     document = parse_json(path.read_text(encoding="utf-8"))
     if not isinstance(document, dict):
-        raise ValueError(f"{path.name} is no table")
+        raise ValueError(f"{path.name} is not a table")
     return document
 
 

@@ -1,4 +1,4 @@
-"""One HTML file: nothing is fetched, nothing is run, names from files cannot become markup."""
+"""Build one self-contained HTML file: no requests, no scripts, and all text is escaped."""
 
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
@@ -12,14 +12,14 @@ from dmrl.guards import limits
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 
 MARK = "<!-- written by dmrl report -->"
-"""Stands in every page: one that has it may be written again."""
+"""Comment in every report: a file with it may be replaced."""
 MOST_BYTES = 9_000_000
-"""Of a page, pictures and all."""
+"""Size of a page with its images, at most."""
 WRONG = (
     *(DmrlError, OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError),
     StopIteration,
 )
-"""What a stranger's document or recording that is not as it should be leads to."""
+"""Errors that an invalid document or recording of another program may raise."""
 PLAIN_BYTES, WIDEST_PX = 250_000, 1400
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #ffffff; --line: #d0d7de;
@@ -47,14 +47,14 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def text(value: object) -> str:
-    """Words of anything as HTML: one line, no markup."""
+    """Convert any value to HTML text: one line, no markup."""
     if value is None:
         return ""
     return escape(f"{value:.4g}" if isinstance(value, float) else one_line(str(value)))
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table; columns of numbers, or of texts that begin as one, are set flush right."""
+    """Build a table; columns of numbers, or of texts that begin with one, are right-aligned."""
     body = [[text(cell) for cell in row] for row in rows]
     number = [
         bool(body) and all(row[k][:1].lstrip("-").isdigit() or not row[k] for row in body)
@@ -73,7 +73,7 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def chart(svg: str, caption: str, *, least_rem: int = 0) -> str:
-    """A chart of dmrl's own drawing, with words below; ``least_rem`` wide at least, to scroll."""
+    """Build a figure from SVG with a caption; ``least_rem`` wide at least, else it scrolls."""
     words = f"<figcaption>{text(caption)}</figcaption>"
     if not least_rem:
         return f"<figure>{svg}{words}</figure>"
@@ -82,14 +82,14 @@ def chart(svg: str, caption: str, *, least_rem: int = 0) -> str:
 
 
 def row(figures: Iterable[str]) -> str:
-    """Figures beside each other, or below where there is no room. Nothing, if there are none."""
+    """Place figures beside each other, as far as the page is wide enough. Empty without figures."""
     inside = "".join(figures)
     return f'<div class="row">{inside}</div>' if inside else ""
 
 
 @dataclass(slots=True)
 class Pictures:
-    """Pictures that go into a page, as long as there is room.
+    """Embed images in a page until it is full.
 
     Parameters
     ----------
@@ -100,14 +100,14 @@ class Pictures:
     room: int = MOST_BYTES
 
     def figure(self, path: Path, caption: str, *, full: bool = False) -> str:
-        """A picture with words below; large ones are made smaller."""
+        """Build a figure with an embedded image and a caption; large images are scaled down."""
         try:
             data, kind = _small(path)
         except (DmrlError, OSError) as e:
             return f"<p>{text(path.name)}: {text(e)}</p>"
         words = b64encode(data).decode()
         if len(words) > self.room:
-            return f"<p>{text(path.name)}: no room left in this page; look at the file</p>"
+            return f"<p>{text(path.name)}: no room left in this page. Open the file instead</p>"
         self.room -= len(words)
         where = f"data:image/{kind};base64,{words}"
         image = f'<img src="{where}" alt="{text(caption)}" loading="lazy">'
@@ -116,7 +116,7 @@ class Pictures:
 
 
 def _small(path: Path) -> tuple[bytes, str]:
-    """A picture's bytes and kind, a JPEG where it was large."""
+    """Return an image's bytes and format; large images become JPEG."""
     data = path.read_bytes()
     if len(data) <= PLAIN_BYTES and data.startswith(b"\x89PNG"):
         return data, "png"
@@ -129,16 +129,16 @@ def _small(path: Path) -> tuple[bytes, str]:
 
 
 def html(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> str:
-    """The page.
+    """Build the page.
 
     Parameters
     ----------
     title
-        Its name.
+        Its title.
     lead
-        What it comes to, in a sentence.
+        Its summary, one sentence.
     sections
-        (words of the heading, HTML); those without content are left out.
+        (heading, HTML); sections without content are left out.
     """
     shown = [(words, body) for words, body in sections if body]
     links = "".join(f'<a href="#s{k}">{text(words)}</a>' for k, (words, _) in enumerate(shown))

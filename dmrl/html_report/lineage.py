@@ -1,4 +1,4 @@
-"""Provenance as a graph: kinds of outputs in columns, each after what it was made from."""
+"""Build a graph from provenance: stages in columns, each to the right of its inputs."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -6,20 +6,21 @@ from collections.abc import Mapping
 from dmrl.recording import Input, Provenance
 
 MOST_FILES = 12
-"""Sources that get a box of their own; the rest shares one."""
+"""Source files with a box of their own; the others share one."""
 Graph = tuple[list[list[str]], list[tuple[str, str]]]
+"""Columns of boxes, and arrows between boxes."""
 
 
 def ancestry(made: Mapping[str, Provenance]) -> Graph:
-    """Columns of boxes, from sources to results, and the arrows between them.
+    """Build columns of boxes, from sources to results, and the arrows between them.
 
-    A box is what one stage made, however many outputs that are: "label x12". What a stage made of
-    what had gone through it before is a box of its own: "label, round 2".
+    A box stands for all outputs of one stage: "label x12". A stage whose inputs went through the
+    same stage before has a box of its own: "label, round 2".
 
     Parameters
     ----------
     made
-        How each output was made, by its name.
+        Provenance of each output, by its name.
     """
     chain = _Chain()
     count = Counter(chain.box(one) for one in made.values())
@@ -31,16 +32,16 @@ def ancestry(made: Mapping[str, Provenance]) -> Graph:
 
 
 class _Chain:
-    """Boxes while they are found: how deep each lies, and what leads to it."""
+    """Boxes and arrows during the search, with the column of each box."""
 
     def __init__(self) -> None:
         self.depth: dict[str, int] = {}
         self.arrows: dict[tuple[str, str], None] = {}
-        self._rounds: dict[str, Counter[str]] = {}  # of every stage, on the way to a box
+        self._rounds: dict[str, Counter[str]] = {}  # by box: how often each stage ran before it
         self._known: dict[str, str] = {}  # the box of an input, by its hash
 
     def box(self, one: Provenance) -> str:
-        """The box of an output, and those of all that it was made from."""
+        """Return the box of an output; add it and the boxes of all its inputs."""
         inputs = [self._input(source) for source in one.inputs]
         rounds: Counter[str] = Counter()
         for box in inputs:

@@ -1,4 +1,4 @@
-"""The figures that a recipe wants its page to begin with, drawn from what its steps wrote."""
+"""Draw the figures that a recipe defines for the top of its report."""
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,11 +20,11 @@ from dmrl.recording import Contents, read, summary
 PICTURE = {"images": "circles.png", "errors": "error-violins.png"}
 LOSSES = {"confidence_loss": "confidence loss", "depth_loss": "depth loss"}
 MOST_MAPS = 3
-"""Images of a figure of maps."""
+"""Images of a figure of maps, at most."""
 
 
 def story(found: Found, pictures: Pictures) -> str:
-    """HTML of a recipe's figures, in its order; what cannot be drawn says why."""
+    """Build the HTML of a recipe's figures, in its order; a figure that fails shows its error."""
     parts = []
     for shown in found.story:
         try:
@@ -56,12 +56,12 @@ def _document(found: Found, name: str) -> Any:
 
 
 def _inside(found: Found, name: str) -> Path:
-    """An output by its name; nothing outside the folder, and no pipe, which never ends."""
+    """Return the path of an output; reject paths outside the folder, and pipes, which never end."""
     path = found.folder / name
     if not path.resolve().is_relative_to(found.folder.resolve()):
         raise ValueError(f"{name} leads out of the folder")
     if path.exists() and not path.is_file():
-        raise ValueError(f"{name} is no file")
+        raise ValueError(f"{name} is not a file")
     return path
 
 
@@ -89,7 +89,7 @@ def _maps(found: Found, shown: Shown, pictures: Pictures) -> str:
     names = {who: path for who, path in every.items() if path.exists()}  # some are optional
     drawn = _rows_of_maps(names)
     if not drawn:
-        raise ValueError(f"{', '.join(shown.of)} hold no maps of the same images")
+        raise ValueError(f"{', '.join(shown.of)} have no maps of the same images")
     with tempfile.TemporaryDirectory() as place:
         plots.map_pairs(drawn, Path(place) / "maps")
         picture = pictures.figure(Path(place) / "maps.png", ", ".join(names), full=True)
@@ -97,7 +97,7 @@ def _maps(found: Found, shown: Shown, pictures: Pictures) -> str:
 
 
 def _agreement(drawn: Sequence[plots.MapPair]) -> str:
-    """How far the maps lie from those of the first."""
+    """Build a table that compares the maps with those of the first recording."""
     first, *others = drawn[0].maps
     rows = []
     for who in others:
@@ -110,7 +110,7 @@ def _agreement(drawn: Sequence[plots.MapPair]) -> str:
 
 
 def _rows_of_maps(names: Mapping[str, Path]) -> list[plots.MapPair]:
-    """A few images that all recordings have maps of."""
+    """Return a few images of which all recordings have maps."""
     first = next(iter(names.values()))
     robot = next(iter(topics.robots(list(Contents(first, topics.GRID).topics), topics.GRID)), None)
     if robot is None:

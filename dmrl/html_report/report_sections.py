@@ -1,6 +1,7 @@
-"""What a folder comes to, one function per section of the page.
+"""Build the sections of a report, one function for each.
 
-Documents may be a stranger's: what is not as dmrl writes it is named, and the rest is shown.
+Documents may come from other programs. One that does not have dmrl's form is named, and the others
+are shown.
 """
 
 import math
@@ -23,9 +24,9 @@ from dmrl.plots import charts
 from dmrl.topics import robots
 
 FIGURES_OF_CARDS = ("position", "depth", "peers")
-"""Names of the pictures that `dmrl card` draws."""
+"""Stems of the images that `dmrl card` draws."""
 MOST_SHOWN = 12
-"""Evaluations, models or pairs that are drawn; tables have them all."""
+"""Evaluations, models or pairs that are drawn, at most; tables list all."""
 FIGURES = {
     "median_px": ("median, px", ".1f"),
     "within_8_px": ("within 8 px", ".1%"),
@@ -37,12 +38,12 @@ FIGURES = {
     "ap_16_px": ("AP at 16 px", ".3f"),
 }
 NOTHING: tuple[Any, ...] = (None, False, "", [], {})
-"""Settings that say little in a line."""
+"""Values of settings that are omitted from a command line."""
 Documents = Mapping[str, Mapping[str, Any]]
 
 
 def page(found: Found) -> str:
-    """The page of a folder, HTML."""
+    """Build the report of a folder, HTML."""
     pictures = Pictures()
     bodies: list[tuple[str, str]] = [
         (found.title, story(found, pictures)),
@@ -52,11 +53,11 @@ def page(found: Found) -> str:
         ("Training", _training(found)),
         ("int8", _int8(found, pictures)),
         ("Datasets", _datasets(found, pictures)),
-        ("Pictures", row(pictures.figure(path, path.name) for path in found.pictures[:MOST_SHOWN])),
+        ("Images", row(pictures.figure(path, path.name) for path in found.pictures[:MOST_SHOWN])),
         ("Catalogue", "".join(listed(*one) for one in found.catalogues.items())),
         ("Recordings", _recordings(found)),
-        ("Where it comes from", _origin(found)),
-        ("Not read", table(("file", "why"), found.unread.items()) if found.unread else ""),
+        ("Provenance", _origin(found)),
+        ("Unreadable files", table(("file", "why"), found.unread.items()) if found.unread else ""),
     ]
     return html.html(found.folder.resolve().name, _lead(found), bodies)
 
@@ -74,18 +75,18 @@ def _lead(found: Found) -> str:
 
 
 def _each(documents: Documents, show: Callable[[str, Any], str]) -> str:
-    """What every document comes to; one that is not as dmrl writes it is named."""
+    """Show every document; name one that does not have dmrl's form."""
     parts = []
     for name, said in documents.items():
         try:
             parts.append(show(name, said))
         except WRONG as e:
-            parts.append(f"<p>{text(name)} is not as dmrl writes it ({text(repr(e))}).</p>")
+            parts.append(f"<p>{text(name)} does not have dmrl's form ({text(repr(e))}).</p>")
     return "".join(parts)
 
 
 def _kept(documents: Documents, take: Callable[[Any], Any]) -> dict[str, Any]:
-    """Something of every document that has it."""
+    """Apply ``take`` to every document that has the values it needs."""
     out = {}
     for name, said in documents.items():
         try:
@@ -103,7 +104,7 @@ def _detections(found: Found, pictures: Pictures) -> str:
     rows = _kept(judged, lambda said: [said["against"], said["images"], *_cells(said["overall"])])
     parts = [
         table(heads, [[name, *cells] for name, cells in rows.items()]),
-        "<p>In brackets: 95 % intervals, a bootstrap over images.</p>",
+        "<p>In brackets: 95 % intervals from a bootstrap over images.</p>",
     ]
     few = dict(list(judged.items())[:MOST_SHOWN])
     drawn = []
@@ -112,10 +113,10 @@ def _detections(found: Found, pictures: Pictures) -> str:
         if bands:
             drawn.append(_drawn(charts.by_distance, bands, words, caption=f"{words} by distance"))
     if curves := _kept(few, _curve):
-        words = "precision over recall, within 16 px"
+        words = "precision over recall, matches within 16 px"
         drawn.append(_drawn(charts.precision_recall, curves, caption=words))
     if bins := _kept(few, _bins):
-        words = "share of detections that are right, over their confidence: honest is the diagonal"
+        words = "share of correct detections over their confidence; calibrated is the diagonal"
         drawn.append(_drawn(charts.reliability, bins, caption=words))
     parts.append(row(drawn))
     parts.append(_each(few, lambda name, said: _evaluation(found, name, said, pictures)))
@@ -123,7 +124,7 @@ def _detections(found: Found, pictures: Pictures) -> str:
 
 
 def _drawn(draw: Callable[..., str], *given: Any, caption: str) -> str:
-    """A chart; or a line, where what it should show cannot be drawn."""
+    """Draw a chart; a line of text if its data are invalid."""
     try:
         return chart(draw(*given), caption)
     except WRONG as e:
@@ -201,7 +202,7 @@ def _positions(found: Found, pictures: Pictures) -> str:
 
 
 def _from_above(found: Found) -> list[str]:
-    """Maps of the first pairs whose true positions are known."""
+    """Draw maps of the first pairs with true positions."""
     out: list[str] = []
     for name in found.recordings:
         if len(out) >= 4:
@@ -213,7 +214,7 @@ def _from_above(found: Found) -> list[str]:
             continue
         for (robot, peer), path in list(known.items())[:2]:
             if path.kept.any():
-                words = f"{name}: {peer}, seen from {robot}; 95 % ellipses"
+                words = f"{name}: {peer} relative to {robot}, from above; 95 % ellipses"
                 places = path.true_m, path.estimate_m, path.covariance, path.kept
                 out.append(_drawn(charts.positions, *places, caption=words))
     return out
@@ -234,7 +235,7 @@ def _training(found: Found) -> str:
     models = found.of("models")
     if not models:
         return ""
-    heads = ("model", "architecture", "parameters", "images learnt from", "labels", "threshold")
+    heads = ("model", "architecture", "parameters", "training images", "labels", "threshold")
     rows = _kept(models, _model)
     histories = {
         name: losses
@@ -282,7 +283,7 @@ def _datasets(found: Found, pictures: Pictures) -> str:
             path = folder / "figures" / f"{stem}.png"
             drawn.append(_if_there(path, f"{name}: {stem}", pictures))
     shown = row([figure for figure in drawn if figure][:MOST_SHOWN])
-    return table(("dataset", "inputs", "of"), rows) + shown if rows else ""
+    return table(("dataset", "inputs", "recordings"), rows) + shown if rows else ""
 
 
 def _recordings(found: Found) -> str:

@@ -1,4 +1,4 @@
-"""The page as a file, in the folder that it tells of."""
+"""Write the report of a folder into a file."""
 
 import os
 from pathlib import Path
@@ -13,31 +13,31 @@ NAME = "report.html"
 
 
 def write(folder: Path, out: Path | None = None) -> Path:
-    """Write the page of a folder; a page that this has written before is written again.
+    """Write the report of a folder; an existing report is replaced.
 
     Parameters
     ----------
     folder
-        With recordings, datasets, models or evaluations.
+        Folder with recordings, datasets, models or evaluations.
     out
-        Page to write. None: report.html in the folder.
+        File to write. None: report.html in the folder.
 
     Raises
     ------
     SettingError
-        If the folder holds nothing of the kind.
+        If the folder contains no output.
     MissingExtra
         If matplotlib is not installed.
     OutputError
-        If another file is in the way, or it cannot be written.
+        If another file has that name, or the report cannot be written.
     """
     path = folder / NAME if out is None else out
     if path.suffix != ".html":
-        raise OutputError(f"{path}: a report is a page. Call it {path.stem or 'page'}.html")
+        raise OutputError(f"{path}: a report is HTML. Name it {path.stem or 'page'}.html")
     again = path.is_file() and not path.is_symlink()
     if again and not path.read_bytes()[:200].decode(errors="replace").count(MARK):
-        raise OutputError(f"{path} exists and is no report of dmrl's. Choose another name")
-    text = page(gather(Path(os.fspath(folder))))  # of a bucket, a copy here
+        raise OutputError(f"{path} exists and is not a report of dmrl. Choose another name")
+    text = page(gather(Path(os.fspath(folder))))  # a bucket's local copy
     with rewritten_file(path) if again else partial_file(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     return path

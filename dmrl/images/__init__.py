@@ -1,1 +1,1 @@
-"""Pictures: encoded, decoded, and raw as a Bayer sensor gives them."""
+"""Image encoding, decoding, drawing and raw Bayer images."""

@@ -1,4 +1,4 @@
-"""Raw pictures of colour sensors made into RGB (demosaicing), by OpenCV."""
+"""Conversion between raw Bayer images and RGB, with OpenCV."""
 
 from types import ModuleType
 
@@ -9,17 +9,17 @@ from dmrl.images.codec import Grey, Rgb
 
 
 def load_opencv(extra: str = "bayer", what: str = "a raw picture") -> ModuleType:
-    """Have OpenCV ready.
+    """Import OpenCV.
 
     Parameters
     ----------
     extra, what
-        What the user is told to install, and what for.
+        Extra and purpose in the error.
 
     Raises
     ------
     MissingExtra
-        If it is not installed.
+        If OpenCV is not installed.
     """
     try:
         import cv2  # noqa: PLC0415 - an extra
@@ -29,10 +29,10 @@ def load_opencv(extra: str = "bayer", what: str = "a raw picture") -> ModuleType
 
 
 def rgb_of(raw: Grey) -> Rgb:
-    """Colours of a raw picture, bilinear, as OpenCV makes them.
+    """Convert a raw RGGB image to RGB, bilinearly, as OpenCV does.
 
-    The AI-deck's sensor is RGGB: red at the first pixel, blue one down and one to the right.
-    Its firmware's own conversion of published frames is this one, to within 1 of 255.
+    The AI-deck's sensor is RGGB: red at the first pixel, blue one down and one to the right. The
+    firmware's own conversion of published frames is identical to within 1 of 255.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def rgb_of(raw: Grey) -> Rgb:
 
 
 def mosaic(rgb: Rgb) -> Grey:
-    """What an RGGB sensor keeps of a picture: one colour per pixel, (H, W) uint8."""
+    """Convert RGB to a raw (H, W) uint8 RGGB image with one colour per pixel."""
     raw = rgb[..., 1].copy()
     raw[::2, ::2] = rgb[::2, ::2, 0]
     raw[1::2, 1::2] = rgb[1::2, 1::2, 2]

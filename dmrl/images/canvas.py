@@ -1,4 +1,4 @@
-"""Filled polygons on a part of an image, with smooth edges.
+"""Canvas that draws filled, antialiased polygons on a region of an image.
 
 Colours are (red, green, blue), 0 to 1. Corners are pixels in pixel-edge coordinates, u right
 and v down.
@@ -17,36 +17,36 @@ Levels = NDArray[np.uint8]
 Colour = Array
 """(3,) red, green, blue."""
 Outline = tuple[list[float], tuple[int, ...]]
-"""Corners in fine pixels, u and v by turns; red, green, blue and opacity, 0 to 255."""
+"""Corners in fine pixels, u and v alternating; red, green, blue and opacity, 0 to 255."""
 LEVELS = 255
 BAND_ROWS = 56
 
 
 def bands(rows: int) -> Iterator[slice]:
-    """Rows of a picture, some at a time: arrays that stay in a processor's cache."""
+    """Iterate over bands of an image's rows whose arrays fit in a processor's cache."""
     return (slice(k, min(k + BAND_ROWS, rows)) for k in range(0, rows, BAND_ROWS))
 
 
 class Canvas:
-    """A part of an image to draw on, transparent at first.
+    """Region of an image to draw on, initially transparent.
 
-    It is drawn several times as fine as the image, in whole numbers, so the same polygons give the
-    same bytes on every machine. The mean of the fine pixels makes edges smooth; polygons come out
-    about 0.2 fine pixels larger on every side, and in their place.
+    The canvas has several fine pixels per pixel and integer values, so the same polygons give the
+    same bytes on every machine. Averaging the fine pixels antialiases the edges. Polygons become
+    about 0.2 fine pixels larger on every side, without a shift.
 
     Parameters
     ----------
     left_px, top_px
         Corner of the canvas in the image.
     width_px, height_px
-        Its size.
+        Size of the canvas.
     fineness
-        Fine pixels per pixel, each way.
+        Fine pixels per pixel, in each direction.
     brightest
-        The highest value of a colour that is told from others.
+        Maximum value of a colour.
     ground
-        (H, W, 3) what is drawn upon, 255 the brightest. None: nothing; `opacity` says then how
-        much still shows.
+        (H, W, 3) background, 255 at maximum. None: transparent, and `to_opacity` returns the
+        opacity.
     """
 
     def __init__(
@@ -69,21 +69,21 @@ class Canvas:
         else:
             self._rgb = Image.fromarray(ground).resize(size, Image.Resampling.NEAREST)
         self._cover = Image.new("RGB", size) if ground is None else None
-        # Drawing in RGBA on an image that has no alpha blends, which takes longer than to replace.
+        # Drawing in RGBA on an image without alpha blends, which is slower than replacing.
         images = [self._rgb] if self._cover is None else [self._rgb, self._cover]
         self._over = [(ImageDraw.Draw(one), ImageDraw.Draw(one, "RGBA")) for one in images]
 
     def fill(self, corners_px: Array, colour: Colour, opacity: float = 1.0) -> None:
-        """Draw a polygon over what is there.
+        """Draw a polygon over the existing content.
 
         Parameters
         ----------
         corners_px
             (K, 2) pixels of the image, in order around the polygon.
         colour
-            Its colour.
+            Colour of the polygon.
         opacity
-            1 hides what is below.
+            1 for opaque.
         """
         corners = ((corners_px - (self.left_px, self.top_px)) * self._fineness).ravel().tolist()
         scale = LEVELS / self._brightest
@@ -91,12 +91,12 @@ class Canvas:
         self.draw((corners, (*levels, round(opacity * LEVELS))))
 
     def outlines(self, corners_px: Array, colours: Array, opacity: float | Array) -> list[Outline]:
-        """Polygons of as many corners each, as `draw` takes them.
+        """Prepare polygons with equal numbers of corners for `draw_outline`.
 
         Parameters
         ----------
         corners_px
-            (F, K, 2) as in `fill`.
+            (F, K, 2) as in `fill_polygon`.
         colours
             (F, 3) of each.
         opacity
@@ -111,7 +111,7 @@ class Canvas:
         return list(zip(corners, map(tuple, whole), strict=True))
 
     def draw(self, outline: Outline) -> None:
-        """Draw one of `outlines` over what is there."""
+        """Draw one of `make_outlines` over the existing content."""
         corners, ink = outline
         whole = ink[3] == LEVELS
         for (replacing, blending), colour in zip(
@@ -124,29 +124,29 @@ class Canvas:
 
     @property
     def part(self) -> tuple[slice, slice]:
-        """Rows and columns of the image that it covers."""
+        """Rows and columns of the image that the canvas covers."""
         return (
             slice(self.top_px, self.top_px + self.height_px),
             slice(self.left_px, self.left_px + self.width_px),
         )
 
     def levels(self) -> Levels:
-        """(H, W, 3) colours, 255 the brightest; without a ground multiplied by their opacity."""
+        """Return (H, W, 3) colours, 255 at maximum. Without a background they are premultiplied."""
         return np.asarray(self._rgb.reduce(self._fineness))
 
     def rgb(self) -> Picture:
-        """(H, W, 3) `levels` as colours."""
+        """Return `to_levels` as (H, W, 3) colours."""
         return self.levels() * np.float32(self._brightest / LEVELS)
 
     def opacity(self) -> Picture:
-        """(H, W, 1) how much of what is below is hidden, 0 to 1.
+        """Return the (H, W, 1) opacity, 0 to 1.
 
         Raises
         ------
         ValueError
-            If there is a ground: it is whole.
+            If the canvas has a background, which is opaque.
         """
         if self._cover is None:
-            raise ValueError("a canvas with a ground has no opacity of its own")
+            raise ValueError("a canvas with a background has no opacity of its own")
         levels = np.asarray(self._cover.getchannel(0).reduce(self._fineness), np.float32)
         return np.asarray(levels[..., None] / np.float32(LEVELS), np.float32)

@@ -1,7 +1,7 @@
-"""Pictures as bytes and as arrays. The only home of Pillow.
+"""Image codec: encoded bytes to arrays and back. The only user of Pillow's decoders.
 
 Arrays are (height, width, 3), uint8, RGB. EXIF orientation is not applied: a camera's
-calibration belongs to the pixels as they were stored.
+calibration refers to the pixels as stored.
 """
 
 import re
@@ -21,12 +21,12 @@ Rgb = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 
 FORMATS = ("PNG", "JPEG", "PPM", "BMP")
-# What Pillow raises on broken pictures, whichever decoder meets them.
+# Exceptions that Pillow's decoders raise on broken images.
 BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
 
 
 _spent = 0
-"""Pixels of large pictures that this process decoded, beyond what their bytes explain."""
+"""Pixels of large images that this process decoded, in excess of their compressed size."""
 
 
 def _open(data: bytes, what: object) -> Image.Image:
@@ -34,20 +34,18 @@ def _open(data: bytes, what: object) -> Image.Image:
         if data[:1] == b"P" and not _has_header(data):
             raise ValueError("a header without end")
         with warnings.catch_warnings():
-            # Of many pixels: our own limit is stricter. Of strange metadata: nothing reads it.
+            # Warnings about many pixels: our limit is stricter. About metadata: it is not used.
             warnings.simplefilter("ignore")
             return Image.open(BytesIO(data), formats=FORMATS)
     except Image.DecompressionBombError:
         raise _too_many(what, limits.PIXELS) from None
     except BROKEN:
         names = ", ".join(FORMATS)
-        raise SourceError(
-            f"{what} is not a picture ({names}). Remove it or save it again"
-        ) from None
+        raise SourceError(f"{what} is not an image ({names}). Remove it or save it again") from None
 
 
 def _has_header(data: bytes) -> bool:
-    """Whether the sizes of a PPM stand at its beginning: Pillow reads comments byte by byte."""
+    """Return whether a PPM's sizes are near its start: Pillow reads comments byte by byte."""
     words = re.sub(rb"#[^\r\n]*[\r\n]", b" ", data[: limits.HEADER_BYTES]).split(None, 4)
     return len(words) >= (3 if data[:2] in (b"P1", b"P4") else 4)
 
@@ -58,9 +56,9 @@ def _too_many(what: object, most: int) -> SourceError:
 
 
 def _decodable(image: Image.Image, data: bytes, what: object, most: int) -> None:
-    """Nothing, if decoding takes no more time and memory than a picture may."""
+    """Raise SourceError if decoding exceeds the limits on time and memory."""
     pixels = image.width * image.height
-    # Every scan of a progressive JPEG goes over all pixels; FF DA starts one.
+    # Every scan of a progressive JPEG visits all pixels. FF DA starts a scan.
     scans = data.count(b"\xff\xda") if image.format == "JPEG" else 1
     if pixels > most or pixels * scans > limits.DECODED_PIXELS:
         raise _too_many(what, most)
@@ -78,12 +76,12 @@ def _decodable(image: Image.Image, data: bytes, what: object, most: int) -> None
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """A PNG, JPEG, PPM or BMP whose header was read, and no pixel.
+    """A PNG, JPEG, PPM or BMP whose header was read, but no pixel.
 
     Parameters
     ----------
     width_px, height_px
-        Its size.
+        Size of the image.
     kind
         png, jpeg, ppm or bmp.
     """
@@ -96,7 +94,7 @@ class Opened:
     _what: object
 
     def decode(self, most: int) -> Rgb:
-        """Its pixels, once, of which it may have ``most``: see `decode`."""
+        """Decode the pixels, once. The image may have at most ``most``: see `decode`."""
         with self._image as image:
             _decodable(image, self._data, self._what, most)
             try:
@@ -104,7 +102,7 @@ class Opened:
                     warnings.simplefilter("ignore")
                     if image.mode == "P" and image.palette is None:  # Pillow only asserts it
                         raise ValueError("its palette is missing")
-                    # Converting what is RGB already would copy it.
+                    # Converting an RGB image would copy it.
                     return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
             except BROKEN as e:
                 why = " ".join(str(e).split())
@@ -114,35 +112,35 @@ class Opened:
 
 
 def opened(data: bytes, what: object = "the image") -> Opened:
-    """A picture's header: its size before it is decoded.
+    """Read an image's header, with its size.
 
     Parameters
     ----------
     data
-        The encoded picture.
+        The encoded image.
     what
-        Name of the picture in errors.
+        Name of the image in errors.
 
     Raises
     ------
     SourceError
-        If the bytes do not start like such a picture.
+        If the bytes do not start like such an image.
     """
     image = _open(data, what)
     return Opened(image.width, image.height, str(image.format).lower(), image, data, what)
 
 
 def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIXELS) -> Rgb:
-    """Pixels of a PNG, JPEG, PPM or BMP.
+    """Decode a PNG, JPEG, PPM or BMP.
 
     Parameters
     ----------
     data
-        The encoded picture. Bytes after its end are ignored.
+        The encoded image. Bytes after its end are ignored.
     what
-        Name of the picture in the error.
+        Name of the image in the error.
     most
-        Pixels that it may have.
+        Maximum number of pixels.
 
     Returns
     -------
@@ -152,42 +150,42 @@ def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIX
     Raises
     ------
     SourceError
-        If the bytes are no such picture, end too soon, or ask for more pixels than a picture may.
+        If the bytes are not such an image, are truncated, or exceed the limits.
     """
     return opened(data, what).decode(most)
 
 
 def size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
-    """Width and height in pixels and format (png, jpeg, ppm, bmp), without decoding.
+    """Return width and height in pixels and format (png, jpeg, ppm, bmp), without decoding.
 
     Raises
     ------
     SourceError
-        If the bytes do not start like such a picture.
+        If the bytes do not start like such an image.
     """
     picture = opened(data, what)
     return picture.width_px, picture.height_px, picture.kind
 
 
 def encode_png(rgb: Rgb | NDArray[np.uint16]) -> bytes:
-    """Lossless PNG of (H, W, 3) uint8 RGB, or of grey (H, W). Same pixels, same bytes."""
+    """Encode (H, W, 3) uint8 RGB, or grey (H, W), as PNG. The same pixels give the same bytes."""
     buffer = BytesIO()
-    # Level 1 takes half the time of the default 6; camera images grow by a tenth.
+    # Level 1 takes half the time of the default 6; camera images become a tenth larger.
     Image.fromarray(rgb).save(buffer, "PNG", compress_level=1)
     return buffer.getvalue()
 
 
 def encode_jpeg(rgb: Rgb, quality: int = 95, *, subsampled: bool = False) -> bytes:
-    """JPEG of an (H, W, 3) uint8 RGB array.
+    """Encode an (H, W, 3) uint8 RGB array as JPEG.
 
     Parameters
     ----------
     rgb
-        The picture.
+        The image.
     quality
         1 to 100.
     subsampled
-        Whether four pixels share their colour (4:2:0), as most JPEGs have it.
+        Whether four pixels share their chroma (4:2:0), as in most JPEGs.
     """
     buffer = BytesIO()
     Image.fromarray(rgb).save(buffer, "JPEG", quality=quality, subsampling=2 if subsampled else 0)
@@ -202,7 +200,7 @@ def crop_and_scale(
     *,
     sharp: bool = True,
 ) -> Rgb:
-    """Pixels inside ``box_px``, scaled to (height_px, width_px, 3).
+    """Crop an image to ``box_px`` and scale it to (height_px, width_px, 3).
 
     Parameters
     ----------
@@ -213,9 +211,9 @@ def crop_and_scale(
     width_px, height_px
         Size of the result.
     sharp
-        False: half the time, a hair softer.
+        False takes half the time and is slightly softer.
     """
     image = Image.fromarray(rgb)
-    # Both average when they shrink, Pillow scales their support: no aliasing.
+    # Both filters average when they shrink, so there is no aliasing: Pillow scales their support.
     how = Image.Resampling.BICUBIC if sharp else Image.Resampling.HAMMING
     return np.asarray(image.resize((width_px, height_px), how, box=box_px))

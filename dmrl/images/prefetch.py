@@ -1,4 +1,4 @@
-"""Pictures worked on before they are needed, in threads: decoding lets other threads run."""
+"""Prefetching of results in threads. Image decoding releases the GIL."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -12,18 +12,18 @@ Made = TypeVar("Made")
 def ahead(
     function: Callable[[Item], Made], items: Iterable[Item], threads: int, *, held: int = 8
 ) -> Iterator[Made]:
-    """``function`` of every item, in their order, computed in threads before it is asked for.
+    """Yield ``function`` of every item, in their order, computed ahead in threads.
 
     Parameters
     ----------
     function
-        Of one item. What it raises is raised when its turn has come.
+        Function of one item. Its exceptions are raised in the order of the items.
     items
-        Taken one by one, in the caller's thread.
+        Read one by one, in the caller's thread.
     threads
-        How many.
-    held
-        Results of a thread that wait to be taken, at most: what bounds the memory.
+        Number of threads.
+    max_waiting
+        Results waiting per thread, at most. Bounds the memory.
     """
     waiting: deque[Future[Made]] = deque()
     pool = ThreadPoolExecutor(threads)

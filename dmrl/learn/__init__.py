@@ -1,9 +1,9 @@
-"""Networks, training, decoding and metrics, on arrays. The only home of torch.
+"""Networks, training, decoding and metrics, on arrays. The only package that uses torch.
 
-``decode`` and ``metrics`` are NumPy only and work without torch.
+``decode_grids`` and ``detection_metrics`` use NumPy only and work without torch.
 """
 
 import os
 
-# torch's C++ reports a process that went away; which it was, and why, dmrl says itself.
+# torch's C++ logs lost processes; dmrl reports which one and why itself.
 os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")

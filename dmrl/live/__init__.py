@@ -1,4 +1,4 @@
-"""Robots on the network: links, cameras and their clocks; and simulated drones to try them with.
+"""Robots on the network: links, cameras and clocks, and simulated drones for trials.
 
-Samples come out and flights go in as arrays: nothing here knows recordings.
+Links yield samples, and simulated drones take flights as arrays: this package reads no recordings.
 """

@@ -1,4 +1,4 @@
-"""An AI-deck's camera over WiFi: its images as samples, connected again whenever it is lost."""
+"""Camera of an AI-deck over WiFi: images as samples, with automatic reconnection."""
 
 import socket
 import threading
@@ -22,33 +22,33 @@ SILENT_S = 3.0
 RETRY_S = 1.0
 READ_BYTES = 1 << 16
 GARBAGE_BYTES = 1 << 20
-"""So many bytes without an image are no image stream."""
+"""Bytes without an image after which a connection is no image stream."""
 
 RobotTime = Callable[[float], int | None]
 
 
 def address(text: str) -> tuple[str, int]:
-    """Host and port of "HOST:PORT", or "HOST" for the AI-deck's own port.
+    """Parse host and port of "HOST:PORT", or "HOST" for the AI-deck's own port.
 
     Raises
     ------
     SettingError
-        If it is neither.
+        If the text is neither.
     """
     host, colon, port = text.rpartition(":")
     if not colon:
         host, port = text, str(PORT)
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise SettingError(f"camera={text} is no HOST:PORT. Try camera=192.168.4.1:{PORT}")
+        raise SettingError(f"camera={text} is no HOST:PORT. Use camera=192.168.4.1:{PORT}")
     return host, int(port)
 
 
 @dataclass(slots=True)
 class _Times:
-    """When images were taken, on this computer's time; of one connection.
+    """Times of exposure of one connection's images, on this computer's clock.
 
-    The best that the camera tells counts: its image's time on the robot's clock, on its own,
-    or nothing but when it arrives.
+    The best available source is used: the robot's time of an image, else the camera's, else the
+    time of arrival.
     """
 
     robot_time: RobotTime
@@ -67,26 +67,26 @@ class _Times:
 
 
 class CameraClient(threading.Thread):
-    """One camera, from now until stopped.
+    """Thread that receives the images of one camera until it is stopped.
 
     Parameters
     ----------
     robot
-        That carries it.
+        Robot that carries the camera.
     host, port
-        Where it listens.
+        Address of the camera.
     feed
-        Where the samples go: the calibration first, then images.
+        Queue for the samples: the calibration first, then images.
     now
-        This computer's time.
+        This computer's clock.
     colours
-        Whether raw images have colour filters before their pixels.
+        Whether raw images come from a sensor with colour filters.
     stored
-        See `encoded`.
+        See `encode_image`.
     camera
-        Its calibration; None: the AI-deck's, where the size fits.
+        Its calibration; None: the AI-deck's, if the size matches.
     robot_time
-        A time of the robot's clock, milliseconds, on this computer's; None while unknown.
+        Convert a time of the robot's clock, milliseconds, to this computer's; None while unknown.
     """
 
     def __init__(
@@ -113,11 +113,11 @@ class CameraClient(threading.Thread):
         self._warned: set[str] = set()
 
     def stop(self) -> None:
-        """Ask it to end; `join` waits for that."""
+        """Request the thread to end; `join` waits for it."""
         self._stop_wanted.set()
 
     def run(self) -> None:
-        """Connect, hand on images, and again."""
+        """Connect and post images, again after each loss, until stopped."""
         while not self._stop_wanted.is_set():
             why = self._connection()
             if self._stop_wanted.is_set():
@@ -130,7 +130,7 @@ class CameraClient(threading.Thread):
         self.health.state = "stopped"
 
     def _connection(self) -> str:
-        """Listen until it ends. Why it ended."""
+        """Receive until the connection ends. Return the reason."""
         try:
             with socket.create_connection(self._where, timeout=CONNECT_S) as connection:
                 connection.settimeout(0.2)
@@ -186,7 +186,7 @@ class CameraClient(threading.Thread):
         self.health.received += 1
 
     def _calibrate(self, sent_px: tuple[int, int], time_ns: int, arrival_ns: int) -> None:
-        """Hand on the calibration before the first image, if there is one of its size."""
+        """Post the calibration before the first image, if it matches the image size."""
         size_px = (AIDECK.width_px, AIDECK.height_px) if sent_px == AIDECK_SENSOR_PX else sent_px
         if size_px == self._size_px:
             return
@@ -198,7 +198,7 @@ class CameraClient(threading.Thread):
             self._feed.put(Received(calibration(time_ns, self.robot, camera), arrival_ns))
             return
         self._warn(
-            f"{self.robot}: images are {size_px[0]} x {size_px[1]} px, the calibration is of "
+            f"{self.robot}: images are {size_px[0]} x {size_px[1]} px, the calibration is for "
             f"{camera.width_px} x {camera.height_px} px and left out; labels will need one"
         )
 

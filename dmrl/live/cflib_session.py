@@ -1,6 +1,6 @@
-"""cflib, loaded when a link is opened and not before. Its only home.
+"""Sessions of cflib, which is imported when a link is opened. Only this module uses cflib.
 
-It is GPL-3.0, and so an extra.
+cflib is GPL-3.0, and therefore an extra.
 """
 
 import logging
@@ -14,11 +14,13 @@ from dmrl.errors import MissingExtra, SettingError
 from dmrl.live.log_blocks import SLOW_PERIOD_MS, Block, Plan
 
 UDP_BUFFER_BYTES = 1 << 22
-"""Asked for, so that a busy computer loses nothing; the system gives what it allows."""
+"""Requested size of the receive buffer, so that a busy computer loses no packets. The system may
+grant less.
+"""
 
 
 def load_cflib() -> None:
-    """Have cflib and its drivers ready.
+    """Import cflib and initialise its drivers.
 
     Raises
     ------
@@ -34,7 +36,7 @@ def load_cflib() -> None:
         raise MissingExtra("cflib", "record", "dmrl record") from None
     log = logging.getLogger("cflib")
     if not log.handlers:
-        # It would print what `Health` says better.
+        # `LinkStatus` reports the same, more clearly.
         log.addHandler(logging.NullHandler())
         log.propagate = False
     if not cflib.crtp.CLASSES:
@@ -42,14 +44,14 @@ def load_cflib() -> None:
 
 
 def check_uri(uri: str) -> None:
-    """Nothing, if a driver of cflib takes such an address.
+    """Raise SettingError unless a driver of cflib accepts the address.
 
     Raises
     ------
     MissingExtra
         If cflib is not installed.
     SettingError
-        If none does.
+        If no driver accepts it.
     """
     load_cflib()
     scheme, rest = uri.partition("://")[::2]
@@ -57,27 +59,27 @@ def check_uri(uri: str) -> None:
     bad_port = scheme in ("udp", "tcp") and not (host and port.isdecimal() and int(port) < 65536)
     if scheme not in ("radio", "usb", "udp", "tcp") or not rest or bad_port:
         raise SettingError(
-            f"{uri} is no address of a Crazyflie. Try radio://0/80/2M/E7E7E7E7E7 or "
+            f"{uri} is no address of a Crazyflie. Use radio://0/80/2M/E7E7E7E7E7 or "
             "udp://127.0.0.1:19850"
         )
 
 
 class Session:
-    """One use of a link: opened, started, closed.
+    """One session of a link: opened, started, closed.
 
     Parameters
     ----------
     cache
-        Folder where cflib keeps the drones' tables of contents.
+        Folder where cflib caches the drones' tables of contents.
 
     Attributes
     ----------
     ready
-        Set when the drone's log can be asked for.
+        Set when the drone's log can be requested.
     lost, refused
-        Why the link ended, or a block was not taken; empty while all is well.
+        Reason why the link ended, or why a block was rejected; empty without an error.
     last_packet_s
-        When something came last, monotonic; 0: never.
+        Time of the last packet, monotonic; 0: none yet.
     """
 
     def __init__(self, cache: str) -> None:
@@ -90,8 +92,8 @@ class Session:
         self.last_packet_s = self._opened_s = 0.0
         self._drone = crazyflie
         self._configs: list[Any] = []
-        # Closing a link would send a set-point of zero, which drops a drone that flies by
-        # itself.
+        # Closing a link would send a set-point of zero, which drops a drone that flies on its
+        # own.
         crazyflie.commander.send_setpoint = lambda *_: None
         crazyflie.connected.add_callback(lambda _: self.ready.set())
         crazyflie.connection_failed.add_callback(self._gone)
@@ -99,20 +101,20 @@ class Session:
         crazyflie.packet_received.add_callback(self._heard)
 
     def open(self, uri: str) -> None:
-        """Begin to connect; `ready` or `lost` says how it went."""
+        """Start to connect; `ready` or `lost` reports the result."""
         self._drone.open_link(uri)
         self._opened_s = time.monotonic()
         link = getattr(self._drone.link, "socket", None)
         if isinstance(link, socket.socket):
-            with suppress(OSError):  # closed again already: `lost` says so
+            with suppress(OSError):  # closed already: `lost` reports it
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER_BYTES)
 
     def silent_s(self) -> float:
-        """For how long nothing came."""
+        """Return the seconds since the last packet."""
         return time.monotonic() - max(self.last_packet_s, self._opened_s)
 
     def toc(self) -> dict[str, str]:
-        """Type of each log variable."""
+        """Return the type of each log variable."""
         groups = self._drone.log.toc.toc
         return {
             f"{group}.{name}": element.ctype
@@ -121,12 +123,12 @@ class Session:
         }
 
     def start(self, wanted: Plan, take: Any) -> None:
-        """Have the drone send all blocks.
+        """Request all blocks from the drone.
 
         Raises
         ------
         SettingError
-            If cflib does not take a block.
+            If cflib rejects a block.
         """
         for number, block in enumerate(wanted.blocks):
             config = self._config(number, block)
@@ -135,7 +137,7 @@ class Session:
             try:
                 self._drone.log.add_config(config)
             except (KeyError, AttributeError) as e:
-                raise SettingError(f"cflib takes no block {number}: {e}. Log less") from e
+                raise SettingError(f"cflib rejects block {number}: {e}. Log fewer variables") from e
             config.start()
             self._configs.append(config)
 

@@ -1,4 +1,4 @@
-"""A link to a Crazyflie: its log as samples."""
+"""Link to a Crazyflie that converts its log to samples."""
 
 import math
 import threading
@@ -17,30 +17,30 @@ from dmrl.live.receive_clocks import HostTime, SenderClock
 MS = 1_000_000
 TIMESTAMP_BITS = 24
 SILENT_S = 5.0
-"""Without a log packet for so long, a link is taken to be dead."""
+"""Seconds without a log packet after which a link is assumed dead."""
 FIRST_ANSWER_S, NEXT_ANSWER_S = 2.0, 5.0
-"""Without an answer for so long, setting up is given up; all of it may take much longer."""
+"""Seconds without an answer after which the setup is aborted. The whole setup may take longer."""
 RETRY_S = 1.0
 
 
 @dataclass(slots=True)
 class _Stream:
-    """What is known of the packets of one block."""
+    """Packets of one block, to count losses."""
 
     period_ms: int
     last_ms: int | None = None
 
     def lost_before(self, time_ms: int) -> int:
-        """Packets that are missing between the last one and this."""
+        """Return the number of packets lost between the last one and this one."""
         last, self.last_ms = self.last_ms, time_ms
         return 0 if last is None else max(round((time_ms - last) / self.period_ms) - 1, 0)
 
 
 @dataclass(slots=True)
 class _Flight:
-    """What one connection's packets become.
+    """Packets of one connection and their conversion to samples.
 
-    A new one for each connection: the drone may have been started anew, its clock with it.
+    Each connection has a new one, since the drone and its clock may have restarted.
     """
 
     reading: Reading
@@ -52,7 +52,7 @@ class _Flight:
     def take(
         self, block: str, timestamp: int, values: Mapping[str, float], arrival_ns: int
     ) -> Iterator[Received]:
-        """Samples that can be told the time of now."""
+        """Yield the samples whose times are known by now."""
         time_ms = self.unwrapped(timestamp)
         self.clock.hear(time_ms * MS, arrival_ns)
         self.held.append((time_ms, values, arrival_ns))
@@ -60,7 +60,7 @@ class _Flight:
             yield from self.rest()
 
     def rest(self) -> Iterator[Received]:
-        """Samples of all packets that wait for the clock."""
+        """Yield the samples of all packets that wait for the clock."""
         held, self.held = self.held, []
         for time_ms, values, arrival_ns in held:
             for sample in self.reading.samples(self.clock.host_ns(time_ms * MS), values):
@@ -68,24 +68,24 @@ class _Flight:
 
 
 class Link(threading.Thread):
-    """One drone's log, from now until stopped, connected again whenever it is lost.
+    """Thread that receives one drone's log until stopped, and reconnects after each loss.
 
-    Never sends a set-point: a drone in the air stays there whatever happens to this program.
+    It never sends a set-point, so a flying drone is not affected by this program.
 
     Parameters
     ----------
     robot
         Its name.
     uri
-        Its address, as cflib takes it.
+        Its address, in the form of cflib.
     peers
-        See `plan`.
+        See `plan_blocks`.
     period_ms
-        See `plan`.
+        See `plan_blocks`.
     feed
-        Where the samples go.
+        Queue for the samples.
     now
-        This computer's time.
+        This computer's clock.
     """
 
     def __init__(
@@ -108,19 +108,19 @@ class Link(threading.Thread):
         self._fault: Exception | None = None
 
     def stop(self) -> None:
-        """Ask it to end; `join` waits for that."""
+        """Request the thread to end; `join` waits for it."""
         self._stop_wanted.set()
 
     def robot_time(self, robot_ms: float) -> int | None:
-        """A time of the drone's clock on this computer's; None while that is not known.
+        """Convert a time of the drone's clock to this computer's; None while unknown.
 
         Parameters
         ----------
         robot_ms
-            With all bits, or with those of the log's time stamps only.
+            Milliseconds, with all bits or only those of the log's timestamps.
         """
         flight = self._flight
-        # Not yet settled is still nearer than the time an image arrives by WiFi.
+        # A clock that has not settled is still more accurate than the WiFi arrival of an image.
         if flight is None or not flight.clock.heard:
             return None
         whole_ms = math.floor(robot_ms)
@@ -128,7 +128,7 @@ class Link(threading.Thread):
         return flight.clock.host_ns(round(near_ms * MS))
 
     def run(self) -> None:
-        """Connect, hand on samples, and again."""
+        """Connect and post samples, again after each loss, until stopped."""
         with TemporaryDirectory(prefix="dmrl-record-") as cache:
             while not self._stop_wanted.is_set():
                 try:
@@ -156,7 +156,7 @@ class Link(threading.Thread):
         self.health.state = why
 
     def _set_up(self, session: Session) -> str | None:
-        """Connect and start the blocks. Why it failed, or None."""
+        """Connect and start the blocks. Return the reason of a failure, or None."""
         session.open(self.uri)
         while not session.ready.wait(0.1):
             if session.lost or self._stop_wanted.is_set():
@@ -176,7 +176,7 @@ class Link(threading.Thread):
             self._feed.say(f"{self.robot} logs no distance to {', '.join(missing)}")
 
     def _listen(self, session: Session) -> str:
-        """Wait for the end. Why it ended."""
+        """Wait for the end of the connection. Return the reason."""
         self.health.state = "connected"
         self.health.connections += 1
         self.health.last_arrival_ns = self._now()
@@ -193,7 +193,7 @@ class Link(threading.Thread):
         return "stopped"
 
     def _take(self, timestamp: int, values: Mapping[str, float], block: Any) -> None:
-        """Called by cflib's thread with each packet; cflib swallows what is raised there."""
+        """Process a packet in cflib's thread, which discards exceptions."""
         arrival_ns = self._now()
         try:
             self._take_at(arrival_ns, timestamp, values, block)

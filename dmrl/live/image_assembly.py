@@ -1,4 +1,4 @@
-"""What a camera sent, as a picture that can be stored."""
+"""Encoding of a camera's images for storage."""
 
 from typing import Literal
 
@@ -15,24 +15,24 @@ JPEG_QUALITY = 95
 
 
 def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[bytes, str]:
-    """The picture, and "png" or "jpeg".
+    """Return the encoded image, and "png" or "jpeg".
 
-    Images of the whole sensor are cut to the 320 x 224 px that the calibration is of. A JPEG
-    that need not be cut keeps its bytes.
+    Images of the whole sensor are cropped to the 320 x 224 px of the calibration. A JPEG that needs
+    no crop keeps its bytes.
 
     Parameters
     ----------
     image
-        As it came.
+        Image as received.
     colours
-        Whether there are colour filters before the pixels of a raw image.
+        Whether a raw image comes from a sensor with colour filters.
     stored
-        What becomes of the rest: PNG, so that nothing is lost, or JPEG, a fifth of that.
+        Format of all other images: PNG is lossless, JPEG takes a fifth of its size.
 
     Raises
     ------
     SourceError
-        If a JPEG cannot be decoded, or has another size than the camera said.
+        If a JPEG cannot be decoded, or its size differs from its header.
     """
     whole = (image.width_px, image.height_px) == AIDECK_SENSOR_PX
     if image.encoding == "jpeg":
@@ -40,7 +40,7 @@ def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[byt
         if (width_px, height_px) != (image.width_px, image.height_px) or kind != "jpeg":
             raise SourceError(
                 f"the camera's {kind} is {width_px} x {height_px} px, not "
-                f"{image.width_px} x {image.height_px} px as it said. Start the deck anew"
+                f"{image.width_px} x {image.height_px} px as in its header. Restart the deck"
             )
         if not whole:
             return image.data, "jpeg"

@@ -1,4 +1,4 @@
-"""Links and cameras of the robots that are recorded: made, ended, and what to say of them."""
+"""Construction, shutdown and reports of the links and cameras of recorded robots."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from dmrl.terminal.progress import say
 
 
 def check(robots: Sequence[Robot]) -> None:
-    """Nothing, if these robots can be recorded together.
+    """Raise SettingError unless these robots can be recorded together.
 
     Raises
     ------
     SettingError
-        If there are none, two share a name or an address, or an address cannot be one.
+        If there are none, two share a name or an address, or an address is invalid.
     """
     if not robots:
-        raise SettingError("nobody to record. Name robots: --robot cf1=URI")
+        raise SettingError("no robot to record. Pass robots: --robot cf1=URI")
     for what, values in (("name", [r.name for r in robots]), ("address", [r.uri for r in robots])):
         if twice := [value for value, count in Counter(values).items() if count > 1]:
             raise SettingError(f"two robots with the {what} {twice[0]}. Give each its own")
@@ -35,26 +35,26 @@ def check(robots: Sequence[Robot]) -> None:
 def links_of(
     robots: Sequence[Robot], peer: Sequence[str], rate_hz: float, feed: Feed, now: HostTime
 ) -> dict[str, Link]:
-    """A link to each robot, by name, not yet started.
+    """Build a link to each robot, by name, not yet started.
 
     Parameters
     ----------
     robots
-        Who is recorded.
+        Robots to record.
     peer
         ``N=NAME`` for distances that are not to robot cf<N>.
     rate_hz
         Log packets per second and block.
     feed, now
-        As of `Link`.
+        See `CrazyflieLink`.
     """
     names, period_ms = [robot.name for robot in robots], 10 * max(round(100 / rate_hz), 1)
     peers = {name: peers_of(name, names, peer) for name in names}
     for name in names if len(names) > 1 else ():
         if not peers[name]:
             say(
-                f"{name}: nothing says whose its ranging.distance<N> is, so no range of it is "
-                "recorded. Say: --peer N=NAME"
+                f"{name}: the peer of its ranging.distance<N> is unknown, so no range of it is "
+                "recorded. Pass: --peer N=NAME"
             )
     return {r.name: Link(r.name, r.uri, peers[r.name], period_ms, feed, now) for r in robots}
 
@@ -66,18 +66,18 @@ def cameras_of(
     feed: Feed,
     now: HostTime,
 ) -> list[CameraClient]:
-    """A client of each robot's camera, for those that have one, not yet started.
+    """Build a client for each robot's camera, not yet started.
 
     Parameters
     ----------
     robots
-        Who is recorded.
+        Robots to record.
     links
-        Theirs, which know the robots' clocks.
+        Their links, which convert the robots' times.
     form
-        Colours of the cameras, and how images are stored.
+        Colours of the cameras, and the stored format of images.
     feed, now
-        As of `CameraClient`.
+        See `CameraClient`.
     """
     calibrations = {r.name: read_camera(r.calibration) if r.calibration else None for r in robots}
     return [
@@ -97,7 +97,7 @@ def cameras_of(
 
 
 def end_all(threads: Sequence[Link | CameraClient]) -> None:
-    """Have all end, and wait for that."""
+    """Stop all threads, and wait for their end."""
     for thread in threads:
         thread.stop()
     for thread in threads:
@@ -106,6 +106,6 @@ def end_all(threads: Sequence[Link | CameraClient]) -> None:
 
 
 def nothing_came(out: object, links: Sequence[Link]) -> str:
-    """What to say when nothing came."""
+    """Return the error text for a recording without any sample."""
     states = ", ".join(f"{link.robot} at {link.uri}: {link.health.state}" for link in links)
-    return f"nothing came for {out} ({states}). Is the drone on, and the address right?"
+    return f"no data for {out} ({states}). Check that the drone is on, and the address"

@@ -1,8 +1,8 @@
-"""Which log variables of a Crazyflie are asked for, in which blocks, and what they mean.
+"""Selection of a Crazyflie's log variables, their distribution over blocks, and their decoding.
 
-A block is a packet that the drone sends at an even pace: 26 bytes of variables at most, with
-the drone's time in milliseconds. What belongs to one message goes into one block, so that its
-values are of one instant.
+A block is a packet that the drone sends at a fixed period: at most 26 bytes of variables, with
+the drone's time in milliseconds. All variables of a message are in one block, so that its values
+are of the same instant.
 """
 
 import math
@@ -26,19 +26,19 @@ SIZES = {
     "int32_t": 4,
     "float": 4,
 }
-"""Bytes of a variable by its type, as cflib names types."""
+"""Bytes of a variable by its type, in cflib's names."""
 
 MOTION = ("roll", "pitch", "yaw", "vx", "vy")
 YAW_RATE, PITCH_RATE = "gyro.z", "gyro.y"
 HEIGHT, GROUND = "stateEstimate.z", "range.zrange"
 BATTERY = "pm.vbat"
 SLOW_PERIOD_MS = 1000
-RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios that found nothing say 65535 mm
+RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
 
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A log variable, "group.name", and the type it is sent as."""
+    """A log variable, "group.name", and the type in which it is sent."""
 
     name: str
     sent_as: str
@@ -59,16 +59,16 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is asked of one drone.
+    """Log blocks requested from one drone.
 
     Parameters
     ----------
     blocks
-        In the order of creation; the first holds the motion.
+        Blocks in the order of creation; the first contains the motion.
     peers
         Peer by the name of the variable with the distance to it.
     millimetres
-        Distances that come in millimetres; metres otherwise.
+        Distance variables in millimetres; others are in metres.
     """
 
     blocks: tuple[Block, ...]
@@ -77,7 +77,7 @@ class Plan:
 
 
 def number_of(robot: str) -> int | None:
-    """The number at the end of a robot's name, by which others' firmware counts it."""
+    """Return the number at the end of a robot's name, its id in the firmware of others; or None."""
     found = re.search(r"\d+$", robot)
     return int(found.group()) if found else None
 
@@ -85,33 +85,33 @@ def number_of(robot: str) -> int | None:
 def plan(
     toc: Mapping[str, str], peers: Mapping[int, str], period_ms: int, *, robot: str = "the drone"
 ) -> Plan:
-    """Blocks that hold all that is wanted and the drone has.
+    """Plan blocks with all variables that are needed and that the drone has.
 
     Parameters
     ----------
     toc
         Type of each log variable of the drone by "group.name".
     peers
-        Name of the robot that ``ranging.distance<number>`` is the distance to, by number.
+        Robot to which ``ranging.distance<number>`` is the distance, by number.
     period_ms
-        Of the blocks with motion, height and distances.
+        Period of the blocks with motion, height and distances.
     robot
         Its name in errors.
 
     Raises
     ------
     SettingError
-        If it lacks what every flight needs, or has more than can be sent.
+        If it lacks a required variable, or needs too many blocks.
     """
     motion = [Variable(f"stateEstimate.{name}", "float") for name in MOTION]
     motion.append(Variable(YAW_RATE, "float"))
     height = HEIGHT if HEIGHT in toc else GROUND
     if missing := [name for name in (*(v.name for v in motion), height) if name not in toc]:
         raise SettingError(
-            f"{robot} has no log variable {', '.join(missing)}. Is its firmware a Crazyflie's?"
+            f"{robot} has no log variable {', '.join(missing)}. Use a Crazyflie's firmware"
         )
     if PITCH_RATE in toc:
-        # With half the bits it fits; it only corrects the turning rate for tilt.
+        # As FP16 it fits into the block. It only corrects the yaw rate for tilt.
         motion.append(Variable(PITCH_RATE, "FP16"))
     distances = {f"ranging.distance{number}": peer for number, peer in peers.items()}
     distances = {name: peer for name, peer in distances.items() if name in toc}
@@ -122,7 +122,7 @@ def plan(
     if len(blocks) > BLOCKS_MAX:
         raise SettingError(
             f"{robot}: {len(distances)} distances need more than {BLOCKS_MAX} blocks. "
-            "Name fewer with --peer"
+            "Pass fewer with --peer"
         )
     millimetres = frozenset(name for name in distances if toc[name] not in ("float", "FP16"))
     return Plan(tuple(blocks), distances, millimetres)
@@ -140,17 +140,17 @@ def _packed(variables: Sequence[Variable], period_ms: int) -> Iterator[Block]:
 
 @dataclass(slots=True)
 class Reading:
-    """Values of a drone's blocks, one after the other, as samples.
+    """Decoder of a drone's block values to samples, one packet after the other.
 
-    The log's pitch is positive nose up and its velocity is along the axes of the take-off:
-    here pitch is positive nose down, and velocity turns with the robot.
+    The log's pitch is positive nose up, and its velocity is along the axes of the take-off. In the
+    samples, pitch is positive nose down, and velocity turns with the robot.
 
     Parameters
     ----------
     robot
         Its name.
     plan
-        What was asked.
+        The requested blocks.
     """
 
     robot: str
@@ -160,14 +160,14 @@ class Reading:
     _known: dict[str, float] = field(default_factory=dict)
 
     def samples(self, time_ns: int, values: Mapping[str, float]) -> Iterator[Sample]:
-        """What a packet says.
+        """Yield the samples of a packet.
 
         Parameters
         ----------
         time_ns
-            When the drone took it.
+            Time at which the drone measured it.
         values
-            By variable.
+            Values by variable.
         """
         if YAW_RATE in values:
             yield from self._motion(time_ns, values)
@@ -195,7 +195,7 @@ class Reading:
 
     def _distance(self, time_ns: int, name: str, value: float) -> Iterator[Sample]:
         # The variable keeps its value until the next ranging: only a change is a measurement,
-        # and how old the first one is nobody knows.
+        # and the age of the first one is unknown.
         known = self._known.get(name)
         self._known[name] = value
         range_m = value / 1000 if name in self.plan.millimetres else value

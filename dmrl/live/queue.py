@@ -1,4 +1,4 @@
-"""What comes in from robots, on its way to whoever writes or shows it."""
+"""Queue of received samples, and status of the links that fill it."""
 
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -8,7 +8,7 @@ from dmrl.samples.sample import Sample
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A sample and when it arrived on this computer, nanoseconds since 1970."""
+    """A sample and its time of arrival on this computer, nanoseconds since 1970."""
 
     sample: Sample
     arrival_ns: int
@@ -16,22 +16,22 @@ class Received:
 
 @dataclass(slots=True)
 class Health:
-    """How one link or camera is doing. Written by its thread, read by others.
+    """Status of one link or camera. Written by its thread, read by others.
 
     Parameters
     ----------
     source
         Robot, and "camera" for its camera.
     state
-        In a word or a line: what it is doing now.
+        Current activity, in a word or a line.
     received
         Packets or images so far.
     lost
-        That were sent and never came, as far as it can be told.
+        Packets or images that were sent and never arrived, as far as it can be detected.
     broken
-        That came and cannot be used.
+        Packets or images that cannot be used.
     connections
-        How often it was connected.
+        Number of connections so far.
     """
 
     source: str
@@ -45,21 +45,21 @@ class Health:
 
 
 class Feed:
-    """A queue from many threads to one."""
+    """Queue from many threads to one."""
 
     def __init__(self) -> None:
         self._queue: SimpleQueue[Received | str] = SimpleQueue()
 
     def put(self, received: Received) -> None:
-        """Hand on a sample."""
+        """Post a sample."""
         self._queue.put(received)
 
     def say(self, line: str) -> None:
-        """Hand on a line of news for the user."""
+        """Post a message for the user."""
         self._queue.put(line)
 
     def take(self, timeout_s: float) -> list[Received | str]:
-        """All that is there; waits for the first at most so long."""
+        """Return all queued items; wait for the first at most ``timeout_s``."""
         taken: list[Received | str] = []
         try:
             taken.append(self._queue.get(timeout=timeout_s))

@@ -1,7 +1,7 @@
-"""From a robot's clock, or none, to times of this computer, as samples arrive.
+"""Conversion of a robot's times to this computer's clock while samples arrive.
 
-A sample is taken at some time of the sender's clock and arrives after a delay that varies and
-is never negative. The least delay seen lately says best how the two clocks stand.
+A sample is taken at a time of the sender's clock. It arrives after a varying delay that is never
+negative. The smallest recent delay is the best estimate of the clocks' offset.
 """
 
 import time
@@ -11,58 +11,58 @@ SECOND_NS = 1_000_000_000
 
 
 class HostTime:
-    """Nanoseconds since 1970 that never go back, unlike the system's clock."""
+    """Clock of nanoseconds since 1970 that never steps back, unlike the system's clock."""
 
     def __init__(self) -> None:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     def __call__(self) -> int:
-        """Now."""
+        """Return the current time."""
         return time.monotonic_ns() + self._offset_ns
 
 
 class SenderClock:
-    """A sender's clock, on this computer's time.
+    """Estimator of a sender's clock on this computer's time.
 
-    For the first second the difference of the clocks is the least delay so far. Then it is
-    settled, and follows the least delay of the last `WINDOW_S`, and so the drift, at no more
-    than `SLEW`: times keep the sender's own even steps.
+    During the first second, the offset is the smallest delay so far. Then it is settled. It follows
+    the smallest delay of the last `WINDOW_S`, and thus the drift, by at most `MAX_SLEW`, so that
+    times keep the sender's own regular steps.
 
     Parameters
     ----------
     settle_s
-        How long to look before the difference is settled.
+        Seconds of observation before the offset is settled.
     """
 
     WINDOW_S = 10
     SLEW = 200e-6
     OTHER_PACE_NS = SECOND_NS // 2
-    """A difference that changes by more is no drift: a clock of another pace is left alone."""
+    """Largest change of the offset that counts as drift. Ignores clocks at another rate."""
 
     def __init__(self, settle_s: float = 1.0) -> None:
         self.settled = False
         self._settle_ns = round(settle_s * SECOND_NS)
         self._first_ns: int | None = None
         self._last_ns = 0
-        # Whole: a float64 holds nanoseconds since 1970 to a quarter of a microsecond only.
+        # Integer: float64 resolves nanoseconds since 1970 to a quarter of a microsecond only.
         self._offset_ns = 0
-        # (second of the sender's clock, least difference in it)
+        # (second of the sender's clock, smallest difference in it)
         self._least: deque[tuple[int, int]] = deque(maxlen=self.WINDOW_S)
 
     @property
     def heard(self) -> bool:
-        """Whether anything is known of the sender's clock."""
+        """Whether a sample of the sender has arrived."""
         return self._first_ns is not None
 
     def hear(self, sender_ns: int, arrival_ns: int) -> None:
-        """Take note of a sample.
+        """Update the offset with a sample.
 
         Parameters
         ----------
         sender_ns
-            When it was taken, on the sender's clock, unwrapped.
+            Time of the sample on the sender's clock, unwrapped.
         arrival_ns
-            When it came, on this computer's.
+            Time of arrival on this computer's clock.
         """
         if self._first_ns is None:
             self._first_ns, self._last_ns = arrival_ns, sender_ns
@@ -79,7 +79,7 @@ class SenderClock:
         self._last_ns = max(sender_ns, self._last_ns)
 
     def host_ns(self, sender_ns: int) -> int:
-        """A time of the sender's clock on this computer's time; something was heard before."""
+        """Convert a time of the sender's clock to this computer's time; needs an earlier sample."""
         return sender_ns + self._offset_ns
 
     def _note(self, second: int, difference_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Robots as the user names them."""
+"""Parsing of the robots and peers that a user names."""
 
 import re
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ class Robot:
     Parameters
     ----------
     name
-        As it stands in topics.
+        Its name in topics.
     uri
-        Of its Crazyflie.
+        Address of its Crazyflie.
     camera
         Host and port of its AI-deck; None: it has none.
     calibration
@@ -35,29 +35,29 @@ class Robot:
 
 
 def robot_of(text: str) -> Robot:
-    """A robot as the command line names it: ``cf1=URI[,camera=HOST:PORT][,calibration=FILE]``.
+    """Parse a robot from the command line: ``cf1=URI[,camera=HOST:PORT][,calibration=FILE]``.
 
     Raises
     ------
     SettingError
-        If it is not that.
+        If the text has another form.
     """
     name, equals, rest = text.partition("=")
     uri, *options = rest.split(",")
     if not equals or not ROBOT.fullmatch(name) or not uri:
         raise SettingError(
-            f"--robot {text}: write NAME=URI, such as cf1=radio://0/80/2M/E7E7E7E7E7"
+            f"--robot {text}: not NAME=URI. Use, for example, cf1=radio://0/80/2M/E7E7E7E7E7"
         )
     given = dict(option.partition("=")[::2] for option in options)
     if unknown := sorted(given.keys() - {"camera", "calibration"}):
-        raise SettingError(f"--robot {text}: no option {unknown[0]}. There are camera, calibration")
+        raise SettingError(f"--robot {text}: no option {unknown[0]}. Use camera or calibration")
     camera = address(given["camera"]) if "camera" in given else None
     calibration = Path(given["calibration"]) if "calibration" in given else None
     return Robot(name, uri, camera, calibration)
 
 
 def peers_of(robot: str, names: Sequence[str], given: Sequence[str]) -> dict[int, str]:
-    """Whom ``ranging.distance<number>`` of a robot is the distance to, by number.
+    """Return the peers of a robot's ``ranging.distance<number>``, by number.
 
     Parameters
     ----------
@@ -66,18 +66,18 @@ def peers_of(robot: str, names: Sequence[str], given: Sequence[str]) -> dict[int
     names
         All robots.
     given
-        "N=NAME" as the user says it; empty: the number at the end of each name.
+        "N=NAME" texts of the user; empty: the number at the end of each name.
 
     Raises
     ------
     SettingError
-        If a text is not that.
+        If a text has another form.
     """
     found: dict[int, str] = {}
     for text in given:
         number, equals, name = text.partition("=")
         if not equals or not number.isdecimal() or not ROBOT.fullmatch(name):
-            raise SettingError(f"--peer {text}: write N=NAME, such as 1=cf2")
+            raise SettingError(f"--peer {text}: not N=NAME. Use, for example, 1=cf2")
         found[int(number)] = name
     if not given:
         numbers = {name: number_of(name) for name in names}

@@ -1,4 +1,4 @@
-"""How the links are doing, as a table that is drawn again and again on standard error."""
+"""Status of the links as a table on standard error that is redrawn continuously."""
 
 import time
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from dmrl.live.crazyflie_link import Link
 from dmrl.live.queue import Health
 
 RATE_S = 1.0
-"""Rates are of the last second, or a little more."""
+"""Shortest window over which rates are measured."""
 LOW_BATTERY_V = 3.5
 
 
 class _Rate:
-    """How often a count goes up, per second."""
+    """Rate at which a count increases, per second."""
 
     def __init__(self) -> None:
         self._since_s, self._count, self.per_s = time.monotonic(), 0, 0.0
@@ -35,14 +35,14 @@ class _Rate:
 
 
 class LiveTable:
-    """The table, where standard error is a terminal; nothing but the news where it is not.
+    """Status table on a terminal; elsewhere only messages are printed.
 
     Parameters
     ----------
     links
-        Of the robots.
+        Links of the robots.
     cameras
-        State of the cameras.
+        Status of the cameras.
     """
 
     def __init__(self, links: Sequence[Link], cameras: Sequence[Health]) -> None:
@@ -69,16 +69,16 @@ class LiveTable:
             self._live.stop()
 
     def say(self, line: str) -> None:
-        """Print a line of news above the table."""
+        """Print a message above the table."""
         self._console.print(one_line(line))
 
     def update(self, messages: int) -> None:
-        """Draw it again.
+        """Draw the table again.
 
         Parameters
         ----------
         messages
-            Written so far.
+            Number of messages written so far.
         """
         rates = {h.source: self._rates[h.source].update(h.received) for h in self._healths}
         if self._live is not None:
@@ -102,7 +102,7 @@ class LiveTable:
 
 
 def _of_robot(link: Link) -> tuple[str, str]:
-    """Battery and distances of a robot, in words."""
+    """Return battery and distances of a robot, as text."""
     reading = link.reading
     if reading is None:
         return "", ""

@@ -1,4 +1,4 @@
-"""Figures of datasets and evaluations, as PNG and SVG. The only home of matplotlib."""
+"""Figures of datasets and evaluations, as PNG and SVG. The only user of matplotlib."""
 
 from dmrl.plots.datasets import depth_histogram, peers_per_image, position_heat
 from dmrl.plots.error_plots import error_by_distance, error_trace, error_violins

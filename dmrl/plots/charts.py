@@ -1,4 +1,4 @@
-"""Charts for a page: SVG that is drawn in the page's own ink, light or dark."""
+"""SVG charts for an HTML page, in the page's text colour, light or dark."""
 
 import io
 import re
@@ -14,9 +14,9 @@ from dmrl.plots.style import STYLE, Figure, MaxNLocator, mpl, plain_numbers
 Array = NDArray[np.float64]
 
 INK = "#010203"
-"""Stands for the page's ink, which SVG calls currentColor."""
+"""Placeholder of the page's text colour, which SVG names currentColor."""
 LINES = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#7f7f7f", "#b8a800")
-"""After Okabe and Ito; all are read on white and on black."""
+"""Line colours after Okabe and Ito, legible on white and on black."""
 THEME = STYLE | {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -29,12 +29,12 @@ THEME = STYLE | {
 }
 SIZE_INCHES = (4.8, 3.6)
 SHORT = 28
-"""Letters of names that stand two in a row."""
+"""Maximum letters of a name in a legend with two columns."""
 
 
 @contextmanager
 def _chart(size: tuple[float, float] = SIZE_INCHES) -> Iterator[tuple[Figure, list[str]]]:
-    """A figure in the theme, and a list that gets its SVG at the end."""
+    """Yield a themed figure, and a list that receives its SVG at the end."""
     made: list[str] = []
     with mpl.rc_context(THEME):
         figure = Figure(size, layout="constrained")
@@ -44,12 +44,12 @@ def _chart(size: tuple[float, float] = SIZE_INCHES) -> Iterator[tuple[Figure, li
         figure.savefig(stream, format="svg", transparent=True, metadata=metadata)
     svg = stream.getvalue()
     svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
-    # The size is the page's to choose.
+    # Remove the size: the page determines it.
     made.append(re.sub(r'(<svg[^>]*?) height="[^"]*"([^>]*?) width="[^"]*"', r"\1\2", svg, count=1))
 
 
 def _legend(axes: Any) -> None:
-    """Below the axes, where it covers no curve; nothing for a single one."""
+    """Add a legend below the axes, where it covers no curve. A single curve has none."""
     handles, names = axes.get_legend_handles_labels()
     if len(names) > 1:
         columns = 2 if max(map(len, names)) < SHORT else 1
@@ -58,7 +58,7 @@ def _legend(axes: Any) -> None:
 
 
 def losses(histories: Mapping[str, Sequence[float]], words: str = "loss") -> str:
-    """Loss over the epochs of a training, one line per model."""
+    """Plot the loss over the epochs of a training, one line per model."""
     with _chart() as (figure, made):
         axes = figure.subplots()
         for name, values in histories.items():
@@ -74,7 +74,7 @@ def losses(histories: Mapping[str, Sequence[float]], words: str = "loss") -> str
 def by_distance(
     figures: Mapping[str, Sequence[tuple[float, float, float, float, float]]], words: str
 ) -> str:
-    """A figure with its interval for each range of distance, one colour per evaluation.
+    """Plot a metric with its interval for each range of distance, one colour per evaluation.
 
     Parameters
     ----------
@@ -82,12 +82,12 @@ def by_distance(
         By evaluation: both ends of the range, metres, the last one infinite; value, and both ends
         of the interval.
     words
-        Of the axis up.
+        Label of the vertical axis.
     """
     with _chart() as (figure, made):
         axes = figure.subplots()
         ranges = sorted({row[:2] for rows in figures.values() for row in rows})
-        beside = min(0.15, 0.8 / len(figures))  # all of a range stay nearer to it than to the next
+        beside = min(0.15, 0.8 / len(figures))  # offsets stay within the range's column
         for k, (name, rows) in enumerate(figures.items()):
             at = np.array([ranges.index(row[:2]) for row in rows], float)
             at += beside * (k - (len(figures) - 1) / 2)
@@ -105,7 +105,7 @@ def by_distance(
 
 
 def precision_recall(curves: Mapping[str, tuple[Array, Array]]) -> str:
-    """Precision over recall, one line per evaluation: (K,) recall and precision each."""
+    """Plot precision over recall, one line per evaluation: (K,) recall and precision each."""
     with _chart() as (figure, made):
         axes = figure.subplots()
         for name, (recall, precision) in curves.items():
@@ -117,12 +117,12 @@ def precision_recall(curves: Mapping[str, tuple[Array, Array]]) -> str:
 
 
 def reliability(bins: Mapping[str, tuple[Array, Array, Array]]) -> str:
-    """Share of detections that are right over their confidence; honest is the diagonal.
+    """Plot the share of correct detections over their confidence. The diagonal is calibrated.
 
     Parameters
     ----------
     bins
-        By evaluation: (K,) mean confidence, share that is right, and number of detections.
+        By evaluation: (K,) mean confidence, share of correct ones, and number of detections.
     """
     with _chart() as (figure, made):
         axes = figure.subplots()
@@ -138,16 +138,16 @@ def reliability(bins: Mapping[str, tuple[Array, Array, Array]]) -> str:
 
 
 def positions(true_m: Array, estimate_m: Array, covariance: Array, kept: NDArray[np.bool_]) -> str:
-    """Where a peer was and was estimated to be, from above, with 95 % ellipses.
+    """Plot true and estimated positions of a peer from above, with 95 % ellipses.
 
     Parameters
     ----------
     true_m, estimate_m
         (N, 2) x forward and y left of the observer, metres.
     covariance
-        (N, 2, 2), square metres; an ellipse is drawn of some thirty.
+        (N, 2, 2), square metres. About thirty ellipses are drawn.
     kept
-        (N,) whether the estimator believes it.
+        (N,) whether the estimator keeps the position.
     """
     with _chart((4.6, 4.4)) as (figure, made):
         axes = figure.subplots()
@@ -163,12 +163,12 @@ def positions(true_m: Array, estimate_m: Array, covariance: Array, kept: NDArray
 
 
 def _turned(xy_m: Array) -> tuple[Array, Array]:
-    """Forward is up, left is left."""
+    """Convert to the axes of the plot: forward is up, left is left."""
     return -xy_m[..., 1], xy_m[..., 0]
 
 
 def _ellipse(centre_m: Array, covariance: Array, inside: float = 0.95) -> Array:
-    """(41, 2) points around what holds so much of a Gaussian."""
+    """Return (41, 2) points of the ellipse that contains this share of a Gaussian."""
     values, axes = np.linalg.eigh(covariance)
     turn = np.linspace(0, 2 * np.pi, 41)
     radii = np.sqrt(-2 * np.log(1 - inside) * np.maximum(values, 0.0))
@@ -177,14 +177,14 @@ def _ellipse(centre_m: Array, covariance: Array, inside: float = 0.95) -> Array:
 
 
 def chain(columns: Sequence[Sequence[str]], arrows: Sequence[tuple[str, str]]) -> str:
-    """What was made from what: boxes in columns, from sources to results.
+    """Plot the lineage of results: boxes in columns, from sources to results.
 
     Parameters
     ----------
     columns
-        Words of the boxes, each once, from left to right.
+        Texts of the boxes, each once, from left to right.
     arrows
-        (from, to), by words.
+        (from, to), by texts.
     """
     tallest = max(len(column) for column in columns)
     with _chart((1.9 * len(columns), max(0.5 * tallest, 1.0))) as (figure, made):

@@ -1,4 +1,4 @@
-"""Figures of what is in a dataset."""
+"""Figures of a dataset's contents."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,12 +10,12 @@ from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, MaxNLocator, mpl, save
 
 
 def depth_histogram(depth_m: Mapping[str, NDArray[np.float64]], stem: Path) -> None:
-    """Histogram of the peers' depths, one colour per split.
+    """Plot a histogram of the peers' depths, one colour per split.
 
     Parameters
     ----------
     depth_m
-        Split to depths of the peers inside its images, metres.
+        Depths of the peers inside the images, by split, metres.
     stem
         Path without suffix.
     """
@@ -37,7 +37,7 @@ def depth_histogram(depth_m: Mapping[str, NDArray[np.float64]], stem: Path) -> N
 def position_heat(
     uv_px: NDArray[np.float64], width_px: int, height_px: int, cell_px: int, stem: Path
 ) -> None:
-    """Heat map of where peers are in the image.
+    """Plot a heat map of the peers' positions in the image.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ def position_heat(
 
 
 def peers_per_image(counts: Mapping[str, NDArray[np.int64]], stem: Path) -> None:
-    """Bar chart of how many peers an image shows, one colour per split.
+    """Plot a bar chart of the number of peers per image, one colour per split.
 
     Parameters
     ----------
     counts
-        Split to the number of peers inside each image.
+        Number of peers inside each image, by split.
     stem
         Path without suffix.
     """

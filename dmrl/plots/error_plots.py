@@ -1,4 +1,4 @@
-"""Figures of errors: their spread, over time, over distance, against what they cost."""
+"""Figures of errors: distributions, over time and over distance."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,12 +13,12 @@ from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, mpl, plain_numbers, sav
 def error_violins(
     u_px: NDArray[np.float64], v_px: NDArray[np.float64], depth_m: NDArray[np.float64], stem: Path
 ) -> None:
-    """Violins of the errors in u, v and depth, as in the paper.
+    """Plot violins of the errors in u, v and depth, as in the paper.
 
     Parameters
     ----------
     u_px, v_px, depth_m
-        (N,) label minus detection; NaN where there was no detection.
+        (N,) label minus detection, NaN where there was no detection.
     stem
         Path without suffix.
     """
@@ -34,7 +34,7 @@ def error_violins(
 
 
 def _violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float) -> None:
-    """One violin per name, over what lies within the axis; the rest is counted."""
+    """Draw one violin per name over the values inside the axis, and count the others."""
     known = {name: values[np.isfinite(values)] for name, values in errors.items()}
     spread = [np.percentile(np.abs(values), 80) for values in known.values() if values.size]
     limit = max([least, *spread])
@@ -61,18 +61,18 @@ def error_trace(
     errors_m: Mapping[str, NDArray[np.float64]],
     stem: Path,
 ) -> None:
-    """Errors of positions over time, one axis above the other, with their 3-sigma bands.
+    """Plot position errors over time, one row per axis, with their 3-sigma bands.
 
     Parameters
     ----------
     title
-        Words above it.
+        Title of the figure.
     time_s
         (N,) seconds.
     sigma_m
-        (N, A) standard deviations, as the estimator has them.
+        (N, A) standard deviations of the estimator.
     errors_m
-        (N, A) errors by what made them, NaN where there are none; the last in black, on top.
+        (N, A) errors by their source, NaN where missing. The last one is black and on top.
     stem
         Path without suffix.
     """
@@ -88,7 +88,7 @@ def error_trace(
             axes.axhline(0, color="grey", linewidth=0.8)
             axes.grid(alpha=0.3)
             axes.set_ylabel(f"error in {'xyz'[k]}, m")
-        # Far errors and wide bands at the start would flatten the rest.
+        # Limit the axis: large errors and wide bands at the start would flatten the rest.
         sizes = np.abs(np.concatenate([error.ravel() for error in errors_m.values()]))
         limit = np.percentile(sizes[np.isfinite(sizes)], 99) if np.isfinite(sizes).any() else 0.0
         axes.set_ylim(-1.2 * max(0.3, float(limit)), 1.2 * max(0.3, float(limit)))
@@ -108,26 +108,26 @@ def error_by_distance(
     *,
     step_m: float = 0.25,
 ) -> None:
-    """Pixel and depth error of every label over its distance, with medians.
+    """Plot pixel and depth error of every label over its distance, with medians.
 
     Parameters
     ----------
     distance_m
         (N,) depth of the label, metres.
     error_px
-        (N,) length of the pixel error; not finite where there was no detection.
+        (N,) length of the pixel error, not finite where there was no detection.
     depth_error_m
         (N,) label minus detection, metres.
     stem
         Path without suffix.
     step_m
-        Range of distance that one median is taken over.
+        Width of the distance bins of the medians, metres.
     """
     found = np.isfinite(error_px)
     with mpl.rc_context(STYLE):
         figure = Figure((SIZE_INCHES[0], 5.0), layout="constrained")
         pixels, metres = figure.subplots(2, 1, sharex=True)
-        # Below a tenth of a pixel a logarithmic axis would show nothing but noise.
+        # Errors below a tenth of a pixel are only noise on a logarithmic axis.
         shown_px = np.maximum(error_px[found], 0.1)
         for axes, values in ((pixels, shown_px), (metres, depth_error_m[found])):
             axes.plot(distance_m[found], values, ".", alpha=0.5, label="label")
@@ -153,7 +153,7 @@ def error_by_distance(
 def _medians(
     at: NDArray[np.float64], values: NDArray[np.float64], step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Edges of equal steps from zero, and the median in each; NaN where there is none."""
+    """Return edges of equal bins from zero, and the median in each, NaN in empty ones."""
     edges = np.arange(0.0, at.max(initial=step) + step, step)
     place = np.digitize(at, edges) - 1
     medians = [

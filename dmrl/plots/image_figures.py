@@ -1,4 +1,4 @@
-"""Figures of images: with labels and detections, with the maps of networks."""
+"""Figures of images with labels and detections, and of network output maps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ from dmrl.plots.style import STYLE, Figure, mpl, save, withStroke
 
 Box = tuple[float, float, float, float]
 CELL_INCHES = (3.4, 2.6)
-"""Of an image of a gallery."""
+"""Size of an image in a gallery."""
 CIRCLE_POINTS, TEXT_POINTS = (19.0, 19.0), (42.0, 11.0)
-"""Width and height of what a gallery draws of a detection."""
+"""Width and height of a detection's circle and text in a gallery."""
 PLACES = [(x, y) for y in (0.0, -16.0, 16.0, -30.0, 30.0) for x in (33.0, -33.0, 0.0) if x or y]
-"""Where the middle of its text may stand, points right and up of it; the first is best."""
+"""Offsets of the text's middle from a detection, points right and up, best first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """One image with its labels and what the network made of it.
+    """An image with its labels and the network's output.
 
     Parameters
     ----------
     title
-        Line above it.
+        Title above the image.
     rgb
         (H, W, 3) uint8.
     confidence, depth_m
@@ -48,16 +48,16 @@ class Example:
 
 
 def examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) -> None:
-    """A row per example: image with labels and detections, confidence map, depth map.
+    """Plot one row per example: image with labels and detections, confidence map, depth map.
 
     Parameters
     ----------
     shown
-        At least one.
+        At least one example.
     stem
         Path without suffix.
     depth_max_m
-        Depth of the last colour, metres.
+        Depth at the end of the colour map, metres.
     """
     with mpl.rc_context(STYLE):
         figure = Figure((10.5, 2.6 * len(shown) + 0.6), layout="constrained")
@@ -85,7 +85,7 @@ def examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) 
 
 
 def _mark(axes: Any, example: Example) -> None:
-    """Labels as squares, detections as crosses, in their colours with a dark rim."""
+    """Draw labels as squares and detections as crosses, in their colours with a dark rim."""
     marks = (
         (example.labels_px, "s", 9, example.source, f"label ({example.source})"),
         (example.detections_px, "x", 6, "detection", "detection"),
@@ -106,12 +106,12 @@ def _mark(axes: Any, example: Example) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Circled:
-    """One image and what was found in it.
+    """An image with its detections.
 
     Parameters
     ----------
     title
-        Line above it.
+        Title above the image.
     rgb
         (H, W, 3) uint8.
     uv_px
@@ -127,16 +127,16 @@ class Circled:
 
 
 def gallery(shown: Sequence[Circled], stem: Path, *, columns: int = 3) -> None:
-    """Images with a white circle around every detection and its depth, as in the paper.
+    """Plot images with a white circle around every detection, and its depth, as in the paper.
 
     Parameters
     ----------
     shown
-        At least one.
+        At least one image.
     stem
         Path without suffix.
     columns
-        Images in a row, at most.
+        Images per row, at most.
     """
     columns = min(columns, len(shown))
     rows = -(-len(shown) // columns)
@@ -155,7 +155,7 @@ def gallery(shown: Sequence[Circled], stem: Path, *, columns: int = 3) -> None:
 
 
 def _circles(axes: Any, example: Circled, width: int, height: int) -> None:
-    """White circles with a black rim; depths beside them, where there is room."""
+    """Draw white circles with a black rim, and depths beside them where there is room."""
     places = _text_places(example.uv_px, width, height)
     for (u, v), (text_u, text_v), depth_m in zip(
         example.uv_px.tolist(), places, example.depth_m.tolist(), strict=True
@@ -176,7 +176,7 @@ def _circles(axes: Any, example: Circled, width: int, height: int) -> None:
 
 
 def _text_places(uv_px: NDArray[np.float64], width: int, height: int) -> list[tuple[float, float]]:
-    """Where the middle of each text stands, pixels: on no circle or other text, if it can."""
+    """Place the middle of each text, pixels, avoiding circles and other texts where possible."""
     point_px = width / (72 * CELL_INCHES[0])
     taken = [_box((u, v), point_px, CIRCLE_POINTS) for u, v in uv_px.tolist()]
     out = []
@@ -185,7 +185,7 @@ def _text_places(uv_px: NDArray[np.float64], width: int, height: int) -> list[tu
         tried = [(u + right * point_px, level - up * point_px) for right, up in PLACES]
         boxes = [_box(middle, point_px, TEXT_POINTS) for middle in tried]
         free = [_inside(box, width, height) and not _meets(box, taken) for box in boxes]
-        # Where there is no room at all, to the side that is in the image.
+        # Without any free place, use the side that is inside the image.
         best = free.index(True) if any(free) else int(u > 0.75 * width)
         taken.append(boxes[best])
         out.append(tried[best])
@@ -193,7 +193,7 @@ def _text_places(uv_px: NDArray[np.float64], width: int, height: int) -> list[tu
 
 
 def _box(middle: tuple[float, float], point_px: float, size: tuple[float, float]) -> Box:
-    """Left, upper, right and lower edge, pixels, of what is so many points wide and high."""
+    """Return the left, upper, right and lower edge, pixels, of a box of this size in points."""
     (u, v), (half_u, half_v) = middle, (0.5 * point_px * side for side in size)
     return u - half_u, v - half_v, u + half_u, v + half_v
 
@@ -211,16 +211,16 @@ def _meets(box: Box, others: Sequence[Box]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class MapPair:
-    """One image, and the maps of networks, or of one network computed in several ways.
+    """An image with the maps of several networks, or of one network on several backends.
 
     Parameters
     ----------
     title
-        Line above it.
+        Title above the image.
     rgb
         (H, W, 3) uint8.
     maps
-        What computed them, to its (rows, cols) confidence and depth.
+        (rows, cols) confidence and depth, by network or backend.
     """
 
     title: str
@@ -229,14 +229,14 @@ class MapPair:
 
 
 def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
-    """A row per image: the image, then confidence, then depth, each by all that computed it.
+    """Plot one row per image: the image, then confidence, then depth, by network or backend.
 
-    Colours run from 0 to the largest confidence, and to the largest depth, of all rows.
+    Colours range from 0 to the largest confidence, and to the largest depth, of all rows.
 
     Parameters
     ----------
     shown
-        At least one, all computed by the same.
+        At least one, all with the same networks or backends.
     stem
         Path without suffix.
     """

@@ -1,4 +1,4 @@
-"""A robot's model with its axes, its box and its size."""
+"""Figure of a robot's model with its axes, its box and its size."""
 
 import io
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ AXES = (("x forward", "#e00000"), ("y left", "#007a00"), ("z up", "#0030e0"))
 BOX = "#404040"
 VIEW_INCHES = 3.6
 NAME_PX = np.array([46.0, 14.0])
-"""From the end of an axis to the middle of its name, of one that lies and one that stands."""
+"""Distance from the end of an axis to its name, if horizontal and if vertical."""
 SHORTEST_PX = 30
-"""Of an axis that is drawn: one that points at the camera is only a dot."""
+"""Minimum length of a drawn axis. One that points at the camera is only a dot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Side:
     Parameters
     ----------
     name
-        Which side.
+        Name of the side.
     rgb
         (H, W, 3) uint8.
     axes_px
@@ -42,16 +42,16 @@ class Side:
 
 
 def model_sides(sides: Sequence[Side], title: str, size_m: Sequence[float]) -> bytes:
-    """PNG of a robot from some sides.
+    """Plot a robot from several sides as PNG.
 
     Parameters
     ----------
     sides
-        Two or more, two in a row.
+        Two or more, two per row.
     title
-        Line above them.
+        Title above them.
     size_m
-        (3,) of the box along x, y and z, metres.
+        (3,) size of the box along x, y and z, metres.
     """
     rows = -(-len(sides) // 2)
     words = " x ".join(f"{metres:.3g}" for metres in size_m)

@@ -1,4 +1,4 @@
-"""How every figure looks, and how it is written."""
+"""Style and output of all figures."""
 
 import os
 import sys
@@ -12,10 +12,10 @@ from dmrl.errors import MissingExtra
 
 @contextmanager
 def _any_backend() -> Iterator[None]:
-    """Import matplotlib whatever the environment's MPLBACKEND is.
+    """Ignore MPLBACKEND while matplotlib is imported.
 
-    Figures go to files here and need no backend, while matplotlib refuses to be imported where
-    the one that is named is not installed: every notebook's shell names its own.
+    Figures are written to files and need no backend, but matplotlib cannot be imported if the
+    backend in MPLBACKEND is not installed. Notebooks set it.
     """
     wanted = None if "matplotlib" in sys.modules else os.environ.pop("MPLBACKEND", None)
     try:
@@ -25,7 +25,7 @@ def _any_backend() -> Iterator[None]:
             os.environ["MPLBACKEND"] = wanted
     if wanted is not None:
         with suppress(ValueError):
-            mpl.rcParams["backend"] = wanted  # what a notebook plots after this, is shown
+            mpl.rcParams["backend"] = wanted  # so that the notebook shows its later plots
 
 
 try:
@@ -48,7 +48,7 @@ __all__ = [
     "withStroke",
 ]
 
-# Equal input gives equal bytes: no date, no version, no random ids.
+# No date, version or random ids, so that equal input gives equal bytes.
 STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # names come from files: a $ in them is no formula
     "svg.hashsalt": "dmrl",
@@ -62,14 +62,14 @@ SIZE_INCHES = (6.0, 3.6)
 
 
 class _Plain(LogFormatter):
-    """The same choice of numbers, each as a person writes it."""
+    """Formatter with matplotlib's choice of numbers, written plainly."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def plain_numbers(axis: Any) -> None:
-    """Numbers of a logarithmic axis as plain text: formulas are not drawn, see `STYLE`."""
+    """Set plain numbers on a logarithmic axis: formulas are disabled, see `STYLE`."""
     axis.set_major_formatter(_Plain())
     axis.set_minor_formatter(_Plain(minor_thresholds=(1.5, 0.5)))
 

@@ -1,6 +1,7 @@
-"""Recordings: MCAP files, written whole, read fast, mended and checked.
+"""Read, write, copy, repair and check recordings, which are MCAP files of protobuf messages.
 
-The only home of mcap. Messages are protobuf; times are nanoseconds of log time.
+Times are log times in nanoseconds. `reader` reads messages, `writer` writes a recording, and
+`summary` reads its topics and metadata. No other package imports mcap.
 """
 
 from dmrl.recording.attachments import copy_extras, splits

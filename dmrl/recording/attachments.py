@@ -1,4 +1,4 @@
-"""What copying stages carry over besides messages: metadata and attachments."""
+"""Copy the metadata and attachments of a recording, and read the split in its metadata."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
 def copy_extras(found: Summary, out: RecordingWriter) -> None:
     """Copy a recording's metadata and attachments into another.
 
-    Its provenance and recipe are left out: they are in the ancestry of the new one.
+    Provenance and recipe are left out: the provenance of the new recording includes them.
     """
     for name, records in found.metadata.items():
         if name not in (METADATA_NAME, checksums.METADATA_NAME):
@@ -26,21 +26,21 @@ def copy_extras(found: Summary, out: RecordingWriter) -> None:
 
 
 def splits(path: Path, found: Summary) -> dict[str, list[tuple[int, int]]]:
-    """The source's own split: by name, log times in [first, last], nanoseconds.
+    """Return the split that the source defines: name to log times in [first, last], nanoseconds.
 
     Parameters
     ----------
     path
         The recording, for errors.
     found
-        Its summary.
+        Summary of the recording.
 
     Raises
     ------
     RecordingError
-        If its metadata is not that.
+        If the metadata is malformed.
     UnsafeName
-        If a split has a name that could not be a folder's.
+        If the name of a split cannot be a folder name.
     """
     out: dict[str, list[tuple[int, int]]] = {}
     try:

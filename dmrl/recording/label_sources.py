@@ -1,6 +1,6 @@
-"""Sources of labels (truth, published, ...), as a PeerLabels message names them.
+"""List the label sources (truth, published, ...) that a PeerLabels message names.
 
-A source that looked at an image and saw nobody is named as well: no label is then a fact.
+A source that labelled an image without peers is listed as well: the absence is then certain.
 """
 
 from typing import Any
@@ -9,15 +9,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 LOOKED = ("peers", "sources")
-"""Fields of PeerLabels that say who looked."""
+"""Fields of PeerLabels that contain sources."""
 
 
 def sources_in(peers: pa.Array, sources: pa.Array) -> set[str]:
-    """Who looked at any image, by the columns of PeerLabels that `LOOKED` names."""
+    """Return the sources in the columns `SOURCE_FIELDS` of PeerLabels."""
     named = pc.struct_field(peers.flatten(), "source")
     return {*pc.unique(named).to_pylist(), *pc.unique(sources.flatten()).to_pylist()}
 
 
 def looked_at(labels: Any) -> set[str]:
-    """Who looked at the image of a PeerLabels; empty: not known."""
+    """Return the sources of one PeerLabels message; empty if they are unknown."""
     return {*labels.sources, *(label.source for label in labels.peers)}

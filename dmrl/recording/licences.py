@@ -1,4 +1,4 @@
-"""Licences that lie beside what recordings were made from, carried along as metadata."""
+"""Find the licence file of a source, and read the licences from recordings' metadata."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -7,27 +7,29 @@ from dmrl.recording.summary import summary
 
 LICENCES_METADATA = "dmrl.licences"
 NAMES = ("LICENSE", "LICENCE", "COPYING")
+"""Names of licence files without their suffix."""
 LINE_MAX = 100
+"""Longest licence title, characters."""
 
 
 def licence_beside(source: Path) -> Path | None:
-    """The file with the licence of a source, in a folder or beside a file; None: there is none."""
+    """Return the licence file in a folder, or next to a file; None if there is none."""
     folder = source if source.is_dir() else source.parent
     try:
         return next((p for p in sorted(folder.iterdir()) if p.stem in NAMES and p.is_file()), None)
-    except OSError:  # a folder that may not be listed
+    except OSError:  # the folder cannot be listed
         return None
 
 
 def licence_words(path: Path) -> str:
-    """What a file with a licence says first: as a rule, which it is."""
+    """Return the first line with text of a licence file, usually the licence's name."""
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = (line.strip(" #*") for line in text.splitlines())
     return next((line for line in lines if line), "empty")[:LINE_MAX]
 
 
 def licences(recordings: Sequence[Path]) -> dict[str, str]:
-    """Licences by the names of what recordings were made from, as far as they were found.
+    """Return the licences of the sources of some recordings, by source name.
 
     Raises
     ------

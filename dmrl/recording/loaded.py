@@ -1,4 +1,4 @@
-"""Some topics of a recording, held in memory: read in one pass, however many they are."""
+"""Hold some topics of a recording in memory, read in one pass."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,27 +20,27 @@ from dmrl.recording.reader import Stamped, parsed
 from dmrl.recording.summary import summary
 
 PART = re.compile(r"\\{\w+\\}")
-"""A part of a pattern that is left open, escaped."""
+"""A placeholder of a topic pattern, escaped."""
 
 
 class Contents:
-    """A recording, with the bytes of some of its topics.
+    """A recording with the messages of some topics in memory.
 
-    They are held as they stand in the file, and decoded when they are asked for. Topics that were
-    not named are read once they are asked for, in a pass of their own.
+    Messages are kept encoded and decoded on request. Other topics are read on request, each in a
+    pass of its own.
 
     Parameters
     ----------
     path
         A complete recording.
     wanted
-        Topics, and patterns of them as in ``dmrl.topics``: ``/{robot}/labels``. None of them has
-        to be there. What is large, such as pictures, is better read with `read`.
+        Topics, or patterns as in ``dmrl.topics``: ``/{robot}/labels``. They may be missing.
+        Read large topics, such as images, with `read` instead.
 
     Raises
     ------
     RecordingError
-        If the file is not a complete recording, or a topic of dmrl's carries another type.
+        If the file is not a complete recording, or one of dmrl's topics carries another type.
     """
 
     def __init__(self, path: Path, *wanted: str) -> None:
@@ -62,31 +62,31 @@ class Contents:
     def hold(
         self, names: frozenset[str], parts: Sequence[Block], channels: dict[int, Channel]
     ) -> None:
-        """Hold what was read already: all messages of these topics."""
+        """Keep all messages of these topics, which were read already."""
         found = apart(joined(parts).sorted(), channels) if parts else {}
         for topic in names:
             own = {n: channel for n, channel in channels.items() if channel.topic == topic}
-            own = own or {0: channel_on(self.path, topic)}  # one without messages
+            own = own or {0: channel_on(self.path, topic)}  # the topic has no messages
             self._held[topic] = found.get(topic, EMPTY), own
 
     @property
     def topics(self) -> Mapping[str, TopicInfo]:
-        """All topics of the recording, held or not."""
+        """All topics of the recording, in memory or not."""
         return self.summary.topics
 
     @property
     def start_ns(self) -> int:
-        """First log time of the recording."""
+        """First log time of the recording, nanoseconds."""
         return self.summary.start_ns
 
     def times(self, topic: str) -> Ints:
-        """(N,) log times of any topic, sorted, as the index has them; none where it is missing."""
+        """Return the (N,) sorted log times of any topic from the index; empty if it is missing."""
         if topic in self._held:
             return self._held[topic][0].time_ns
         return log_times(self.path, [topic]).get(topic, np.zeros(0, np.int64))
 
     def table(self, topic: str, fields: Sequence[str] | None = None) -> pa.Table:
-        """One topic as an Arrow table; see `columns`. It may have no rows.
+        """Return one topic as an Arrow table, possibly without rows; see `iter_columns`.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class Contents:
         return pa.Table.from_batches([decoded(self.path, topic, block, channels, fields)])
 
     def messages(self, topic: str) -> Iterator[Stamped]:
-        """The messages of a topic, decoded, in log-time order; raises what `table` does."""
+        """Yield the decoded messages of a topic in log-time order; raise as `get_table`."""
         block, channels = self._of(topic)
         kinds = {n: GetMessageClass(descriptor_of(self.path, c)) for n, c in channels.items()}
         for number, time_ns, publish_ns, data in block.rows():
@@ -107,7 +107,7 @@ class Contents:
             yield Stamped(time_ns, topic, parsed(raw, kinds[number], self.path))
 
     def _of(self, topic: str) -> tuple[Block, dict[int, Channel]]:
-        """Messages of a topic, and its channels by number."""
+        """Return the messages of a topic, and its channels by channel id."""
         if topic not in self.topics:
             raise MissingTopic(topic, self.topics, self.path)
         if topic not in self._held:

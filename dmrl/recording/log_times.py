@@ -1,4 +1,4 @@
-"""Log times of a recording's topics, as its message indexes have them."""
+"""Read the log times of topics from the message indexes."""
 
 import zlib
 from collections.abc import Iterable, Iterator
@@ -23,21 +23,21 @@ _NO_TIMES: Ints = np.empty(0, np.int64)
 def log_times(
     path: Path, topics: Iterable[str], *, start_ns: int | None = None, end_ns: int | None = None
 ) -> dict[str, Ints]:
-    """Log times of topics, as the index has them: no message is read.
+    """Read the log times of topics from the index, without reading messages.
 
     Parameters
     ----------
     path
         A complete recording.
     topics
-        Those that the recording lacks are left out.
+        Topics to read. Missing topics are left out.
     start_ns, end_ns
-        Only log times in [start_ns, end_ns), nanoseconds.
+        Return log times in [start_ns, end_ns) only, nanoseconds.
 
     Returns
     -------
     dict
-        Topic to (N,) log times, sorted.
+        Topic to (N,) sorted log times, nanoseconds.
 
     Raises
     ------
@@ -54,12 +54,12 @@ def log_times(
 
 
 def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
-    """Log times of topics, as they stand in the message indexes; chunks are not unpacked.
+    """Read log times in the order of the message indexes, without decompressing chunks.
 
     Raises
     ------
     RecordingError
-        If the file is not a complete recording, or its message indexes are damaged.
+        If the file is not a complete recording, or its message indexes are corrupt.
     """
     parts: dict[str, list[Ints]] = {topic: [_NO_TIMES] for topic in topics}
     with opened(path) as stream:
@@ -78,9 +78,9 @@ def indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
 def _times_in_indexes(
     path: Path, stream: Bounded, summary: McapSummary, topics: frozenset[str]
 ) -> Iterator[tuple[str, Ints]]:
-    """Topic and log times of every message index, chunk by chunk; at last their CRC.
+    """Yield topic and log times of every message index by chunk, then verify the CRC of all.
 
-    Of a recording in a bucket, the indexes of chunks that hold the topics, without that CRC.
+    For a file in a bucket, only indexes of chunks with the topics are read, without that CRC.
     """
     said = metadata_of(path, stream, summary).get(checksums.METADATA_NAME)
     crc = 0

@@ -1,4 +1,4 @@
-"""A few messages from all over a recording, to guess what it is like before it is read."""
+"""Sample a few messages from the whole length of a recording."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,30 +20,29 @@ from dmrl.recording.protobuf.message_types import require_types
 from dmrl.recording.summary import summary
 
 CHUNKS = 16
-"""Chunks that are read of each topic: some 2 MB at most, wherever they lie in the file."""
+"""Chunks that are read per channel, at most some 2 MB."""
 
 
 def glance(
     path: Path, fields: Mapping[str, Sequence[str] | None], *, start_ns: int, end_ns: int
 ) -> dict[str, pa.RecordBatch]:
-    """Messages of a few chunks, spread evenly over a stretch of time.
+    """Read the messages of a few chunks, evenly spread over a time range.
 
-    A topic that has messages in the stretch has at least one here.
+    Every topic with messages in the range has at least one in the result.
 
     Parameters
     ----------
     path
         A complete recording.
     fields
-        Topics, and which fields of each; None: all. Topics that the recording lacks are
-        left out.
+        Topics, and the fields of each to read (None: all). Missing topics are left out.
     start_ns, end_ns
-        Only log times in [start_ns, end_ns), nanoseconds.
+        Read log times in [start_ns, end_ns) only, nanoseconds.
 
     Returns
     -------
     dict
-        Topic to columns, as `columns` gives them, in log-time order.
+        Topic to columns as in `iter_columns`, in log-time order.
 
     Raises
     ------
@@ -55,7 +54,7 @@ def glance(
     require_types(path, present, names)
     held, channels = _spread(path, names, start_ns, end_ns)
     missing = names - _topics(held, channels)
-    # Rare: none of the messages in those chunks is within the time, or nothing is indexed.
+    # Rare: the chunks have no message in the range, or the file has no index.
     rest = blocks(path, missing, start_ns=start_ns, end_ns=end_ns) if missing else ()
     for block, own in rest:
         held.append(block)
@@ -69,7 +68,7 @@ def glance(
 def _spread(
     path: Path, names: frozenset[str], start_ns: int, end_ns: int
 ) -> tuple[list[Block], dict[int, Channel]]:
-    """A few blocks, and their channels by number."""
+    """Read the chosen chunks; return their batches, and channels by channel id."""
     with opened(path) as stream:
         index = mcap_summary(path, stream)
         if index is None:
@@ -90,7 +89,7 @@ def _spread(
 def _chosen(
     index: McapSummary, channels: Mapping[int, Channel], start_ns: int, end_ns: int
 ) -> list[ChunkIndex]:
-    """Of each channel the first chunk that holds it, the last, and some between."""
+    """Choose the first chunk of each channel, its last, and some between."""
     found: dict[int, ChunkIndex] = {}
     for number in channels:
         candidates = chunks_between(index, {number}, start_ns, end_ns)

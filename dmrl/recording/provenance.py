@@ -1,8 +1,8 @@
-"""Where a recording, dataset or model comes from: stage, settings, seed, inputs, libraries.
+"""Record the origin of a recording, dataset or model: stage, settings, seed, inputs, libraries.
 
-Each input carries its own provenance, so one output tells its whole ancestry. An ancestor that
-many inputs share, such as the model that labelled all of a hundred flights, is told once, where it
-first comes: told each time, three rounds of labels over fifty flights were 300 MB of text.
+Each input contains its own provenance, so an output contains its whole ancestry. A shared ancestor,
+such as the model that labelled a hundred flights, is written in full only the first time.
+Otherwise three rounds of labels over fifty flights took 300 MB of text.
 """
 
 import json
@@ -18,21 +18,23 @@ from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
 
 FILE_NAME = "provenance.json"
+"""File in a dataset or run folder."""
 METADATA_NAME = "dmrl.provenance"
+"""Metadata record in a recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """One input of a stage.
+    """An input of a stage.
 
     Parameters
     ----------
     name
-        File or folder name, without its path: outputs do not depend on where inputs lay.
+        File or folder name without its path, so that outputs do not depend on the location.
     sha256
-        Of the file, or of a folder's sorted names and contents.
+        Hash of the file, or of a folder's sorted names and contents.
     provenance
-        Its own provenance, or None for a source that dmrl did not write.
+        Provenance of the input, or None for a source that dmrl did not write.
     """
 
     name: str
@@ -42,18 +44,18 @@ class Input:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """How an output was made.
+    """Origin of an output.
 
     Parameters
     ----------
     stage
-        The command's name.
+        Name of the command.
     settings
-        Every setting, as plain values.
+        All settings, as plain values.
     seed
-        The random seed, or None where nothing is random.
+        Random seed, or None if nothing is random.
     inputs
-        What the stage read.
+        Files and folders that the stage read.
     libraries
         Versions of the packages that can change the result.
     dmrl_version
@@ -68,13 +70,13 @@ class Provenance:
     dmrl_version: str = __version__
 
     def to_json(self) -> dict[str, Any]:
-        """Plain dictionaries, lists and values, inputs' provenance nested, each told once."""
+        """Return plain dictionaries, lists and values, with each input's provenance nested once."""
         return asdict(self._told_once())
 
     def _told_once(self) -> "Provenance":
-        """The same, but with no provenance for an input that was there before, by its hash.
+        """Return a copy with the provenance of each input only at its first occurrence, by hash.
 
-        Nor for one that is older than the budget: its hash stays, its story does not.
+        Ancestors deeper than `limits.ANCESTORS` keep their hash without a provenance.
         """
         told: set[str] = set()
 
@@ -93,12 +95,12 @@ class Provenance:
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
-        """The provenance that ``to_json`` gave.
+        """Build the provenance from the result of ``to_json``.
 
         Raises
         ------
         KeyError, TypeError, ValueError
-            If the document is not one.
+            If the document is not a provenance.
         """
         try:
             return cls._read(document, {})
@@ -115,16 +117,16 @@ class Provenance:
             inputs.append(Input(str(name), str(sha256), known.get(sha256)))
         made = cls(**{**document, "inputs": tuple(inputs)})
         if not (isinstance(made.settings, dict) and isinstance(made.libraries, dict)):
-            raise TypeError("settings and libraries are no tables")
+            raise TypeError("settings and libraries are not tables")
         texts = (made.stage, made.dmrl_version)
         if not all(isinstance(text, str) for text in texts) or not isinstance(
             made.seed, int | None
         ):
-            raise TypeError("stage and version are no texts, or the seed is no number")
+            raise TypeError("stage and version are not texts, or the seed is not a number")
         return made
 
     def to_metadata(self) -> dict[str, str]:
-        """The same as MCAP metadata: strings, JSON where a value is not one."""
+        """Return MCAP metadata: strings, or JSON for other values."""
         return {
             k: v if isinstance(v, str) else json.dumps(v, sort_keys=True)
             for k, v in self.to_json().items()
@@ -132,16 +134,16 @@ class Provenance:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self:
-        """The provenance that ``to_metadata`` gave."""
+        """Build the provenance from the result of ``to_metadata``."""
         plain = ("stage", "dmrl_version")
         return cls.from_json({k: v if k in plain else parse_json(v) for k, v in metadata.items()})
 
     def to_recipe(self) -> str:
-        """The settings as a TOML recipe: what was run can be run again."""
+        """Return the settings as a TOML recipe that repeats the run."""
         return tomli_w.dumps({"kind": self.stage, **_without_none(self.settings)})
 
     def ancestry(self) -> Iterator[tuple[int, Input]]:
-        """Depth of every input, and of theirs, nearest first; each with its provenance once."""
+        """Yield depth and input for all direct and indirect inputs, each provenance once."""
         yield from _nested(self._told_once(), 0)
 
     def write(self, folder: Path) -> None:
@@ -158,7 +160,7 @@ def _nested(made: Provenance, depth: int) -> Iterator[tuple[int, Input]]:
 
 
 def _without_none(value: Any) -> Any:
-    """The same without what TOML has no word for."""
+    """Return the value without None, which TOML cannot express."""
     if isinstance(value, Mapping):
         return {k: _without_none(v) for k, v in value.items() if v is not None}
     return [_without_none(v) for v in value] if isinstance(value, list | tuple) else value

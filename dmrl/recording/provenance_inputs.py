@@ -1,4 +1,4 @@
-"""Provenance of an output about to be written: its inputs hashed, their ancestry nested."""
+"""Build the provenance of an output: hash its inputs and nest their provenance."""
 
 import hashlib
 import json
@@ -16,16 +16,11 @@ from dmrl.recording.summary import summary
 from dmrl.storage import Remote
 
 NO_CONTENT = ("README.md", "figures", "tensorboard")
+"""Files and folders that the hash of an output folder leaves out."""
 
 
 def refuse_twice(paths: Sequence[Path]) -> None:
-    """Nothing, if every recording is named once.
-
-    Raises
-    ------
-    RecordingError
-        If one is named twice.
-    """
+    """Raise RecordingError if a recording is named twice."""
     if len({path.resolve() for path in paths}) != len(paths):
         raise RecordingError(f"{paths[0]}: a recording is given twice. Name each once")
 
@@ -38,25 +33,25 @@ def provenance(
     seed: int | None = None,
     libraries: Sequence[str] = (),
 ) -> Provenance:
-    """Provenance of an output about to be written; hashes the inputs.
+    """Build the provenance of an output, and hash its inputs.
 
     Parameters
     ----------
     stage
-        The command's name.
+        Name of the command.
     settings
         A settings dataclass, a dictionary, or None.
     inputs
-        Files and folders that are read.
+        Files and folders that the stage reads.
     seed
         Random seed.
     libraries
-        Names of installed packages whose version matters.
+        Names of installed packages whose version can change the result.
 
     Raises
     ------
     RecordingError
-        If an input is not there.
+        If an input does not exist.
     """
     values = settings if isinstance(settings, dict) else asdict(settings) if settings else {}
     return Provenance(
@@ -69,7 +64,7 @@ def provenance(
 
 
 def _name(value: object) -> str:
-    # A path in a setting is named, not located, for the same reason as an input.
+    # Only the name of a path: outputs do not depend on the location of files.
     return value.name if isinstance(value, Path) else str(value)
 
 
@@ -83,18 +78,18 @@ def _version(package: str) -> str:
 
 
 def input_of(path: Path) -> Input:
-    """Name, hash and own provenance of a file or folder.
+    """Return name, hash and provenance of a file or folder.
 
     Raises
     ------
     RecordingError
         If there is no such file or folder.
     UnsafeName
-        If it is a pipe or a device, which has no end.
+        If it is a pipe or a device, which cannot be read to an end.
     """
     if not path.exists():
         raise RecordingError(f"no file or folder {path}. Check the name")
-    refuse_pipe(path)  # in a folder, a link may lead to a device
+    refuse_pipe(path)  # a link in a folder may point to a device
     if path.suffix == ".mcap" and path.is_file():
         expect_unchanged(path)
     digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
@@ -102,7 +97,7 @@ def input_of(path: Path) -> Input:
 
 
 def sha256_of_file(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
+    """Return the SHA-256 of a file, hexadecimal."""
     if isinstance(path, Remote):
         return path.sha256()
     with path.open("rb") as stream:
@@ -110,10 +105,10 @@ def sha256_of_file(path: Path) -> str:
 
 
 def sha256_of_folder(folder: Path) -> str:
-    """SHA-256 over the sorted relative names and contents of a folder's files.
+    """Return the SHA-256 of the sorted relative names and contents of a folder's files.
 
-    Of a folder that dmrl wrote, the card is left out, which may be written again at any time, and
-    the log of a training, which tells when it ran.
+    In a folder that dmrl wrote, the card, which may be rewritten, and the training log, which
+    contains times, are left out.
     """
     left_out = NO_CONTENT if (folder / FILE_NAME).is_file() else ()
     digest = hashlib.sha256()
@@ -125,12 +120,12 @@ def sha256_of_folder(folder: Path) -> str:
 
 
 def provenance_of(path: Path) -> Provenance | None:
-    """How a recording, or an output folder, was made; None: it does not say.
+    """Read the provenance of a recording or output folder; return None if it has none.
 
     Raises
     ------
     RecordingError
-        If what it says is damaged.
+        If the provenance is corrupt.
     """
     if path.suffix == ".mcap" and path.is_file():
         return summary(path).provenance

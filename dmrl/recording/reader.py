@@ -1,4 +1,4 @@
-"""Messages of a recording, one at a time or as Arrow columns, in log-time order."""
+"""Read messages of a recording in log-time order, one at a time or as Arrow columns."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,12 +21,12 @@ from dmrl.recording.protobuf.message_types import descriptor_of, require_types
 from dmrl.recording.summary import summary
 
 STRETCH_BYTES = 4 << 20
-"""Bytes of messages that `stretches` decodes at once: few calls, little memory."""
+"""Bytes of messages that `iter_topic_batches` decodes at once: few calls, little memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stamped:
-    """A message with its log time (nanoseconds) and topic."""
+    """A decoded message with its log time (nanoseconds) and topic."""
 
     time_ns: int
     topic: str
@@ -34,21 +34,21 @@ class Stamped:
 
 
 def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
-    """Topics of a recording that the names and patterns ask for.
+    """Return the topics of a recording that match some names and patterns.
 
     Parameters
     ----------
     path
         A recording.
     wanted
-        Topics, or patterns in which ``*`` stands for one part: ``/*/labels``.
+        Topics, or patterns in which ``*`` matches one part: ``/*/labels``.
 
     Raises
     ------
     MissingTopic
-        If one of them matches nothing.
+        If a name or pattern matches nothing.
     RecordingError
-        If a topic of dmrl's carries another message type.
+        If one of dmrl's topics carries another message type.
     """
     topics = summary(path).topics
     found: set[str] = set()
@@ -67,16 +67,16 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
 def read_raw(
     path: Path, *topics: str, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[RawMessage]:
-    """Messages as they stand in the file, in log-time order.
+    """Yield undecoded messages in log-time order.
 
     Parameters
     ----------
     path
         A complete recording.
     topics
-        Only these topics or patterns. None given: all.
+        Topics or patterns to read. None given: all.
     start_ns, end_ns
-        Only log times in [start_ns, end_ns), nanoseconds.
+        Read log times in [start_ns, end_ns) only, nanoseconds.
 
     Raises
     ------
@@ -94,16 +94,16 @@ def read_raw(
 def read(
     path: Path, *topics: str, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Stamped]:
-    """Decoded messages, in log-time order, a few chunks in memory.
+    """Yield decoded messages in log-time order, with a few chunks in memory.
 
     Parameters
     ----------
     path
         A complete recording.
     topics
-        Only these topics or patterns (``/*/labels``). None given: all.
+        Topics or patterns (``/*/labels``) to read. None given: all.
     start_ns, end_ns
-        Only log times in [start_ns, end_ns), nanoseconds.
+        Read log times in [start_ns, end_ns) only, nanoseconds.
 
     Raises
     ------
@@ -121,13 +121,7 @@ def read(
 
 
 def parsed(raw: RawMessage, kind: Any, path: Path) -> Any:
-    """The message of a class that a recording's bytes hold.
-
-    Raises
-    ------
-    RecordingError
-        If they hold none.
-    """
+    """Parse the payload of a message; raise RecordingError if it is not of the class."""
     try:
         return kind.FromString(raw.data)
     except DecodeError as e:
@@ -142,18 +136,18 @@ def columns(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> Iterator[pa.RecordBatch]:
-    """One topic as Arrow columns, in log-time order, a batch per chunk or so.
+    """Yield one topic as Arrow columns in log-time order, about a batch per chunk.
 
     Parameters
     ----------
     path
         A complete recording.
     topic
-        One topic, no pattern.
+        A topic, not a pattern.
     fields
-        Only these fields of the message. None: all.
+        Fields of the message to decode. None: all.
     start_ns, end_ns
-        Only log times in [start_ns, end_ns), nanoseconds.
+        Read log times in [start_ns, end_ns) only, nanoseconds.
 
     Yields
     ------
@@ -179,22 +173,21 @@ def stretches(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> Iterator[dict[str, pa.RecordBatch]]:
-    """Several topics as Arrow columns in one pass, one stretch of time after another.
+    """Yield several topics as Arrow columns in one pass, one time range after another.
 
     Parameters
     ----------
     path
         A complete recording.
     fields
-        Topics, and which fields of each; None: all. Topics that the recording lacks are
-        left out.
+        Topics, and the fields of each to decode (None: all). Missing topics are left out.
     start_ns, end_ns
-        Only log times in [start_ns, end_ns), nanoseconds.
+        Read log times in [start_ns, end_ns) only, nanoseconds.
 
     Yields
     ------
     dict
-        Topic to columns, as `columns` gives them, for those with messages in the stretch.
+        Topic to columns as in `iter_columns`, for topics with messages in the time range.
 
     Raises
     ------
@@ -225,7 +218,7 @@ def read_table(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> pa.Table:
-    """One topic as an Arrow table, all in memory; see ``columns``. It may have no rows."""
+    """Read one topic into an Arrow table, possibly without rows; see ``iter_columns``."""
     batches = list(columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns))
     if not batches:
         batches = [batch_of(EMPTY, descriptor_of(path, channel_on(path, topic)), fields)]

@@ -1,4 +1,4 @@
-"""Bringing back what a killed or damaged recording still holds."""
+"""Recover the messages of a truncated or corrupt recording."""
 
 import struct
 import zlib
@@ -45,11 +45,11 @@ from dmrl.recording.recovery import Recovery
 from dmrl.recording.summary import Summary
 from dmrl.recording.writer import RecordingWriter
 
-INDEX_HEAD = struct.Struct("<HI")  # of a message index: channel, bytes of entries
+INDEX_HEAD = struct.Struct("<HI")  # of a Message Index record: channel id, bytes of entries
 
 
 class _Indexed(NamedTuple):
-    """What a message index says of a chunk."""
+    """Number of messages that a message index lists for a channel."""
 
     channel: int
     messages: int
@@ -61,16 +61,16 @@ class _Walk:
 
     path: Path
     recovery: Recovery
-    end: McapSummary  # what the end of the file says, as far as it is there
+    end: McapSummary  # Summary section, as far as it can be read
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    numbered: dict[int, McapChannel] = field(default_factory=dict)  # the same, as they stand
+    numbered: dict[int, McapChannel] = field(default_factory=dict)  # Channel records
     metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
-    found: Counter[int] = field(default_factory=Counter)  # messages by channel number
-    skipped: Counter[int] = field(default_factory=Counter)  # in damaged chunks, by their indexes
+    found: Counter[int] = field(default_factory=Counter)  # messages by channel id
+    skipped: Counter[int] = field(default_factory=Counter)  # in corrupt chunks, by their indexes
     summed: checksums.Sums = field(default_factory=checksums.Sums)
-    extras: int = 0  # metadata and attachments
+    extras: int = 0  # number of metadata and attachments
     chunks: int = 0
     unpacked: int = 0
     footer: bool = False
@@ -80,20 +80,20 @@ class _Walk:
 def recover(path: Path, out: Path) -> Recovery:
     """Write a complete recording with every message that can still be read.
 
-    Chunks in the middle that fail their CRC are left out; what follows them is kept.
+    Chunks that fail their CRC are left out; later chunks are kept.
 
     Parameters
     ----------
     path
-        A recording that was cut short or damaged, ``.partial`` for instance.
+        A truncated or corrupt recording, such as a ``.partial`` file.
     out
         Recording to write.
 
     Raises
     ------
     RecordingError
-        If ``path`` does not begin as a recording, no message can be brought back, or it unpacks to
-        more than its size explains.
+        If ``path`` does not begin as a recording, no message can be recovered, or it decompresses
+        to more than the limit for its size.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -102,15 +102,15 @@ def recover(path: Path, out: Path) -> Recovery:
     with Bounded(path) as stream:
         if stream.size < len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
             raise RecordingError(
-                f"{path} does not begin as a recording: nothing to recover. Make it again"
+                f"{path} does not begin like a recording: nothing to recover. Make it again"
             )
         walk = _Walk(path, Recovery(), _end(path, stream))
         for record in (*walk.end.schemas.values(), *walk.end.channels.values()):
-            # A topic is defined in the chunk that has its first message. If that is damaged, all
-            # later ones would be nameless.
+            # A topic is defined in the chunk with its first message. If that chunk is corrupt,
+            # later messages would have no topic.
             _define(walk, record)
         pieces = _pieces(stream, walk)
-        # Our provenance stands before the first message: it is known once that is reached.
+        # dmrl writes the provenance before the first message, so read up to that first.
         first = next(pieces, None)
         if first is None:
             raise RecordingError(f"{path} holds no whole chunk: nothing to recover. Make it again")
@@ -129,13 +129,13 @@ def _provenance(walk: _Walk) -> Provenance:
         try:
             own = Provenance.from_metadata(walk.metadata[METADATA_NAME][-1])
         except (ValueError, KeyError, TypeError, RecursionError):
-            own = None  # damaged like the rest; the messages are what is wanted
+            own = None  # corrupt as well; the messages matter more
     source = Input(walk.path.name, sha256_of_file(walk.path), own)
     return Provenance("recover", inputs=(source,))
 
 
 def _end(path: Path, stream: Bounded, start: int | None = None) -> McapSummary:
-    """The summary section where the footer says it is, or at ``start``; empty if it is damaged."""
+    """Read the Summary section at ``start`` or where the Footer points; empty if corrupt."""
     try:
         return stated(path, stream, start)[0] or McapSummary()
     except (RecordingError, *DAMAGE):
@@ -143,8 +143,8 @@ def _end(path: Path, stream: Bounded, start: int | None = None) -> McapSummary:
 
 
 def _pieces(stream: Bounded, walk: _Walk) -> Iterator[Piece]:
-    """Everything that can be read and whose topic is known, in the order of the file."""
-    damaged = False  # the chunk whose message indexes follow
+    """Yield everything that is readable and has a known topic, in file order."""
+    damaged = False  # whether the chunk before the next message indexes is corrupt
     for at, record in _records(stream, walk):
         if isinstance(record, Chunk):
             walk.chunks += 1
@@ -164,7 +164,7 @@ def _pieces(stream: Bounded, walk: _Walk) -> Iterator[Piece]:
 
 
 def _copied_sums(record: McapRecord, at: int) -> bool:
-    """Whether this record holds sums of another file."""
+    """Return whether this record contains the checksums of another file."""
     return (
         isinstance(record, Metadata)
         and record.name == checksums.METADATA_NAME
@@ -173,7 +173,7 @@ def _copied_sums(record: McapRecord, at: int) -> bool:
 
 
 def _unpacked(stream: Bounded, walk: _Walk, chunk: Chunk, at: int) -> Block | None:
-    """The messages of a chunk, what it defines noted; None if it is damaged."""
+    """Return the messages of a chunk and register its definitions; None if it is corrupt."""
     try:
         scan = scanned(unpacked(walk.path, chunk, at))
         found = list(scan.definitions())
@@ -182,14 +182,14 @@ def _unpacked(stream: Bounded, walk: _Walk, chunk: Chunk, at: int) -> Block | No
         return None
     walk.unpacked += len(scan.data)
     if walk.unpacked > limits.unpacked_bytes(stream.size):
-        raise too_large(walk.path, "it unpacks to more than its size explains")
+        raise too_large(walk.path, "it unpacks to much more than its size")
     for record in found:
         _define(walk, record)
     return scan.block
 
 
 def _named(walk: _Walk, block: Block, chunk: Chunk | None) -> Iterator[Piece]:
-    """The messages of a block whose topic is known, and whose time can be; none, or a piece."""
+    """Yield the messages of a batch that have a known topic and a valid time."""
     named = np.isin(block.channel, list(walk.channels))
     timed = block.possible
     walk.recovery.nameless += int((~named).sum())
@@ -203,7 +203,7 @@ def _named(walk: _Walk, block: Block, chunk: Chunk | None) -> Iterator[Piece]:
 
 
 def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord | _Indexed]]:
-    """Where they start and whole records up to the footer, over what is damaged between."""
+    """Yield offset and record up to the footer, skipping corrupt ranges."""
     known = sorted(start for start, _ in places(walk.end))
     at = len(MAGIC)
     while at < stream.size and not walk.footer:
@@ -211,7 +211,7 @@ def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord | _
         edge = known[later] if later < len(known) else stream.size
         try:
             record, end = _record_at(stream, walk, at, edge)
-        except DAMAGE:  # the next record that is known is where reading goes on
+        except DAMAGE:  # continue at the next record that the Summary section lists
             walk.recovery.lost_bytes += edge - at
             at = edge
             continue
@@ -223,22 +223,22 @@ def _records(stream: Bounded, walk: _Walk) -> Iterator[tuple[int, McapRecord | _
 def _record_at(
     stream: Bounded, walk: _Walk, at: int, edge: int
 ) -> tuple[McapRecord | _Indexed | None, int]:
-    """The record that starts here, None if it is of no use, and where it ends.
+    """Read the record at an offset; return it, or None if it is unused, and its end.
 
-    One that would end after ``edge`` is damaged: there starts a record that is known.
+    A record that would end after ``edge``, where a listed record starts, is corrupt.
     """
     stream.seek(at)
     opcode, length = RECORD.unpack(stream.read(RECORD.size))
     end = at + RECORD.size + length
     if end > edge:
-        raise McapError("it runs into the next record that is known")
+        raise McapError("a record overlaps the next listed record")
     record = _parsed(opcode, stream.read(length), walk)
     if opcode == Opcode.DATA_END:
         walk.data_ended = True
         if walk.end.statistics is None:
             walk.end = _end(walk.path, stream, end)
     elif walk.data_ended and opcode in (Opcode.CHUNK, Opcode.MESSAGE):
-        walk.recovery.doubtful = True  # no writer puts them there
+        walk.recovery.doubtful = True  # not allowed after the data section
     walk.footer |= opcode == Opcode.FOOTER
     return record, end
 
@@ -253,7 +253,7 @@ _KINDS: dict[int, type[Any]] = {
 
 
 def _parsed(opcode: int, body: bytes, walk: _Walk) -> McapRecord | _Indexed | None:
-    """The record that these bytes are; None for one that is of no use here."""
+    """Parse a record from its body; return None for an unused type."""
     if opcode == Opcode.MESSAGE:
         message: Message = Message.read(ReadDataStream(BytesIO(body)), len(body))
         return message
@@ -273,7 +273,7 @@ def _parsed(opcode: int, body: bytes, walk: _Walk) -> McapRecord | _Indexed | No
 
 
 def _define(walk: _Walk, record: McapRecord) -> None:
-    """Note what a record defines."""
+    """Register a definition, metadata record or attachment."""
     match record:
         case Schema():
             walk.schemas[record.id] = record
@@ -289,7 +289,7 @@ def _define(walk: _Walk, record: McapRecord) -> None:
 
 
 def _account(walk: _Walk) -> None:
-    """What is missing, by what the file says it had."""
+    """Complete the report: compare the recovered messages with the file's statistics."""
     recovery, said = walk.recovery, walk.end.statistics
     had = Counter(said.channel_message_counts) if said is not None else walk.found + walk.skipped
     for number, count in sorted((had - walk.found).items()):
@@ -309,5 +309,5 @@ def _account(walk: _Walk) -> None:
         and not (recovery.damaged_chunks or recovery.lost_bytes)
         and not (recovery.nameless or recovery.timeless)
         and not recovery.missing
-        and not walk.found - had  # some twice, or of another recording
+        and not walk.found - had  # duplicates, or messages of another recording
     )

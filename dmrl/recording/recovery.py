@@ -1,31 +1,31 @@
-"""What could be brought back of a killed or damaged recording."""
+"""Define the report about a recovered recording."""
 
 from dataclasses import dataclass, field
 
 
 @dataclass(slots=True)
 class Recovery:
-    """What was brought back.
+    """Report about a recovered recording.
 
     Parameters
     ----------
     messages
         Messages written, bit-exact.
     damaged_chunks
-        Chunks within the file that failed their CRC and were left out.
+        Chunks that were left out because they failed their CRC.
     nameless
-        Messages left out because what defines their topic was in a damaged chunk.
+        Messages left out because the definition of their topic was in a corrupt chunk.
     timeless
         Messages left out because their time is beyond the year 2262.
     lost_bytes
-        Bytes that are no whole record: after the last one, or before one that is known.
+        Bytes outside of complete records: after the last one, or before the next listed one.
     missing
-        Messages that the file had and that were not brought back, by topic, as far as it says.
+        Messages that were not recovered, by topic, as far as the file lists them.
     counted
-        Whether it says so of the whole file: its end, with its statistics, is there.
+        Whether ``missing`` covers the whole file: its Statistics record was readable.
     doubtful
-        Whether metadata or attachments are missing or fail their checksum; what is there is kept
-        as it stands.
+        Whether metadata or attachments are missing or fail their checksum. They are kept as they
+        are.
     whole
         Whether the file has its footer and nothing was lost.
     """

@@ -1,4 +1,4 @@
-"""The summary of a recording: topics, times, metadata, attachments and provenance."""
+"""Read the summary of a recording: topics, times, metadata, attachments and provenance."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,24 +17,25 @@ from dmrl.recording.mcap.summary_index import (
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 
 SPLIT_METADATA = "dmrl.split"
+"""Metadata record with the split that the source defines."""
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a recording holds.
+    """Topics, times, metadata, attachments and provenance of a recording.
 
     Parameters
     ----------
     topics
-        By name.
+        Type and message count by topic.
     start_ns, end_ns
-        First and last log time, nanoseconds; both 0 where there are no messages.
+        First and last log time, nanoseconds; both 0 without messages.
     metadata
-        Named strings; a name may occur more than once.
+        Strings by name. A name may occur several times.
     attachments
-        Named files.
+        Files by name.
     provenance
-        How it was made, or None for a recording that dmrl did not write.
+        Origin of the recording, or None if dmrl did not write it.
     """
 
     topics: dict[str, TopicInfo]
@@ -51,12 +52,12 @@ class Summary:
 
 
 def summary(path: Path) -> Summary:
-    """What a recording holds; reads its summary, metadata and attachments only.
+    """Read the summary of a recording, its metadata and its attachments.
 
     Raises
     ------
     RecordingError
-        If the file is absent, not MCAP, cut short or damaged.
+        If the file is absent, not MCAP, truncated or corrupt.
     """
     with opened(path) as stream:
         return remembered("summary", path, stream, lambda: _summary(path, stream))
@@ -86,7 +87,7 @@ def _summary(path: Path, stream: Bounded) -> Summary:
 
 
 def _scanned(path: Path, stream: Bounded) -> Summary:
-    """The summary of a complete file that was written without one."""
+    """Build the summary of a complete file that has no Summary section."""
     walk = walked(path, stream)
     walk.metadata.pop(checksums.METADATA_NAME, None)
     counts = walk.counts()

@@ -1,6 +1,6 @@
-"""Writing a recording: whole or absent, with its provenance at the front.
+"""Write recordings atomically, with their provenance first.
 
-Pictures stand in chunks of their own, so that whoever reads numbers unpacks no picture.
+Images are in chunks of their own, so that readers of numbers need not decompress images.
 """
 
 from collections.abc import Mapping
@@ -25,29 +25,30 @@ from dmrl.topics import row_of
 
 SUFFIX = ".mcap"
 RECIPE_NAME = "recipe.toml"
+"""Attachment with the settings of the run as a recipe."""
 
 
 class RecordingWriter:
-    """Writes one recording; the file appears under its name only when complete.
+    """Writes one recording. The file appears under its name only when it is complete.
 
-    A killed process leaves ``<name>.partial``, which ``dmrl recover`` reads: everything
-    before the open chunks, one of pictures and one of the rest, is in it.
+    A killed process leaves ``<name>.partial``, which ``dmrl recover`` reads. It contains all
+    messages except those in the two open chunks, one of images and one of numbers.
 
     Parameters
     ----------
     path
-        File to write; must not exist.
+        File to write. It must not exist.
     provenance
-        Stage, settings and inputs; written before the first message.
+        Stage, settings and inputs. Written before the first message.
     recipe
-        Text of the recipe that was run. None: the settings as TOML.
+        Text of the recipe of the run. None: the settings as TOML.
     keep_on_error
-        Leave ``<name>.partial`` when the work stops: for work that can be resumed.
+        Keep ``<name>.partial`` after an error, for work that can be resumed.
 
     Raises
     ------
     OutputError
-        If the file exists, is not called ``.mcap``, its folder does not exist, or the disk is
+        If the file exists, its suffix is not ``.mcap``, its folder does not exist, or the disk is
         full.
     """
 
@@ -59,8 +60,8 @@ class RecordingWriter:
         recipe: str | None = None,
         keep_on_error: bool = False,
     ) -> None:
-        if SUFFIX not in path.suffixes:  # a resumed one is out.mcap.kept for a while
-            raise OutputError(f"{path} is no name of a recording. Call it {path.name}{SUFFIX}")
+        if SUFFIX not in path.suffixes:  # a resumed recording is out.mcap.kept for a while
+            raise OutputError(f"{path} is not named like a recording. Use {path.name}{SUFFIX}")
         self._path = path
         self._topics: dict[str, tuple[type, int, OpenChunk]] = {}
         self._resources = ExitStack()
@@ -68,7 +69,7 @@ class RecordingWriter:
         try:
             self._file = Container(partial, f"dmrl {provenance.dmrl_version}")
             self._resources.callback(self._file.close)
-            # What is left of work that stopped is whole moments: pictures with their numbers.
+            # Work that can be resumed leaves complete moments: images with their numbers.
             self.chunks = Assembly(path, self._file, 1 if keep_on_error else OLDEST)
             self._file.add_metadata(METADATA_NAME, provenance.to_metadata())
             text = provenance.to_recipe() if recipe is None else recipe
@@ -83,23 +84,23 @@ class RecordingWriter:
     def write(
         self, time_ns: int, topic: str, message: Any, *, publish_ns: int | None = None
     ) -> None:
-        """Append one message. Times need not increase; readers sort.
+        """Append one message. Times need not increase; readers sort them.
 
         Parameters
         ----------
         time_ns
-            Log time: the sensor's time, nanoseconds.
+            Log time: time of the measurement, nanoseconds.
         topic
             Topic, as in ``topics.py``.
         message
-            A message of the type that the topic carries.
+            A message of the topic's type.
         publish_ns
-            When it was received, nanoseconds. None: the log time.
+            Time of reception, nanoseconds. None: the log time.
 
         Raises
         ------
         RecordingError
-            If the topic is dmrl's and carries another message type, or the time is negative.
+            If dmrl's topic carries another message type, or the time is negative.
         """
         known = self._topics.get(topic)
         if known is None or known[0] is not type(message):
@@ -119,28 +120,28 @@ class RecordingWriter:
         *,
         publish_ns: Ints | None = None,
     ) -> None:
-        """Append many messages of one topic, from columns: a tenth of the time of `write`.
+        """Append many messages of one topic from columns, ten times faster than `write`.
 
         Parameters
         ----------
         topic
             Topic, as in ``topics.py``.
         kind
-            The class of their type: ``message("Attitude")``.
+            Message class: ``message("Attitude")``.
         time_ns
             (N,) log times, nanoseconds.
         fields
             By name: (N,) numbers or texts, (N, K) for a repeated field, one value for all, or the
-            fields of a sub-message. Those that are missing have their default.
+            fields of a sub-message. Missing fields have their default.
         publish_ns
-            (N,) when they were received, nanoseconds. None: the log times.
+            (N,) times of reception, nanoseconds. None: the log times.
 
         Raises
         ------
         RecordingError
-            If the topic is dmrl's and carries another message type, or a time is negative.
+            If dmrl's topic carries another message type, or a time is negative.
         TypeError, ValueError
-            If a column is none of the type's.
+            If a column does not fit the message type.
         """
         if not len(time_ns):
             return
@@ -150,20 +151,20 @@ class RecordingWriter:
         self.chunks.add_records(channel, records, at, time_ns, publish_ns)
 
     def write_raw(self, raw: RawMessage) -> None:
-        """Append a message of another recording, bit for bit."""
+        """Append a message of another recording, its payload bit for bit."""
         number, chunk = self.chunks.begin(raw.channel)
         self.chunks.add(number, chunk, raw.time_ns, raw.publish_ns, raw.data)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
-        """Append named strings, such as the source's own split."""
+        """Append a metadata record, such as the split of the source."""
         self._file.add_metadata(name, values)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Append a named file."""
+        """Append an attachment."""
         self._file.add_attachment(name, media_type, data)
 
     def flush(self) -> None:
-        """Close the open chunks, so that a killed process keeps them."""
+        """Write the open chunks, so that they survive a kill of the process."""
         self.chunks.flush()
 
     def _abandon(self, error: BaseException) -> None:
@@ -187,12 +188,12 @@ class RecordingWriter:
 
 
 def channel_for(topic: str, kind: Descriptor) -> Channel:
-    """The channel of a topic that carries a type of message.
+    """Build the channel of a topic for a message type.
 
     Raises
     ------
     RecordingError
-        If the topic is dmrl's and carries another.
+        If dmrl's topic carries another type.
     """
     schema_name = str(kind.full_name)
     row = row_of(topic)

@@ -1,1 +1,1 @@
-"""Poses in, pixels out."""
+"""Rendering of labelled images of robots from their poses."""

@@ -1,7 +1,7 @@
-"""Blender's own Python environment: found, or made on first use.
+"""Blender's own Python environment, found or created on first use.
 
-bpy needs Python 3.11 and NumPy 1, which dmrl cannot live with; so it has a virtual
-environment of its own below the user's cache folder.
+bpy needs Python 3.11 and NumPy 1, which dmrl does not support. It therefore has a separate
+virtual environment below the user's cache folder.
 """
 
 import os
@@ -21,29 +21,29 @@ LIBRARIES = "libgl1 libsm6 libxfixes3 libxi6 libxkbcommon0 libxxf86vm1"
 
 
 def folder() -> Path:
-    """Where the environment is, or will be."""
+    """Return the folder of the environment, whether it exists or not."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache) / "dmrl" / f"blender-{BLENDER}"
 
 
 def python() -> Path | None:
-    """Python of the environment; None where it has not been made."""
+    """Return the Python of the environment, or None if it was not created yet."""
     found = folder() / "bin" / "python"
     return found if found.exists() else None
 
 
 def ensure(say: Callable[[str], None]) -> Path:
-    """Python of the environment, made now if it is not there.
+    """Return the Python of the environment, creating it first if necessary.
 
     Parameters
     ----------
-    say
-        Takes lines of news.
+    report
+        Receives progress messages, one line each.
 
     Raises
     ------
     BlenderError
-        If there is neither Python 3.11 nor uv, or the packages cannot be had.
+        If neither Python 3.11 nor uv is installed, or the packages cannot be installed.
     """
     there = python()
     if there is not None:
@@ -55,11 +55,11 @@ def ensure(say: Callable[[str], None]) -> Path:
     try:
         _make(partial)
         _try(partial / "bin" / "python")
-        # A virtual environment finds itself by where its Python lies: it may be moved whole.
+        # A virtual environment locates itself from its Python's path, so it can be moved whole.
         partial.rename(target)
     except OSError as e:
         if python() is None:  # another process may have been faster
-            raise BlenderError(f"cannot set up {target}: {e}. Free its place, try again") from e
+            raise BlenderError(f"cannot set up {target}: {e}. Remove it and try again") from e
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     say("Blender is set up")
@@ -76,13 +76,13 @@ def _make(target: Path) -> None:
         _run([uv, "venv", "-q", "--python", PYTHON, str(target)], "get Python 3.11", WAY_OUT)
         install = [uv, "pip", "install", "-q", "--python", str(python)]
     else:
-        raise BlenderError(f"Blender needs Python {PYTHON}, and there is none, nor uv. {WAY_OUT}")
+        raise BlenderError(f"Blender needs Python {PYTHON}; neither it nor uv was found. {WAY_OUT}")
     hint = "Check the connection, then: dmrl render --setup"
     _run([*install, *REQUIREMENTS], "fetch Blender (bpy)", hint)
 
 
 def _python_311() -> str | None:
-    """A Python 3.11 that runs; one may be named and not run, as pyenv's are."""
+    """Return a Python 3.11 that runs, or None: a shim on PATH, such as pyenv's, may fail."""
     own = sys.executable if sys.version_info[:2] == (3, 11) else None
     for name in (shutil.which(f"python{PYTHON}"), own):
         if name is None:
@@ -107,6 +107,6 @@ def _run(command: list[str], what: str, hint: str) -> None:
 
 
 def _try(python: Path) -> None:
-    """Import bpy once, because a missing system library shows only then."""
+    """Import bpy once: a missing system library is only detected by an import."""
     hint = f"If a library is missing, install (Debian's names): {LIBRARIES}"
     _run([str(python), "-c", "import bpy"], "start Blender", hint)

@@ -1,4 +1,4 @@
-"""Robots, each rendered alone, laid over a backdrop: the picture and its exact labels."""
+"""Compositing of separately rendered robots over a backdrop, with exact labels."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,24 +13,25 @@ from dmrl.rendering.shot import Layer, Look, Part, Robot, Shot
 COVERED = 1 / 255
 """Opacity above which a pixel counts as covered by a robot."""
 TAPS_MAX = 24
-FARTHEST_M = 65.0  # Blender says 1e10 where the ray of the depth missed what others hit
+"""Samples along the motion of a robot, at most."""
+FARTHEST_M = 65.0  # Blender writes 1e10 where the depth ray missed but other rays hit
 
 
 def compose(
     camera: Camera, robots: Sequence[Robot], look: Look, layers: Mapping[int, Layer]
 ) -> Shot:
-    """The picture and its labels.
+    """Return the image of a scene and its labels.
 
     Parameters
     ----------
     camera
-        Whose picture it is.
+        Camera that takes the image.
     robots
         All robots.
     look
         Backdrop, light and sensor.
     layers
-        By number of the robot, those that can be seen.
+        Rendered layers of the visible robots, by the robot's index.
     """
     canvas = canvas_of(camera)
     xyz = np.array([robot.pose.xyz_camera for robot in robots]).reshape(-1, 3)
@@ -55,7 +56,7 @@ def compose(
 def _visible(
     canvas: Canvas, layers: Mapping[int, Layer], order: Sequence[int]
 ) -> tuple[dict[int, Picture], dict[int, float]]:
-    """Opacity of every robot that no nearer one hides, and its share, inside the image."""
+    """Return the opacity that no nearer robot hides, and the visible share inside the image."""
     clear = canvas.inside.astype(np.float32)
     visible, share = {}, {}
     for k in order:
@@ -68,12 +69,12 @@ def _visible(
 
 
 def _box(canvas: Canvas, camera: Camera, layer: Layer, seen: NDArray[np.bool_]) -> Array:
-    """Edges of the pixels that are seen, as the lens bends them, clipped to the image."""
+    """Return the bounding box of the visible pixels after distortion, clipped to the image."""
     if not seen.any():
         return np.full(4, np.nan)
     rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     width, height = seen.shape[1], seen.shape[0]
-    # Of each row and column the outermost pixels; the lens moves no other beyond them.
+    # The outermost pixels of each row and column suffice: distortion moves no other beyond them.
     left, right = seen[rows].argmax(axis=1), width - seen[rows, ::-1].argmax(axis=1)
     top, bottom = seen[:, cols].argmax(axis=0), height - seen[::-1, cols].argmax(axis=0)
     u = np.concatenate([left, left, right, right, cols, cols + 1, cols, cols + 1])
@@ -87,7 +88,7 @@ def _box(canvas: Canvas, camera: Camera, layer: Layer, seen: NDArray[np.bool_]) 
 def _place(
     canvas: Canvas, camera: Camera, layer: Layer, spread_px: Array
 ) -> tuple[Part, Picture] | None:
-    """Part of the image that shows a layer, so far smeared, and where its pixels lie in it."""
+    """Return the image region that shows a blurred layer, and its pixels' places in the layer."""
     height, width = layer.depth_m.shape
     u, v = np.linspace(0, width, 9), np.linspace(0, height, 9)
     rim = np.concatenate([np.column_stack([u, v * 0 + y]) for y in (0, height)])
@@ -136,7 +137,7 @@ def _mark(
 def _paint(
     canvas: Canvas, camera: Camera, robot: Robot, layer: Layer, look: Look, picture: Picture
 ) -> None:
-    """Lay a robot over what is behind it, smeared by its movement."""
+    """Draw a robot over the image, with motion blur."""
     move_px = _move_px(camera, robot)
     found = _place(canvas, camera, layer, np.abs(move_px) / 2 + 3 * look.robot_blur_px)
     if found is None:

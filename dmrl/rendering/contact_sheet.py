@@ -1,4 +1,4 @@
-"""Pictures of several cameras, one below the other, to be looked at."""
+"""Contact sheets of images of several cameras."""
 
 from collections.abc import Sequence
 
@@ -11,17 +11,17 @@ GAP_PX = 8
 
 
 def evenly(count: int, most: int) -> list[int]:
-    """Numbers from 0 to count - 1, at most so many, evenly over all."""
+    """Return at most ``most`` indices from 0 to count - 1, evenly spaced."""
     return sorted({int(k) for k in np.linspace(0, count - 1, min(count, most)).round()})
 
 
 def sheet(ways: Sequence[Sequence[Rgb]]) -> bytes:
-    """PNG of two rows of each set of pictures, evenly over all of it.
+    """Return a PNG with two rows of evenly spaced images of each set.
 
     Parameters
     ----------
-    ways
-        (H, W, 3) uint8 each, one picture of each set at least.
+    image_sets
+        Sets of (H, W, 3) uint8 images, at least one image each.
     """
     rows = []
     for way in ways:

@@ -1,7 +1,7 @@
-"""Rendered images of simulated flights: one place for a flight, robots that keep their looks.
+"""Rendered images of simulated flights, with a constant appearance per flight.
 
-A flight happens in one panorama under one sun, which turn with the camera; every robot has its
-colours and every camera its sensor for all of the flight.
+A flight takes place in one panorama under one sun. Every robot keeps its colours and every
+camera its sensor for the whole flight.
 """
 
 from collections.abc import Iterable, Iterator
@@ -22,12 +22,13 @@ from dmrl.rendering.settings import PRESETS, Settings
 from dmrl.rendering.shot import Light, Look, Robot, Shot
 
 GAIN = 0.6
-"""Light of robots over that of the panorama; they fly where lamps are above and behind."""
+"""Light of the robots relative to the panorama. Robots fly where lamps are above and behind."""
 MIDDLE = 0.3
+"""Level of a panorama at which the gain applies as it is."""
 
 
 def himax() -> Settings:
-    """Ranges of the AI-deck's camera."""
+    """Return the settings of the AI-deck's camera."""
     keys: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in PRESETS["himax"].items()
@@ -36,14 +37,14 @@ def himax() -> Settings:
 
 
 class Flight:
-    """Pictures along one flight.
+    """Render the images of one flight.
 
     Parameters
     ----------
     renderer
-        Renders them.
+        Renders the robots.
     seed
-        Of the flight: chooses the place, colours and cameras.
+        Seed of the flight. Selects the panorama, the colours and the cameras.
     """
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
@@ -65,11 +66,11 @@ class Flight:
         self._paint = cache(self._paint_of)
 
     def __call__(self, camera: Camera, views: Iterable[View]) -> Iterator[Shot]:
-        """Shots of the views of one robot, in their order."""
+        """Yield the shots of one robot's views, in their order."""
         return self._renderer.shots(self._scene(camera, view) for view in views)
 
     def _paint_of(self, name: str) -> dict[str, Any]:
-        """Colours of a robot, and the first angle and speed of its rotors."""
+        """Return the colours of a robot."""
         rng = np.random.default_rng((self._seed, 1, *name.encode()))
         wear = float(rng.uniform(*self._settings.wear))
         return random_paint(rng, CRAZYFLIE, wear, self._settings.colour_spread)
@@ -77,7 +78,7 @@ class Flight:
     def _scene(self, camera: Camera, view: View) -> Scene:
         seed, number, _ = view.key
         ranges = self._settings
-        rng = np.random.default_rng((seed, 2, number))  # the same for all of a camera's pictures
+        rng = np.random.default_rng((seed, 2, number))  # the same for all images of a camera
         sensor = random_sensor(ranges, rng)
         soft_px = float(rng.uniform(*ranges.background_blur_px))
         shutter_s = float(rng.uniform(*ranges.shutter_s))
@@ -98,7 +99,7 @@ class Flight:
         return camera, robots, look
 
     def _turned(self, name: str, rng: np.random.Generator, shutter_s: float) -> dict[str, Any]:
-        """Paint of a robot with its rotors where they are in one picture."""
+        """Return a robot's paint with the rotor angles of one image."""
         turns = float(rng.uniform(*self._settings.rotor_speed_rps)) * shutter_s
         first = float(rng.uniform(0, np.pi))
         return self._paint(name) | {
@@ -108,7 +109,7 @@ class Flight:
 
 
 def _level(panorama: Picture) -> float:
-    """Usual light of a panorama about the horizon, its lamps cut off."""
+    """Return the mean light of a panorama near the horizon, with lamps clipped."""
     rows = len(panorama)
     band: Array = panorama[rows // 3 : 2 * rows // 3].astype(float)
     return max(float(np.minimum(band, HIGHLIGHTS * band.mean()).mean()), 1e-3)

@@ -1,7 +1,4 @@
-"""Messages of a rendered image: picture, labels, true poses, masks, depth.
-
-One moment of a recording, whoever chose the poses.
-"""
+"""Messages of one rendered image: pixels, labels, true poses, masks and depth."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,23 +15,23 @@ from dmrl.rendering.shot import Robot, Shot
 from dmrl.samples.sample import Sample, image, labels
 
 ROBOT = "cf1"
-"""The robot that carries the camera."""
+"""Name of the robot that carries the camera."""
 
 
 def peer(number: int, robot: Robot) -> str:
-    """Name of the robot of that number in an image, from 0."""
+    """Return the name of the robot with this index in an image, counted from 0."""
     return f"{robot.make}{number + 2}"
 
 
 def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Iterator[Sample]:
-    """Everything that is recorded of one image.
+    """Yield all samples of one rendered image.
 
     Parameters
     ----------
     time_ns
-        Of the exposure.
+        Log time of the image, nanoseconds.
     settings
-        Which topics are wanted.
+        Settings that select the topics and the image format.
     scene
         True poses.
     shot
@@ -54,7 +51,7 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
         yield _truth(time_ns, peer(k, robot), xyz)
     yield _transforms(time_ns, scene, horizontal_from_camera)
-    # Pictures last: so a resumed recording is copied, and its chunks become the same.
+    # Images come last, so that a resumed recording gets identical chunks when it is copied.
     yield image(time_ns, ROBOT, data, settings.image_format)
     if settings.masks:
         mask = encode_png(_mask(shot))
@@ -65,7 +62,7 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
 
 
 def _peers(scene: Drawn, shot: Shot) -> Iterator[dict[str, Any]]:
-    """Labels of the robots of which anything is seen, their centres by the lens at least."""
+    """Yield the labels of robots that are visible and whose centre the lens can project."""
     for k, share in enumerate(shot.visible_share.tolist()):
         if share <= 0 or np.isnan([*shot.box_px[k], *shot.uv_px[k]]).any():
             continue
@@ -81,7 +78,7 @@ def _peers(scene: Drawn, shot: Shot) -> Iterator[dict[str, Any]]:
 
 
 def _mask(shot: Shot) -> Any:
-    """(H, W) uint8: number in the name of the peer that covers most of a pixel; 0: none."""
+    """Return an (H, W) uint8 mask: number of the peer that covers most of a pixel, 0 for none."""
     if not len(shot.opacity):
         return np.zeros(shot.rgb.shape[:2], np.uint8)
     most = shot.opacity.max(axis=0)
@@ -95,7 +92,7 @@ def _truth(time_ns: int, name: str, xyz: Array) -> Sample:
 
 
 def _transforms(time_ns: int, scene: Drawn, horizontal_from_camera: Array) -> Sample:
-    """True poses: the observer's horizontal frame is the world; camera and peers in it."""
+    """Return the true poses of camera and peers. The observer's horizontal frame is the world."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
     poses = [("world", f"{ROBOT}/horizontal", np.zeros(3), np.eye(3))]
     poses.append((f"{ROBOT}/horizontal", f"{ROBOT}/camera", np.zeros(3), horizontal_from_camera))
@@ -117,14 +114,14 @@ def _transforms(time_ns: int, scene: Drawn, horizontal_from_camera: Array) -> Sa
 
 
 def quaternion(matrix: Array) -> list[float]:
-    """x, y, z, w of a rotation, w not negative.
+    """Return the quaternion x, y, z, w of a rotation, with w >= 0.
 
     Parameters
     ----------
     matrix
         (3, 3) rotation.
     """
-    # The eigenvector of Bar-Itzhack's matrix: exact for any angle, without case by case.
+    # The largest eigenvector of Bar-Itzhack's matrix is exact for any angle, without branches.
     m = matrix
     k = np.array(
         [

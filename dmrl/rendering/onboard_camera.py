@@ -1,4 +1,4 @@
-"""Poses in the world to poses in a robot's camera: which other robots it sees, and where."""
+"""Conversion of poses in the world to views of a robot's camera."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from dmrl.rendering.sketch_renderer import Pose, Sketch, draw
 from dmrl.rendering.sketch_scene import random_look
 
 NEAREST_M = 2 * RADIUS_M
-"""Robots nearer to the image plane than this are not drawn: they would touch it."""
+"""Minimum depth of a drawn robot, metres: nearer ones would touch the image plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A robot in the world, which is level with z up.
+    """Pose of a robot in the world frame, z up.
 
     Parameters
     ----------
     xyz_world
-        (3,) its centre, metres.
+        (3,) centre, metres.
     yaw_rad, roll_rad, pitch_rad
         Attitude Rz(yaw) Ry(pitch) Rx(roll).
     """
@@ -34,19 +34,19 @@ class Body:
 
     @property
     def horizontal_from_world(self) -> Array:
-        """(3, 3) rotation."""
+        """(3, 3) rotation from the world to the robot's horizontal frame."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
     @property
     def body_from_world(self) -> Array:
-        """(3, 3) rotation. The camera looks along the body's x, from its centre."""
+        """(3, 3) rotation to the body. The camera looks along the body's x, from its centre."""
         tilt = camera_from_horizontal(self.roll_rad, self.pitch_rad)
         return np.asarray(tilt @ self.horizontal_from_world)
 
 
 def pose_of(peer: Body, here: Body) -> Pose:
-    """A peer as the camera of the robot ``here`` has it in front, or behind."""
+    """Return the pose of a peer in the camera frame of ``observer``."""
     camera_from_world = here.body_from_world
     return Pose(
         camera_from_world @ (peer.xyz_world - here.xyz_world),
@@ -55,26 +55,26 @@ def pose_of(peer: Body, here: Body) -> Pose:
 
 
 def in_front(pose: Pose) -> bool:
-    """Whether a pose can be drawn."""
+    """Return whether a pose is far enough in front of the camera to be drawn."""
     return bool(pose.xyz_camera[0] > NEAREST_M)
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What one camera has before it at one moment.
+    """Poses and motion of the peers in front of one camera at one time.
 
     Parameters
     ----------
     here
-        The robot that carries the camera.
+        Robot that carries the camera.
     poses
-        By name, the peers in front.
+        Peers in front of the camera, by name.
     velocity_mps
-        By name, (3,) how fast a peer moves in the camera frame, the camera's turning included.
+        (3,) velocities of the peers in the camera frame, by name. Includes the camera's rotation.
     turning_rps
-        (2,) how fast what is far away moves in the image, right and down, radians per second.
+        (2,) angular velocity of distant points in the image, right and down, radians per second.
     key
-        Seed of the flight, number of the camera, number of the picture.
+        Seed of the flight, index of the camera, index of the image.
     """
 
     here: Body
@@ -85,9 +85,10 @@ class View:
 
 
 Renderer = Callable[[Camera, Iterable[View]], Iterator[Sketch | Shot]]
-"""Camera and views of one robot, to pictures with labels of the peers, in their order."""
+"""Function that renders the views of one robot's camera, in their order, with labels."""
 
 MOMENT_S = 0.005
+"""Half the step of the central differences that give velocities, seconds."""
 
 
 def view(
@@ -96,18 +97,18 @@ def view(
     time_s: float,
     key: tuple[int, int, int],
 ) -> View:
-    """What the camera of a robot has before it.
+    """Return the view of a robot's camera.
 
     Parameters
     ----------
     bodies
-        Every robot by name at a time, seconds.
+        Returns the poses of all robots by name at a time, seconds.
     robot
-        Carries the camera.
+        Robot that carries the camera.
     time_s
-        Of the picture.
+        Time of the image, seconds.
     key
-        See `View`.
+        See `CameraView`.
     """
     before, now, after = (bodies(time_s + step) for step in (-MOMENT_S, 0.0, MOMENT_S))
     peers = {name: pose_of(peer, now[robot]) for name, peer in now.items() if name != robot}
@@ -126,7 +127,7 @@ def view(
 
 
 def sketched(camera: Camera, views: Iterable[View]) -> Iterator[Sketch]:
-    """Pictures drawn by code, each before a background of its own."""
+    """Yield a sketch of every view, each with its own random background."""
     for one in views:
         rng = np.random.default_rng(one.key)
         yield draw(camera, list(one.poses.values()), random_look(rng, camera))

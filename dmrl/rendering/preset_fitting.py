@@ -1,8 +1,7 @@
-"""A preset whose renders look like one's own frames: each range follows the figure that it moves.
+"""Fitting of a rendering preset to real images, by matching image statistics.
 
-Pictures are taken of backdrops alone, without Blender: the sensor makes cast, grain, blur and the
-rest, and a small drone changes none of them. What the figures measure hangs together, so all ranges
-go a step towards what they lack, again and again.
+The statistics are measured on backdrops alone, without Blender. A small drone changes none of
+them. They depend on each other, so every round moves all ranges one step towards their targets.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,33 +19,33 @@ from dmrl.rendering.randomise import behind, random_sensor, without_highlights
 from dmrl.rendering.settings import LIMITS, Settings
 
 COARSE, FINE = (8, 32), (5, 192)
-"""Rounds and pictures: first a few, then as many as tell a camera from chance."""
+"""Rounds and images of each stage: few images first, then enough to average out chance."""
 ROUNDS = COARSE[0] + FINE[0]
 PIXELS = 24_000_000
-"""Of all pictures of a round, at most; of large frames there are fewer, but `COARSE` anyway."""
+"""Pixels of all images of a round, at most. Large images are fewer, but no fewer than `COARSE`."""
 FOCAL = 0.57
-"""Over the width, as the AI-deck's: how far pictures move when the camera turns."""
+"""Focal length over the image width, as the AI-deck's. It scales motion blur."""
 GREY = 0.01
-"""Colour under which a camera is grey."""
+"""Colour statistic below which a camera counts as grey."""
 MOSAIC = 0.15
-"""Correlation of grain from which it is not one pixel's own."""
+"""Noise correlation from which a Bayer mosaic is assumed."""
 QUALITIES = ((98, 100), (90, 96), (75, 90))
-"""Of JPEG: the worse, the coarser its grain."""
+"""Ranges of JPEG quality. A lower quality makes coarser noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Knob:
-    """A range of the settings and the figure that it moves.
+    """A range of the settings and the statistic that it controls.
 
     Parameters
     ----------
     key, figure
-        Their names.
+        Names of the setting and of the statistic.
     by
-        What a step is in: "factor" of both, "square" of both, or "lost", of which the figure
-        is what is left.
+        Scale of a step: "factor" of both, "square" of both, or "lost", where the statistic is the
+        remaining share.
     gain
-        Of a step, over what the figure lacks.
+        Step relative to the remaining difference.
     """
 
     key: str
@@ -67,28 +66,28 @@ KNOBS = (
     Knob("shot_noise", "grain", "factor", 1.6),
 )
 LEAST = {
-    "contrast_gamma": 1.0,  # a sensor's: what is missing is the scene's
+    "contrast_gamma": 1.0,  # of a sensor; the rest of the contrast belongs to the scene
     "read_noise": 2e-4,
     "shot_noise": 1e-6,
     "saturation": 0.02,
     "vignetting": 0.0,
 }
-"""Of a range that is fitted: from 0 it would never move."""
+"""Lower bounds of fitted ranges. A range at 0 would never move."""
 
 
 def scenes(photos: Photos, settings: Settings, size_px: tuple[int, int], seed: int) -> list[Rgb]:
-    """What is pictured: parts of photos, as many as `FINE` says.
+    """Return crops of photos as test scenes, as many as `FINE` requires.
 
     Parameters
     ----------
     photos
-        Rooms, or photos.
+        Rooms or photos.
     settings
-        How far they are zoomed into.
+        Settings with the range of zooms.
     size_px
         Width and height.
     seed
-        Another seed, other scenes.
+        Seed of the crops.
     """
     width_px, height_px = size_px
     camera = Camera(width_px, height_px, 1.0, 1.0, width_px / 2, height_px / 2)
@@ -98,16 +97,16 @@ def scenes(photos: Photos, settings: Settings, size_px: tuple[int, int], seed: i
 
 
 def pictures(settings: Settings, behind_all: Iterable[Rgb], seed: int) -> Iterator[Rgb]:
-    """Scenes as the settings' camera takes them, without robots.
+    """Yield images of the scenes as the settings' camera takes them, without robots.
 
     Parameters
     ----------
     settings
-        Of the camera and the backdrops.
-    behind_all
-        `scenes`.
+        Settings of the camera and the backdrops.
+    backdrops
+        Result of `sample_scenes`.
     seed
-        Of noise and of what is drawn from ranges.
+        Seed of the noise and of all draws.
     """
     for number, scene in enumerate(behind_all):
         rng = np.random.default_rng((seed, number, 1))
@@ -122,21 +121,21 @@ def pictures(settings: Settings, behind_all: Iterable[Rgb], seed: int) -> Iterat
 def fitted(
     real: Seen, settings: Settings, all_scenes: Sequence[Rgb], seed: int
 ) -> Iterator[Settings]:
-    """Settings whose pictures come nearer to the figures of real frames, round by round.
+    """Yield settings that approach the statistics of real images, one per round.
 
     Parameters
     ----------
     real
-        What was measured of frames of one camera.
+        Measurements of real images of one camera.
     settings
-        To start from.
-    all_scenes
-        `scenes`: what stands for that which the real camera saw.
+        Settings to start from.
+    backdrops
+        Result of `sample_scenes`, as a substitute for the real scenes.
     seed
-        Of what is drawn.
+        Seed of all draws.
     """
     settings = _kind(settings, real)
-    for turn in range(COARSE[0] + FINE[0]):  # of the same draws, so that a step is not chance
+    for turn in range(COARSE[0] + FINE[0]):  # with the same draws, so that steps are comparable
         count = COARSE[1] if turn < COARSE[0] else FINE[1]
         have = seen(pictures(settings, all_scenes[:count], seed))
         settings = _step(settings, real, have)
@@ -146,7 +145,7 @@ def fitted(
 
 
 def _kind(settings: Settings, real: Seen) -> Settings:
-    """With or without colours, and a mosaic before the pixels where there is one."""
+    """Return settings with the camera's type: colour or grey, with or without a Bayer mosaic."""
     colour, correlation = (real.middle(name) or 0.0 for name in ("colour", "grain_correlation"))
     if colour < GREY:
         settings = replace(settings, bayer=False, saturation=(0.0, 0.0), warmth=(1.0, 1.0))
@@ -155,7 +154,7 @@ def _kind(settings: Settings, real: Seen) -> Settings:
 
 
 def _step(settings: Settings, real: Seen, have: Seen) -> Settings:
-    """Settings with every range nearer to what its figure lacks, in its middle and its width."""
+    """Return settings whose ranges are one step closer to their targets, in middle and width."""
     changed: dict[str, Any] = {}
     for knob in KNOBS:
         if knob.key in ("saturation", "warmth") and settings.saturation[1] == 0:
@@ -166,7 +165,7 @@ def _step(settings: Settings, real: Seen, have: Seen) -> Settings:
 
 
 def _moved(knob: Knob, limits: tuple[float, float], want: Array, got: Array) -> tuple[float, float]:
-    """A range a step on: shifted by what the figure lacks, widened by how far it spreads."""
+    """Return a range after one step: shifted by the difference, widened by the ratio of spreads."""
     if not len(want) or not len(got):
         return limits
     least, most = LIMITS[knob.key]
@@ -184,7 +183,7 @@ def _moved(knob: Knob, limits: tuple[float, float], want: Array, got: Array) -> 
         bounds = np.array([least, most])
     spread = np.clip(float(want.std() / max(got.std(), 1e-3)), 0.8, 1.15)
     middle = np.clip(ends.mean(), *bounds)
-    # As far to both sides: an end that is cut off alone would move the middle back.
+    # Symmetric about the middle: clipping one end alone would move the middle back.
     half = min(np.ptp(ends) / 2 * spread, *np.abs(bounds - middle))
     low, high = np.clip([middle - half, middle + half], *bounds)
     if knob.by == "factor":
@@ -193,7 +192,7 @@ def _moved(knob: Knob, limits: tuple[float, float], want: Array, got: Array) -> 
 
 
 def _quality(settings: Settings, real: Seen, have: Seen) -> tuple[int, int]:
-    """The next worse quality where the grain is finer than it should be by a fifth."""
+    """Return the next lower quality where the noise correlates less than 1/1.2 of the real one."""
     want, got = (one.middle("grain_correlation") or 0.0 for one in (real, have))
     at = QUALITIES.index(settings.jpeg_quality) if settings.jpeg_quality in QUALITIES else 0
     return QUALITIES[min(at + (want > 1.2 * got), len(QUALITIES) - 1)]

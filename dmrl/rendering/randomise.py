@@ -1,4 +1,4 @@
-"""Poses and looks drawn at random from the ranges of the settings."""
+"""Random scenes, drawn from the ranges of the settings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,31 +19,32 @@ from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch_renderer import Pose
 
 TRIES = 30
-# Of panoramas, whose suns and lamps would leave nothing else to see; photos end below.
+"""Attempts per robot to find a free place."""
 HIGHLIGHTS = 3.0
+"""Clip panoramas at this multiple of their mean: suns and lamps would hide everything else."""
 BEHIND_THE_CAMERA = np.array([-1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """Where looks come from.
+    """Sources of random scenes.
 
     Parameters
     ----------
     settings
         Ranges.
     camera
-        Its image is filled.
+        Camera whose image is filled.
     radius_m
-        Of a ball that holds a robot.
+        Radius of a ball that contains a robot, metres.
     lights
-        Panoramas by name.
+        Names of the panoramas.
     panorama
-        Gives a panorama's picture.
+        Returns the image of a panorama.
     photos
-        Backgrounds; None: the panoramas.
+        Backgrounds, or None to show the panoramas.
     design
-        The robot whose parts are painted.
+        Robot whose parts are painted.
     """
 
     settings: Settings
@@ -57,7 +58,7 @@ class World:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A scene: attitude of the camera, robots, look, and how the picture is stored."""
+    """A scene: attitude of the camera, robots, look, and JPEG quality."""
 
     roll_rad: float
     pitch_rad: float
@@ -67,12 +68,12 @@ class Drawn:
 
 
 def draw_scene(world: World, index: int) -> Drawn:
-    """Scene number ``index``, the same whatever else is drawn.
+    """Draw scene number ``index``, independently of all other scenes.
 
     Parameters
     ----------
     world
-        Where it comes from.
+        Sources of the scene.
     index
         Number of the image, from 0.
     """
@@ -93,7 +94,7 @@ def _between(rng: Generator, limits: Range) -> float:
 
 
 def _factor(rng: Generator, limits: Range) -> float:
-    """Between limits, every factor as likely."""
+    """Draw a log-uniform number between limits."""
     return float(np.exp(rng.uniform(*np.log(limits))))
 
 
@@ -113,7 +114,7 @@ def _poses(world: World, rng: Generator, tilt: Array) -> list[Pose]:
 
 
 def _place(world: World, rng: Generator) -> Array:
-    """Uniform in a part of the image as it is seen, distorted."""
+    """Draw a position, uniform in a region of the distorted image."""
     camera, settings = world.camera, world.settings
     size = np.array([camera.width_px, camera.height_px])
     low, high = np.transpose([settings.place_u, settings.place_v]) * size
@@ -127,7 +128,7 @@ def _place(world: World, rng: Generator) -> Array:
 
 
 def _attitude(settings: Settings, rng: Generator) -> Array:
-    """Rotation horizontal_from_body."""
+    """Draw the rotation horizontal_from_body."""
     tilt_rad = np.radians(settings.robot_tilt_max_deg)
     roll, pitch = rng.uniform(-tilt_rad, tilt_rad, 2).tolist()
     yaw = rng.uniform(-np.pi, np.pi)
@@ -142,7 +143,7 @@ def _robot(world: World, rng: Generator, pose: Pose, shutter_s: float) -> Robot:
     velocity = rng.normal(size=3)
     velocity *= settings.speed_max_mps * rng.random() / np.linalg.norm(velocity)
     stopped = rng.random() < settings.rotors_stopped_share
-    # Without a shutter time, rotors are as at 10 ms: a disc.
+    # Without a shutter time, rotors are rendered as at 10 ms: a disc.
     open_s = shutter_s or 0.01
     sweep = 0.0 if stopped else 2 * np.pi * _between(rng, settings.rotor_speed_rps) * open_s
     paint = random_paint(rng, design, _between(rng, settings.wear), settings.colour_spread)
@@ -154,18 +155,18 @@ def _robot(world: World, rng: Generator, pose: Pose, shutter_s: float) -> Robot:
 
 
 def random_paint(rng: Generator, design: Design, wear: float, spread: float) -> dict[str, Any]:
-    """Colour and finish of every material, as the worker's shaders read them.
+    """Draw the colour and finish of every material, as properties of the worker's shaders.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
+        Random generator.
     design
-        What is painted.
+        Robot to paint.
     wear
-        0: new; 1: grey and dull.
+        0 for new, 1 for grey and dull.
     spread
-        How far colours vary, 0 to 1.
+        Variation of the colours, 0 to 1.
     """
     parts = len(design.materials)
     other, which, dust, glow = rng.random((4, parts))
@@ -187,17 +188,17 @@ def random_paint(rng: Generator, design: Design, wear: float, spread: float) -> 
 
 
 def strong_colours(rng: Generator, design: Design) -> dict[str, Any]:
-    """Two colours at random over all parts that do not glow, as of a drone of another make.
+    """Draw two colours for all parts that do not glow, as of a drone of another make.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
+        Random generator.
     design
-        What is painted.
+        Robot to paint.
     """
     parts = len(design.materials)
-    two = rng.random((2, 3)) ** 2  # linear light: rather dark and vivid than pale
+    two = rng.random((2, 3)) ** 2  # linear light: dark and vivid rather than pale
     shades = two[rng.integers(2, size=parts)] * rng.uniform(0.6, 1.4, (parts, 1))
     dull = (k for k, finish in enumerate(design.paint.values()) if not finish[3])
     return {f"colour_{k}": np.clip(shades[k], 0, 1).tolist() for k in dull}
@@ -227,18 +228,18 @@ def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s
 
 
 def behind(settings: Settings, rng: Generator, light: Picture, px_per_rps: float) -> Picture:
-    """What is behind the robots as it meets the camera: its contrast, out of focus, smeared.
+    """Return the light behind the robots with contrast, defocus and motion blur applied.
 
     Parameters
     ----------
     settings
         Ranges.
     rng
-        Draws from them.
+        Random generator.
     light
         (H, W, 3) linear light.
     px_per_rps
-        How far it moves while the shutter is open, of a camera that turns by a radian a second.
+        Image motion during the exposure of a camera that turns by one radian per second, pixels.
     """
     if settings.background_contrast != (1.0, 1.0):
         light = stretched(light, _factor(rng, settings.background_contrast))
@@ -249,7 +250,7 @@ def behind(settings: Settings, rng: Generator, light: Picture, px_per_rps: float
 
 
 def without_highlights(light: Picture) -> Picture:
-    """(H, W, 3) light, of which suns and lamps are cut off."""
+    """Return (H, W, 3) light with suns and lamps clipped."""
     return np.minimum(light, HIGHLIGHTS * max(float(light.mean()), 1e-3))
 
 
@@ -277,7 +278,7 @@ def _light(
 
 
 def random_sensor(settings: Settings, rng: Generator, *, exposed: bool = True) -> Sensor:
-    """A camera's response, from the ranges of the settings; its exposure fixed or as they say."""
+    """Draw a sensor from the ranges of the settings. Without ``exposed`` its exposure is fixed."""
     warmth = _factor(rng, settings.warmth) ** 0.5
     return Sensor(
         brightness=_between(rng, settings.brightness) if exposed else None,

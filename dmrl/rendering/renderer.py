@@ -1,7 +1,7 @@
-"""Renders shots: camera, robots and look in, pixels and truth out, in the order asked.
+"""Renderer of robots with Blender worker processes.
 
-with Renderer(ensure(say), Model()) as renderer:
-    for shot in renderer.shots((camera, robots, look) for ...):
+with Renderer(ensure_environment(report), RobotModel()) as renderer:
+    for shot in renderer.render_shots((camera, robots, look) for ...):
         ...
 """
 
@@ -23,8 +23,10 @@ from dmrl.rendering.shot import Layer, Look, Robot, Shot, requests
 from dmrl.rendering.worker_pool import Pool, Start, Worker
 
 MODEL_KINDS = (".blend", ".glb", ".gltf", ".obj", ".stl")
+"""Suffixes of model files that Blender can import."""
 PANORAMA_KINDS = (".exr", ".hdr")
 SMALLEST_M, LARGEST_M = 0.01, 3.0
+"""Size of a robot, metres: smallest and largest."""
 SAMPLES = 8
 BOUNCES = 2
 
@@ -33,20 +35,20 @@ Scene = tuple[Camera, Sequence[Robot], Look]
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What the robots look like.
+    """Shape of the robots.
 
     Parameters
     ----------
     path
-        .blend, .glb, .obj or .stl; None: ``design``.
+        .blend, .glb, .obj or .stl file, or None for ``design``.
     scale
-        Metres per unit of the file; of the drawn one, times its life size.
+        Metres per unit of the file. Without a file, times life size.
     up
-        Axis of the file that points up; auto: y of .obj and .glb, z of .stl and .blend.
+        Axis of the file that points up. auto: y of .obj and .glb, z of .stl and .blend.
     centre
-        What labels are about: the middle of the model's box, or the file's origin.
+        Reference point of the labels: the middle of the model's box, or the file's origin.
     design
-        What dmrl draws where there is no file.
+        Built-in robot that is used without a file.
     """
 
     path: Path | None = None
@@ -77,29 +79,27 @@ def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> S
 
 
 class Renderer:
-    """Workers with one model and the panoramas that may light it.
+    """Pool of workers that share one robot model and a set of panoramas.
 
     Parameters
     ----------
     python
-        Of Blender's environment, see ``environment.ensure``.
+        Python of Blender's environment, see ``blender_environment.ensure_environment``.
     model
-        The robot.
+        Robot model.
     lights
-        Panoramas (.exr, .hdr) by path. None: those that come with Blender.
+        Paths of panoramas (.exr, .hdr). None uses those that ship with Blender.
     workers
-        Processes. 0: as many as there are cores.
+        Number of processes. 0 uses one per core.
     samples
         Light paths per pixel.
 
     Raises
     ------
     BlenderError
-        If Blender does not start.
-    ModelError
-        If the model cannot be used.
+        If Blender does not start, or cannot import the model.
     SettingError
-        If the scale makes a robot that is no small drone.
+        If the model is missing, or the scale makes a robot that is no small drone.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Renderer:
         self.version = self._pool.version
         self.points = _outermost(self._pool.points)
         self.box = np.array([self._pool.points.min(axis=0), self._pool.points.max(axis=0)])
-        """(2, 3) lowest and highest x, y and z of the robot, body frame, metres."""
+        """(2, 3) minimum and maximum x, y and z of the robot, body frame, metres."""
         size_m = float(np.ptp(self.box, axis=0).max())
         if not SMALLEST_M <= size_m <= LARGEST_M:
             self._pool.__exit__()
@@ -125,21 +125,21 @@ class Renderer:
 
     @property
     def radius_m(self) -> float:
-        """Radius of a ball about the origin that holds a robot."""
+        """Radius of a ball about the origin that contains a robot, metres."""
         return float(np.linalg.norm(self.points, axis=1).max())
 
     @property
     def pool(self) -> Pool:
-        """The processes."""
+        """The worker processes."""
         return self._pool
 
     def shots(self, scenes: Iterable[Scene]) -> Iterator[Shot]:
-        """Shots of scenes, in their order; few scenes are taken ahead.
+        """Yield the shots of scenes, in their order. Few scenes are read ahead.
 
         Raises
         ------
         BlenderError
-            If Blender dies again and again on one scene.
+            If Blender exits repeatedly on one scene.
         """
         return self._pool.map(self._shot, scenes)
 
@@ -147,7 +147,7 @@ class Renderer:
         return shoot(worker, scene, self.points)
 
     def panorama(self, name: str) -> Picture:
-        """(H, W, 3) linear light of a panorama, all around."""
+        """Return the (H, W, 3) linear light of a panorama."""
         _, arrays = self._pool.call(lambda worker: worker.ask({"panorama": name}))
         return np.array(arrays["panorama"], np.float32)
 
@@ -159,21 +159,21 @@ class Renderer:
 
 
 def shoot(worker: Worker, scene: Scene, points: Array) -> Shot:
-    """One shot by one worker.
+    """Render one shot with one worker.
 
     Parameters
     ----------
     worker
-        Renders it.
+        Renders the robots.
     scene
         Camera, robots and look.
     points
-        (N, 3) points whose hull holds a robot, body frame.
+        (N, 3) points whose convex hull contains a robot, body frame.
 
     Raises
     ------
     EOFError, OSError
-        If the worker has died.
+        If the worker has exited.
     """
     camera, robots, look = scene
     layers = {}
@@ -185,14 +185,14 @@ def shoot(worker: Worker, scene: Scene, points: Array) -> Shot:
 
 
 def _cores() -> int:
-    """Cores that this process may use; all, where that cannot be asked (macOS, Windows)."""
+    """Return the number of cores available to this process; all cores on macOS and Windows."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def shipped_lights(python: Path) -> list[Path]:
-    """Panoramas that come with Blender, sorted."""
+    """List the panoramas that ship with Blender, sorted."""
     found = python.parent.parent.glob(
         "lib/python*/site-packages/bpy/*/datafiles/studiolights/world"
     )
@@ -200,29 +200,29 @@ def shipped_lights(python: Path) -> list[Path]:
 
 
 def panoramas_in(folder: Path) -> list[Path]:
-    """Panoramas of a folder, sorted.
+    """List the panoramas of a folder, sorted.
 
     Raises
     ------
     SettingError
-        If there is no folder, or no panorama in it.
+        If the folder does not exist or contains no panorama.
     """
     if not folder.is_dir():
-        raise SettingError(f"no folder {folder} of panoramas. Check lights")
+        raise SettingError(f"no folder {folder} of panoramas. Check the key lights")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PANORAMA_KINDS)
     if not found:
         kinds = ", ".join(PANORAMA_KINDS)
-        raise SettingError(f"{folder} holds no panorama ({kinds}). Choose another for lights")
+        raise SettingError(f"{folder} contains no panorama ({kinds}). Use another for lights")
     return found
 
 
 def _why_not(model: Model, size_m: float) -> str:
-    """What is wrong with robots of this size."""
+    """Return the error text for a robot of this size."""
     limits = f"they must be {SMALLEST_M:g} to {LARGEST_M:g} m"
     if model.path is None:
         return (
             f"the robot that dmrl draws, {model.scale:g} times life size, is {size_m:.3g} m; "
-            f"{limits}. Give the --model that this scale is for, or --scale 1"
+            f"{limits}. Pass the --model of this scale, or use --scale 1"
         )
     return (
         f"--scale {model.scale:g} makes robots of {size_m:.3g} m; {limits}. Change --scale, "
@@ -235,13 +235,13 @@ def _check_model(model: Model) -> None:
         if not model.path.is_file():
             raise SettingError(f"no model {model.path}. Check --model")
         if model.path.suffix.lower() not in MODEL_KINDS:
-            raise SettingError(f"{model.path} is no model. Known: {', '.join(MODEL_KINDS)}")
+            raise SettingError(f"{model.path} is not a model. Use one of {', '.join(MODEL_KINDS)}")
     if not np.isfinite(model.scale) or model.scale <= 0:
-        raise SettingError(f"--scale {model.scale:g} is not over 0. Give metres per unit")
+        raise SettingError(f"--scale {model.scale:g} is not above 0. Pass metres per unit")
 
 
 def _outermost(points: Array) -> Array:
-    """The points that lie farthest in some of many directions: they hold all others, nearly."""
+    """Return the farthest points in 400 directions. Their hull nearly contains all points."""
     k = np.arange(400) + 0.5  # directions on a golden spiral
     z, turn = 1 - 2 * k / 400, np.pi * (1 + 5**0.5) * k
     ring = np.sqrt(1 - z * z)

@@ -1,4 +1,4 @@
-"""The robot alone from four sides, with what is needed to lay its axes and its box over it."""
+"""Preview of the robot model from four sides, with its axes and its box."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from dmrl.rendering.sketch_renderer import Pose
 
 SIDE_PX = 480
 DISTANCE = 12.0
-"""Of the camera, in radii of the robot: sides that lie one behind the other look alike long."""
+"""Distance of the camera, in radii of the robot. A large distance avoids strong perspective."""
 FILLED = 0.68
-"""Share of the picture that a ball about the robot fills: the rest is for the axes."""
+"""Share of the image that the robot's ball fills. The rest leaves room for the axes."""
 AXIS = 1.1
 """Length of the axes, in halves of the box's longest side."""
 GREY = 0.5
@@ -30,23 +30,23 @@ VIEWS = (
     ("from the front", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     ("from above", (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
 )
-"""What each is called, where the camera stands, and what is up in the picture; body frame."""
+"""Name of each view, position of the camera, and the direction that is up; body frame."""
 EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
-"""Corners of a box, by the bits of x, y and z, that an edge joins."""
+"""Pairs of box corners joined by an edge. Corner k has the bits of x, y and z."""
 
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """What a robot is, before any is rendered.
+    """Preview of a robot before rendering.
 
     Parameters
     ----------
     png
-        Picture of it from `VIEWS`, with its axes, its box and its size.
+        Image from all `SIDES`, with axes, box and size.
     size_m
-        Of its box along x, y and z, metres.
+        Size of its box along x, y and z, metres.
     px_wide_at_1_m
-        Its width 1 m before the camera.
+        Width in the image at 1 m from the camera, pixels.
     """
 
     png: bytes
@@ -55,16 +55,16 @@ class Preview:
 
 
 def preview(renderer: Renderer, settings: Settings, camera: Camera) -> Preview:
-    """The settings' robot from all sides, with its size.
+    """Render the settings' robot from all sides, and compute its size.
 
     Parameters
     ----------
     renderer
-        With that robot.
+        Renderer with that robot.
     settings
-        Of the renders.
+        Settings of the images.
     camera
-        Whose renders they are.
+        Camera of the images.
     """
     words = f"{settings.design}, scale {settings.scale:g}"
     if settings.model is not None:
@@ -76,14 +76,14 @@ def preview(renderer: Renderer, settings: Settings, camera: Camera) -> Preview:
 
 
 def views(renderer: Renderer, design: Design) -> Iterator[Side]:
-    """The robot of a renderer, from four sides.
+    """Render the robot from four sides.
 
     Parameters
     ----------
     renderer
-        With the model.
+        Renderer with the model.
     design
-        Whose paint the drawn robot has.
+        Design that provides the paint.
     """
     box = renderer.box
     middle, radius_m = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
@@ -108,7 +108,7 @@ def _pose(
     middle: Array,
     distance_m: float,
 ) -> Pose:
-    """The robot's pose before a camera that looks at the middle of its box."""
+    """Return the robot's pose for a camera that points at the middle of its box."""
     forward = -np.array(towards) / np.linalg.norm(towards)
     left = np.cross(upright, forward)
     left /= np.linalg.norm(left)
@@ -117,14 +117,14 @@ def _pose(
 
 
 def _pixels(points: Array, pose: Pose, camera: Camera) -> Array:
-    """(..., 2) pixels of (..., 3) points of the body."""
+    """Project (..., 3) points of the body to (..., 2) pixels."""
     xyz = points.reshape(-1, 3) @ pose.camera_from_body.T + pose.xyz_camera
     uv, _ = project(xyz, camera.image_from_optical)
     return np.asarray(uv.reshape(*points.shape[:-1], 2))
 
 
 def _look(light: str) -> Look:
-    """A grey wall, and a lamp above the camera's shoulder: shapes show, and nothing is random."""
+    """Return a fixed look: a grey wall, and a lamp above the camera's shoulder."""
     backdrop = np.full((SIDE_PX, SIDE_PX, 3), GREY, np.float32)
     sun = np.array([-1.0, 0.5, 1.0]) / 1.5
     shine = Light(light, (0.0, 0.0, 0.0), 0.5, sun, 2.0, (1.0, 1.0, 1.0), 0.1)

@@ -1,4 +1,4 @@
-"""What a run of renders may look like: every range that poses and looks are drawn from."""
+"""Settings of rendered images: the ranges of all random draws."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -10,7 +10,7 @@ from dmrl.errors import RecipeError
 Range = tuple[float, float]
 
 ANY = (-float("inf"), float("inf"))
-# Least and greatest sensible value of every key that is a number or a range of numbers.
+# Minimum and maximum of every key that is a number or a range of numbers.
 LIMITS: dict[str, Range] = {
     "images": (1, 9_999_999),
     "seed": (0, 2**31 - 1),
@@ -56,40 +56,38 @@ LIMITS: dict[str, Range] = {
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is rendered. A range is drawn from anew for every image.
+    """Settings of rendered images. A range is sampled anew for every image.
 
     Parameters
     ----------
     images
-        Images to render.
+        Number of images.
     seed
-        Another seed renders other images.
+        Seed of all random draws.
     workers
-        Blender processes. 0: as many as there are cores. Changes no byte of the output.
+        Blender processes. 0: one per core. Does not change the output.
     samples
         Light paths per pixel.
     camera
-        aideck: the paper's calibration. published: that of the published renders. Else a TOML
-        file as ``dmrl calibrate`` writes, of any size; its mount and delay are left out.
+        aideck: the paper's calibration. published: that of the published renders. Otherwise a TOML
+        file as written by ``dmrl calibrate``, of any image size; its mount and delay are ignored.
     distorted
         Whether images have the camera's lens distortion.
     design
-        The robot that dmrl draws. crazyflie: with its decks. violet: a bare one in the colours of
-        the published renders.
+        Built-in robot. crazyflie: with its decks. violet: a bare one in the colours of the
+        published renders.
     model
-        .blend, .glb, .obj or .stl of a robot, in place of the drawn one.
+        .blend, .glb, .obj or .stl file of a robot, instead of the built-in one.
     model_up
-        Axis of the model's file that points up. auto: as is usual for its kind, y of .obj and
-        .glb, z of .stl and .blend.
+        Axis of the model's file that points up. auto: y of .obj and .glb, z of .stl and .blend.
     model_centre
-        What of the model its labels are about: the middle of its box, or the file's origin.
+        Reference point of the labels: the middle of the model's box, or the file's origin.
     scale
-        Metres per unit of the model; without a model, times life size.
+        Metres per unit of the model. Without a model, times life size.
     backgrounds
-        Folder of photos, a dataset, or rooms, which are made by code. Without it, what the
-        panoramas show.
+        Folder of photos, a dataset, or rooms for generated rooms. Default: the panoramas.
     lights
-        Folder of panoramas (.exr, .hdr). Without it, those that come with Blender.
+        Folder of panoramas (.exr, .hdr). Default: those that ship with Blender.
     masks
         Whether to write a mask of every robot.
     depths
@@ -97,71 +95,70 @@ class Settings:
     rate_hz
         Images per second of the recording's time.
     test_share
-        Share of images, the last ones, that form the test split, 0 to 1.
+        Share of images in the test split, taken from the end, 0 to 1.
     empty_share
         Share of images without a robot, 0 to 1.
     robots_max
-        Robots in an image, at most; every number is as likely.
+        Robots per image, at most. Every number is equally likely.
     place_u, place_v
-        Range of robots' centres across and down the image, shares of its width and height.
+        Ranges of the robots' centres across and down the image, shares of its width and height.
     depth_m
         Range of depths.
     depth_spacing
-        log: every factor of depth is as likely; linear: every metre.
+        log: log-uniform depths. linear: uniform depths.
     robot_tilt_max_deg
         Roll and pitch of the robots, at most.
     robot_turns
-        Axes of the robots' turns, from the horizontal frame on. zyx: yaw, pitch, roll, as
-        aircraft count. xzy: roll, yaw, pitch, as the authors' script.
+        Order of the robots' rotations, starting from the horizontal frame. zyx: yaw, pitch, roll
+        (aerospace convention). xzy: roll, yaw, pitch, as in the authors' script.
     camera_tilt_max_deg
         Roll and pitch of the camera, at most.
     speed_max_mps
-        Speed of the robots seen from the camera, at most.
+        Speed of the robots relative to the camera, at most.
     shutter_s
-        Range of exposure times, with which speed and shake smear.
+        Range of exposure times, which determine motion blur.
     shake_max_dps
         Turning rate of the camera, at most, degrees per second.
     rotor_speed_rps
         Range of rotor speeds, turns per second.
     rotors_stopped_share
-        Share of robots whose rotors stand still.
+        Share of robots with stopped rotors.
     wear
         Range of wear: worn robots are duller and greyer.
     colour_spread
-        How far colours of parts vary, 0 to 1.
+        Variation of the colours of parts, 0 to 1.
     painted_share
-        Share of robots in two strong colours drawn at random, as of another make. They are called
-        painted2 and so on in place of cf2.
+        Share of robots in two strong random colours, as of another make. They are named painted2
+        and so on instead of cf2.
     light_strength
         Range of the panorama's light on the robots.
     sun_strength
         Range of the sun's or lamp's light on the robots, watts per square metre.
     robot_gain
-        Range of the light of robots over that of the background; every factor is as likely.
+        Range of the robots' light relative to the background, log-uniform.
     robot_blur_px
-        Range of the blur of the robots alone, a standard deviation, pixels: what a renderer's
-        pixel filter does to what it lays over a photo.
+        Range of the blur of the robots alone, a standard deviation, pixels. Models the pixel filter
+        of a renderer that composites over a photo.
     pasted
-        Whether robots are laid over photos as the authors did: the photo keeps its values, and
-        the robots are lit by a lamp at the camera that knows nothing of the photo. Without
-        photos, no.
+        Whether robots are composited over photos as the authors did: the photo keeps its values,
+        and a lamp at the camera lights the robots independently of it. Ignored without photos.
     background_zoom
-        Range of how far photos are zoomed into.
+        Range of zoom factors of the photos.
     recoloured_share
-        Share of photos whose colours are exchanged: leaves may be blue.
+        Share of photos whose colour channels are permuted: leaves may be blue.
     background_contrast
-        Range of the power that the background's light is raised to, about its mean; every factor
-        is as likely. Over 1, its bright places stand out more.
+        Range of the exponent applied to the background's light, relative to its mean, log-uniform.
+        Above 1, bright areas become brighter.
     background_blur_px
         Range of the background's blur, a standard deviation, pixels.
     brightness
-        Range of the mean of the image, 0 to 1.
+        Range of the mean image brightness, 0 to 1.
     contrast_gamma
-        Range of the response: 1 is proportional to light, 2.2 as screens expect.
+        Range of the response exponent: 1 is linear, 2.2 matches screens.
     warmth
-        Range of red over blue; every factor is as likely.
+        Range of the ratio of red to blue, log-uniform.
     saturation
-        Range of how well the sensor tells colours apart, 0 to 1.
+        Range of the sensor's colour separation, 0 to 1.
     vignetting
         Range of light lost in the corners, 0 to 1.
     defocus_px
@@ -173,11 +170,11 @@ class Settings:
     read_noise
         Range of the noise's standard deviation in the dark, full scale 1.
     image_format
-        Of the images in the recording.
+        Encoding of the images in the recording.
     jpeg_quality
         Range of qualities, 1 to 100.
     jpeg_subsampled
-        Whether four pixels share their colour (4:2:0).
+        Whether four pixels share their chroma (4:2:0).
     """
 
     images: int = 1000
@@ -242,7 +239,7 @@ class Settings:
 
 
 def _faults(settings: Settings) -> list[str]:
-    """Every value that is out of its limits, and every range that is upside down."""
+    """List all values outside their limits and all reversed ranges."""
     faults = []
     for key in fields(settings):
         low, high = LIMITS.get(key.name, ANY)
@@ -257,7 +254,7 @@ def _faults(settings: Settings) -> list[str]:
     return faults
 
 
-# Defaults of a recipe that says `preset`; its own keys come before them.
+# Defaults by the recipe's key `preset`. The recipe's other keys override them.
 PRESETS: dict[str, dict[str, Any]] = {
     # The HM01B0 of the AI-deck: raw response, no white balance, small lens.
     "himax": {
@@ -278,9 +275,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "bayer": True,
         "shot_noise": [0.0001, 0.001],
         "read_noise": [0.001, 0.005],
-        "jpeg_quality": [98, 100],  # below, JPEG makes the grain as coarse as it is not
+        "jpeg_quality": [98, 100],  # below, JPEG makes noise coarser than that of real images
     },
-    # The authors' renders: f = 120 px about the middle, twice life size, a clean camera.
+    # The authors' renders: f = 120 px, centred, robots at twice life size, a clean camera.
     "published": {
         "camera": "published",
         "distorted": False,
@@ -309,12 +306,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def filled(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of a recipe over those of its preset.
+    """Merge a recipe's keys over those of its preset.
 
     Raises
     ------
     RecipeError
-        If there is no such preset.
+        If the preset does not exist.
     """
     own = dict(keys)
     preset = own.pop("preset", "plain")

@@ -1,6 +1,6 @@
-"""One picture with its exact labels: camera, robots and look in, pixels and truth out.
+"""Rendered shots: scene description, requests to a worker, and the image with exact labels.
 
-Nothing here is random but the sensor's noise, which is keyed by the look's seed.
+The only randomness here is the sensor's noise, which depends on the look's seed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,23 +16,23 @@ from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.sketch_renderer import Pose
 
 Part = tuple[slice, slice]
-"""Rows and columns of a picture."""
+"""Rows and columns of an image."""
 PAD_PX = 1
 NEAREST_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What shines on the robots.
+    """Light on the robots.
 
     Parameters
     ----------
     name
-        Panorama: a file the renderer was started with.
+        Panorama: a file that the renderer was started with.
     turn_rad
-        Roll and pitch of the camera, and the panorama's turn about the vertical.
+        Roll and pitch of the camera, and the panorama's rotation about the vertical.
     strength
-        Of the panorama; 1: as it was photographed.
+        Strength of the panorama, 1 for its photographed light.
     sun_camera
         (3,) unit vector towards the sun or lamp, camera frame.
     sun_strength
@@ -40,9 +40,9 @@ class Light:
     sun_colour
         Red, green, blue.
     sun_angle_rad
-        Apparent size: large is soft.
+        Apparent size. A large sun casts soft shadows.
     sun_shadow
-        Whether parts of a robot shade others from it.
+        Whether parts of a robot cast shadows from the sun.
     """
 
     name: str
@@ -57,18 +57,18 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot before the camera.
+    """Robot in front of the camera.
 
     Parameters
     ----------
     pose
-        At the middle of the exposure.
+        Pose at the middle of the exposure.
     paint
-        Properties of its materials, as the worker's shaders read them.
+        Properties of its materials, as read by the worker's shaders.
     move_camera_m
-        (3,) how far it moves in the camera frame while the shutter is open, metres.
+        (3,) displacement in the camera frame during the exposure, metres.
     make
-        What it is called, before its number.
+        Prefix of its name, before the number.
     """
 
     pose: Pose
@@ -79,22 +79,22 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Everything that changes pixels and no label.
+    """Appearance of a scene: everything that changes pixels but no label.
 
     Parameters
     ----------
     backdrop
         (H, W, 3) linear light behind the robots.
     light
-        What shines on the robots.
+        Light on the robots.
     sensor
-        What the camera makes of it.
+        Response of the camera.
     robot_gain
-        Light of the robots over that of the backdrop.
+        Light of the robots relative to the backdrop.
     robot_blur_px
         Blur of the robots alone, a standard deviation, pixels.
     seed
-        Of the renderer's and the sensor's noise.
+        Seed of the renderer's and the sensor's noise.
     """
 
     backdrop: Picture
@@ -107,25 +107,24 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """A picture and its exact labels, robots in the order in which they were given.
+    """Image with exact labels. Arrays follow the order of the robots.
 
     Parameters
     ----------
     rgb
         (H, W, 3) uint8.
     uv_px
-        (N, 2) pixels of the robots' centres, with the camera's distortion; NaN where its lens
-        shows nothing.
+        (N, 2) pixels of the robots' centres, distorted. NaN where the lens cannot project them.
     depth_m
         (N,) distance of the centres along camera x.
     box_px
-        (N, 4) left, top, right, bottom of the visible part; NaN where nothing is visible.
+        (N, 4) left, top, right, bottom of the visible part. NaN where nothing is visible.
     visible_share
         (N,) share of a robot's opacity in the image that no nearer robot hides.
     opacity
         (N, H, W) uint8, visible opacity of each robot, without blur.
     surface_m
-        (H, W) distance of the nearest surface along camera x; 0 where there is no robot.
+        (H, W) distance of the nearest surface along camera x, 0 where there is no robot.
     """
 
     rgb: NDArray[np.uint8]
@@ -139,7 +138,7 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """One robot alone on the canvas: premultiplied light and opacity, and depth, of a crop."""
+    """One robot rendered alone: premultiplied light, opacity and depth of a crop of the canvas."""
 
     left_px: int
     top_px: int
@@ -148,22 +147,22 @@ class Layer:
 
     @property
     def part(self) -> Part:
-        """Rows and columns of the canvas that it covers."""
+        """Rows and columns of the canvas that the layer covers."""
         height, width = self.depth_m.shape
         return np.s_[self.top_px : self.top_px + height, self.left_px : self.left_px + width]
 
 
 def crop_of(canvas: Canvas, pose: Pose, points: Array) -> tuple[int, int, int, int] | None:
-    """Left, top, right, bottom of the part of the canvas that can show a robot; None if none.
+    """Return left, top, right, bottom of the canvas region that can show a robot, or None.
 
     Parameters
     ----------
     canvas
-        Of the camera.
+        Canvas of the camera.
     pose
-        Of the robot.
+        Pose of the robot.
     points
-        (N, 3) points whose convex hull holds the robot, body frame.
+        (N, 3) points whose convex hull contains the robot, body frame.
     """
     limit = np.array([canvas.pinhole.width_px, canvas.pinhole.height_px])
     xyz = points @ pose.camera_from_body.T + pose.xyz_camera
@@ -182,7 +181,7 @@ def crop_of(canvas: Canvas, pose: Pose, points: Array) -> tuple[int, int, int, i
 def request(
     canvas: Canvas, crop: tuple[int, int, int, int], robot: Robot, look: Look, number: int
 ) -> dict[str, Any]:
-    """What a worker is asked for one robot."""
+    """Build a worker's request for one robot."""
     camera = canvas.pinhole
     light = look.light
     matrix = np.eye(4)
@@ -206,7 +205,7 @@ def request(
 
 
 def _pointing(towards: Array) -> Array:
-    """(4, 4) rotation whose z axis points that way."""
+    """Return a (4, 4) rotation whose z axis points towards ``towards``."""
     aside = np.cross(towards, (0.0, 0.0, 1.0) if abs(towards[2]) < 0.9 else (1.0, 0.0, 0.0))
     aside /= np.linalg.norm(aside)
     matrix = np.eye(4)
@@ -217,14 +216,14 @@ def _pointing(towards: Array) -> Array:
 def requests(
     camera: Camera, robots: Sequence[Robot], look: Look, points: Array
 ) -> list[tuple[int, dict[str, Any]]]:
-    """Number of every robot that can be seen, and what a worker is asked for it.
+    """Build the requests for all robots that can be visible, with their indices.
 
     Parameters
     ----------
     camera, robots, look
         The scene.
     points
-        (N, 3) points whose convex hull holds a robot, body frame.
+        (N, 3) points whose convex hull contains a robot, body frame.
     """
     canvas = canvas_of(camera)
     crops = [crop_of(canvas, robot.pose, points) for robot in robots]

@@ -1,7 +1,7 @@
-"""Pictures of small quadrotors, drawn by code in milliseconds: poses in, pixels out.
+"""Fast sketches of small quadrotors, without Blender: poses in, images out, in milliseconds.
 
-For demonstrations and tests, where labels must be exact and nothing can be downloaded. The
-same camera, poses and look give the same picture; ``scene`` draws them at random.
+Used for demonstrations and tests, which need exact labels and no downloads. The same camera,
+poses and look give the same image. ``sketch_scene`` draws them at random.
 """
 
 from collections.abc import Sequence
@@ -17,16 +17,16 @@ from dmrl.rendering.robots import quadrotor
 SEEN = 1 / 255
 """Opacity from which a pixel counts as covered by a robot."""
 BRIGHTEST = 2.0
-"""Of a robot in strong light."""
+"""Maximum brightness of a robot in strong light."""
 CURVE_STEPS = 255 * 16 + 1
-"""Of the light that a sensor tells apart: fine enough for 255 levels at any gamma."""
+"""Input levels of the gamma curve. Fine enough for 255 output levels at any gamma."""
 SMALLEST_FACE_PX2 = 0.1
-"""Faces that cover less of a pixel are not drawn: far robots have many."""
+"""Minimum area of a drawn face, square pixels. Distant robots have many smaller ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a robot is in front of the camera.
+    """Pose of a robot in the camera frame.
 
     Parameters
     ----------
@@ -42,34 +42,34 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Everything that changes pixels and no label.
+    """Appearance of a sketch: everything that changes pixels but no label.
 
     Parameters
     ----------
     background
-        (H, W, 3) uint8, what is behind the robots.
+        (H, W, 3) uint8, background of the robots.
     light_camera
         (3,) unit vector to the light, camera frame.
     ambient
-        Light from everywhere, 0 to 1; the rest comes from the light.
+        Share of ambient light, 0 to 1. The rest comes from the light.
     shine
         (3,) colour of the light on the robots.
     rotor_opacity
-        Of what the rotors sweep.
+        Opacity of the discs that the rotors sweep.
     blade_rad
-        How far the rotors have turned.
+        Angle of the rotors.
     blur
-        0: sharp; 1: every pixel the mean of a 3x3 neighbourhood.
+        0: sharp. 1: every pixel is the mean of a 3x3 neighbourhood.
     vignette
         Light lost in the corners, 0 to 1.
     gain
         (3,) exposure and white balance.
     gamma
-        Over 1 darkens the middle tones.
+        Above 1, middle tones become darker.
     noise_deviation
-        How strong the noise is, by the brightest level.
+        Standard deviation of the noise, relative to the brightest level.
     noise
-        (H, W, 3) of deviation 1, added last.
+        (H, W, 3) noise of standard deviation 1, added last.
     """
 
     background: Levels
@@ -88,7 +88,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Sketch:
-    """A picture and its exact labels.
+    """Image with exact labels.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Sketch:
     depth_m
         (N,) distance of the centres along camera x.
     box_px
-        (N, 4) left, top, right, bottom of the visible part; NaN where nothing is visible.
+        (N, 4) left, top, right, bottom of the visible part. NaN where nothing is visible.
     visible_share
         (N,) share of a robot's pixels in the image that no nearer robot hides.
     """
@@ -112,12 +112,12 @@ class Sketch:
 
 
 def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
-    """The picture of robots in front of a camera, with its labels.
+    """Draw robots in front of a camera, and return the image with its labels.
 
     Parameters
     ----------
     camera
-        Without distortion.
+        Camera without distortion.
     poses
         One per robot, in any order.
     look
@@ -126,10 +126,10 @@ def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
     Raises
     ------
     ValueError
-        If the camera has distortion, or a robot is not wholly in front of it.
+        If the camera has distortion, or a robot is not entirely in front of it.
     """
     if any(camera.distortion):
-        raise ValueError("sketches are drawn without distortion; give a camera without")
+        raise ValueError("sketches have no distortion. Pass a camera without distortion")
     xyz = np.array([pose.xyz_camera for pose in poses]).reshape(-1, 3)
     uv_px, depth_m = project(xyz, camera.image_from_optical)
     levels = look.background.copy()
@@ -149,7 +149,7 @@ def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
 
 
 def _visible(canvas: Canvas, opacity: Picture, clear: Picture) -> tuple[Array, float]:
-    """Box and share of what is seen of a robot behind others."""
+    """Return the bounding box and the share of a robot's visible part."""
     rows, cols = np.nonzero(opacity * clear >= SEEN)
     if not rows.size:
         return np.full(4, np.nan), 0.0
@@ -160,7 +160,7 @@ def _visible(canvas: Canvas, opacity: Picture, clear: Picture) -> tuple[Array, f
 
 @dataclass(frozen=True, slots=True)
 class _Outlines:
-    """Flat parts of one kind: pixels (F, K, 2), distance (F,), colours (F, 3), opacity."""
+    """Projected polygons of one kind: pixels (F, K, 2), distance (F,), colours (F, 3), opacity."""
 
     uv_px: Array
     distance_m: Array
@@ -178,7 +178,7 @@ def _outlines(
 
 
 def _robot(camera: Camera, pose: Pose, look: Look) -> Canvas | None:
-    """One robot alone, on a canvas just large enough; None if it is not in the image."""
+    """Draw one robot on a canvas of minimal size, or return None if it is outside the image."""
     dark = np.tile(0.08 * look.shine, (4, 1))
     blades = quadrotor.blades(look.blade_rad)
     groups = (
@@ -203,23 +203,23 @@ def _robot(camera: Camera, pose: Pose, look: Look) -> Canvas | None:
 
 
 def _body(camera: Camera, pose: Pose, look: Look) -> _Outlines:
-    """Faces of the body that are turned to the camera and large enough to see, lit."""
+    """Project and light the body's faces that point to the camera and are large enough."""
     mesh = quadrotor.MESH
     lit = np.maximum(mesh.normals @ pose.camera_from_body.T @ look.light_camera, 0)
     lit = look.shine * (look.ambient + (1 - look.ambient) * lit)[:, None]
     colours = mesh.colours * np.where(mesh.glows[:, None], 1.0, lit)
     faces = _outlines(camera, pose, mesh.corners, colours, 1.0)
     across = faces.uv_px[:, 2:] - faces.uv_px[:, :2]  # the two diagonals of each face
-    # Corners run the other way round in the image when a face is seen from inside.
+    # The corners' order in the image is reversed for faces that point away from the camera.
     area_px2 = (across[:, 0, 1] * across[:, 1, 0] - across[:, 0, 0] * across[:, 1, 1]) / 2
     seen = area_px2 >= SMALLEST_FACE_PX2
     return _Outlines(faces.uv_px[seen], faces.distance_m[seen], colours[seen], 1.0)
 
 
 def _sensor(levels: Levels, look: Look) -> Levels:
-    """What a small camera makes of the light that reaches it, (H, W, 3) uint8."""
+    """Apply the sensor's blur, vignetting, gain, gamma and noise. Return (H, W, 3) uint8."""
     height, width, _ = levels.shape
-    # Gain and vignette come before the curve of gamma: each is a power of its own after it.
+    # Gain and vignetting precede gamma: applied after it, each is raised to that power.
     v = np.linspace(-1, 1, height)[:, None] ** 2
     u = np.linspace(-1, 1, width)[:, None] ** 2
     dim_v = ((1 - look.vignette / 2 * v) ** look.gamma).astype(np.float32)
@@ -229,11 +229,11 @@ def _sensor(levels: Levels, look: Look) -> Levels:
     noise = look.noise.reshape(height, -1)
     deviation = np.float32(255 * look.noise_deviation)
     flat = levels.reshape(height, -1)
-    flat = np.concatenate([flat[:1], flat, flat[-1:]])  # beyond the border it is repeated
+    flat = np.concatenate([flat[:1], flat, flat[-1:]])  # repeat the border rows
     out = np.empty((height, 3 * width), np.uint8)
     for rows in bands(height):
         near = flat[rows.start : rows.stop + 2]
-        band = curve.take(_blurred(near, look.blur), mode="clip")  # that looks at no index twice
+        band = curve.take(_blurred(near, look.blur), mode="clip")  # "clip" skips index checks
         band *= gain
         band *= dim_v[rows]
         grains = noise[rows] * deviation
@@ -244,9 +244,9 @@ def _sensor(levels: Levels, look: Look) -> Levels:
 
 
 def _blurred(near: Levels, blur: float) -> NDArray[np.intp]:
-    """Rows in steps of the curve, of 16 each level, mixed with the mean of 3 x 3 pixels.
+    """Combine rows with their 3 x 3 mean, and return indices of the curve, 16 per level.
 
-    ``near`` has the rows above and below as well. Beyond the sides the border is repeated.
+    ``near`` also has the rows above and below. The border columns are repeated.
     """
     around = round(blur * 256 / 9)
     middle = near[1:-1].astype(np.uint16)

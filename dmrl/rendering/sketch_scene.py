@@ -1,4 +1,4 @@
-"""Random poses and looks for sketches."""
+"""Random poses and looks of sketches."""
 
 from functools import cache
 
@@ -17,19 +17,19 @@ TRIES = 30
 
 
 def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
-    """At most ``count`` robots, uniform over the image, log-uniform in depth 0.2 to 2 m.
+    """Draw at most ``count`` poses, uniform over the image, log-uniform in depth, 0.2 to 2 m.
 
-    Robots keep apart in the image, so that none hides the centre of another; where there
-    is no room for one more, there are fewer.
+    No robot hides the centre of another. Where there is no room for another robot, the result
+    has fewer poses.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
+        Random generator.
     camera
-        Its image is filled.
+        Camera whose image is filled.
     count
-        Robots wanted.
+        Requested number of robots.
     """
     tilt = camera_from_horizontal(*rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist())
     poses: list[Pose] = []
@@ -51,7 +51,7 @@ def _place(rng: Generator, camera: Camera) -> Array:
 
 
 def _attitude(rng: Generator) -> Array:
-    """Rotation horizontal_from_body: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Draw the rotation horizontal_from_body: Rz(yaw) Ry(pitch) Rx(roll)."""
     roll, pitch = rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist()
     yaw = rng.uniform(-np.pi, np.pi)
     c, s = np.cos(yaw), np.sin(yaw)
@@ -60,20 +60,20 @@ def _attitude(rng: Generator) -> Array:
 
 
 def _apart(one: Array, other: Array) -> bool:
-    """Whether neither hides the other's centre, and they do not touch."""
+    """Return whether two robots do not touch and neither hides the other's centre."""
     slope = np.hypot(*(one[1:] / one[0] - other[1:] / other[0]))
     return bool(slope > RADIUS_M / min(one[0], other[0]))
 
 
 def random_look(rng: Generator, camera: Camera) -> Look:
-    """Background, light and sensor at random.
+    """Draw background, light and sensor.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
+        Random generator.
     camera
-        Gives the size of the picture.
+        Camera with the size of the image.
     """
     size = camera.width_px, camera.height_px
     towards = rng.normal((0.0, 0.0, 1.5), 1.0)
@@ -96,6 +96,6 @@ def random_look(rng: Generator, camera: Camera) -> Look:
 
 @cache
 def _static(width_px: int, height_px: int) -> Picture:
-    """(2 H, 2 W * 3) grey white noise; every picture shows a window of it."""
+    """Return (2 H, 2 W * 3) grey white noise. Every image uses a random window of it."""
     rng = np.random.default_rng(0)
     return rng.standard_normal((2 * height_px, 2 * width_px), np.float32).repeat(3, axis=1)

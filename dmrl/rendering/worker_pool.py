@@ -1,4 +1,4 @@
-"""Blender processes that render robots, replaced when they die."""
+"""Pool of Blender worker processes, which are replaced when they exit."""
 
 import subprocess
 import threading
@@ -17,7 +17,7 @@ from dmrl.rendering.blender.protocol import Arrays, receive, send
 WORKER = Path(__file__).parent / "blender" / "worker.py"
 TRIES = 3
 AHEAD = 4
-"""Jobs under way or waiting to be taken, for each worker."""
+"""Jobs in progress or waiting for the caller, per worker."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -25,12 +25,12 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a worker is told first.
+    """First message to a worker.
 
     Parameters
     ----------
     python
-        Of Blender's environment.
+        Python of Blender's environment.
     head, arrays
         The model, the panoramas and the quality.
     """
@@ -41,17 +41,17 @@ class Start:
 
 
 class Worker:
-    """One Blender process with a robot in its scene.
+    """A Blender process with one robot in its scene.
 
     Parameters
     ----------
     start
-        What it is told first.
+        First message.
 
     Raises
     ------
     BlenderError
-        If it does not start, or cannot use the model: says why.
+        If the process does not start, or cannot use the model. Contains the reason.
     """
 
     def __init__(self, start: Start) -> None:
@@ -79,16 +79,16 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
+        """Process id."""
         return self._process.pid
 
     def ask(self, head: dict[str, Any], arrays: Arrays | None = None) -> tuple[Any, Arrays]:
-        """What the worker answers.
+        """Send a request and return the reply.
 
         Raises
         ------
         EOFError, OSError
-            If it has died.
+            If the process has exited.
         """
         assert self._process.stdin is not None and self._process.stdout is not None
         send(self._process.stdin, head, arrays)
@@ -101,12 +101,12 @@ class Worker:
                 self._last_words.append(line)
 
     def why(self) -> str:
-        """What it said last, or how it ended."""
+        """Return its last line on standard error, or its exit status."""
         words = self._last_words[-1].decode(errors="replace").strip() if self._last_words else ""
         return words or f"exit {self._process.poll()}"
 
     def close(self) -> None:
-        """End the process."""
+        """Stop the process."""
         self._process.kill()
         self._process.wait()
         self._listener.join()
@@ -114,7 +114,7 @@ class Worker:
             if stream is not None:
                 try:
                     stream.close()
-                except BrokenPipeError:  # what it never read is of no use to it now
+                except BrokenPipeError:  # unread requests do not matter any more
                     continue
 
 
@@ -122,12 +122,12 @@ HINT = "Try: dmrl render --setup"
 
 
 class Pool:
-    """Workers that take jobs as they come free; results keep the order of the tasks.
+    """Workers that run jobs as they become free. Results keep the order of the tasks.
 
     Parameters
     ----------
     start
-        What every worker is told first.
+        First message to every worker.
     count
         Number of workers.
 
@@ -147,7 +147,7 @@ class Pool:
         self.version, self.points = first.version, first.points
         self._idle.put(first)
         for _ in range(count - 1):
-            self._idle.put(None)  # started by the first job that takes it
+            self._idle.put(None)  # the first job that takes it starts the worker
         self._threads = ThreadPoolExecutor(count)
         self.replaced = 0
 
@@ -162,16 +162,16 @@ class Pool:
 
     @property
     def pids(self) -> list[int]:
-        """Numbers of the processes."""
+        """Process ids of all workers."""
         return [worker.pid for worker in self._all]
 
     def call(self, job: Callable[[Worker], Result]) -> Result:
-        """What ``job`` makes of a worker; asked again of a new one if that dies.
+        """Run ``job`` with a free worker. Retry it with a new one if the worker exits.
 
         Raises
         ------
         BlenderError
-            If three workers died of it.
+            If three workers exited during the job.
         """
         worker = self._idle.get()
         why = ""
@@ -194,11 +194,11 @@ class Pool:
             self._idle.put(worker)
         raise BlenderError(
             f"Blender died {TRIES} times on one image: {why}. Free memory, use fewer --workers, "
-            "or set Blender up anew"
+            "or set up Blender again"
         )
 
     def map(self, job: Callable[[Worker, Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
-        """Results of all tasks, in their order; few are under way or waiting at a time.
+        """Yield the results of all tasks, in their order, with few in progress at a time.
 
         Raises
         ------
@@ -219,7 +219,7 @@ class Pool:
     def __exit__(self, *_: object) -> None:
         self._threads.shutdown(wait=False, cancel_futures=True)
         with self._lock:
-            self._closed = True  # who starts one from now on ends it itself
+            self._closed = True  # from now on _start_worker closes what it starts
             workers = list(self._all)
         for worker in workers:
             worker.close()

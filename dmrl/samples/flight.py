@@ -1,6 +1,6 @@
-"""Samples of a flight: what robots measure of themselves, of each other, and the truth.
+"""Samples of a flight: measurements of robots and of their peers, and the true positions.
 
-Time goes in as (N,) int64 nanoseconds, values as (N,) arrays.
+Times are (N,) int64 nanoseconds, values (N,) arrays.
 """
 
 import heapq
@@ -26,29 +26,29 @@ LOG_COLUMNS = (
     "vy_mps",
     "height_m",
 )
-"""What a robot's log holds, as ``robot_log`` wants it."""
+"""Columns of a robot's log, as ``iter_robot_log`` needs them."""
 
 EXACT = [0.0] * 9
 STRETCH = 256
-"""Rows that become Python's numbers at a time: as such they take ten times the memory."""
+"""Rows converted to Python numbers at a time, which take ten times the memory of an array."""
 
 
 def stretches(count: int) -> Iterator[slice]:
-    """Rows of a column, so few at a time that hundreds of streams hold little."""
+    """Yield slices of a column, short enough for hundreds of streams in memory."""
     return (slice(first, first + STRETCH) for first in range(0, count, STRETCH))
 
 
 def rows_of(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
-    """Python's numbers of (N,) columns side by side, made a stretch at a time."""
+    """Yield rows of Python numbers from (N,) columns, converted slice by slice."""
     for part in stretches(len(columns[0])):
         yield from zip(*(column[part].tolist() for column in columns), strict=True)
 
 
 def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
-    """Attitude, velocity and height of one robot, three samples per time.
+    """Yield attitude, velocity and height of one robot, three samples per time.
 
-    A sensor whose values are not all finite has no sample at that time. The yaw of the attitude
-    is the integral of the yaw rate, from 0 at the first time, gaps bridged.
+    A sensor whose values are not all finite has no sample at that time. The yaw of the attitude is
+    the integral of the yaw rate, from 0 at the first time, interpolated over gaps.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Itera
 
 
 def ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sample]:
-    """UWB distances that a robot measured to a peer."""
+    """Yield UWB distances that a robot measured to a peer."""
     topic = topics.uwb_range(robot, peer)
     for moment, value in rows_of(time_ns, range_m):
         yield Sample(moment, topic, "UwbRange", {"range_m": value})
@@ -88,7 +88,7 @@ def ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sa
 def sensor(
     topic: str, message: str, time_ns: Times, columns: Mapping[str, Array]
 ) -> Iterator[Sample]:
-    """What a sensor said, where all of its (N,) columns are numbers; named as the fields."""
+    """Yield the messages of a sensor where all of its (N,) columns, named as fields, are finite."""
     values = np.stack(list(columns.values()), axis=1)
     known = np.isfinite(values).all(axis=1)
     for moment, *row in rows_of(time_ns[known], *values[known].T):
@@ -96,7 +96,7 @@ def sensor(
 
 
 def truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[Sample]:
-    """Exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
+    """Yield exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
     topic, frame = topics.truth(robot, peer), f"{robot}/horizontal"
     for moment, x, y, z in rows_of(time_ns, *xyz_m.T):
         fields = {"frame_id": frame, "x": x, "y": y, "z": z, "covariance": EXACT}
@@ -114,9 +114,9 @@ class Placed:
 
 
 def transforms(time_ns: int, robots: Mapping[str, Placed]) -> Sample:
-    """The horizontal, camera and optical frames of robots, as foxglove.FrameTransforms.
+    """Build the horizontal, camera and optical frames of robots, as foxglove.FrameTransforms.
 
-    The camera is taken to be at the robot's centre, looking along its x.
+    The camera is assumed at the robot's centre, with its axis along the robot's x.
     """
     seconds, nanos = divmod(time_ns, 1_000_000_000)
     frames = [
@@ -148,17 +148,17 @@ def _frames(robot: str, placed: Placed) -> Iterator[dict[str, Any]]:
 
 
 def in_order(streams: Iterable[Iterable[Sample]]) -> Iterator[Sample]:
-    """Samples of several streams, each in time order, in time order."""
+    """Merge several streams, each in time order, into one in time order."""
     return heapq.merge(*streams, key=lambda sample: sample.time_ns)
 
 
 def nanoseconds(time_s: Array) -> Times:
-    """(N,) seconds as whole nanoseconds."""
+    """Convert (N,) seconds to whole nanoseconds."""
     return np.rint(time_s * 1e9).astype(np.int64)
 
 
 def from_poses(time_s: Array, xy_m: Array, yaw_rad: Array) -> dict[str, Array]:
-    """The log of a robot on level ground that moved like this, by central differences.
+    """Return the log of a robot that moved like this on level ground, by central differences.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def from_poses(time_s: Array, xy_m: Array, yaw_rad: Array) -> dict[str, Array]:
     xy_m
         (N, 2) world frame.
     yaw_rad
-        (N,) against world x; may be wrapped.
+        (N,) relative to world x; may be wrapped.
     """
     yaw = np.unwrap(yaw_rad)
     vx, vy = np.gradient(xy_m, time_s, axis=0).T

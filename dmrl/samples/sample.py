@@ -1,4 +1,4 @@
-"""A sample: a message by its fields, not built yet, as every format and simulation gives it."""
+"""A sample: the fields of a message that is not built yet, as formats and simulations yield it."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,20 +16,20 @@ Intervals = dict[str, list[tuple[int, int]]]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One message to be.
+    """One message that is not built yet.
 
     Parameters
     ----------
     time_ns
         Log time: the sensor's, nanoseconds.
     topic
-        Where it goes.
+        Topic of the message.
     message
-        The message, as ``dmrl.messages.message`` takes it: its name, or variables of a log.
+        Type for ``dmrl.messages.message_class``: its name, or the variables of a log.
     fields
         Its fields; a nested message is a mapping, a repeated one a list of mappings.
     publish_ns
-        When it was received, nanoseconds; None: not known, the log time stands for it.
+        Time of reception, nanoseconds; None: unknown, the log time replaces it.
     """
 
     time_ns: int
@@ -46,7 +46,7 @@ class Columns:
     Parameters
     ----------
     topic, message
-        As of a `Sample`.
+        See `Sample`.
     time_ns
         (N,) log times, nanoseconds.
     fields
@@ -64,13 +64,13 @@ class Columns:
             yield Sample(moment, self.topic, self.message, fields)
 
     def between(self, first_ns: int, end_ns: int) -> "Columns":
-        """Those of log times in [first_ns, end_ns)."""
+        """Return the samples with log times in [first_ns, end_ns)."""
         there = (self.time_ns >= first_ns) & (self.time_ns < end_ns)
         return replace(self, time_ns=self.time_ns[there], fields=_taken(self.fields, there))
 
 
 def _rows(fields: Mapping[str, Any], count: int) -> Iterator[dict[str, Any]]:
-    """Fields of one sample after another."""
+    """Yield the fields of one sample after another."""
     columns: list[Iterable[Any]] = []
     for value in fields.values():
         if isinstance(value, Mapping):
@@ -95,7 +95,7 @@ def _taken(fields: Mapping[str, Any], there: NDArray[np.bool_]) -> dict[str, Any
 
 
 def intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:
-    """Inclusive intervals of log time in which every moment has the same split.
+    """Return inclusive intervals of log time in which every moment has the same split.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _stamp(time_ns: int) -> dict[str, int]:
 
 
 def image(time_ns: int, robot: str, data: bytes, kind: str) -> Sample:
-    """An encoded picture as foxglove.CompressedImage.
+    """Build a sample of an encoded image, as foxglove.CompressedImage.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def image(time_ns: int, robot: str, data: bytes, kind: str) -> Sample:
     robot
         Robot that carries the camera.
     data
-        The encoded picture.
+        The encoded image.
     kind
         "png" or "jpeg".
     """
@@ -147,10 +147,10 @@ def image(time_ns: int, robot: str, data: bytes, kind: str) -> Sample:
 
 
 def calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
-    """A camera as foxglove.CameraCalibration, K and P in pixel-edge coordinates.
+    """Build a sample of a camera, as foxglove.CameraCalibration, K and P in pixel-edge coordinates.
 
-    Pixel-edge means that cx and cy are 0.5 px more than in OpenCV, whose first pixel has
-    its centre at (0, 0).
+    In pixel-edge coordinates, cx and cy are 0.5 px larger than in OpenCV, where the centre of the
+    first pixel is (0, 0).
     """
     k = camera.image_from_optical
     fields = {
@@ -170,6 +170,6 @@ def calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
 def labels(
     time_ns: int, robot: str, peers: Sequence[Mapping[str, Any]], sources: Iterable[str]
 ) -> Sample:
-    """All peers of one picture as PeerLabels, and who looked; no peers: "none in view"."""
+    """Build the PeerLabels of one image with the labellers as sources; no peers: "none in view"."""
     fields = {"peers": list(peers), "sources": sorted(sources)}
     return Sample(time_ns, topics.labels(robot), "PeerLabels", fields)

@@ -1,7 +1,7 @@
-"""Files that lie in a bucket: read by ranges, written whole or not at all.
+"""Read files in a bucket by byte ranges, and upload outputs atomically.
 
-`path_of` makes a path of what a user names: of ``s3://bucket/a.mcap`` a `Remote`, which answers
-as a path does. Who opens one by its name, as a library does, gets a copy on this machine.
+`to_path` turns a name such as ``s3://bucket/a.mcap`` into a `RemotePath`, which has the interface
+of `pathlib.Path`. A library that opens it by name gets a local copy.
 """
 
 from dmrl.storage.remote import SCHEMES, Remote, path_of

@@ -1,7 +1,7 @@
-"""A path to a file or folder in a bucket, which answers as one of this machine's does.
+"""Define a path to a file or folder in a bucket with the interface of `pathlib.Path`.
 
-Listings, sizes and times come from the server. Opened with `Remote.open` it is read by ranges. A
-library that opens it by its name (`os.fspath`) gets a copy, kept as long as this process.
+Listings, sizes and times come from the server. `RemotePath.open` reads by byte ranges. A library
+that opens it by name (`os.fspath`) gets a local copy, which is kept until this process ends.
 """
 
 import hashlib
@@ -22,33 +22,33 @@ from dmrl.storage.remote_stream import STEP_BYTES, Ranged
 from dmrl.storage.system import system, told
 
 SCHEMES = ("s3", "gs", "gcs", "az", "abfs", "http", "https")
-"""What a name begins with, before ``://``."""
+"""Schemes of a remote name, before ``://``."""
 UNFINISHED = ".dmrl-unfinished"
-"""Stands in a folder while it is written: what has it is not whole, and not there."""
+"""Mark in a folder that is being written. A folder with it counts as missing."""
 VERSION = "?versionId="
-"""What s3fs takes for an end of the key."""
+"""Text that s3fs interprets as the end of a key."""
 METADATA = "dmrl-sha256"
-"""Of an object that dmrl wrote: its hash, so that nobody has to read it for that."""
+"""Metadata key of an object that dmrl wrote, with its hash, so that no reader has to compute it."""
 
 
 class Remote(PosixPath):
-    """A path such as ``s3://bucket/key``; what is relative to one is plain again."""
+    """A path such as ``s3://bucket/key``. Paths relative to one are plain paths."""
 
     @property
     def scheme(self) -> str:
-        """What it begins with, such as "s3"; empty: it is part of a path."""
+        """Scheme, such as "s3"; empty for a part of a path."""
         head = self.parts[0] if self.parts else ""
         return head[:-1] if head[:-1] in SCHEMES and head.endswith(":") else ""
 
     @property
     def key(self) -> str:
-        """Its name in the file system of its scheme."""
+        """Name in the file system of its scheme."""
         rest = "/".join(self.parts[1:])
         return f"{self.scheme}://{rest}" if self.scheme.startswith("http") else rest
 
     @property
     def bucket(self) -> "Remote":
-        """The bucket that it lies in."""
+        """The bucket of this path."""
         return type(self)(*self.parts[:2])
 
     def __str__(self) -> str:
@@ -64,7 +64,7 @@ class Remote(PosixPath):
             return found
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """Size and times; its inode is a hash of what the server calls this version of it."""
+        """Return size and times. The inode is a hash of the server's version tag."""
         info = self._info()
         kind = stat.S_IFDIR if info["type"] == "directory" else stat.S_IFREG
         when = info.get("LastModified") or info.get("updated") or info.get("mtime") or 0
@@ -79,18 +79,18 @@ class Remote(PosixPath):
         )
 
     def exists(self, **_: Any) -> bool:
-        """Whether it is there, and whole."""
+        """Return whether the file, or a complete folder, exists."""
         return self.is_file() or self.is_dir()
 
     def is_file(self) -> bool:
-        """Whether it is an object."""
+        """Return whether the path is an object."""
         try:
             return bool(self._info()["type"] == "file")
         except FileNotFoundError:
             return False
 
     def is_dir(self) -> bool:
-        """Whether there is something below it, and it is whole."""
+        """Return whether objects exist below the path, and the folder is complete."""
         try:
             there = self._info()["type"] == "directory"
         except FileNotFoundError:
@@ -98,29 +98,28 @@ class Remote(PosixPath):
         return there and not (self / UNFINISHED).is_file()
 
     def is_symlink(self) -> bool:
-        """Buckets have no links."""
+        """Return False: buckets have no links."""
         return False
 
     def samefile(self, other: Any) -> bool:
-        """Whether it has the same name."""
+        """Return whether the other path has the same name."""
         return str(self) == str(other)
 
     def resolve(self, strict: bool = False) -> "Remote":
-        """Itself."""
+        """Return the path itself."""
         return self
 
     def absolute(self) -> "Remote":
-        """Itself."""
+        """Return the path itself."""
         return self
 
     def below(self) -> list["Remote"]:
-        """Every file below it, by name.
+        """Return every file below the path, by name.
 
         Raises
         ------
         StorageError
-            If there is one whose key no path stands for: of ``a//b`` the path is that of ``a/b``,
-            which is another.
+            If no path can express a key. The path of ``a//b`` is that of ``a/b``, another object.
         """
         with told(str(self)):
             found = system(self.scheme).find(self.key)
@@ -128,23 +127,23 @@ class Remote(PosixPath):
         for name in sorted(found):
             key = name.removeprefix(head)
             if key.endswith("/"):
-                continue  # consoles make such an object for an empty folder
+                continue  # web consoles create such an object for an empty folder
             path = type(self)(head + key)
             if path.key != key or VERSION in key:
                 raise StorageError(
-                    f"{self}: an object is called {key!r}, which can be no path. Rename it, or "
+                    f"{self}: an object is called {key!r}, which cannot be a path. Rename it, or "
                     "name the files"
                 )
             paths.append(path)
         return paths
 
     def iterdir(self) -> Iterator["Remote"]:  # type: ignore[override]
-        """Files and folders in it."""
+        """Yield the files and folders in the folder."""
         depth = len(self.parts) + 1
         yield from dict.fromkeys(type(self)(*one.parts[:depth]) for one in self.below())
 
     def glob(self, pattern: str, **_: Any) -> Iterator["Remote"]:  # type: ignore[override]
-        """Files below it whose names match, part by part; ``**`` is not known."""
+        """Yield the files below whose names match, part by part. ``**`` is not supported."""
         wanted = pattern.split("/")
         for one in self.below():
             parts = one.parts[len(self.parts) :]
@@ -152,25 +151,25 @@ class Remote(PosixPath):
                 yield one
 
     def rglob(self, pattern: str, **_: Any) -> Iterator["Remote"]:  # type: ignore[override]
-        """Files below it whose last part matches."""
+        """Yield the files below whose last part matches."""
         return (one for one in self.below() if fnmatchcase(one.name, pattern))
 
     def open(self, mode: str = "r", *_: Any, encoding: str | None = None, **more: Any) -> Any:
-        """A stream that reads by ranges; it cannot be written."""
+        """Open a stream that reads by byte ranges. Writing is not supported."""
         if set(mode) - set("rbt"):
-            raise io.UnsupportedOperation(f"{self} is written whole or not at all")
+            raise io.UnsupportedOperation(f"{self} can only be opened for reading")
         stream = io.BufferedReader(self.ranged())
         if "b" in mode:
             return stream
         return io.TextIOWrapper(stream, encoding or "utf-8", more.get("errors"))
 
     def ranged(self) -> Ranged:
-        """The file, to be read by ranges."""
+        """Return a reader of byte ranges of the file."""
         info = self._info()
         return Ranged(system(self.scheme), self.key, str(self), int(info.get("size") or 0))
 
     def sha256(self) -> str:
-        """Of its bytes, as whoever wrote it said, or else all read."""
+        """Return the hash from the object's metadata, or compute it from all its bytes."""
         if self.scheme == "s3":
             with told(str(self)):
                 said = system("s3").metadata(self.key, refresh=True)
@@ -184,10 +183,10 @@ class Remote(PosixPath):
         return digest.hexdigest()
 
     def mkdir(self, *_: Any, **__: Any) -> None:
-        """Nothing: folders of buckets are there once something is in them."""
+        """Ignore the call: folders of buckets exist once they contain a file."""
 
     def rmdir(self) -> None:
-        """Nothing, for the same reason."""
+        """Ignore the call, as `mkdir` does."""
 
     def unlink(self, missing_ok: bool = False) -> None:
         """Remove the file."""
@@ -205,7 +204,7 @@ class Remote(PosixPath):
                 system(self.scheme).rm(self.key, recursive=True)
 
     def replace(self, target: Any) -> Any:
-        """Give it another name in the same store; the server copies it."""
+        """Rename within the same store; the server copies the objects."""
         files = [self] if self.is_file() else self.below()
         if not files:
             raise FileNotFoundError(2, "No such file", str(self))
@@ -226,12 +225,12 @@ class Remote(PosixPath):
 
 
 def path_of(name: str) -> Path:
-    """The path that a name stands for: of ``s3://bucket/key`` a `Remote`, else a plain one.
+    """Return a `RemotePath` for a name such as ``s3://bucket/key``, else a plain path.
 
     Raises
     ------
     UnsafeName
-        If it is that of a pipe or a device: who opens one waits for ever, or reads without end.
+        If it names a pipe or a device, where a read could block or never end.
     """
     scheme, mark, _ = name.partition("://")
     if mark and scheme in SCHEMES:
@@ -246,7 +245,7 @@ def _kept() -> tempfile.TemporaryDirectory[str]:
 
 
 def _copy(path: Remote) -> str:
-    """Where a copy of a file, or of a folder with all in it, lies on this machine."""
+    """Download a file, or a folder with all its files, and return the local path."""
     info = path._info()
     version = f"{path} {info.get('ETag')} {info.get('size')}"
     place = Path(_kept().name) / hashlib.sha256(version.encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""A remote file as a stream: of what is not read, nothing is fetched."""
+"""Read a remote file by byte ranges, fetching only the ranges that are read."""
 
 import io
 from collections.abc import Sequence
@@ -8,29 +8,29 @@ from dmrl.errors import StorageError
 from dmrl.storage.system import told
 
 TOGETHER_BYTES, TOGETHER = 16 << 20, 64
-"""Of places that will be read, how much is fetched at a time, side by side."""
+"""Bytes and ranges that are prefetched at a time, in parallel."""
 LEAST_BYTES = 512
-"""Of a file, that are fetched at a time."""
+"""Buffer size of small reads. Larger ranges are fetched unbuffered."""
 STEP_BYTES = 8 << 20
-"""Of a file that is read as a whole."""
+"""Bytes per request when a whole file is read."""
 
 Place = tuple[int, int]
-"""Start and size, bytes."""
+"""Start and size of a range, bytes."""
 
 
 class Ranged(io.RawIOBase):
-    """A file read by ranges.
+    """A file that is read by byte ranges.
 
     Parameters
     ----------
     system
-        fsspec's.
+        fsspec file system.
     name
-        In the system.
+        Name of the file in the file system.
     url
-        For errors.
+        Name of the file in errors.
     size
-        Of the file, bytes.
+        Size of the file, bytes.
     """
 
     def __init__(self, system: Any, name: str, url: str, size: int) -> None:
@@ -41,17 +41,17 @@ class Ranged(io.RawIOBase):
         self._held: dict[Place, bytes] = {}
 
     def expect(self, places: Sequence[Place]) -> None:
-        """Say what will be read, in that order: then it is fetched some at a time."""
+        """Register the next reads, in order, so that they are fetched in groups."""
         self._expected, self._held = list(reversed(places)), {}
 
     def suits(self, start: int, size: int) -> bool:
-        """Whether a place is best fetched as it is: it is large, or expected."""
+        """Return whether a range should be fetched unbuffered: it is large, or registered."""
         place = start, size
         expected = bool(self._expected) and self._expected[-1] == place
         return size > LEAST_BYTES or place in self._held or expected
 
     def fetch(self, start: int, size: int) -> bytes:
-        """Bytes from a place on; fewer at the end of the file."""
+        """Return the bytes of a range; fewer at the end of the file."""
         size = max(0, min(size, self._size - start))
         if not size:
             return b""
@@ -65,22 +65,22 @@ class Ranged(io.RawIOBase):
         return self._whole(data, size)
 
     def _whole(self, data: bytes, size: int) -> bytes:
-        """What a server sent for a place, if it is as long as that.
+        """Return the bytes that a server sent for a range.
 
         Raises
         ------
         StorageError
-            If not.
+            If their number is wrong.
         """
         if len(data) != size:
             raise StorageError(
-                f"{self._url}: the server sent {len(data)} bytes for {size}. Copy the file, "
+                f"{self._url}: the server sent {len(data)} bytes instead of {size}. Copy the file, "
                 "and check it"
             )
         return bytes(data)
 
     def _fetch_some(self) -> None:
-        """Fetch the next places that are expected, side by side."""
+        """Fetch the next registered ranges in parallel."""
         some: list[Place] = []
         while self._expected and len(some) < TOGETHER:
             if some and sum(size for _, size in some) + self._expected[-1][1] > TOGETHER_BYTES:
@@ -96,24 +96,24 @@ class Ranged(io.RawIOBase):
         }
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go to a place."""
+        """Move the stream position, and return it."""
         self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
         return self._at
 
     def tell(self) -> int:
-        """Where it stands."""
+        """Return the stream position."""
         return self._at
 
     def readinto(self, buffer: Any, /) -> int:
-        """Read into a buffer; how many bytes."""
+        """Read into a buffer, and return the number of bytes."""
         data = self.fetch(self._at, len(buffer))
         buffer[: len(data)] = data
         self._at += len(data)

@@ -1,4 +1,4 @@
-"""fsspec, and what it says when something is wrong: one line with the name and the way out."""
+"""Open fsspec file systems, and turn their errors into one line with a way out."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,16 +9,17 @@ from dmrl.errors import MissingExtra, StorageError
 
 PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
 PACKAGES |= {"http": "aiohttp", "https": "aiohttp"}
+"""Package that each scheme needs."""
 
 
 @cache
 def system(scheme: str) -> Any:
-    """The file system of a scheme, which remembers no listings.
+    """Return the file system of a scheme, without a cache of listings.
 
     Raises
     ------
     MissingExtra
-        If the package that knows the scheme is not installed.
+        If the package for the scheme is not installed.
     """
     try:
         import fsspec  # noqa: PLC0415 - an extra
@@ -34,14 +35,14 @@ def system(scheme: str) -> Any:
 
 @contextmanager
 def told(name: str) -> Iterator[None]:
-    """What a server or its library says, as one line; that a file is not there passes.
+    """Turn errors of a server or its library into one line; pass on missing files.
 
     Raises
     ------
     StorageError
-        If it cannot be reached, refuses, or has no such bucket.
+        If the server cannot be reached or refuses, or the bucket does not exist.
     FileNotFoundError
-        If there is no such file in the bucket.
+        If the file does not exist in the bucket.
     """
     try:
         yield
@@ -55,7 +56,7 @@ def told(name: str) -> Iterator[None]:
         raise StorageError(
             f"{name}: the server refuses these credentials. Check them, and the name"
         ) from None
-    except Exception as e:  # botocore, aiohttp and google have their own
+    except Exception as e:  # botocore, aiohttp and google define their own classes
         raise StorageError(_words(name, e)) from e
 
 

@@ -1,7 +1,7 @@
-"""Outputs made here and uploaded when they are whole.
+"""Write outputs locally and upload them when they are complete.
 
-A file comes by one request, or by a multipart upload that is completed at its end. A folder has a
-mark in it until its last file is there.
+A file is uploaded by one request, or by a multipart upload that is completed at its end. A folder
+contains a mark until its last file is uploaded.
 """
 
 import hashlib
@@ -18,13 +18,7 @@ from dmrl.storage.system import system, told
 
 
 def require_bucket(path: Remote) -> None:
-    """Nothing, if the bucket of a path is there.
-
-    Raises
-    ------
-    StorageError
-        If not, or if nobody can write there.
-    """
+    """Raise StorageError unless the bucket of a path exists and can be written."""
     if path.scheme.startswith("http"):
         raise StorageError(f"{path}: web servers are read only. Name a bucket, or a folder here")
     with told(str(path)):
@@ -35,7 +29,7 @@ def require_bucket(path: Remote) -> None:
 
 @contextmanager
 def uploaded_file(path: Remote) -> Iterator[Path]:
-    """A path here to write to; the file is uploaded when the block ends without an error.
+    """Yield a local path to write to, and upload the file if the block ends without an error.
 
     Raises
     ------
@@ -50,14 +44,14 @@ def uploaded_file(path: Remote) -> Iterator[Path]:
 
 @contextmanager
 def uploaded_folder(path: Remote) -> Iterator[Path]:
-    """A folder here to write in; it is uploaded when the block ends without an error.
+    """Yield a local folder to write in; upload it if the block ends without an error.
 
-    What a process that was killed had uploaded is removed first.
+    Files that a killed process had uploaded are removed first.
 
     Raises
     ------
     StorageError
-        If the server cannot be reached, or refuses; then nothing is left there.
+        If the server cannot be reached, or refuses. Uploaded files are then removed.
     """
     with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
         here = inside(Path(folder), path.name, f"{path}: its name")
@@ -79,7 +73,7 @@ def uploaded_folder(path: Remote) -> Iterator[Path]:
 
 @contextmanager
 def added_files(path: Remote, last: str) -> Iterator[Path]:
-    """A folder here to write in; its files are uploaded into one that is there, ``last`` last.
+    """Yield a local folder, and upload its files into an existing one, ``last`` as the last.
 
     Raises
     ------

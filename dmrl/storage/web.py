@@ -1,7 +1,7 @@
-"""Files on a web server, which may be anybody's: no byte is taken but those that were asked for.
+"""Read files from web servers, which are not trusted: only requested bytes are accepted.
 
-fsspec reads whatever a server answers, as a whole, into memory. Here an answer is read up to the
-size that was asked for, and has to be that part of that version of the file.
+fsspec reads the whole answer of a server into memory. Here an answer is read up to the
+requested size, and must be that range of the same version of the file.
 """
 
 import re
@@ -15,37 +15,38 @@ from fsspec.implementations.http import HTTPFileSystem
 from dmrl.errors import StorageError
 
 STEP_BYTES = 1 << 20
+"""Bytes that are read at a time when a file is copied."""
 PATIENCE_S, SLOWEST_BPS = 30.0, 50_000
-"""An answer takes so many seconds, and one more for so many bytes; a server could drip for ever."""
+"""Timeout of an answer: a fixed part, seconds, and a minimum rate, bytes per second."""
 PARTIAL = 206
 RANGE = re.compile(r"bytes (\d+)-(\d+)/(?:\d+|\*)")
 VERSION = ("ETag", "Last-Modified")
-"""Headers that tell a version of a file from another."""
+"""Headers that identify the version of a file."""
 
 
 class Web(HTTPFileSystem):  # type: ignore[misc]
-    """Web servers, for `dmrl.storage.system`."""
+    """File system of web servers, for `dmrl.storage.system`."""
 
     protocol = ("http", "https")
 
     def __init__(self, **given: Any) -> None:
-        # What is packed could unpack to any size.
+        # A compressed answer could decompress to any size.
         told = {"auto_decompress": False, "timeout": _patience(0)}
         super().__init__(client_kwargs=told, **given)
         self._versions: dict[str, dict[str, str]] = {}
 
     async def _info(self, url: str, **given: Any) -> dict[str, Any]:
-        """Size and version; parts that are read later have to be of this version."""
+        """Return size and version. Later reads must be of this version."""
         info: dict[str, Any] = await super()._info(url, **given)
         if info["size"] is None:
-            raise StorageError(f"{url}: the server does not say how large it is. Copy the file")
+            raise StorageError(f"{url}: the server does not report its size. Copy the file")
         self._versions[url] = {name: info[name] for name in VERSION if info.get(name)}
         return info
 
     async def _cat_file(
         self, url: str, start: int | None = None, end: int | None = None, **_: Any
     ) -> bytes:
-        """Bytes from ``start`` to ``end``."""
+        """Return the bytes from ``start`` to ``end``."""
         assert start is not None and end is not None
         session = await self.set_session()
         asked = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity"}
@@ -62,11 +63,11 @@ class Web(HTTPFileSystem):  # type: ignore[misc]
             return data
 
     async def _get_file(self, url: str, path: str, **_: Any) -> None:
-        """Copy a file, which has the size that the server said."""
+        """Copy a file of the size that the server reported."""
         size = (await self._info(url))["size"]
         free = shutil.disk_usage(Path(path).parent).free
         if size > free:
-            raise StorageError(f"{url} has {size} bytes, and here are {free} free. Free some")
+            raise StorageError(f"{url} has {size} bytes, but only {free} are free. Free some")
         session = await self.set_session()
         with Path(path).open("wb") as out:
             async with session.get(
@@ -84,11 +85,11 @@ class Web(HTTPFileSystem):  # type: ignore[misc]
             raise _other(url)
 
     async def _find(self, *_: Any, **__: Any) -> list[str]:
-        """Nothing: pages with links are no folders, and such pages could go on for ever."""
+        """Return nothing: web pages with links are not folders, and could go on for ever."""
         return []
 
     def _refuse_other(self, url: str, answer: Any) -> None:
-        """Nothing, if an answer is of the version of a file that is being read, and not packed."""
+        """Raise StorageError if an answer is compressed, or from another version of the file."""
         known = self._versions.get(url, {})
         if any(answer.headers.get(name, said) != said for name, said in known.items()):
             raise StorageError(f"{url} changed while it was read. Run it again")
@@ -97,7 +98,7 @@ class Web(HTTPFileSystem):  # type: ignore[misc]
 
 
 async def _read(answer: Any, size: int, url: str) -> bytes:
-    """So many bytes of an answer, or all that there are."""
+    """Read ``size`` bytes of an answer, or all if there are fewer."""
     parts, left = [], size
     try:
         while left and (data := await answer.content.read(left)):
@@ -109,7 +110,7 @@ async def _read(answer: Any, size: int, url: str) -> bytes:
 
 
 def _patience(size: int) -> ClientTimeout:
-    """How long an answer of so many bytes is waited for."""
+    """Return the timeout of an answer of this size."""
     return ClientTimeout(total=PATIENCE_S + size / SLOWEST_BPS)
 
 
@@ -119,5 +120,5 @@ def _slow(url: str) -> StorageError:
 
 def _other(url: str) -> StorageError:
     return StorageError(
-        f"{url}: the server sent other bytes than it was asked for. Copy the file, and check it"
+        f"{url}: the server sent other bytes than requested. Copy the file, and check it"
     )

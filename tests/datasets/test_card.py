@@ -139,7 +139,7 @@ def test_it_says_what_to_know_before_learning(record: Record, tmp_path: Path) ->
     path = record(peers=[*([boxed(k)] for k in range(30)), None], split={"train": "[[0, 10]]"})
     run([path], tmp_path / "out", Settings(split="none"))
     text = (tmp_path / "out" / "README.md").read_text()
-    assert "labels of `published` are: 30 of 30 have a sigma, median 0.0 px in u, 3.0 px in" in text
+    assert "labels from `published`: 30 of 30 have a sigma, median 0.0 px in u, 3.0 px in" in text
     assert "labels of source 'published' are biased: +0.0 px in u and +10.0 px in v" in text
     assert "- Left out: 1 images had no labels." in text
     assert "- Leaks: no images of a test split" in text
@@ -164,7 +164,7 @@ def test_licences_beside_a_source_reach_the_card(tmp_path: Path) -> None:
     convert.run(folder, tmp_path / "a.mcap", convert.Settings())
     run([tmp_path / "a.mcap"], tmp_path / "out", Settings())
     text = (tmp_path / "out" / "README.md").read_text()
-    assert "- Licence beside `pictures`: MIT License." in text
+    assert "- Licence of `pictures`: MIT License." in text
 
 
 def test_what_a_hand_wrote_below_the_line_stays(built: Path) -> None:
@@ -196,7 +196,7 @@ def test_licences_that_are_known_are_taken(built: Path, license_id: str) -> None
 def test_a_licence_that_nobody_knows_is_refused(
     built: Path, record: Record, tmp_path: Path
 ) -> None:
-    with pytest.raises(SettingError, match=r"--license foo-1: no licence that .* Try: cc-by-4"):
+    with pytest.raises(SettingError, match=r"--license foo-1: neither SPDX nor .* Try: cc-by-4"):
         run_card(built, CardSettings(license="foo-1"))
     with pytest.raises(SettingError, match="--license foo-1"):
         run([record("new.mcap", seed=2)], tmp_path / "new", Settings(license="foo-1"))
@@ -245,13 +245,13 @@ def test_the_hub_reads_the_front_matter(built: Path) -> None:
 
 def test_it_says_what_limits_it_and_what_it_was_taken_with(built: Path, tmp_path: Path) -> None:
     text = (built / "README.md").read_text()
-    assert "- 2 of 5 images show nobody" in text and "No image shows more than 2." in text
+    assert "- 2 of 5 images show no peer." in text and "peers in one image is 2." in text
     assert "- Labels by status: OK 5." in text
-    assert "- No recording has the calibration of a camera." in text
+    assert "- No recording has a camera calibration." in text
     flight = dmrl.fly(tmp_path / "f.mcap", duration_s=4.0, camera=True, camera_rate_hz=1.0)
     run([flight.path], tmp_path / "set", Settings(split="none"))
     text = (tmp_path / "set" / "README.md").read_text()
-    assert "of simulated flights: a real camera's look different" in text
+    assert "from simulated flights. Those of a real camera differ" in text
     assert "`/{robot}/range/{peer}`" in text
     assert re.search(r"Camera of `f.mcap: cf1`, .*: 320 x 224 px, fx 183\.7", text)
 
@@ -267,7 +267,7 @@ def test_many_recordings_are_a_few_lines_of_a_card() -> None:
     ]
     found = [line for line in told(facts) if "a bias" in line or "more lines" in line]
     assert len(found) == 21 and found[19] == "- `019.mcap`: a bias."
-    assert found[20] == "- 80 more lines like these: see `facts.json`."
+    assert found[20] == "- 80 more lines of this kind are in `facts.json`."
 
 
 def test_without_matplotlib_the_card_has_no_figures_and_says_how_to_get_them(

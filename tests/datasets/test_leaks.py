@@ -50,7 +50,7 @@ def test_test_images_that_look_like_one_in_train_are_counted(
     twin = record("twin.mcap", split={"test": "[[0, 600000000]]"}, seed=3)
     run([path, twin], tmp_path / "out", Settings())
     text = (tmp_path / "out" / "README.md").read_text()
-    assert "3 images of a test split have the pixels of one in train, 3 look" in text
+    assert "3 images of a test split have the pixels of one in train, 3 are near" in text
 
 
 def test_moments_and_poses_that_train_has_too_are_counted(record: Record, tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_a_wrong_figure_is_a_fault_of_the_recipe(change: dict[str, Any], says: s
 )
 def test_a_format_that_is_none_or_asks_for_a_gigabyte_is_a_fault(form: str) -> None:
     row = {"what": "px", "of": "judged", "at": "x", "form": form}
-    assert "is no format" in wrong({"title": "N", "shows": "numbers", "rows": [row]})
+    assert "is not a number format" in wrong({"title": "N", "shows": "numbers", "rows": [row]})
 
 
 def test_tables_that_are_none_are_faults() -> None:

@@ -38,15 +38,15 @@ def test_a_velocity_that_cannot_be_turned_says_what_it_wants() -> None:
     level = Series(at, np.zeros((3, 3)))
     values = {"vx": still, "vy": still}
     for frame, attitude, wanted in (
-        ("body", level, r"body wants \[vz\], \[roll\]"),
-        ("body", None, r"body wants \[vz\], \[roll\]"),
-        ("horizontal", None, "horizontal wants an attitude"),
+        ("body", level, r"body needs \[vz\], \[roll\]"),
+        ("body", None, r"body needs \[vz\], \[roll\]"),
+        ("horizontal", None, "horizontal needs an attitude"),
     ):
         with pytest.raises(SourceError, match=wanted):
             mapped_csv._world_velocity(Path("a"), at, values, frame, attitude)
     for frame, attitude in (("world", None), ("horizontal", level)):
         found = mapped_csv._world_velocity(Path("a"), at, values, frame, attitude)
         assert len(found) == 2
-    with pytest.raises(SourceError, match="body wants"):
+    with pytest.raises(SourceError, match="body needs"):
         mapped_csv._world_velocity(Path("a"), at, {**values, "vz": still}, "body", None)
     assert mapped_csv._world_velocity(Path("a"), at, {**values, "vz": still}, "body", level)

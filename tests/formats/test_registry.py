@@ -77,8 +77,8 @@ def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
     ("name", "data", "said"),
     [
         ("a.txt", b"", "is empty, 0 bytes"),
-        ("a.txt", b"x", "looks like no kind that is known. Say --from: locanet, csv, "),
-        ("a.mcap", b"x", "is a recording already. Say --to: csv, parquet, ros2"),
+        ("a.txt", b"x", "matches no known format. Pass --from: locanet, csv, "),
+        ("a.mcap", b"x", "is a recording already. Pass --to: csv, parquet, ros2"),
     ],
 )
 def test_what_is_no_source_is_said(name: str, data: bytes, said: str, tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_what_is_no_source_is_said(name: str, data: bytes, said: str, tmp_path: 
 def test_folders_that_are_empty_and_things_that_are_not_there_are_said(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="is an empty folder"):
         format_of(tmp_path)
-    with pytest.raises(SourceError, match=r"no file or folder .*nothing. Name one"):
+    with pytest.raises(SourceError, match=r"no file or folder .*nothing. Pass one"):
         format_of(tmp_path / "nothing")
     (tmp_path / "below").mkdir()
     os.mkfifo(tmp_path / "below" / "pipe")
@@ -114,7 +114,7 @@ def test_a_kind_that_is_misspelled_is_told_the_near_one(
     ):
         with pytest.raises(SourceError) as e:
             format_of(tmp_path / "a", name)
-        assert f"--from {name}: no such kind. {hint}Kinds: locanet, csv" in str(e.value)
+        assert f"--from {name}: no such format. {hint}Formats: locanet, csv" in str(e.value)
         assert str(e.value).endswith("images, theirs")
 
 
@@ -127,7 +127,7 @@ def test_a_plug_in_is_asked_after_our_own_and_by_its_name(
     assert (found.name, found.what) == ("theirs", "a log of theirs")
     assert found.recognises(tmp_path / "a.theirs") and not found.recognises(tmp_path / "a.txt")
     err = capsys.readouterr().err
-    assert "of the package their-logs, fails to look at" in err and "Not tried on" in err
+    assert "of the package their-logs, fails to check" in err and "Not tried on" in err
     (tmp_path / "log").write_bytes(foreign.usd_log())
     assert format_of(tmp_path / "log").name == "cfusdlog"
     assert format_of(tmp_path / "log", "theirs").name == "theirs"

@@ -125,7 +125,7 @@ def test_a_database_that_computes_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.db3"
     with sqlite3.connect(path) as database:
         database.executescript(text)
-    with pytest.raises(SourceError, match="holds more than tables"):
+    with pytest.raises(SourceError, match="has more than tables"):
         read(path)
 
 

@@ -42,7 +42,7 @@ def test_wrong_keys_are_named(tmp_path: Path, old: str, new: str, message: str) 
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"no calibration .*a\.toml\. Name a TOML file"):
+    with pytest.raises(SourceError, match=r"no calibration .*a\.toml\. Use a TOML file"):
         read_camera(tmp_path / "a.toml")
 
 

@@ -91,7 +91,7 @@ def test_what_is_no_file_is_refused_under_its_own_name_too(
     else:
         with socket.socket(socket.AF_UNIX) as one:
             one.bind("a.toml")
-    with pytest.raises(UnsafeName, match=r"^a.toml is a pipe or a device, no file"):
+    with pytest.raises(UnsafeName, match=r"^a.toml is a pipe or a device, not a file"):
         reads("a.toml")
 
 
@@ -105,7 +105,7 @@ def test_every_path_of_a_command_line_is_refused_so() -> None:
     ]
     assert {name for name, hint in of_paths if hint != Path} >= {"label", "render", "train", "view"}
     for _, hint in of_paths:
-        with pytest.raises(UnsafeName, match=r"^/dev/zero is a pipe or a device, no file"):
+        with pytest.raises(UnsafeName, match=r"^/dev/zero is a pipe or a device, not a file"):
             cli.exact(hint, ["/dev/zero"])
 
 
@@ -126,5 +126,5 @@ def test_a_name_that_is_no_text_is_said(name: str) -> None:
 @pytest.mark.parametrize("what", ["a dataset", "a model", "a model for a backend"])
 def test_what_libraries_open_by_its_name_has_one_that_is_text(what: str, tmp_path: Path) -> None:
     (given := tmp_path / os.fsdecode(b"\xff")).mkdir()
-    with pytest.raises(UnsafeName, match="is no text"):
+    with pytest.raises(UnsafeName, match="is not valid UTF-8"):
         OPENED[what](given)

@@ -47,15 +47,15 @@ class _Seen(HTMLParser):
 def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None:
     html = page(gather(outputs))
     seen = _Seen(html)
-    wanted = ["Detections", "Positions", "Training", "Pictures", "Recordings"]
-    assert seen.headings == [*wanted, "Where it comes from"]
+    wanted = ["Detections", "Positions", "Training", "Images", "Recordings"]
+    assert seen.headings == [*wanted, "Provenance"]
     assert not seen.tags & {"script", "link", "iframe", "object", "embed", "form"}
     assert all(place.startswith(("#", "data:image/")) for place in seen.places)
     assert "url(" not in re.sub(r"url\(#", "", html) and "@import" not in html
     assert "default-src 'none'" in html
     assert html.count("<svg") >= 6 and html.count("data:image/png") == 2
     assert "0.5 (0.5, 0.6)" in html and "24778" in html and "flight.mcap" in html
-    assert "seen from cf1; 95 % ellipses" in html
+    assert "cf2 relative to cf1, from above; 95 % ellipses" in html
 
 
 @pytest.mark.heavy
@@ -108,8 +108,8 @@ def test_documents_that_are_not_as_they_should_be_leave_the_rest(
         (outputs / f"odd{k}/evaluation.json").write_text(json.dumps(document))
     html = page(gather(outputs))
     assert all(f"odd{k}" in html for k in range(len(odd)))
-    assert "odd5 is not as dmrl writes it" in html
-    assert "evaluation.json is no table" in html
+    assert "odd5 does not have dmrl's form" in html
+    assert "evaluation.json is not a table" in html
     assert "Training" in html and "Recordings" in html
 
 
@@ -118,7 +118,7 @@ def test_damaged_recordings_and_pictures_are_named_and_the_rest_is_shown(outputs
     (outputs / "cut.mcap").write_bytes((outputs / "flight.mcap").read_bytes()[:-20])
     (outputs / "odd.png").write_bytes(b"\xff\xd8 no picture" * 30_000)
     html = page(gather(outputs))
-    assert "cut.mcap" in html and "is cut short" in html and "Not read" in html
+    assert "cut.mcap" in html and "is cut short" in html and "Unreadable files" in html
     assert "odd.png" in html
 
 
@@ -141,19 +141,19 @@ def test_a_report_is_written_again_but_no_other_file(outputs: Path) -> None:
     assert write(outputs).read_bytes() == before
     other = outputs / "mine.html"
     other.write_text("<p>mine</p>")
-    with pytest.raises(OutputError, match="no report of dmrl's"):
+    with pytest.raises(OutputError, match="is not a report of dmrl"):
         write(outputs, other)
-    with pytest.raises(OutputError, match=r"Call it page\.html"):
+    with pytest.raises(OutputError, match=r"Name it page\.html"):
         write(outputs, outputs / "page.pdf")
-    with pytest.raises(OutputError, match=r"Call it page\.html"):
+    with pytest.raises(OutputError, match=r"Name it page\.html"):
         write(outputs, Path())
     assert other.read_text() == "<p>mine</p>"
 
 
 def test_a_folder_with_nothing_to_tell_of_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="holds no recording"):
+    with pytest.raises(SettingError, match="contains no recording"):
         write(tmp_path)
-    with pytest.raises(SettingError, match="no folder"):
+    with pytest.raises(SettingError, match="is not a folder"):
         write(tmp_path / "none")
 
 

@@ -114,7 +114,7 @@ def test_what_leads_out_of_the_folder_is_not_shown(pipeline: Path, tmp_path: Pat
 def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> None:
     (pipeline / "recipe.toml").write_text("[[figure]]\nshows = 3\n")
     html = page(gather(pipeline))
-    assert "recipe.toml" in html[html.index("Not read</h2>") :]
+    assert "recipe.toml" in html[html.index("Unreadable files</h2>") :]
     assert "Detections</h2>" in html
 
 
@@ -132,7 +132,7 @@ def test_what_a_stranger_wants_shown_is_shown_or_says_why(pipeline: Path) -> Non
     more = maps_of.format("absent.mcap") + maps_of.format("chip.mcap")
     (pipeline / "recipe.toml").write_text(other + more)
     shown = page(gather(pipeline))
-    assert "judged/pipe.json is no file" in shown
+    assert "judged/pipe.json is not a file" in shown
     assert shown.count("cannot be drawn") >= 3
 
 

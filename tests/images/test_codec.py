@@ -55,7 +55,7 @@ def test_a_cut_picture_is_named(rgb: codec.Rgb, share: float) -> None:
 @pytest.mark.parametrize("bad", [b"", b"GIF89a" + b"\0" * 40, b"\x89PNG\r\n\x1a\n" + b"\0" * 40])
 def test_what_is_no_picture_is_named(bad: bytes) -> None:
     for function in (codec.decode, codec.size):
-        with pytest.raises(SourceError, match=r"^a\.png is not a picture \(PNG, JPEG"):
+        with pytest.raises(SourceError, match=r"^a\.png is not an image \(PNG, JPEG"):
             function(bad, "a.png")
 
 
@@ -153,7 +153,7 @@ def test_a_ppm_whose_header_does_not_end_is_refused() -> None:
         b"P6 #" + b"x" * 100_000 + b"\n2 2 255\n",
         b"P6 " + b"#\n" * 50_000 + b"2 2 255\n",
     ):
-        with pytest.raises(SourceError, match="not a picture"):
+        with pytest.raises(SourceError, match="not an image"):
             codec.decode(head + bytes(12))
 
 

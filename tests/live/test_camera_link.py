@@ -113,7 +113,7 @@ def test_images_of_another_size_come_without_a_calibration(client: Start) -> Non
     wait(lambda: camera.health.received == 1)
     received, said = taken(feed)
     assert [item.sample.topic for item in received] == ["/cf1/camera/image"]
-    assert "16 x 16 px, the calibration is of 320 x 224 px" in said[0]
+    assert "16 x 16 px, the calibration is for 320 x 224 px" in said[0]
 
 
 @pytest.mark.parametrize("text", ["", ":5000", "host:", "host:0", "host:70000", "host:x"])

@@ -33,5 +33,5 @@ def test_a_jpeg_of_the_right_size_keeps_its_bytes() -> None:
 
 def test_a_jpeg_of_another_size_than_was_said_is_refused() -> None:
     jpeg = codec.encode_jpeg(SMOOTH)
-    with pytest.raises(SourceError, match="not 160 x 120 px as it said"):
+    with pytest.raises(SourceError, match="not 160 x 120 px as in its header"):
         encoded(Image(160, 120, "jpeg", jpeg), "colour")

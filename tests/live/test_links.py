@@ -11,7 +11,7 @@ from dmrl.live.robot_options import Robot
 @pytest.mark.parametrize(
     ("names", "peer", "said"),
     [
-        (["left", "right"], [], ["left: nothing says", "right: nothing says"]),
+        (["left", "right"], [], ["left: the peer of", "right: the peer of"]),
         (["left", "right"], ["1=left", "2=right"], []),
         (["cf1", "cf2"], [], []),
         (["left"], [], []),
@@ -26,5 +26,5 @@ def test_ranges_that_are_nobodys_are_said(
     links = links_of(robots, peer, 100.0, Feed(), HostTime())
     assert list(links) == names
     lines = capsys.readouterr().err.splitlines()
-    assert [line for line in lines if "nothing says" in line] == lines
+    assert [line for line in lines if "the peer of" in line] == lines
     assert [line[: len(start)] for line, start in zip(lines, said, strict=True)] == said

@@ -122,8 +122,8 @@ def test_what_the_system_refuses_a_step_is_its_error_and_no_bug(
     monkeypatch.setattr(work, "interface_of", refused)
     answer = work.perform(job("sketch", None, {}, {}))
     assert answer == {
-        "error": "cannot read or write a.png: Input/output error. Check its name, its rights, its "
-        "space"
+        "error": "cannot read or write a.png: Input/output error. Check its name, permissions and "
+        "free space"
     }
 
 

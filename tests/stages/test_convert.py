@@ -122,7 +122,7 @@ def test_what_is_odd_in_a_new_recording_is_said_at_once(
 
 def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
     (tmp_path / "new").mkdir()
-    with pytest.raises(SourceError, match=r"new is an empty folder\. Name one with files"):
+    with pytest.raises(SourceError, match=r"new is an empty folder\. Pass one with files"):
         run(tmp_path / "new", tmp_path / "out.mcap", Settings())
 
 
@@ -132,12 +132,12 @@ def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
         (
             Settings(source_kind="image"),
             SourceError,
-            "Did you mean images.* Kinds: locanet, csv, .*, images",
+            "Did you mean images.* Formats: locanet, csv, .*, images",
         ),
         (
             Settings(source_kind="floppy"),
             SourceError,
-            "no such kind. Kinds: locanet, csv, .*, images",
+            "no such format. Formats: locanet, csv, .*, images",
         ),
         (Settings(source_kind="locanet"), SourceError, r"no posLabel\.txt"),
         (Settings(width_px=320), SettingError, "--width-px and --height-px go together"),
@@ -147,7 +147,7 @@ def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
         (Settings(width_px=100_000, height_px=100_000), SettingError, "8192 at most"),
         (Settings(source_kind="rosbag2"), SourceError, "cannot be read as a ROS bag"),
         (Settings(robot="a/b"), SettingError, "'a/b' cannot stand in a topic"),
-        (Settings(camera=Path("aidek")), SourceError, "no calibration aidek. Name a TOML file"),
+        (Settings(camera=Path("aidek")), SourceError, "no calibration aidek. Use a TOML file"),
         (Settings(camera=Path("aideck")), SettingError, "is 64x48 px, its camera 320x224"),
         (Settings(names="cf2"), SettingError, "--names 'cf2' is not OLD=NEW. Try: 0=cf2,1=cf3"),
         (Settings(names="0=a/b"), SettingError, "is not OLD=NEW"),
@@ -174,12 +174,12 @@ def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("hello")
     with pytest.raises(
-        SourceError, match=r"looks like no kind .* Say --from: locanet, csv, .*, images"
+        SourceError, match=r"matches no known format.* Pass --from: locanet, csv, .*, images"
     ):
         run(tmp_path / "notes", tmp_path / "out.mcap", Settings())
     with pytest.raises(SourceError, match="no file or folder"):
         run(tmp_path / "none", tmp_path / "out.mcap", Settings())
-    with pytest.raises(UnsafeName, match="is a pipe or a device, no file"):
+    with pytest.raises(UnsafeName, match="is a pipe or a device, not a file"):
         run(Path("/dev/null"), tmp_path / "out.mcap", Settings())
 
 
@@ -212,7 +212,7 @@ def test_the_command_prints_counts_and_exits_by_kind_of_error(
 
 def test_an_empty_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "log00").write_bytes(b"")
-    with pytest.raises(SourceError, match=r"log00 is empty, 0 bytes\. Name another file"):
+    with pytest.raises(SourceError, match=r"log00 is empty, 0 bytes\. Pass another file"):
         run(tmp_path / "log00", tmp_path / "out.mcap", Settings())
     assert list(tmp_path.glob("out*")) == []
 
@@ -279,7 +279,9 @@ def _as_logged(flight: Path, robot: str, peer: int) -> bytes:
 
 def test_a_recording_is_not_a_source(pictures: Path, tmp_path: Path) -> None:
     run(pictures, tmp_path / "a.mcap", Settings())
-    with pytest.raises(SourceError, match=r"is a recording already\. Say --to: csv, parquet, ros2"):
+    with pytest.raises(
+        SourceError, match=r"is a recording already\. Pass --to: csv, parquet, ros2"
+    ):
         run(tmp_path / "a.mcap", tmp_path / "b.mcap", Settings())
 
 

@@ -119,7 +119,9 @@ def test_an_export_is_no_model_for_torch(exported: Path, tmp_path: Path) -> None
 @pytest.mark.parametrize("backend", ["onnx", "onnx-int8", "integer"])
 def test_images_of_another_size_are_refused(exported: Path, backend: str) -> None:
     opened = detector.open_detector(exported, backend)
-    with pytest.raises(SettingError, match=r"an image: images of 72 x 48 px, .* takes 64 x 48 al"):
+    with pytest.raises(
+        SettingError, match=r"an image: images of 72 x 48 px, .* takes only 64 x 48"
+    ):
         opened.require_size(72, 48, "an image")
 
 

@@ -92,7 +92,7 @@ def test_a_recording_will_do_and_json_says_it_all(
 
 def test_what_cannot_be_measured_is_one_line(tmp_path: Path, dots: Path) -> None:
     (tmp_path / "none").mkdir()
-    with pytest.raises(SourceError, match="no picture"):
+    with pytest.raises(SourceError, match="no image"):
         run(tmp_path / "none", tmp_path / "a.toml", Settings())
     mixed = tmp_path / "mixed"
     mixed.mkdir()

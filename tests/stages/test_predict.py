@@ -162,7 +162,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(dots: Path, model: Path, tmp_p
         run(model, tmp_path / "blind.mcap", out, Settings())
     with RecordingWriter(tmp_path / "noise.mcap", Provenance("test")) as sink:
         sink.write(0, "/cf1/camera/image", message("CompressedImage")(data=b"noise"))
-    with pytest.raises(SourceError, match=r"noise\.mcap: the image of .* is not a picture"):
+    with pytest.raises(SourceError, match=r"noise\.mcap: the image of .* is not an image"):
         run(model, tmp_path / "noise.mcap", out, Settings())
     with pytest.raises(ModelError, match="no model"):
         run(tmp_path / "nothing", dots, out, Settings())

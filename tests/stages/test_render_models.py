@@ -94,7 +94,7 @@ def test_a_preview_is_refused_under_another_name_and_on_a_cluster(tmp_path: Path
 @pytest.mark.heavy
 def test_a_scale_for_a_model_that_is_not_given_asks_for_it(blender: Path, tmp_path: Path) -> None:
     settings = settings_of("synthetic_published", images=1, workers=1)
-    with pytest.raises(SettingError, match=r"Give the --model that this scale is for"):
+    with pytest.raises(SettingError, match=r"Pass the --model of this scale"):
         run(tmp_path / "out.mcap", settings)
 
 
@@ -144,7 +144,7 @@ def test_a_file_that_is_no_model_is_refused(blender: Path, tmp_path: Path, kind:
 
 def test_models_of_other_kinds_are_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "m.txt").write_text("x")
-    with pytest.raises(SettingError, match="no model"):
+    with pytest.raises(SettingError, match="not a model"):
         Renderer(Path("none"), Model(tmp_path / "m.txt"))
     with pytest.raises(SettingError, match="Check --model"):
         Renderer(Path("none"), Model(tmp_path / "none.glb"))

@@ -301,7 +301,7 @@ def test_a_key_that_no_path_stands_for_is_not_taken_for_another(key: str, lab: A
     assert [path.name for path in Remote(f"s3://{folder}").below()] == ["b", "b.mcap", "b.mcap"]
     lab.call_s3("put_object", Bucket="lab", Key=f"{folder.removeprefix('lab/')}/{key}", Body=b"odd")
     for look in (Remote.below, lambda path: list(path.rglob("*.mcap")), os.fspath):
-        with pytest.raises(StorageError, match="can be no path"):
+        with pytest.raises(StorageError, match="cannot be a path"):
             look(Remote(f"s3://{folder}"))
 
 

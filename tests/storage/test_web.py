@@ -183,12 +183,12 @@ def test_what_a_server_sends_beyond_what_was_asked_is_not_read(wrong: str, site:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ("fewer", "the server sent other bytes than it was asked for"),
-        ("elsewhere", "the server sent other bytes than it was asked for"),
-        ("packed", "the server sent other bytes than it was asked for"),
+        ("fewer", "the server sent other bytes than requested"),
+        ("elsewhere", "the server sent other bytes than requested"),
+        ("packed", "the server sent other bytes than requested"),
         ("whole", "the server cannot send parts of a file"),
         ("changes", "changed while it was read"),
-        ("none", "the server does not say how large it is"),
+        ("none", "the server does not report its size"),
         ("huge", "is cut short"),
     ],
 )
@@ -230,7 +230,7 @@ def test_a_server_leads_to_no_file_of_this_machine(address: str, site: Site) -> 
     [
         ("", None),
         ("endless", None),
-        ("huge", "bytes, and here are"),
+        ("huge", "bytes, but only"),
         ("short", "sent other bytes"),
         ("changes", "changed while it was read"),
     ],

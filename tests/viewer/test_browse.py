@@ -88,10 +88,10 @@ def test_the_worst_row_comes_first_and_those_without_a_peer_last(
     errors_px = column(rrd, "/row/error_px", "Scalars:scalars")
     assert errors_px == [[30.0], [10.0], [3.0], [1.0]]
     facts = [words for (words,) in column(rrd, "/row/facts", "TextDocument:text")]
-    assert "**30.0 px** off" in facts[0]
-    assert "**0.50 m** in depth" in facts[0]
+    assert "**30.0 px** pixel error" in facts[0]
+    assert "**0.50 m** depth error" in facts[0]
     assert "recording pictures.mcap" in facts[0]
-    assert "Shows nobody" in facts[4]
+    assert "No peer in view" in facts[4]
     assert column(rrd, "/row/detections", "Points2D:positions")[0] == [[50.0, 12.0]]
     maps = column(rrd, "/row/grid/confidence", "DepthImage:buffer")
     assert np.frombuffer(bytes(maps[0][0]), "<f4")[0] == np.float32(0.1)
@@ -119,7 +119,9 @@ def test_rows_are_filtered_by_error_and_number(folder: Path, found: Path, rrd: P
 def test_a_filter_that_leaves_nothing_says_what_there_is(
     folder: Path, found: Path, rrd: Path
 ) -> None:
-    with pytest.raises(SettingError, match=r"go from 1\.00 to 30\.00 px. Change --error-from-px"):
+    with pytest.raises(
+        SettingError, match=r"errors are 1\.00 to 30\.00 px. Change --error-from-px"
+    ):
         save([folder, found], rrd, Settings(error_from_px=100.0))
     with pytest.raises(SettingError, match=r"name its recording as well"):
         save([folder], rrd, Settings(error_from_px=1.0))

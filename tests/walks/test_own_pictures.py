@@ -42,7 +42,7 @@ def test_the_week_ends_with_a_card_that_hides_nothing(
     assert "labels of source 'hand' are biased: " in capsys.readouterr().err
     with pytest.raises(SettingError, match="has no masks"):
         dataset.run([recording], tmp_path / "d", dataset.Settings(masks=True))
-    with pytest.raises(SettingError, match="no licence that SPDX"):
+    with pytest.raises(SettingError, match="neither SPDX nor"):
         dataset.run([recording], tmp_path / "d", dataset.Settings(license="ccby"))
     dataset.run([recording], tmp_path / "d", dataset.Settings(license="cc-by-4.0"))
     assert "left out: 1 images had no labels" in capsys.readouterr().err

@@ -1,1 +1,1 @@
-"""Join the topics of a recording into what the layouts show."""
+"""Join the topics of a recording into the data of the layouts."""

@@ -1,8 +1,8 @@
-"""A flight while it is read: frames, positions, trails, errors and ranges, stretch by stretch.
+"""Draw a flight while it is read: frames, positions, trails, errors and ranges, batch by batch.
 
-A trail needs the pose of its robot at the time of a position, an error the truth at the time of
-an estimate. What lies between two messages of the other topic waits until the second is read, so
-that nothing depends on where a stretch ends.
+A trail needs the pose of its robot at the time of a position; an error needs the truth at the time
+of an estimate. Rows between two messages of the other topic wait until the second is read. The
+result is therefore independent of the limits of a batch.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,18 +35,18 @@ Rows = tuple[Times, Entity]
 
 @dataclass(slots=True)
 class Heard:
-    """All that was read of a topic or frame, in parts."""
+    """All rows of a topic or frame that were read, in parts."""
 
     parts: list[Timed] = field(default_factory=list)
     until_ns: int = -1
 
     def add(self, part: Timed) -> None:
-        """One part more."""
+        """Add a part."""
         self.parts.append(part)
         self.until_ns = max(self.until_ns, int(part.time_ns[-1]))
 
     def around(self, first_ns: int, last_ns: int) -> Timed:
-        """The parts that reach into a stretch of time, and their neighbours on both sides."""
+        """Return the parts that overlap a time span, with one neighbour on each side."""
         within = [k for k, p in enumerate(self.parts) if p.time_ns[-1] >= first_ns]
         within = [k for k in within if self.parts[k].time_ns[0] <= last_ns]
         before = [k for k, p in enumerate(self.parts) if p.time_ns[-1] < first_ns][-1:]
@@ -56,18 +56,18 @@ class Heard:
 
 @dataclass(slots=True)
 class Derived:
-    """What is drawn of a topic's rows with what another says at their times.
+    """Draw the rows of a topic with interpolated rows of another one.
 
     Parameters
     ----------
     topic
-        Whose rows.
+        Topic of the rows.
     other
-        The other one; None: nothing is needed.
+        Rows of the other topic; None: not needed.
     draw
-        Rows, and what was heard of the other around them, to entities.
+        Converts rows, and the rows of the other topic around them, to entities.
     waiting
-        Rows that the other one has not reached.
+        Rows after the last one of the other topic.
     """
 
     topic: str
@@ -76,7 +76,7 @@ class Derived:
     waiting: list[Timed] = field(default_factory=list)
 
     def ready(self, *, all_read: bool = False) -> Iterator[Rows]:
-        """The rows that can be drawn."""
+        """Yield the rows that can be drawn."""
         if not self.waiting or (self.other is not None and not self.other.parts):
             return
         rows = joined(self.waiting)
@@ -96,17 +96,17 @@ class Derived:
 
 
 class Follower:
-    """Draws the motion of a flight as it is read. One pass, one follower.
+    """Draw the motion of a flight in one pass over it.
 
     Parameters
     ----------
     pairs
-        Who sees whom.
+        Observer and peer of each pair.
     seen
-        A glimpse of the flight: which frames and positions there will be.
+        A sample of the flight, with all its frames and positions.
     begin_ns
-        Log time from which frames stand where they are first known: without a place of its
-        frame at the time that a viewer opens at, a view of space shows nothing at all.
+        Log time at which frames get their first pose. A 3D view is empty if its frame has no pose
+        at the time at which the viewer opens.
     """
 
     def __init__(self, pairs: Sequence[Names], seen: Motion, begin_ns: int) -> None:
@@ -144,11 +144,11 @@ class Follower:
 
     @property
     def topics(self) -> list[str]:
-        """What it has to be given."""
+        """Topics that the streamer reads."""
         return [topics.TRANSFORMS, *self._positions, *self._ranges]
 
     def take(self, stretch: Mapping[str, pa.RecordBatch]) -> Iterator[Rows]:
-        """What can be drawn after a stretch more."""
+        """Yield the rows that can be drawn after another batch."""
         if topics.TRANSFORMS in stretch:
             yield from self._moved(poses_of(stretch[topics.TRANSFORMS]))
         fresh: dict[str, Timed] = {}
@@ -166,12 +166,12 @@ class Follower:
             yield from derived.ready()
 
     def rest(self) -> Iterator[Rows]:
-        """What is left when everything is read."""
+        """Yield the remaining rows after the last batch."""
         for derived in self._derived:
             yield from derived.ready(all_read=True)
 
     def _moved(self, poses: Mapping[str, Poses]) -> Iterator[Rows]:
-        """Frames where they have moved: one that stands still has one row."""
+        """Yield the frames that moved; a fixed frame gets one row."""
         for frame, part in poses.items():
             if frame in self._frames:
                 self._frames[frame].add(part)
@@ -188,7 +188,7 @@ class Follower:
 
 @dataclass(slots=True)
 class Trail:
-    """The way of one robot as another sees it; goes on where it stopped."""
+    """Draw the trajectory of a robot relative to another one, across batches."""
 
     topic: str
     frame: str
@@ -197,11 +197,11 @@ class Trail:
     last_ns: int = -1
 
     def draw(self, positions: Positions, poses: Poses | None) -> Iterator[Entity]:
-        """Some steps more."""
+        """Draw the next steps."""
         there = positions.xyz
         if poses is not None:
             there = poses.applied(there, positions.time_ns)
-        # Another recording begins anew.
+        # Earlier times belong to another recording, which starts a new trail.
         goes_on = self.last is not None and positions.time_ns[0] >= self.last_ns
         first = self.last if goes_on else there[:1]
         self.last, self.last_ns = there[-1:], int(positions.time_ns[-1])
@@ -210,7 +210,7 @@ class Trail:
 
 
 def _own(topic: str, pair: Names, positions: Positions, source: str) -> Iterator[Entity]:
-    """What positions say by themselves."""
+    """Draw the positions of one topic, which need no other topic."""
     yield from space.seen(topic, pair, positions, source)
     yield time_plots.distance(topic, positions, source)
     if source == "estimate":

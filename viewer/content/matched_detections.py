@@ -1,4 +1,4 @@
-"""What a model found in the rows of a dataset, from the recordings that hold it."""
+"""Match the rows of a dataset with detections from the recordings of ``dmrl predict``."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ from dmrl.learn.inference.matching import Points, errors
 from dmrl.recording import Provenance, stretches, summary
 
 Key = tuple[str, str, int]
-"""Recording that a row was made from, robot, log time."""
+"""Source recording of a row, robot, log time in nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Messages of a model, a row for each row of a dataset.
+    """Detections of a model for the rows of a dataset.
 
     Parameters
     ----------
     messages
         All Detections.
     place
-        (N,) which of them belongs to each row; -1: none.
+        (N,) index of each row's message; -1: none.
     where
-        (N,) recording, robot and log time to look for more; None: none.
+        (N,) recording, robot and log time of the message; None: none.
     """
 
     messages: pa.Table
@@ -37,11 +37,11 @@ class Found:
     where: tuple[tuple[Path, str, int] | None, ...]
 
     def of(self, rows: NDArray[np.int64]) -> "Found":
-        """The same for some of the rows."""
+        """Select some of the rows."""
         return Found(self.messages, self.place[rows], tuple(self.where[k] for k in rows))
 
     def detections(self) -> pa.RecordBatch:
-        """Columns of Detections, empty where there are none."""
+        """Return the columns of Detections, with an empty list for rows without a message."""
         empty = self.messages.slice(0, 1).to_pylist()[0] | {"detections": []}
         blank = pa.Table.from_pylist([empty], self.messages.schema)
         every = pa.concat_tables([self.messages, blank])
@@ -49,7 +49,7 @@ class Found:
         return batch
 
     def maps(self) -> pa.RecordBatch | None:
-        """Columns of GridMap; None unless every row has one."""
+        """Read the columns of GridMap; None unless every row has one."""
         if any(where is None for where in self.where):
             return None
         times: dict[tuple[Path, str], list[int]] = {}
@@ -69,7 +69,7 @@ class Found:
 def _maps_at(
     path: Path, robot: str, wanted_ns: Sequence[int]
 ) -> Iterator[tuple[int, pa.RecordBatch]]:
-    """Log time and row of the GridMaps of a robot at some log times."""
+    """Yield the log time and the row of a robot's GridMaps at some log times."""
     topic = topics.grid(robot)
     span = {"start_ns": min(wanted_ns), "end_ns": max(wanted_ns) + 1}
     for stretch in stretches(path, {topic: None}, **span):
@@ -79,12 +79,12 @@ def _maps_at(
 
 
 def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Found:
-    """Detections of the images that a dataset was made from.
+    """Find the detections of the images of a dataset.
 
     Parameters
     ----------
     recordings
-        With detections.
+        Recordings with detections.
     folder
         The dataset.
     wanted
@@ -97,13 +97,13 @@ def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Fou
     """
     sources = {source for source, _, _ in wanted}
     parts: list[pa.RecordBatch] = []
-    where: list[tuple[Path, str, int]] = []  # of each row of the parts
+    where: list[tuple[Path, str, int]] = []  # one for each row of the parts
     at: dict[Key, int] = {}
     for path in recordings:
         names, robots = _related(path, folder, sources)
         for robot, batch in _detected(path, robots):
             for time_ns in batch["log_time"].to_pylist():
-                # A row of the dataset names the recording that it is from: this, or one before it.
+                # The source of a row is this recording, or one that it was made from.
                 at |= {(name, robot, time_ns): len(where) for name in names}
                 where.append((path, robot, time_ns))
             parts.append(batch)
@@ -115,7 +115,7 @@ def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Fou
 
 
 def _detected(path: Path, robots: Sequence[str]) -> Iterator[tuple[str, pa.RecordBatch]]:
-    """Robot and columns of what was detected, one stretch of time after another."""
+    """Yield the robot and the columns of its detections, batch by batch."""
     own = {topics.detections(robot): robot for robot in robots}
     for stretch in stretches(path, dict.fromkeys(own)):
         for topic, batch in stretch.items():
@@ -123,7 +123,7 @@ def _detected(path: Path, robots: Sequence[str]) -> Iterator[tuple[str, pa.Recor
 
 
 def _related(path: Path, folder: Path, sources: set[str]) -> tuple[set[str], list[str]]:
-    """Sources of the dataset that a recording is or was made from, and robots with detections."""
+    """Return the dataset's sources among a recording and its inputs, and robots with detections."""
     kept = summary(path)
     robots = topics.robots(list(kept.topics), topics.DETECTIONS)
     if not robots:
@@ -131,14 +131,14 @@ def _related(path: Path, folder: Path, sources: set[str]) -> tuple[set[str], lis
     names = {path.name, *_ancestors(kept.provenance)} & sources
     if not names:
         raise RecordingError(
-            f"{folder} was not made from {path}, nor from what it was predicted on. "
+            f"{folder} was not made from {path} or its inputs. "
             "Predict on the dataset's own recordings"
         )
     return names, robots
 
 
 def _ancestors(made: Provenance | None) -> set[str]:
-    """Names of all files that a recording was made from."""
+    """Return the names of all files that a recording was made from."""
     if made is None:
         return set()
     return {i.name for i in made.inputs} | {
@@ -147,7 +147,7 @@ def _ancestors(made: Provenance | None) -> set[str]:
 
 
 def errors_of_rows(rows: pa.Table, found: Found, size_px: tuple[int, int]) -> tuple[Array, Array]:
-    """Pixel and depth error of the worst label of each row; NaN where there is none to judge."""
+    """Compute the errors of each row's worst label, pixels and metres of depth; NaN if unknown."""
     peers = rows["peers"].combine_chunks()
     labels = _points(peers, np.arange(len(peers)))
     uv = np.stack([labels.u_px, labels.v_px], axis=1)
@@ -171,7 +171,7 @@ def _worst(count: int, image: NDArray[np.int64], values: Array) -> Array:
 
 
 def _points(column: pa.ListArray, numbers: NDArray[np.int64]) -> Points:
-    """The entries of a list column; ``numbers`` names its rows."""
+    """Build points from the entries of a list column; ``numbers`` are the indices of its rows."""
     flat = column.flatten()
     image = np.repeat(numbers, column.value_lengths().to_numpy())
     u_px, v_px, depth_m = (flat.field(name).to_numpy() for name in ("u_px", "v_px", "depth_m"))

@@ -1,4 +1,4 @@
-"""Where robots are and see each other, as arrays: what 3D views and plots are made from."""
+"""Poses and relative positions of robots as arrays, for 3D views and plots."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -18,17 +18,18 @@ from dmrl.viewer.drawing.entity import WORLD, horizontal_frame
 Times = NDArray[np.int64]
 Names = tuple[str, str]
 MOST = 1e9
-"""Metres, or parts of a quaternion, that are drawn; a recording may say what it likes."""
+"""Largest length in metres, or part of a quaternion, that is drawn; recordings may have any
+value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Where a frame is in its parent.
+    """Poses of a frame in its parent.
 
     Parameters
     ----------
     parent
-        Frame.
+        Parent frame.
     time_ns
         (N,) log times, sorted, at least one.
     xyz, xyzw
@@ -41,7 +42,7 @@ class Poses:
     xyzw: Array
 
     def moved_from(self, last: "Poses | None") -> NDArray[np.bool_]:
-        """(N,) whether a pose is another than the one before it; ``last`` is before the first."""
+        """Return where a pose differs from the one before it, (N,); ``last`` precedes the first."""
         poses = np.concatenate([self.xyz, self.xyzw], axis=1)
         moved = np.ones(len(poses), np.bool_)
         moved[1:] = (poses[1:] != poses[:-1]).any(axis=1)
@@ -51,13 +52,13 @@ class Poses:
         return moved
 
     def applied(self, points: Array, time_ns: Times) -> Array:
-        """(M, 3) points at (M,) times, in the parent; between two poses on the way of both."""
+        """Transform (M, 3) points at (M,) times to the parent; poses are interpolated."""
         after = np.searchsorted(self.time_ns, time_ns).clip(0, len(self.time_ns) - 1)
         before = np.maximum(after - 1, 0)
         span = np.maximum(self.time_ns[after] - self.time_ns[before], 1)
         share = np.clip((time_ns - self.time_ns[before]) / span, 0.0, 1.0)[:, None]
         ends = self.xyzw[before], self.xyzw[after]
-        # A quaternion and its negative are the same turn.
+        # A quaternion and its negative are the same rotation.
         near = np.sign((ends[0] * ends[1]).sum(axis=1, keepdims=True))
         turn = (1 - share) * ends[0] + share * near * ends[1]
         turn /= np.linalg.norm(turn, axis=1, keepdims=True)
@@ -70,7 +71,7 @@ class Poses:
 
 @dataclass(frozen=True, slots=True)
 class Positions:
-    """Where one robot sees another.
+    """Positions of a peer relative to a robot.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ class Positions:
     xyz
         (N, 3) in the robot's horizontal frame, metres.
     covariance
-        (N, 3, 3) square metres; NaN where it is not known.
+        (N, 3, 3) square metres; NaN where unknown.
     status
         (N,) numbers of ``dmrl.v1.Status``.
     """
@@ -90,7 +91,7 @@ class Positions:
     status: NDArray[np.int32]
 
     def at(self, time_ns: Times) -> Array:
-        """(M, 3) positions at (M,) times, on straight lines; NaN over long gaps."""
+        """Interpolate positions linearly at (M,) times, (M, 3); NaN in long gaps."""
         if not len(self.time_ns):
             return np.full((len(time_ns), 3), np.nan)
         after = np.searchsorted(self.time_ns, time_ns).clip(0, len(self.time_ns) - 1)
@@ -113,12 +114,12 @@ Kind = TypeVar("Kind", bound=Timed)
 
 
 def taken(timed: Kind, rows: slice | NDArray[np.int64]) -> Kind:
-    """Some rows."""
+    """Select some rows."""
     return _mapped(timed, lambda name: getattr(timed, name)[rows])
 
 
 def joined(parts: Sequence[Kind]) -> Kind:
-    """All rows, by log time."""
+    """Concatenate parts and sort their rows by log time."""
     if len(parts) == 1:
         return parts[0]
     whole = _mapped(parts[0], lambda name: np.concatenate([getattr(p, name) for p in parts]))
@@ -128,7 +129,7 @@ def joined(parts: Sequence[Kind]) -> Kind:
 
 
 def _mapped(timed: Kind, column: Callable[[str], NDArray[Any]]) -> Kind:
-    """The same with other columns, by name."""
+    """Replace every array by the column of that name."""
     values: dict[str, Any] = {one.name: getattr(timed, one.name) for one in fields(timed)}
     columns = {name: column(name) for name, v in values.items() if isinstance(v, np.ndarray)}
     return type(timed)(**(values | columns))
@@ -136,14 +137,14 @@ def _mapped(timed: Kind, column: Callable[[str], NDArray[Any]]) -> Kind:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Poses and positions of some recordings, by frame and by robot and peer."""
+    """Poses by frame, and positions by robot and peer, of some recordings."""
 
     poses: Mapping[str, Poses] = field(default_factory=dict)
     estimates: Mapping[Names, Positions] = field(default_factory=dict)
     truths: Mapping[Names, Positions] = field(default_factory=dict)
 
     def space(self, robot: str) -> str:
-        """The frame that a robot is shown in: the world, or its own where there is none."""
+        """Return the frame in which a robot is shown: the world, or else its own."""
         own = horizontal_frame(robot)
         return WORLD if own in self.poses and self.poses[own].parent == WORLD else own
 
@@ -151,7 +152,7 @@ class Motion:
 def glimpse(
     recordings: Mapping[Path, Summary], pairs: Iterable[Names], start_ns: int, end_ns: int
 ) -> Motion:
-    """A few moments in [start_ns, end_ns): every frame and pair there is, and how far they go."""
+    """Sample the motion in [start_ns, end_ns): every frame and pair, and their extent."""
     pairs = list(pairs)
     kinds = {topics.position(*pair): ("estimates", pair) for pair in pairs}
     kinds |= {topics.truth(*pair): ("truths", pair) for pair in pairs}
@@ -172,7 +173,7 @@ def glimpse(
 
 
 def poses_of(batch: pa.RecordBatch) -> dict[str, Poses]:
-    """Frames of columns of foxglove.FrameTransforms."""
+    """Read the poses by frame from columns of foxglove.FrameTransforms."""
     column = batch["transforms"]
     rows = np.repeat(np.arange(len(column)), column.value_lengths().to_numpy())
     parts = column.flatten()
@@ -189,18 +190,18 @@ def poses_of(batch: pa.RecordBatch) -> dict[str, Poses]:
 
 
 def _unit(xyzw: Array) -> Array:
-    """Quaternions of length one; NaN where there is no direction."""
+    """Normalize quaternions to length one; NaN where all parts are zero."""
     length = np.linalg.norm(xyzw, axis=1, keepdims=True)
     return xyzw / np.where(length > 0, length, np.nan)
 
 
 def _drawable(values: Array) -> Array:
-    """The values; NaN where they cannot be drawn."""
+    """Replace values that are too large to draw by NaN."""
     return np.where(abs(values) < MOST, values, np.nan)
 
 
 def positions_of(batch: pa.RecordBatch) -> Positions:
-    """Columns of PeerPosition."""
+    """Read the columns of PeerPosition."""
     xyz = np.stack([batch[axis].to_numpy() for axis in "xyz"], axis=1)
     covariance = covariances(batch["covariance"])
     time_ns, status = (batch[name].to_numpy() for name in ("log_time", "status"))
@@ -208,12 +209,12 @@ def positions_of(batch: pa.RecordBatch) -> Positions:
 
 
 def ranges_of(batch: pa.RecordBatch) -> Ranges:
-    """Columns of UwbRange."""
+    """Read the columns of UwbRange."""
     return Ranges(batch["log_time"].to_numpy(), _drawable(batch["range_m"].to_numpy()))
 
 
 def covariances(column: pa.ListArray) -> Array:
-    """(N, 3, 3) of a list column; NaN where it is not given."""
+    """Read a list column of covariances, (N, 3, 3); NaN where missing."""
     given = column.value_lengths().to_numpy() == 9
     out = np.full((len(column), 3, 3), np.nan)
     out[given] = column.filter(pa.array(given)).flatten().to_numpy().reshape(-1, 3, 3)
@@ -221,5 +222,5 @@ def covariances(column: pa.ListArray) -> Array:
 
 
 def vectors(column: pa.StructArray, axes: str) -> Array:
-    """(N, k) of a column of structs with these fields; NaN where they cannot be drawn."""
+    """Read these fields of a column of structs, (N, k); NaN where too large to draw."""
     return _drawable(np.stack([column.field(axis).to_numpy() for axis in axes], axis=1))

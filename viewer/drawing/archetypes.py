@@ -1,7 +1,6 @@
-"""What lies in an image, to rerun archetypes: one function per message type.
+"""Convert messages about an image to rerun archetypes, one function per message type.
 
-All of it is in the ``<robot>/image`` frame, so that maps, labels and detections lie over the
-image where they belong.
+All are in the ``<robot>/image`` frame, so maps, labels and detections match the image's pixels.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,15 +27,15 @@ from dmrl.viewer.drawing.entity import (
 Colour = tuple[int, int, int]
 
 STRIDE_PX = 8
-"""Pixels per cell where a GridMap does not say; the published network's."""
+"""Pixels per cell of a GridMap without a stride; the published network's."""
 
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 CELL_COLOUR = (255, 255, 255)
 HALF_HEIGHT_M, FOCAL, NEAR_M = 0.03, 0.57, 0.1
-"""A text stands so far below a detection: half a small drone, focal length in widths, and the least
-depth that is believed for it."""
+"""Offset of a text below a detection: half the height of a small drone, metres; focal length in
+image widths; smallest depth that is used, metres."""
 BELIEVED = 0.05
-"""Confidence below which a cell's depth is left dark: it is no robot's."""
+"""Confidence below which a cell's depth is drawn dark, since it belongs to no robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +45,13 @@ class Scale:
     Parameters
     ----------
     title
-        What is shown, with its unit.
+        Quantity and unit.
     colormap
         One of rerun's.
     last
         Value of the last colour.
     unit
-        What follows a value.
+        Suffix of a value.
     """
 
     title: str
@@ -62,7 +61,7 @@ class Scale:
 
 
 def scales(depth_max_m: float) -> dict[str, Scale]:
-    """Colours of the channels that are shown, by name of the channel."""
+    """Return the colours of the channels that are shown, by name of the channel."""
     return {
         "confidence": Scale("confidence", "inferno", 1.0, ""),
         "depth_m": Scale("depth, m", "turbo", depth_max_m, " m"),
@@ -70,12 +69,12 @@ def scales(depth_max_m: float) -> dict[str, Scale]:
 
 
 def channel_path(topic: str, channel: str) -> str:
-    """Entity of one channel of a grid."""
+    """Return the entity path of one channel of a grid."""
     return f"{topic}/{channel}"
 
 
 def images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
-    """Compressed images, as they are."""
+    """Draw compressed images without decoding them."""
     formats = batch["format"].to_pylist()
     columns = rr.EncodedImage.columns(
         blob=batch["data"].to_pylist(),
@@ -91,10 +90,10 @@ def detections(
     width_px: int,
     colour: Colour = RGB["detection"],
 ) -> Iterator[Entity]:
-    """Points, their confidence and depth in `texts_path`; below the threshold in `weak_path`.
+    """Draw detections as points; those below the threshold go to `weak_path`.
 
-    Texts stand below the robots. Of two whose texts would cover each other the surer has one.
-    ``width_px`` is the images'.
+    Texts with confidence and depth, in `texts_path`, are below the robots. Of two texts that would
+    overlap, the one with the higher confidence is drawn. ``width_px`` is the width of the images.
     """
     column = batch["detections"]
     found = column.flatten()
@@ -119,24 +118,24 @@ def detections(
 
 
 def texts_path(path: str) -> str:
-    """Entity of what is written below detections."""
+    """Return the entity path of the texts below detections."""
     return f"{path}/texts"
 
 
 def weak_path(path: str) -> str:
-    """Entity of detections below the threshold: in no view until it is added to one."""
+    """Return the entity path of detections below the threshold; no view contains it by default."""
     return f"{path}/weak"
 
 
 def _uncovered(places: NDArray[np.float64], row_of: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """(N,) whose texts stand on none of those before them in their image.
+    """Select the texts that overlap none of those before them in their image, (N,).
 
     Parameters
     ----------
     places
-        (N, 2) in widths of the image.
+        (N, 2) positions in widths of the image.
     row_of
-        (N,) in which image, sorted.
+        (N,) index of the image, sorted.
     """
     out = np.ones(len(places), bool)
     first = np.searchsorted(row_of, row_of)
@@ -159,21 +158,21 @@ def grids(
     *,
     smooth: bool = False,
 ) -> Iterator[Entity]:
-    """Heat maps of confidence and depth, and the cell with the highest confidence.
+    """Draw heat maps of confidence and depth, and the cell with the highest confidence.
 
-    Depth is 0, the darkest colour, where no robot is believed to be: a network says some depth
-    in every cell, and has learned it near robots alone.
+    Depth is drawn as 0, the darkest colour, where confidence is low. A network outputs a depth in
+    every cell but learned depth near robots only.
 
     Parameters
     ----------
     path, frame
-        Where the grid stands, and in which image.
+        Entity path of the grid, and frame of its image.
     batch
         Columns of GridMap.
     scales
         Colours of the channels that are shown.
     smooth
-        Scale the maps up smoothly; otherwise each cell is a square of the pixels it stands for.
+        Interpolate between cells; otherwise each cell is a square of the pixels that it covers.
     """
     sizes = zip(batch["cols"].to_pylist(), batch["rows"].to_pylist(), strict=True)
     formats = [
@@ -214,7 +213,7 @@ def map_entity(
     stride_px: int = STRIDE_PX,
     smooth: bool = False,
 ) -> Entity:
-    """A map that is laid over an image, each cell as large as the pixels it stands for."""
+    """Draw a map over an image; each cell has the size of the pixels that it covers."""
     own = f"{frame}{path}"
     place = rr.Transform3D(scale=[stride_px, stride_px, 1], child_frame=own, parent_frame=frame)
     return Entity(path, columns, (map_style(scale, smooth=smooth), place), own)
@@ -227,7 +226,7 @@ def _best_cells(
     formats: Sequence[rr.components.ImageFormat],
     stride_px: int,
 ) -> Entity:
-    """An outline of the cell with the highest confidence."""
+    """Draw an outline of the cell with the highest confidence."""
     best = np.array([np.frombuffer(buffer, "<f4").argmax() for buffer in buffers])
     cols = np.array([form.width for form in formats])
     centres = (np.column_stack([best % cols, best // cols]) + 0.5) * stride_px
@@ -242,7 +241,7 @@ def _cell_style() -> rr.Boxes2D:
 
 @cache
 def map_style(scale: Scale, *, smooth: bool = False) -> rr.DepthImage:
-    """Colours of a map: fixed range; cells with sharp edges unless they are smoothed."""
+    """Return the style of a map: a fixed range; sharp cells unless they are smoothed."""
     return rr.DepthImage.from_fields(
         colormap=scale.colormap,
         depth_range=[0.0, scale.last],
@@ -256,21 +255,21 @@ def _share(data: bytes, index: int, parts: int) -> bytes:
 
 
 def _dimmed(depth: bytes, confidence: bytes) -> bytes:
-    """A map of depths, 0 where the confidence is under ``BELIEVED``."""
+    """Set the depth to 0 where the confidence is below ``MIN_DEPTH_CONFIDENCE``."""
     believed = np.frombuffer(confidence, "<f4") >= BELIEVED
     return np.where(believed, np.frombuffer(depth, "<f4"), np.float32(0)).tobytes()
 
 
 def rows_of(column: pa.ListArray) -> NDArray[np.intp]:
-    """Which row of a column each value of its lists is in."""
+    """Return the row of a column that each value of its lists belongs to."""
     return np.repeat(np.arange(len(column)), column.value_lengths().to_numpy())
 
 
 def points_px(points: pa.StructArray) -> NDArray[np.float64]:
-    """(N, 2) where labels or detections are."""
+    """Return the positions of labels or detections, (N, 2), pixels."""
     return fields(points, ("u_px", "v_px"))
 
 
 def fields(points: pa.StructArray, names: Sequence[str]) -> NDArray[np.float64]:
-    """(N, k) of a column of structs with these fields."""
+    """Stack these fields of a column of structs, (N, k)."""
     return np.column_stack([points.field(name).to_numpy() for name in names])

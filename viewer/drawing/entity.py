@@ -1,6 +1,6 @@
-"""What is logged: rows of an entity, in a frame, with their style.
+"""Entities to log: rows in a frame, with their style.
 
-Entities are named as the topics they come from. Frames are named as in the recording's /tf:
+An entity has the name of its topic. Frames are named as in the recording's /tf:
 ``world``, ``<robot>/horizontal``, ``<robot>/camera``, ``<robot>/optical``; ``<robot>/image`` is
 the image plane, pixels, u right and v down.
 """
@@ -12,12 +12,12 @@ import rerun as rr
 
 WORLD = "world"
 
-# rerun takes a negative radius in points of the screen: the same at every zoom.
+# rerun treats a negative radius as points of the screen, equal at every zoom.
 POINT_UI, FAINT_POINT_UI, LINE_UI = -4.0, -1.5, -1.0
 INVISIBLE = 0.01
 
-# rerun writes below a point. In the smallest panel that a layout opens with, a text is as high and
-# as wide as these shares of an image's width.
+# Height and width of a text below a point, as shares of the image's width, in the smallest panel
+# that a layout opens.
 TEXT_HEIGHT, TEXT_WIDTH, DETECTION_TEXT_WIDTH = 1 / 12, 1 / 4, 3 / 10
 
 ELLIPSE_SIGMAS = 2.0
@@ -31,13 +31,13 @@ class Entity:
     Parameters
     ----------
     path
-        Where it stands, as a topic.
+        Its path, a topic.
     columns
-        One row per message; none for what does not move.
+        One row per message; empty for a static entity.
     style
-        What never changes; logged once.
+        Static components; logged once.
     frame
-        Frame its coordinates are in; None for what has no place, such as a plot.
+        Frame of its coordinates; None for entities without a position, such as a plot.
     """
 
     path: str
@@ -47,25 +47,25 @@ class Entity:
 
 
 def escaped(path: str) -> str:
-    """A topic as rerun writes an entity's path; robots may have any name."""
+    """Convert a topic to an entity path of rerun; robots may have any name."""
     return rr.new_entity_path(path.strip("/").split("/"))
 
 
 def image_frame(robot: str) -> str:
-    """Frame of what lies in the image plane of a robot's camera."""
+    """Return the frame of the image plane of a robot's camera."""
     return f"{robot}/image"
 
 
 def horizontal_frame(robot: str) -> str:
-    """Frame of what a robot sees around it."""
+    """Return the horizontal frame of a robot, which contains the positions of its peers."""
     return f"{robot}/horizontal"
 
 
 def camera_frame(robot: str) -> str:
-    """Frame of a robot's body and camera."""
+    """Return the frame of a robot's body and camera."""
     return f"{robot}/camera"
 
 
 def optical_frame(robot: str) -> str:
-    """Frame of a robot's lens: x right, y down, z forward."""
+    """Return the frame of a robot's lens: x right, y down, z forward."""
     return f"{robot}/optical"

@@ -1,4 +1,4 @@
-"""Labels in an image: points, boxes, ellipses and texts, to rerun archetypes."""
+"""Draw labels in an image: points, boxes, ellipses and texts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -30,20 +30,20 @@ def labels(
     sources: set[str],
     size_px: tuple[int, int],
 ) -> Iterator[Entity]:
-    """Points, boxes and ellipses of every source of labels.
+    """Draw points, boxes and ellipses of every source of labels.
 
     Parameters
     ----------
     path, frame
-        Where the labels stand, and in which image.
+        Entity path of the labels, and frame of their image.
     batch
         Columns of PeerLabels.
     sources
-        Sources met so far, grown here: a row without a source's labels must still be sent,
-        or the last ones would stay on the screen.
+        Sources found so far; updated in place. A row without labels of a source must still be sent,
+        or the old ones would stay on the screen.
     size_px
-        Width and height of the images: ellipses around points outside are left out, which
-        would cover all that is around the image.
+        Width and height of the images. Ellipses around points outside are left out: they would
+        cover the surroundings of the image.
     """
     column = batch["peers"]
     row_of = rows_of(column)
@@ -64,7 +64,7 @@ def labels(
 
 @dataclass(frozen=True, slots=True)
 class _Labels:
-    """The labels of one source, one after another; ``row_of`` says in which image."""
+    """The labels of one source; ``row_of`` is the image of each."""
 
     peers: pa.StructArray
     row_of: NDArray[np.intp]
@@ -103,14 +103,14 @@ class _Labels:
 
 
 def _boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """(N,) which labels have a box; (M, 2, 2) upper left and lower right corners of those."""
+    """Return which labels have a box, (N,), and the corners of those, (M, 2, 2)."""
     edges = peers.field("box_px")
     boxed = edges.value_lengths().to_numpy() == 4
     return boxed, edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
 
 
 def _tops(peers: pa.StructArray) -> NDArray[np.float64]:
-    """(N, 2) middle of the upper edge of each label's box; the label itself, where it has none."""
+    """Return the middle of the upper edge of each label's box, (N, 2); without a box, the label."""
     boxed, corners = _boxes(peers)
     out = points_px(peers)
     out[boxed] = np.column_stack([corners.mean(axis=1)[:, 0], corners[:, 0, 1]])
@@ -120,14 +120,14 @@ def _tops(peers: pa.StructArray) -> NDArray[np.float64]:
 def _text_places(
     tops_px: NDArray[np.float64], row_of: NDArray[np.intp], width_px: int
 ) -> NDArray[np.float64]:
-    """Where texts stand: above their peers (below stand detections), and none on another.
+    """Place texts above their peers without overlap; the texts of detections are below.
 
     Parameters
     ----------
     tops_px
-        (N, 2) what they stand above; those that come first have the first choice.
+        (N, 2) points below the texts; the first ones have the first choice.
     row_of
-        (N,) in which image, sorted.
+        (N,) index of the image, sorted.
     width_px
         Width of the images.
     """
@@ -143,20 +143,20 @@ def _text_places(
 
 
 def _free_place(wanted: float, taken: NDArray[np.float64], high: float) -> float:
-    """The nearest height that leaves ``high`` to all that are taken; rather above than below."""
+    """Find the nearest height at a distance of ``high`` from all in ``taken``; prefer above."""
     above, below = taken - high, taken + high
     tried = np.concatenate([[wanted], above[above >= 0], below])
     far = np.where(tried > wanted, 3.0, 1.0) * abs(tried - wanted)
     free = (abs(tried[:, None] - taken) > high - 0.5).all(axis=1)
-    # Below the lowest there is always room.
+    # Below the lowest text there is always room.
     return float(tried[np.argmin(np.where(free, far, np.inf))])
 
 
 @cache
 def _label_styles(source: str) -> tuple[rr.Points2D, rr.Points2D, rr.Boxes2D, rr.Ellipses2D]:
-    """Of points, texts, boxes and ellipses. Asked for often, so made once."""
+    """Return the styles of points, texts, boxes and ellipses. Cached for later batches."""
     colour = RGB.get(source, RGB["other"])
-    # Where two sources agree, the one named first in the table is seen.
+    # Where two sources agree, the first one in the table is drawn on top.
     order = 30.0 - _order(source)[0]
     dot, dust = (
         rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
@@ -170,5 +170,5 @@ def _label_styles(source: str) -> tuple[rr.Points2D, rr.Points2D, rr.Boxes2D, rr
 
 
 def _order(source: str) -> tuple[int, str]:
-    """Place of a source in the table of colours; those it does not know come last."""
+    """Return the index of a source in the table of colours; unknown sources come last."""
     return list(RGB).index(source if source in RGB else "other"), source

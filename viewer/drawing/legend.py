@@ -1,4 +1,4 @@
-"""What explains the colours: drawn below the image and the maps, in image pixels."""
+"""Draw the legend and the colour bars below the image and the maps, in image pixels."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
@@ -10,26 +10,26 @@ from dmrl.viewer.drawing.archetypes import Colour, Scale, map_style
 from dmrl.viewer.drawing.entity import LINE_UI, Entity, image_frame
 
 HEIGHT_PX = 26
-"""Room that the legend and the colour bars take below an image, pixels."""
+"""Height of the legend and the colour bars below an image, pixels."""
 
 MARK_PX, BAR_PX, BAR_STEPS = 6, 6, 64
 TEXT_COLOUR = (220, 220, 220)
-# In a panel a quarter as wide as the window, so many characters fit side by side.
 CHARACTERS, AROUND = 50, 4
+"""Characters that fit side by side in a panel of a quarter of the window, and gap between names."""
 
 
 def legend_path(robot: str) -> str:
-    """Entity of a robot's legend of sources."""
+    """Return the entity path of a robot's legend of sources."""
     return f"/{robot}/legend/sources"
 
 
 def bar_path(robot: str, channel: str) -> str:
-    """Entity above the colour bar of a channel of the grid, and its ticks."""
+    """Return the entity path above the colour bar of a channel, and its ticks."""
     return f"/{robot}/legend/{channel}"
 
 
 def legend(robot: str, colours: Mapping[str, Colour], width_px: int, height_px: int) -> Entity:
-    """A line in the colour of each source, with its name."""
+    """Draw a line in the colour of each source, with its name."""
     names = _fitting(list(colours))
     takes = np.array([len(name) + AROUND for name in names])
     middle_px = (np.cumsum(takes) - takes / 2) * width_px / max(CHARACTERS, takes.sum())
@@ -44,7 +44,7 @@ def legend(robot: str, colours: Mapping[str, Colour], width_px: int, height_px: 
 
 
 def _fitting(names: Sequence[str]) -> list[str]:
-    """Names that fit side by side: of those that are too long, what tells them apart."""
+    """Truncate names to fit side by side; long names keep the part in which they differ."""
     length = max(map(len, names), default=0)
     while length > 3 and sum(min(len(name), length) + AROUND for name in names) > CHARACTERS:
         length -= 1
@@ -56,7 +56,7 @@ def _fitting(names: Sequence[str]) -> list[str]:
 
 
 def _alike(names: Sequence[str]) -> int:
-    """How many characters two or more names begin with, all of them."""
+    """Return the length of the common prefix of two or more names."""
     if len(names) < 2:
         return 0
     columns = zip(*names, strict=False)
@@ -64,7 +64,7 @@ def _alike(names: Sequence[str]) -> int:
 
 
 def _shortened(name: str, length: int, first: int, last: int) -> str:
-    """What is not alike in all names; of that the beginning, if it is still too long."""
+    """Remove the common prefix and suffix of a name, and truncate it if it is still too long."""
     own = name[first : len(name) - last]
     kept = f"{'…' * (first > 0)}{own}{'…' * (last > 0)}"
     return kept if len(kept) <= length else f"{kept[: length - 1]}…"
@@ -73,7 +73,7 @@ def _shortened(name: str, length: int, first: int, last: int) -> str:
 def colour_bars(
     robot: str, scales: Mapping[str, Scale], width_px: int, height_px: int
 ) -> Iterator[Entity]:
-    """A bar with three ticks for each channel of the grid."""
+    """Draw a bar with three ticks for each channel of the grid."""
     left_px, length_px = width_px / 10, width_px * 8 / 10
     top_px = height_px + BAR_PX / 2
     shares = (0.0, 0.5, 1.0)

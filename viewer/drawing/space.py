@@ -1,4 +1,4 @@
-"""What stands in space: robots, where they see each other, and how sure they are.
+"""Draw robots in 3D, with the relative positions of peers and their covariance.
 
 Positions of peers are in the ``<robot>/horizontal`` frame; where the recording has /tf, that
 frame moves in ``world``.
@@ -35,7 +35,7 @@ OPTICAL_XYZW = [-0.5, 0.5, -0.5, 0.5]
 
 
 def transform(frame: str, poses: Poses) -> Entity:
-    """Where a frame is in its parent; its log times are those of the poses."""
+    """Draw the poses of a frame in its parent, at the log times of the poses."""
     count = len(poses.time_ns)
     columns = rr.Transform3D.columns(
         translation=poses.xyz,
@@ -47,7 +47,7 @@ def transform(frame: str, poses: Poses) -> Entity:
 
 
 def still_frame(frame: str, parent: str, xyzw: Sequence[float] = (0, 0, 0, 1)) -> Entity:
-    """A frame that stays where it is."""
+    """Build a frame that is fixed in its parent."""
     turn = rr.Quaternion(xyzw=xyzw)
     place = rr.Transform3D(
         translation=(0, 0, 0), quaternion=turn, child_frame=frame, parent_frame=parent
@@ -56,7 +56,7 @@ def still_frame(frame: str, parent: str, xyzw: Sequence[float] = (0, 0, 0, 1)) -
 
 
 def attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
-    """How a robot's body is tilted against its horizontal frame."""
+    """Draw the attitude of a robot's body relative to its horizontal frame."""
     roll, pitch = (batch[f"{name}_rad"].to_numpy() / 2 for name in ("roll", "pitch"))
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     columns = rr.Transform3D.columns(
@@ -68,7 +68,7 @@ def attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
 
 
 def body(robot: str) -> Iterator[Entity]:
-    """A robot's shape, axes and name."""
+    """Draw a robot's shape, axes and name."""
     mesh = crazyflie.CRAZYFLIE.mesh()
     shape = rr.Mesh3D(
         vertex_positions=mesh.vertices,
@@ -85,14 +85,14 @@ def body(robot: str) -> Iterator[Entity]:
 
 
 def frustum(robot: str, path: str, calibration: Mapping[str, Any]) -> Entity:
-    """A robot's field of view, with its image in it.
+    """Draw a robot's field of view, with its image in it.
 
     Parameters
     ----------
     robot
         Its name.
     path
-        Where the calibration stands.
+        Topic of the calibration.
     calibration
         Fields of foxglove.CameraCalibration.
     """
@@ -109,9 +109,9 @@ def frustum(robot: str, path: str, calibration: Mapping[str, Any]) -> Entity:
 
 
 def seen(path: str, pair: Names, positions: Positions, source: str) -> Iterator[Entity]:
-    """Where a robot sees a peer, with the covariance; its log times are those of the positions.
+    """Draw a peer's positions and covariance, at the log times of the positions.
 
-    An estimate that is not OK is drawn in the colour of its status.
+    An estimate that is not OK has the colour of its status.
     """
     frame = horizontal_frame(pair[0])
     colours = np.array([RGB[source], STATUS_RGB["UNCONVERGED"], STATUS_RGB["AMBIGUOUS"]], np.uint8)
@@ -130,7 +130,7 @@ def _ellipsoids(
     colours: NDArray[np.uint8],
     lengths: NDArray[np.intp] | None = None,
 ) -> Iterator[Entity]:
-    """One for each known covariance that is not zero; ``lengths``: how many to a row."""
+    """Draw an ellipsoid for each known covariance that is not zero; ``lengths``: number per row."""
     known = np.isfinite(covariance).all(axis=(1, 2)) & covariance.any(axis=(1, 2))
     if lengths is None and not known.any():
         return
@@ -148,7 +148,7 @@ def _ellipsoids(
 
 
 def _axes(covariance: Array) -> tuple[Array, Array]:
-    """Half axes (N, 3), metres, and directions (N, 4), quaternions, of ellipsoids."""
+    """Return half axes (N, 3), metres, and directions (N, 4), quaternions, of ellipsoids."""
     variance, axes = np.linalg.eigh(covariance)
     # A rotation, not a reflection.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
@@ -156,7 +156,7 @@ def _axes(covariance: Array) -> tuple[Array, Array]:
 
 
 def _quaternions(matrices: Array) -> Array:
-    """(N, 4) xyzw of (N, 3, 3) rotations, from the largest of the four."""
+    """Convert rotations (N, 3, 3) to quaternions xyzw (N, 4), from the largest component."""
     m = matrices
     diagonal = np.einsum("nii->ni", m)
     trace = diagonal.sum(axis=1, keepdims=True)
@@ -173,13 +173,13 @@ def _quaternions(matrices: Array) -> Array:
 
 
 def trail(path: str, frame: str, steps: Array, source: str) -> Entity:
-    """(N, 2, 3) the way from each position to the next; a view shows the last seconds of it."""
+    """Draw the step from each position to the next, (N, 2, 3); a view shows the last seconds."""
     style = rr.LineStrips3D.from_fields(colors=[RGB[source]], radii=[TRAIL_UI])
     return Entity(path, rr.LineStrips3D.columns(strips=_strips(steps)), (style,), frame)
 
 
 def _strips(points: Array) -> pa.ListArray:
-    """(N, k, 3) as N lines. From a list of arrays rerun takes each for itself: 20 us."""
+    """Convert (N, k, 3) points to N lines. rerun takes 20 us for each in a list of arrays."""
     kind = rr.components.LineStrip3DBatch([]).as_arrow_array().type
     flat = pa.array(points.astype(np.float32).reshape(-1))
     offsets = np.arange(len(points) + 1, dtype=np.int32) * points.shape[1]
@@ -188,16 +188,16 @@ def _strips(points: Array) -> pa.ListArray:
 
 
 def ranges(path: str, robot: str, measured: Ranges, towards: Positions | None) -> Iterator[Entity]:
-    """Measured distances: lines to where the peer is thought to be, or spheres where nobody knows.
+    """Draw ranges as lines to the estimated peer, or as spheres without an estimate.
 
     Parameters
     ----------
     path, robot
-        Where the ranges stand, and who measured them.
+        Topic of the ranges, and the robot that measured them.
     measured
-        The distances.
+        The ranges.
     towards
-        Where the peer is thought to be.
+        Estimated or true positions of the peer.
     """
     range_m = measured.range_m
     frame = horizontal_frame(robot)
@@ -222,7 +222,7 @@ def ranges(path: str, robot: str, measured: Ranges, towards: Positions | None) -
 
 
 def tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
-    """Peers followed over time: position, name, velocity and covariance."""
+    """Draw tracks of peers: position, name, velocity and covariance."""
     column, frame = batch["tracks"], horizontal_frame(robot)
     lengths = column.value_lengths().to_numpy()
     found = column.flatten()
@@ -238,7 +238,7 @@ def tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     points = rr.Points3D.columns(positions=xyz, labels=names).partition(lengths)
     dot = rr.Points3D.from_fields(colors=[colour], radii=[POINT_UI], show_labels=True)
     yield Entity(path, points, (dot,), frame)
-    # As far as it goes in one second.
+    # An arrow is as long as the motion in one second.
     arrows = rr.Arrows3D.columns(origins=xyz, vectors=velocity).partition(lengths)
     thin = rr.Arrows3D.from_fields(colors=[colour], radii=[LINE_UI])
     yield Entity(f"{path}/velocity", arrows, (thin,), frame)

@@ -1,6 +1,6 @@
-"""What is plotted over time, every line with its unit in the name of its panel.
+"""Draw values over time; the title of a panel has the unit.
 
-Styles are logged once, but asked for with every stretch: they are made once too.
+Styles are logged once but requested for every batch, so they are cached.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,7 @@ from dmrl.viewer.drawing.entity import Entity
 
 BOUND_SIGMAS = 3.0
 NEES_95 = 5.991
-"""95 % of a chi-square with two degrees of freedom lie below."""
+"""95th percentile of a chi-square distribution with two degrees of freedom."""
 
 _RED, _GREEN, _BLUE = RGB["estimate"]
 DIM_ESTIMATE: Colour = (_RED // 2, _GREEN // 2, _BLUE // 2)
@@ -29,7 +29,7 @@ WIDTH_UI, THIN_UI, MARKER_UI = 1.5, 0.8, 0.8
 
 
 def line(path: str, values: Array, name: str, colour: Colour, width: float = WIDTH_UI) -> Entity:
-    """One line: (N,) values; where they are NaN, it has a gap."""
+    """Draw one line from (N,) values; NaN leaves a gap."""
     style = _lines((colour,), (name,), width)
     return Entity(path, rr.Scalars.columns(scalars=values), (style,))
 
@@ -40,7 +40,7 @@ def _lines(colours: tuple[Colour, ...], names: tuple[str, ...], width: float) ->
 
 
 def dots(path: str, values: Array, name: str, colour: Colour) -> Entity:
-    """(N,) values that scatter too much for a line."""
+    """Draw (N,) values as dots, for values that scatter too much for a line."""
     return Entity(path, rr.Scalars.columns(scalars=values), (_dots(name, colour),))
 
 
@@ -52,7 +52,7 @@ def _dots(name: str, colour: Colour) -> rr.SeriesPoints:
 def sensor(
     topic: str, batch: pa.RecordBatch, row: Topic, robot: str, *, own: bool
 ) -> Iterator[Entity]:
-    """What the table of topics says of a sensor: lines of the robot, dots of a pair."""
+    """Draw a sensor as the table of topics defines: lines for a robot, dots for a pair."""
     if row.curve is None:
         return
     for path, fields in row.curve.lines(topic).items():
@@ -70,10 +70,10 @@ def sensor(
 
 @dataclass(slots=True)
 class Attitude:
-    """Roll, pitch and yaw of a robot, degrees, stretch by stretch.
+    """Draw roll, pitch and yaw of a robot, degrees, across batches.
 
-    A robot that turns on past 180 is drawn past 180: there is no jump to -180. Yaw begins within
-    180 of zero and goes on where the stretch before ended.
+    Yaw is unwrapped, so it does not jump from 180 to -180. It starts within 180 of zero and
+    continues from the end of the batch before.
     """
 
     path: str
@@ -83,7 +83,7 @@ class Attitude:
     last_ns: int = -1
 
     def draw(self, batch: pa.RecordBatch) -> Iterator[Entity]:
-        """Some rows more."""
+        """Draw the next rows."""
         for name, colour in (("roll", OWN), ("pitch", PEER)):
             degrees = np.degrees(batch[f"{name}_rad"].to_numpy())
             yield line(f"{self.path}/{name}", degrees, name, colour)
@@ -93,7 +93,7 @@ class Attitude:
     def _yaw(self, batch: pa.RecordBatch) -> Array:
         degrees: Array = np.degrees(batch["yaw_rad"].to_numpy())
         time_ns = batch["log_time"].to_numpy()
-        # Another recording, or another pass, begins anew.
+        # Earlier times belong to another recording or pass, which starts anew.
         before = self.last_deg if time_ns[0] >= self.last_ns else 0.0
         known = np.isfinite(degrees)
         if known.any():
@@ -104,13 +104,13 @@ class Attitude:
 
 
 def distance(path: str, positions: Positions, source: str) -> Entity:
-    """How far away a peer is thought to be."""
+    """Draw the distance of a peer."""
     values = np.linalg.norm(positions.xyz, axis=1)
     return line(f"{path}/distance", values, source, RGB[source])
 
 
 def errors(path: str, positions: Positions, truth: Positions) -> Iterator[Entity]:
-    """Estimate minus truth with three standard deviations, along x and y; NEES of both."""
+    """Draw the error along x and y with its 3-sigma bounds, and the NEES of both."""
     error = (positions.xyz - truth.at(positions.time_ns))[:, :2]
     covariance = positions.covariance[:, :2, :2]
     bound = BOUND_SIGMAS * np.sqrt(np.einsum("nii->ni", covariance))
@@ -121,11 +121,11 @@ def errors(path: str, positions: Positions, truth: Positions) -> Iterator[Entity
         yield line(f"{path}/error/{axis}", error[:, k], "estimate", RGB["estimate"])
     yield line(f"{path}/nees", _nees(error, covariance), "estimate", RGB["estimate"])
     limit = np.full(len(error), NEES_95)
-    yield line(f"{path}/nees/limit", limit, "95 % are below", PEER, THIN_UI)
+    yield line(f"{path}/nees/limit", limit, "95 % limit", PEER, THIN_UI)
 
 
 def _nees(error: Array, covariance: Array) -> Array:
-    """(N,) squared errors in units of their covariance; NaN where it is unknown or zero."""
+    """Return squared errors divided by their covariance, (N,); NaN where it is unknown or zero."""
     given = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
     spread = np.linalg.det(np.where(np.reshape(given, (-1, 1, 1)), covariance, 0.0))
     known = np.flatnonzero(spread > 0)
@@ -136,7 +136,7 @@ def _nees(error: Array, covariance: Array) -> Array:
 
 
 def status(path: str, positions: Positions) -> Iterator[Entity]:
-    """How far the estimates can be trusted, as a band."""
+    """Draw the status of the estimates as a band."""
     kind = descriptor("PeerPosition").fields_by_name["status"].enum_type
     names = {} if kind is None else {n: v.name for n, v in kind.values_by_number.items()}
     states = [names.get(number, str(number)) for number in positions.status.tolist()]

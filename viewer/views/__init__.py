@@ -1,7 +1,7 @@
-"""What recordings can be shown as: a file here is a layout of ``dmrl view``, by its name.
+"""Layouts of ``dmrl view`` for recordings, one file each; the file has the layout's name.
 
-It has one function, ``scene(selection, settings)``, which gives a `Scene`: what is drawn of which
-topics, and the panels around it. It is loaded when it is shown.
+Each has a function ``scene(selection, settings)``. It returns a `Scene`: the topics that are drawn,
+and the panels around them. A layout is imported when it is shown.
 """
 
 from pkgutil import iter_modules

@@ -1,4 +1,4 @@
-"""Layout ``compare``: what two models found in the same images, and how far off they were."""
+"""Layout ``compare``: detections of two models in the same images, and their errors."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ ROWS: tuple[tuple[str, str, Callable[[Array], str]], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Errors of one model: (N,) log times of labels, sorted, and how far off it was."""
+    """Errors of one model: (N,) log times of labels, sorted, and errors of pixel and depth."""
 
     source: str
     time_ns: Times
@@ -46,12 +46,12 @@ class Judged:
 
 
 def scene(selection: Selection, settings: Settings) -> Scene:
-    """Two models in the images of one robot.
+    """Build the scene of two models in the images of one robot.
 
     Raises
     ------
     RecordingError
-        If there are not two recordings with detections of one robot.
+        Unless exactly two recordings have detections of that robot.
     """
     robot, models = _models(selection, settings.robot)
     scales = archetypes.scales(settings.depth_max_m)
@@ -82,12 +82,12 @@ def _models(selection: Selection, wanted: str | None) -> tuple[str, list[Path]]:
             "Try: dmrl predict MODEL IN.mcap OUT.mcap"
         )
     if models[0].stem == models[1].stem:
-        raise SettingError(f"{names} have the same name, which tells models apart. Rename one")
+        raise SettingError(f"{names} have the same name, but it identifies the model. Rename one")
     return robot, models
 
 
 def _judged(path: Path, robot: str, selection: Selection) -> Judged | None:
-    """How far off a model was; None, and a line, if nothing can judge it."""
+    """Compute the errors of a model; None, with a message, without labels to compare with."""
     try:
         source = label_source(Contents(path, topics.LABELS), "best")
         pairs = detections.join([path], source)
@@ -132,7 +132,7 @@ def _stills(models: Sequence[Path], judged: dict[Path, Judged]) -> Iterator[Stil
 
 
 def _lines(path: Path, judged: Judged, colour: Colour) -> Iterator[Entity]:
-    """The worst label of each image."""
+    """Yield the error of the worst label of each image as lines."""
     _, row = np.unique(judged.time_ns, return_inverse=True)
     for name, values in (("error_px", judged.error_px), ("error_m", abs(judged.error_m))):
         worst = np.full(row.max() + 1, -np.inf)

@@ -20,11 +20,11 @@ from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
 
 CAMERAS_MAX = 4
 DISTANCE = "distance, m"
-"""Where estimates and truth are plotted beside what is measured."""
+"""Title of the plot of estimated, true and measured distances."""
 
 
 def scene(selection: Selection, settings: Settings) -> Scene:
-    """What a flight shows, as far as the recordings have it. A few moments of it say what."""
+    """Build the scene of a flight. A few samples of the recordings decide its panels."""
     pairs = _pairs(selection, settings.robot)
     seen = glimpse(selection.recordings, pairs, *selection.shown_ns)
     robots = _robots(selection, pairs, settings.robot)
@@ -70,12 +70,12 @@ def _pairs(selection: Selection, robot: str | None) -> list[Names]:
     if robot is not None or len(pairs) <= MANY_PAIRS:
         return pairs
     first = min(selection.image_ns, default=pairs[0][0])
-    say(f"{len(pairs)} pairs of robots: {first} is shown. Name another with --robot")
+    say(f"{len(pairs)} pairs of robots: showing those of {first}. Choose another with --robot")
     return selection.pairs(first)
 
 
 def _robots(selection: Selection, pairs: Sequence[Names], only: str | None) -> list[str]:
-    """Robots that are drawn: those of the pairs, and those that measure themselves."""
+    """Return the robots that are drawn: those of the pairs, and those with sensors of their own."""
     own = {n["robot"] for row in topics.OWN_SENSORS for n in selection.found(row.pattern)}
     own |= {n["robot"] for n in selection.found(topics.TRACKS)} | set(selection.image_ns)
     if only is not None or pairs:
@@ -101,7 +101,7 @@ def _sensor_draw(row: Topic, robot: str, peer: str = "", *, own: bool) -> Draw:
 
 
 def _stills(selection: Selection, seen: Motion, robots: Sequence[str]) -> Iterator[Entity]:
-    """Robots, and the frames that hang on those of /tf."""
+    """Yield the bodies of robots, and the fixed frames below those of /tf."""
     present = _topics(selection)
     calibrations = firsts(selection, map(topics.calibration, robots))
     for robot in robots:
@@ -111,7 +111,7 @@ def _stills(selection: Selection, seen: Motion, robots: Sequence[str]) -> Iterat
             yield space.still_frame(optical_frame(robot), camera_frame(robot), space.OPTICAL_XYZW)
         yield from space.body(robot)
         topic = topics.calibration(robot)
-        # Zeros: not calibrated. Others than nine: no camera.
+        # All zeros: not calibrated. Not nine values: no camera.
         k = calibrations[topic]["K"] if topic in calibrations else ()
         if len(k) == 9 and any(k):
             yield space.frustum(robot, topic, calibrations[topic])
@@ -124,7 +124,7 @@ def _spaces(
     robots: Sequence[str],
     eyes: Sequence[Eye],
 ) -> list[Space]:
-    """The world; or what every robot sees around it, where there is no world."""
+    """Return a view of the world, or of each observer's horizontal frame if there is no world."""
     groups: dict[str, list[str]] = {}
     for robot in robots:
         groups.setdefault(motion.space(robot), []).append(robot)
@@ -167,7 +167,7 @@ def _three(point: np.ndarray) -> tuple[float, float, float]:
 def _extent(
     motion: Motion, frame: str, pairs: Sequence[Names], robots: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box that holds nearly all positions, and who sees them, metres."""
+    """Return the corners of the box of nearly all positions and their observers, metres."""
     if frame == WORLD:
         own = (horizontal_frame(robot) for robot in robots)
         found = [motion.poses[name].xyz for name in own if name in motion.poses]
@@ -183,7 +183,7 @@ def _nearly_all(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _panels(selection: Selection, motion: Motion, pair: Names) -> list[Plot]:
-    """Plots of what one robot knows of another, those that have something to show."""
+    """Return the plots of one pair of robots that have data."""
     peer = pair[1]
     estimate, truth = topics.position(*pair), topics.truth(*pair)
     judged = pair in motion.estimates and pair in motion.truths
@@ -216,7 +216,7 @@ def _panels(selection: Selection, motion: Motion, pair: Names) -> list[Plot]:
 def _curves(
     selection: Selection, rows: Sequence[Topic], pairs: Sequence[Names]
 ) -> dict[str, list[str]]:
-    """Lines of sensors that have something to show, by the title of their panel."""
+    """Return the lines of sensors that have data, by the title of their panel."""
     present, found = _topics(selection), dict[str, list[str]]()
     for row in rows:
         for robot, peer in pairs:

@@ -9,7 +9,7 @@ from dmrl.viewer.selection import Selection, Settings
 
 
 def scene(selection: Selection, settings: Settings) -> Scene:
-    """Images and maps of every robot."""
+    """Build the scene with the images and maps of every robot."""
     scales = archetypes.scales(settings.depth_max_m)
     eyes = eyes_of(selection, sorted(selection.image_ns), scales)
     blueprint = layouts.image(eyes, scales, overlay=settings.overlay)

@@ -1,1 +1,1 @@
-"""The rerun viewer as a process: desktop window, web page, live view."""
+"""Run rerun's viewer as a process: desktop window, web page, live view."""

@@ -1,4 +1,4 @@
-"""rerun's viewer in a window, and pictures of it without a screen."""
+"""Show recordings in rerun's desktop viewer, and take screenshots without a screen."""
 
 import subprocess
 import time
@@ -32,27 +32,27 @@ from dmrl.viewer.window.viewer_process import (
     url_of,
 )
 
-# rerun keeps an empty bar above its panels, for the buttons of a window that a picture has not.
 BAR_PX = 36
+"""Height of the empty bar above rerun's panels, which holds the buttons of a window."""
 PICTURE_SIZE = f"1600x{1000 + BAR_PX}"
 
-# What rerun says when it cannot draw, and when it cannot open a window.
+# Parts of rerun's error messages without a Vulkan driver, and without a screen.
 NO_VULKAN = "render context"
 NO_SCREEN = "WAYLAND_DISPLAY"
 
 
 def view(paths: Sequence[Path], settings: Settings) -> None:
-    """Show recordings in a window, until it is closed. It opens while they are being read.
+    """Show recordings in a window until it is closed. It opens while they are still being read.
 
     Raises
     ------
     DatasetError, RecordingError
-        If they cannot be read, or lack what the layout shows.
+        If they cannot be read, or have nothing for the layout.
     SettingError
-        If there is no screen, or nothing lies in the time asked for.
+        If there is no screen, or the recordings are empty at the requested time.
     """
     port = free_port(LOOPBACK)
-    # The viewer wakes up while the recording's index is read.
+    # The viewer starts while the recording's index is read.
     with running(command(LOOPBACK, "--port", str(port))) as viewer:
         show = prepare(paths, settings)
         with ended_by_signal(viewer.ended):
@@ -76,35 +76,35 @@ def screenshot(
     time_s: float | None = None,
     rank: int = 1,
 ) -> str:
-    """Write a PNG picture of what would be shown at a time; needs no screen.
+    """Write a PNG screenshot of the viewer at a time; needs no screen.
 
     Parameters
     ----------
     paths
         Recordings, or a dataset.
     out
-        Picture to write. Must not exist.
+        Image to write. Must not exist.
     settings
-        What is shown.
+        Selects images and layout.
     time_s
-        Seconds from the start of the earliest recording: the nearest image is taken. None:
-        the first image.
+        Seconds from the start of the earliest recording; the nearest image is shown. None: the
+        first image.
     rank
-        Of a dataset: which row, from 1.
+        Row of a dataset, from 1.
 
     Returns
     -------
     str
-        What is seen, in words.
+        The time or row that is shown, in words.
 
     Raises
     ------
     OutputError
         If ``out`` exists, cannot be written, or there is no Vulkan driver to draw with.
     DatasetError, RecordingError
-        If they cannot be read, or lack what the layout shows.
+        If they cannot be read, or have nothing for the layout.
     SettingError
-        If nothing lies in the time asked for.
+        If the recordings are empty at the requested time.
     """
     show = prepare(paths, settings, picture=True, time_s=time_s, rank=rank)
     with partial_file(out) as unfinished:
@@ -117,7 +117,7 @@ def screenshot(
 
 
 def open_window(*, headless: bool = False) -> tuple[subprocess.Popen[bytes], str]:
-    """An empty viewer, and the address where it listens.
+    """Start an empty viewer, and return its process and its address.
 
     Parameters
     ----------
@@ -135,12 +135,12 @@ def open_window(*, headless: bool = False) -> tuple[subprocess.Popen[bytes], str
 
 
 class _ViewerStopped(Exception):
-    """Why the viewer ended or hangs, and the way out."""
+    """The viewer ended or hangs; the message has the reason and a way out."""
 
 
 def _picture(show: Show) -> bytes:
     port = free_port(LOOPBACK)
-    # From a file: a viewer that waits for a stream says so, across the picture.
+    # From a file: a viewer that waits for a stream draws a message over the panels.
     with TemporaryDirectory(prefix="dmrl-view-") as folder:
         path = Path(folder) / "view.rrd"
         write(show, path)
@@ -155,7 +155,7 @@ def _picture(show: Show) -> bytes:
 
 
 def _without_bar(picture: bytes) -> bytes:
-    """A picture without the rows above the panels, where those show nothing."""
+    """Remove the rows above the panels from a screenshot, if they are empty."""
     rgb = decode(picture, "rerun's picture")
     # The corners of the window are round.
     bar = rgb[:BAR_PX, BAR_PX:-BAR_PX]
@@ -166,7 +166,7 @@ def _settled(show: Show, viewer: Viewer, port: int) -> bytes | None:
     deadline = time.monotonic() + PATIENCE_S
     previous = b""
     while time.monotonic() < deadline and viewer.alive:
-        # Until it listens, requests fail; until all is loaded and decoded, pictures differ.
+        # Requests fail until the viewer listens; screenshots differ until all data is decoded.
         with suppress(OSError, RuntimeError):
             client: Any = ViewerClient.connect(url_of(port))
             state = client.get_state()

@@ -1,4 +1,4 @@
-"""Robots in rerun's viewer while they fly: pictures, heights, speeds, distances."""
+"""Show robots in rerun's viewer during a flight: images, heights, speeds, distances."""
 
 import subprocess
 import time
@@ -20,19 +20,20 @@ from dmrl.viewer.layouts import BACKGROUND, TIMELINE
 from dmrl.viewer.window.desktop import open_window
 
 PLOT_EVERY_NS = 100_000_000
-"""Curves get a point ten times a second: more cannot be seen and costs the recorder."""
+"""Interval between points of a curve: a shorter one is invisible and slows the recorder."""
 HISTORY_S = 30.0
+"""Length of the curves, seconds."""
 
 
 def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
-    """Pictures on the left, curves of all robots on the right.
+    """Build a layout with images on the left and curves of all robots on the right.
 
     Parameters
     ----------
     robots
-        All of them.
+        All robots.
     cameras
-        Those with a camera.
+        Robots with a camera.
     """
     pictures = [
         rrb.Spatial2DView(
@@ -66,12 +67,12 @@ def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
 
 
 class LiveView:
-    """Shows samples as they come.
+    """Log samples as they arrive.
 
     Parameters
     ----------
     stream
-        Where they are logged.
+        Receives the samples.
     """
 
     def __init__(self, stream: rr.RecordingStream) -> None:
@@ -81,7 +82,7 @@ class LiveView:
         stream.set_log_tick_enabled(False)
 
     def show(self, received: Received) -> None:
-        """Log one sample, if it is drawn."""
+        """Log one sample, if its topic is drawn."""
         sample = received.sample
         if topics.names(topics.CAMERA_IMAGE, sample.topic):
             kind = sample.fields["format"]
@@ -109,9 +110,9 @@ class LiveWindow:
     Parameters
     ----------
     robots
-        All of them.
+        All robots.
     cameras
-        Those with a camera.
+        Robots with a camera.
     headless
         Without a window, for tests.
 
@@ -132,7 +133,7 @@ class LiveWindow:
         self._process, self.url = open_window(headless=self._headless)
         time.sleep(1.0)
         if self._process.poll() is not None:
-            raise SettingError("no screen for a window. Record without --view, look afterwards")
+            raise SettingError("no screen for a window. Record without --view")
         self._stream = rr.RecordingStream("dmrl-live")
         self._stream.connect_grpc(self.url, default_blueprint=self._layout)
         self.show = LiveView(self._stream).show

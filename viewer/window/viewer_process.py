@@ -1,6 +1,6 @@
-"""rerun's viewer as a child process that reports to nobody.
+"""rerun's viewer as a child process without network access.
 
-What it shows is streamed to it, so that it can be looked at while the rest is read.
+Data are streamed to the viewer, which shows the first while the rest is still being read.
 """
 
 import errno
@@ -20,11 +20,11 @@ from dmrl.viewer.show import Show, stream_of
 
 LOOPBACK = "127.0.0.1"
 PATIENCE_S = 60.0
+"""Timeout for the viewer to listen, to load and to receive data, seconds."""
 POLL_S = 0.1
 
-# CI=1 turns rerun's usage statistics off; its look-up of newer versions has no switch, so the
-# web is put out of its reach, at a port where nobody listens. Its warnings would be drawn over
-# a picture.
+# CI=1 turns rerun's usage statistics off. Its look-up of newer versions has no switch, so its proxy
+# is a closed port. RUST_LOG hides its warnings, which would be drawn over a screenshot.
 NOWHERE = f"http://{LOOPBACK}:9"
 PROXIES = ("all_proxy", "http_proxy", "https_proxy")
 QUIET = {name: NOWHERE for lower in PROXIES for name in (lower, lower.upper())} | {
@@ -45,26 +45,26 @@ class Viewer:
 
     @property
     def alive(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process runs."""
         return self.process.poll() is None
 
     @property
     def wanted(self) -> bool:
-        """Whether it has not ended, nor been told to: `ended` is set."""
+        """Whether the process runs and was not asked to end: `ended` is not set."""
         return self.alive and not self.ended.is_set()
 
     def wait(self) -> None:
-        """Nothing, once it is wanted no more."""
+        """Wait until the process ends or is asked to."""
         while self.wanted:
             self.ended.wait(POLL_S)
 
     def said(self) -> str:
-        """All that it has said on standard error."""
+        """Read its messages on standard error."""
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace")
 
     def close(self) -> None:
-        """End it."""
+        """Stop the process."""
         self.process.kill()
         self.process.wait()
         self._errors.close()
@@ -72,7 +72,7 @@ class Viewer:
 
 @contextmanager
 def running(words: list[str]) -> Iterator[Viewer]:
-    """A viewer that ends with the block."""
+    """Run a viewer until the end of the block."""
     viewer = Viewer(words)
     try:
         yield viewer
@@ -81,7 +81,7 @@ def running(words: list[str]) -> Iterator[Viewer]:
 
 
 def listens(viewer: Viewer, host: str, port: int) -> bool:
-    """Whether the viewer can be talked to, once it can or is wanted no more."""
+    """Wait until the viewer listens; return False if it ends, is asked to end, or times out."""
     deadline = time.monotonic() + PATIENCE_S
     while viewer.wanted and time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection((host, port), timeout=1):
@@ -91,7 +91,7 @@ def listens(viewer: Viewer, host: str, port: int) -> bool:
 
 
 def stream_to(show: Show, viewer: Viewer, port: int, host: str = LOOPBACK) -> None:
-    """Send everything, unless the viewer is closed meanwhile, or told to end."""
+    """Send everything to the viewer, unless it ends or is asked to end before."""
     stream = stream_of()
     stream.connect_grpc(url_of(port, host), default_blueprint=show.blueprint)
     try:
@@ -106,23 +106,23 @@ def stream_to(show: Show, viewer: Viewer, port: int, host: str = LOOPBACK) -> No
 
 
 def command(bind: str, *arguments: str) -> list[str]:
-    """Words that start the viewer."""
+    """Build the command line that starts the viewer."""
     program = files("rerun_cli").joinpath("rerun")
     return [str(program), "--bind", bind, "--hide-welcome-screen", *arguments]
 
 
 def environment() -> dict[str, str]:
-    """What the viewer finds around it."""
+    """Build the environment variables of the viewer."""
     return os.environ | QUIET
 
 
 def url_of(port: int, host: str = LOOPBACK) -> str:
-    """Where a viewer takes what it shows."""
+    """Return the URL at which a viewer receives data."""
     return f"rerun+http://{host}:{port}/proxy"
 
 
 def free_port(bind: str) -> int:
-    """A port that nobody listens on.
+    """Find a free port.
 
     Raises
     ------
@@ -134,13 +134,7 @@ def free_port(bind: str) -> int:
 
 
 def require_free(bind: str, port: int) -> None:
-    """Nothing, if nobody listens on a port.
-
-    Raises
-    ------
-    SettingError
-        If somebody does, or the address is not one of this computer's.
-    """
+    """Raise SettingError unless a port is free and the address is one of this computer's."""
     with _socket(bind) as probe:
         _bound(probe, bind, port)
 
@@ -154,7 +148,7 @@ def _bound(probe: socket.socket, bind: str, port: int) -> int:
     try:
         probe.bind((bind, port))
     except socket.gaierror:
-        raise SettingError(f"{bind} is no address. Try: --bind {LOOPBACK}") from None
+        raise SettingError(f"{bind} is not an address. Try: --bind {LOOPBACK}") from None
     except OSError as e:
         if e.errno == errno.EADDRINUSE:
             raise SettingError(
@@ -167,5 +161,5 @@ def _bound(probe: socket.socket, bind: str, port: int) -> int:
 
 
 def last_line(said: str) -> str:
-    """The last that a viewer said."""
-    return said.strip().rpartition("\n")[2] or "it said nothing"
+    """Return the last line of a viewer's messages."""
+    return said.strip().rpartition("\n")[2] or "it printed no message"

@@ -1,6 +1,6 @@
-"""A page with recordings for a browser or a notebook.
+"""Serve recordings as a page for a browser or a notebook.
 
-It is served on 127.0.0.1 only, unless told otherwise.
+The server listens on 127.0.0.1 only, unless another address is given.
 """
 
 import socket
@@ -35,14 +35,14 @@ FRAME_PX = 700
 
 @dataclass(frozen=True, slots=True)
 class Web:
-    """Where a page is served.
+    """Address of the server.
 
     Parameters
     ----------
     bind
-        Address of the network to listen on. Only on 127.0.0.1 nobody else can look.
+        Network address to listen on. Only 127.0.0.1 is closed to other computers.
     port
-        Of the page. None: any that is free.
+        Port of the page. None: any free port.
     """
 
     bind: str = LOOPBACK
@@ -53,14 +53,14 @@ WEB = Web()
 
 
 def serve(paths: Sequence[Path], settings: Settings, web: Web = WEB) -> None:
-    """Show recordings in a browser, until Ctrl-C. Prints the address.
+    """Show recordings in a browser until Ctrl-C. Prints the address.
 
     Raises
     ------
     DatasetError, RecordingError
-        If they cannot be read, or lack what the layout shows.
+        If they cannot be read, or have nothing for the layout.
     SettingError
-        If nothing lies in the time asked for, or the port is in use.
+        If the recordings are empty at the requested time, or the port is in use.
     """
     with suppress(KeyboardInterrupt), page(paths, settings, web) as shown:
         shown.serve()
@@ -68,7 +68,7 @@ def serve(paths: Sequence[Path], settings: Settings, web: Web = WEB) -> None:
 
 @contextmanager
 def page(paths: Sequence[Path], settings: Settings, web: Web = WEB) -> Iterator["Page"]:
-    """A page with recordings that is served as long as the block lasts.
+    """Serve a page with recordings until the end of the block.
 
     Raises
     ------
@@ -89,9 +89,9 @@ class Page:
     paths
         Recordings, or a dataset.
     settings
-        What is shown.
+        Selects images and layout.
     web
-        Where it is served.
+        Address of the server.
 
     Raises
     ------
@@ -122,11 +122,11 @@ class Page:
             raise
 
     def fill(self) -> None:
-        """Send everything that is shown; the page can be looked at meanwhile."""
+        """Send all data; the page shows the first meanwhile."""
         stream_to(self._show, self._viewer, self._data_port, self._host)
 
     def serve(self) -> None:
-        """Print the address, fill the page and wait for Ctrl-C, or a kill."""
+        """Print the address, send the data and wait for Ctrl-C or a kill."""
         # An exception would be lost in a destructor of rerun's, which talks to the server.
         with ended_by_signal(self._viewer.ended):
             say(f"{self.url} (Ctrl-C ends it)")
@@ -134,7 +134,7 @@ class Page:
             self._viewer.wait()
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server."""
         self._viewer.close()
 
     def _repr_html_(self) -> str:

@@ -1,4 +1,4 @@
-"""A dataset as it is before recordings are added to it."""
+"""Open a dataset to which recordings are added."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,18 +19,18 @@ from dmrl.recording.provenance_inputs import provenance_of
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """What is there.
+    """A dataset before recordings are added to it.
 
     Parameters
     ----------
     folder
-        Of the dataset; None: there is none yet.
+        Its folder. None: the dataset is new.
     manifest
-        Its own.
+        Its manifest.
     made
-        How it was made: the settings of the first time, the inputs of all times.
+        Its provenance: the settings of its creation, and the inputs of all parts.
     size_px
-        Width and height of its images; None: there are none yet.
+        Width and height of its images. None: it has no images yet.
     """
 
     folder: Path | None = None
@@ -40,11 +40,11 @@ class Before:
 
     @property
     def inputs(self) -> Sequence[Input]:
-        """What it was made from."""
+        """Files that the dataset was made from."""
         return self.made.inputs if self.made is not None else ()
 
     def seen(self) -> list[NDArray[np.void]]:
-        """What is known of its images, by part.
+        """Read the hashes of its images, one array per part.
 
         Raises
         ------
@@ -56,24 +56,24 @@ class Before:
         found = [read_seen(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
         if sum(map(len, found)) != sum(map(self.manifest.rows, self.manifest.splits)):
             raise DatasetError(
-                f"{self.folder / PARTS} knows of {sum(map(len, found))} images, the shards hold "
-                "others. Make the dataset again"
+                f"{self.folder / PARTS} has hashes of {sum(map(len, found))} images, which is not "
+                "the number in the shards. Make the dataset again"
             )
         return found
 
 
 def opened(folder: Path) -> Before:
-    """A dataset that can grow.
+    """Open a dataset to add recordings to it.
 
     Raises
     ------
     DatasetError
-        If it is none, is damaged, or was not made by a dmrl that keeps a manifest.
+        If the folder is no dataset, is damaged, or was made by a dmrl that wrote no manifest.
     """
     manifest = read_manifest(folder)
     if manifest is None or not manifest.parts or not any(manifest.splits.values()):
         raise DatasetError(
-            f"{folder} is no dataset that can grow: it has no {layout.MANIFEST}. Make it again "
+            f"{folder} cannot be extended: it has no {layout.MANIFEST}. Make it again "
             "with dmrl dataset, without --add"
         )
     split, shards = next(one for one in manifest.splits.items() if one[1])
@@ -83,12 +83,12 @@ def opened(folder: Path) -> Before:
 
 
 def made_of(folder: Path, manifest: Manifest) -> Provenance:
-    """How all of a dataset was made: as the first time, from the inputs of all times.
+    """Read the provenance of a dataset: settings of its creation, inputs of all parts.
 
     Raises
     ------
     DatasetError
-        If a part does not say.
+        If a part has no provenance.
     """
     parts = []
     for k in range(manifest.parts):  # a damaged manifest can name any number: stop at the first gap
@@ -101,7 +101,7 @@ def made_of(folder: Path, manifest: Manifest) -> Provenance:
 
 
 def joined(parts: Iterable[Provenance]) -> Provenance:
-    """The first, with the inputs of all, each once."""
+    """Return the first provenance with the inputs of all, each once."""
     first, *more = parts
     inputs: dict[str, Input] = {}
     for part in (first, *more):

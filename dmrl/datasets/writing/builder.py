@@ -1,4 +1,4 @@
-"""Rows of many recordings, images decoded ahead of their turn; and what is said of them."""
+"""Build the rows of many recordings, decode images ahead, and report the images left out."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from dmrl.terminal.progress import say, track
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What is wanted of each image; see `rows_of`."""
+    """Filter and contents of the rows; see `iter_row_builders`."""
 
     keep_all: bool
     masks: bool
@@ -37,24 +37,24 @@ def rows(
     size_px: tuple[int, int] | None,
     workers: int,
 ) -> Iterator[tuple[str, Row]]:
-    """Split and row of every image that is kept, recording after recording.
+    """Yield the split and the row of every image that is kept, recording after recording.
 
     Parameters
     ----------
     held
-        Labels that are in memory already. Others are read when it is their turn.
+        Recordings whose labels are in memory already. Others are loaded when their turn comes.
     sources, split_of
-        Of each recording: the source of labels that is used, its splits.
+        By recording: the source of labels that is used, and its splits.
     tally
-        Is counted up.
+        Counts of kept and excluded images; updated in place.
     wanted
-        Which images.
+        Filter of the images.
     total
-        How many there are, for the progress.
+        Number of images, for the progress bar.
     size_px
-        Width and height that they must have. None: as the first has.
+        Required width and height. None: those of the first image.
     workers
-        Threads that decode.
+        Number of decoding threads.
 
     Raises
     ------
@@ -89,12 +89,12 @@ def _made(
 
 
 def has_masks(recording: Path) -> bool:
-    """Whether a recording has masks."""
+    """Return whether a recording has masks."""
     return any(topics.names(topics.MASKS, topic) for topic in summary(recording).topics)
 
 
 def warn_of_others(sources: Mapping[Path, str], others: Mapping[Path, Sequence[str]]) -> None:
-    """Say which source is used where another might be meant."""
+    """Report the source of labels used where both truth and estimates exist."""
     for path, used in sources.items():
         if {"truth", "estimate"} <= {*others[path], used}:
             other = "estimate" if used == "truth" else "truth"
@@ -102,13 +102,7 @@ def warn_of_others(sources: Mapping[Path, str], others: Mapping[Path, Sequence[s
 
 
 def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
-    """Nothing, if a row's image has the size of the rows before it.
-
-    Raises
-    ------
-    RecordingError
-        If it has not.
-    """
+    """Raise RecordingError unless a row's image has the size of the rows before it."""
     if row.size_px != size_px:
         width_px, height_px = row.size_px
         raise RecordingError(
@@ -119,7 +113,7 @@ def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
 
 
 def unused(settings: Settings, tally: Tally) -> None:
-    """Say so where flags name no image: they may be of another recording."""
+    """Report flags that match no image: they may belong to another recording."""
     if settings.without is not None:
         flags = len(read_flags(settings.without))
         if flags > tally.flagged:
@@ -129,7 +123,7 @@ def unused(settings: Settings, tally: Tally) -> None:
 def explain(
     recordings: Sequence[Path], manifest: Manifest, tally: Tally, settings: Settings
 ) -> None:
-    """Say what was left out, and where nothing is held out.
+    """Report the images left out, and a missing test split.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Write datasets: rows in, one Arrow stream or Parquet file per shard out, in bounded memory."""
+"""Write the shards of a dataset, one Arrow stream or Parquet file each, in bounded memory."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -16,9 +16,9 @@ from dmrl.errors import UnsafeName
 from dmrl.images.codec import encode_png
 
 BATCH_IMAGES = 64
-"""Rows per record batch: 14 MB of 320 x 224 pixels, all that a split keeps in memory."""
+"""Rows per record batch: 14 MB of 320 x 224 pixels. A split keeps no more rows in memory."""
 BATCH_PIXELS = 20_000_000
-"""Of these rows together: of images that are larger than 640 x 480 there are fewer."""
+"""Pixels per record batch. Images larger than 640 x 480 make batches of fewer rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,18 +30,18 @@ class Row:
     rgb
         (H, W, 3) pixels, RGB.
     peers
-        Dictionaries with the fields of ``layout.PEER``.
+        Dictionaries with the fields of ``layout.PEER_TYPE``.
     grid
-        (2, H/8, W/8): confidence, and depth in metres, as ``geometry.grid_label`` gives it.
+        (2, H/8, W/8): confidence, and depth in metres, from ``geometry.grid_label``.
     robot
-        Whose camera took it.
+        Robot whose camera took the image.
     source
         File name of the recording.
     time_ns
         Log time of the image.
     mask
-        (H, W) what every pixel shows: 0 or the place of the peer in ``peers``, from 1. None:
-        the dataset has no masks.
+        (H, W) index of the peer that each pixel shows, from 1 in ``peers``; 0 for the background.
+        None: the dataset has no masks.
     """
 
     rgb: NDArray[np.uint8]
@@ -60,16 +60,16 @@ class Row:
 
 @dataclass(slots=True)
 class SplitWriter:
-    """Writes the shards of one split.
+    """Write the shards of one split.
 
     Parameters
     ----------
     folder
-        Folder of the dataset, there already.
+        Folder of the dataset, which exists.
     name
         Name of the split.
     schema
-        From ``layout.schema``.
+        From ``layout.build_schema``.
     parquet
         Parquet files in place of Arrow streams.
     shard_images
@@ -90,7 +90,7 @@ class SplitWriter:
     _sink: Any = None
 
     def add(self, row: Row) -> None:
-        """Add one row; every ``BATCH_IMAGES`` rows, or ``BATCH_PIXELS``, go to disk."""
+        """Add one row; every ``MAX_BATCH_IMAGES`` rows, or ``MAX_BATCH_PIXELS``, go to disk."""
         self._rows.append(row)
         room = self.shard_images - (self._lengths[-1] if self._sink else 0)
         most = min(BATCH_IMAGES, room, max(1, 3 * BATCH_PIXELS // row.rgb.size))
@@ -100,7 +100,7 @@ class SplitWriter:
                 self._close_shard()
 
     def close(self) -> list[Shard]:
-        """Finish the last shard, and give all their names: the shards, in the order of rows."""
+        """Close the last shard, name all shards, and return them in the order of the rows."""
         if self._rows:
             self._flush()
         self._close_shard()
@@ -125,7 +125,7 @@ class SplitWriter:
         self._rows.clear()
 
     def _open_shard(self) -> None:
-        # How many shards there will be is not known yet: the name says 0 until close().
+        # The number of shards is open until close(); until then the name contains 0.
         path = self._path(self.first + len(self._files), 0)
         path.parent.mkdir(exist_ok=True)
         if self.parquet:
@@ -150,20 +150,20 @@ def write_shards(
     shard_images: int,
     before: Manifest,
 ) -> dict[str, list[Shard]]:
-    """Shards written, by split.
+    """Write the rows of all splits, and return the shards written, by split.
 
     Parameters
     ----------
     folder
-        There already.
+        Folder of the dataset, which exists.
     rows
-        Name of the split and row; all images of one size.
+        Name of the split and row; all images have one size.
     png
         PNG bytes in place of raw pixels.
     shard_images
         See `SplitWriter`.
     before
-        Of the dataset that they are for, whose shards are counted on.
+        Manifest of the existing dataset; the numbers of its shards are continued.
 
     Raises
     ------
@@ -182,12 +182,12 @@ def write_shards(
 
 
 def _refuse_case(split: str, others: Iterable[str]) -> None:
-    """Refuse what a disk of macOS or Windows, where a dataset may go, takes for one name."""
+    """Raise UnsafeName if two names differ only in case: macOS and Windows merge them."""
     for other in others:
         if other != split and other.casefold() == split.casefold():
             raise UnsafeName(
-                f"the splits {other} and {split} differ only in case, and are one folder on many "
-                "disks. Rename one in its recording"
+                f"the splits {other} and {split} differ only in case, and many disks store both "
+                "in one folder. Rename one in its recording"
             )
 
 

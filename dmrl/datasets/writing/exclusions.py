@@ -1,7 +1,7 @@
-"""Rows that a person does not want in a dataset: a CSV file, a line for each.
+"""Read the CSV file of images that a person excludes from a dataset, one line each.
 
-``source, robot, log_time`` as the columns of a dataset have them; ``reason`` may say why. The
-page of ``dmrl view DATASET --flag`` writes such files, and so does any spreadsheet.
+Columns ``source, robot, log_time`` as in a dataset; ``reason`` is optional. The page of
+``dmrl view DATASET --flag`` writes such files, and so does any spreadsheet.
 """
 
 import csv
@@ -15,19 +15,19 @@ NEEDED = ("source", "robot", "log_time")
 OPTIONAL = ("reason", "row", "split")
 _TIME = re.compile(r"-?\d{1,19}", re.ASCII)
 MOST = 1_000_000
-"""Lines of a file of flags."""
+"""Lines of a file of flags, at most."""
 Flag = tuple[str, str, int]
-"""File name of a recording, whose image, its log time in nanoseconds."""
+"""File name of a recording, robot whose camera took the image, log time in nanoseconds."""
 
 
 def read_flags(path: Path) -> frozenset[Flag]:
-    """Which images are flagged.
+    """Read the flagged images.
 
     Raises
     ------
     SettingError
-        If the file is not there, is no CSV, lacks a column, or a time is no whole number: names
-        the line.
+        If the file is missing, not CSV, or lacks a column, or if a time is not a whole number. The
+        message names the line.
     """
     found: set[Flag] = set()
     try:
@@ -51,16 +51,16 @@ def _check(path: Path, columns: Sequence[str]) -> None:
     if missing or unknown or len(set(columns)) < len(columns):
         wrong = f"no column {missing[0]}" if missing else f"column {(unknown or columns)[0]!r}"
         raise SettingError(
-            f"{path}:1: {wrong}. The first line names the columns, each once: {', '.join(NEEDED)}, "
-            f"and {', '.join(OPTIONAL)} where wanted"
+            f"{path}:1: {wrong}. Name each column once in the first line: {', '.join(NEEDED)}, "
+            f"and optionally {', '.join(OPTIONAL)}"
         )
 
 
 def _flag(where: str, cells: Mapping[str | None, str | None]) -> Flag:
     values = [(cells.get(name) or "").strip() for name in NEEDED]
     if None in cells or not all(values):
-        raise SettingError(f"{where}: not a {', '.join(NEEDED)}. Mend the line")
+        raise SettingError(f"{where}: not a {', '.join(NEEDED)}. Fix the line")
     source, robot, time = values
     if not _TIME.fullmatch(time):
-        raise SettingError(f"{where}: {time[:40]!r} is no time in nanoseconds. Mend the line")
+        raise SettingError(f"{where}: {time[:40]!r} is not a time in nanoseconds. Fix the line")
     return source, robot, int(time)

@@ -1,4 +1,4 @@
-"""Recordings that should not be put into one dataset: for their images, or for their lenses."""
+"""Reject recordings that do not belong in one dataset: shared images, or different lenses."""
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
@@ -10,46 +10,41 @@ from dmrl.recording import Contents, Input, Provenance
 from dmrl.terminal.progress import say
 
 SAME_LENS = 1.05
-"""Most that the focal lengths of one dataset may differ by without a word, a ratio."""
+"""Largest ratio of the focal lengths of one dataset without a warning."""
 
 
 def refuse_twins(recordings: Sequence[Path], made: Provenance, there: Sequence[Input] = ()) -> None:
-    """Nothing, if no two recordings share a name, bytes or images.
+    """Raise SettingError if two recordings share a name, their bytes or their images.
 
     Parameters
     ----------
     recordings
-        To be put into one dataset.
+        Recordings of the new rows.
     made
-        Names them as its inputs, in their order.
+        Provenance whose first inputs are these recordings, in their order.
     there
-        What the dataset holds already.
-
-    Raises
-    ------
-    SettingError
-        If two do.
+        Inputs of the dataset so far.
     """
     names = {one.name: Path(one.name) for one in there}
     contents = {one.sha256: Path(one.name) for one in there}
     for path, source in zip(recordings, made.inputs, strict=False):
         if (twin := names.setdefault(path.name, path)) is not path:
             raise SettingError(
-                f"{twin} and {path} have one name, so rows could not be traced. Rename one"
+                f"{twin} and {path} have the same name, so rows could not be traced. Rename one"
             )
         if (twin := contents.setdefault(source.sha256, path)) is not path:
             raise SettingError(f"{twin} and {path} hold the same bytes. Name only one of them")
     for path, source in zip(recordings, made.inputs, strict=False):
-        # Its images are the other's: one would be in train, the other in test.
+        # Both have the same images: one could be in train, the other in test.
         for twin in (contents[sha] for sha in _shown_by(source) if sha in contents):
             raise SettingError(f"{path} is made from {twin}. Name only one of them")
 
 
 def _shown_by(recording: Input) -> Iterator[str]:
-    """Hashes of what a recording has its images from.
+    """Yield the hashes of the files that a recording has its images from.
 
-    Not of what went through a dataset: renders over its images, labels of a model that learned
-    from them, show other images.
+    Files behind a dataset are left out: renders over its images, and labels of a model that was
+    trained on them, show other images.
     """
     made = recording.provenance
     if made is not None and made.stage != "dataset":
@@ -59,7 +54,7 @@ def _shown_by(recording: Input) -> Iterator[str]:
 
 
 def focal_lengths(held: Contents) -> list[float]:
-    """Focal lengths of a recording's cameras, pixels, as far as they are known."""
+    """Return the focal lengths of a recording's calibrated cameras, pixels."""
     found = []
     for topic in held.topics:
         if topics.names(topics.CALIBRATION, topic):
@@ -69,16 +64,16 @@ def focal_lengths(held: Contents) -> list[float]:
 
 
 def warn_of_lenses(focal_px: Sequence[float]) -> None:
-    """Say so if the cameras differ: from the size of a drone alone its depth is not known then.
+    """Warn if the cameras differ: the size of a drone alone then gives no depth.
 
     Parameters
     ----------
     focal_px
-        Of all cameras.
+        Focal lengths of all cameras.
     """
     if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
         say(
             f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "
-            "a drone looks larger through the longer one, and a network takes it for nearer. Make "
-            "one dataset for each"
+            "a drone appears larger through the longer one, and a network estimates a smaller "
+            "depth. Make one dataset for each"
         )

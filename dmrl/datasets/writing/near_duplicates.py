@@ -1,7 +1,7 @@
-"""What is known of the images of a dataset, 25 bytes each: enough to find one again.
+"""Find duplicates among the images of a dataset by hashes, 25 bytes for each image.
 
-Kept beside the shards, so that nobody has to read pixels again when the dataset grows. The same
-picture in train and in test is a leak: what a test on it measures is memory.
+The hashes are stored beside the shards, so that an addition to the dataset reads no pixels again.
+An image in both train and test is a leak: the test then measures memory.
 """
 
 import hashlib
@@ -17,23 +17,35 @@ from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.errors import DatasetError
 
 FILE = "seen.bin"
+"""File of the hashes in the folder of a part."""
 NEAR_BITS = 6
-"""Of the 64 of a perceptual hash: pictures that differ in no more look the same to people."""
+"""Largest difference of two 64-bit perceptual hashes that count as near duplicates.
+
+People cannot tell such images apart.
+"""
 AT_ONCE = 64
+"""Test images that are compared with all of train at a time."""
 MOST_PAIRS = 500_000_000
-"""Pictures of tests times those of train that are compared: a second. Of more, a part is."""
+"""Pairs of a test and a train image that are compared, at most: one second. Beyond it, test images
+are sampled.
+"""
 FRESH = 65_536
-"""Keys that wait in a set, before they are sorted into an array: a twelfth of the memory."""
+"""Keys that are collected in a set before they are merged into a sorted array.
+
+The array needs a twelfth of the memory.
+"""
 DTYPE = np.dtype([("key", "<u8"), ("pixels", "<u8"), ("look", "<u8"), ("train", "?")])
-"""Hash of an image's robot, time and pixels; of its pixels; its perceptual hash; its split."""
+"""Hash of an image's robot, time and pixels; hash of its pixels; perceptual hash; is it in
+train."""
 
 Hashes = NDArray[np.uint64]
 
 
 def perceptual_hash(rgb: NDArray[np.uint8]) -> int:
-    """64 bits that change little where a picture does: whether brightness rises along rows.
+    """Return the 64-bit difference hash of an image, which changes little when the image does.
 
-    The difference hash: the green picture shrunk to 8 x 9 means, each compared with the next.
+    The green channel is reduced to 8 x 9 means. Each bit is 1 if brightness rises from a mean to
+    the next in its row.
 
     Parameters
     ----------
@@ -52,12 +64,12 @@ def perceptual_hash(rgb: NDArray[np.uint8]) -> int:
 
 
 class Seen:
-    """Images that were there before, and those that go by.
+    """Hashes of the images of a dataset, those stored before and those added now.
 
     Parameters
     ----------
     before
-        The images that were there, as `read_seen` gives them.
+        Hashes of the existing images, from `read_hashes`.
     """
 
     def __init__(self, before: Sequence[NDArray[np.void]] = ()) -> None:
@@ -70,14 +82,14 @@ class Seen:
     def new(
         self, rows: Iterable[tuple[str, Row]], refuse: Callable[[], None] | None
     ) -> Iterator[tuple[str, Row]]:
-        """Those rows whose image is not there yet, by robot, time and pixels.
+        """Yield the rows whose image is new, by robot, time and pixels, and store their hashes.
 
         Parameters
         ----------
         rows
             Each with its split.
         refuse
-            Called for each of the others. None: these are yielded as well.
+            Called for every duplicate, which is skipped. None: duplicates are yielded as well.
         """
         for split, row in rows:
             pixels = _hash(np.ascontiguousarray(row.rgb).data)
@@ -105,7 +117,7 @@ class Seen:
             self._fresh.clear()
 
     def _known(self, column: str, *, train: bool | None = None) -> Hashes:
-        """A column, of all images or of one kind of splits, with what was there before first."""
+        """Return a column of all images, existing ones first; ``train`` selects the splits."""
         every = (*self._before, self._mine())
         return np.concatenate(
             [one[column] if train is None else one[column][one["train"] == train] for one in every]
@@ -118,12 +130,18 @@ class Seen:
         return found
 
     def twins(self) -> int:
-        """Images outside train whose pixels stand in train as well."""
+        """Count the images outside train whose pixels are in train as well."""
         others = self._known("pixels", train=False)
         return int(np.isin(others, self._known("pixels", train=True)).sum())
 
     def near(self) -> tuple[int, int, int]:
-        """Images outside train that look like one in train; of how many compared; of how many."""
+        """Count the near duplicates of train images among the images outside train.
+
+        Returns
+        -------
+        tuple[int, int, int]
+            Near duplicates, compared images, and all images outside train.
+        """
         train = np.unique(self._known("look", train=True))
         every = self._known("look", train=False)
         others = every[:: max(1, -(-len(every) * len(train) // MOST_PAIRS))]
@@ -134,22 +152,22 @@ class Seen:
         return sum(int(one.sum()) for one in alike), len(others), len(every)
 
     def write(self, folder: Path) -> None:
-        """Write what is known of the images that went by."""
+        """Write the hashes of the added images into a part's folder."""
         (folder / FILE).write_bytes(self._mine().tobytes())
 
 
 def read_seen(folder: Path) -> NDArray[np.void]:
-    """What `Seen.write` wrote, mapped.
+    """Map the hashes that `ImageHashes.write` wrote.
 
     Raises
     ------
     DatasetError
-        If it is missing or damaged.
+        If the file is missing or damaged.
     """
     path = folder / FILE
     try:
         if not path.stat().st_size:
-            return np.empty(0, DTYPE)  # which cannot be mapped
+            return np.empty(0, DTYPE)  # an empty file cannot be mapped
         return np.memmap(os.fspath(path), DTYPE, "r")
     except (OSError, ValueError) as e:
         why = " ".join(str(e).split())

@@ -1,4 +1,4 @@
-"""Recordings as the parts of a dataset: of which split each is."""
+"""Assign the splits of a dataset to its recordings."""
 
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
@@ -20,32 +20,33 @@ def splits_of(
     seed: int,
     there: Sequence[Input] | None = None,
 ) -> dict[Path, SplitOf]:
-    """Split of every log time of each recording.
+    """Return the split of every log time, by recording.
 
     Parameters
     ----------
     recordings
-        Those of a dataset.
+        Recordings of the dataset.
     made
-        Its provenance, whose first inputs they are.
+        Its provenance, whose first inputs are these recordings.
     split, val, test_share, seed
-        As ``dmrl dataset`` has them.
+        The settings of ``dmrl dataset``.
     there
-        What the dataset holds already. None: it is new.
+        Inputs of the dataset so far. None: it is new.
 
     Raises
     ------
     SettingError
-        If two share a name or their content, one is made from another, or none is named ``val``.
+        If two recordings share a name or their content, one is made from another, or ``val``
+        matches none.
     RecordingError
-        If what a recording says of its split cannot be understood.
+        If a recording defines its splits in an invalid form.
     """
     hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=False)}
     refuse_twins(recordings, made, there or ())
     watched = [path for path in recordings if fnmatchcase(path.name, val)]
     if val and not watched and there is None:
         names = ", ".join(path.name for path in recordings)
-        raise SettingError(f"--val {val} fits none of {names}. Give another pattern")
+        raise SettingError(f"--val {val} matches none of {names}. Give another pattern")
     learnt = [path for path in recordings if path not in watched]
     own = {path: splits(path, summary(path)) for path in learnt if split == "auto"}
     by_source = {path: parts for path, parts in own.items() if parts}

@@ -1,10 +1,12 @@
-"""Recordings to rows: images joined with their labels by robot and log time.
+"""Build rows from recordings: images joined with their labels by robot and log time.
 
-Of each image one source of labels is used. An image without any PeerLabels is left out:
-nobody looked. One at which the chosen source looked and saw no peer stays, and so does one
-that nobody saw any peer in. One that only other sources looked at is left out, and so is one with
-a peer whose label is not OK: as a picture of "nobody there" it would teach the opposite of the
-truth.
+Each recording uses one source of labels. These images are kept or left out:
+
+* no PeerLabels: left out, since it was never labelled;
+* labelled by the chosen source, with or without peers: kept;
+* labelled as empty by every source: kept;
+* labelled by other sources only: left out;
+* a peer whose label is not OK: left out. Training would treat the image as one without peers.
 """
 
 import re
@@ -35,18 +37,20 @@ SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
 
 TAUGHT = ("estimate", "truth", "hand", "published")
-"""The same, as a network is to learn from them: who estimated labels of a flight that has true ones
-wants to know what estimates teach."""
+"""Sources of labels in the order of training.
+
+Estimates come first: who labels a flight that has true positions wants to measure the estimates.
+"""
 
 PATTERNS = (topics.camera_image("*"), topics.labels("*"))
 
 Mask = NDArray[np.uint8]
-"""(H, W) what every pixel shows: 0 or the place of a peer among the labels, from 1."""
+"""(H, W) index of the peer that each pixel shows, from 1 among the labels; 0 for the background."""
 
 
 @dataclass(slots=True)
 class Tally:
-    """What became of the images: how many were kept, and how many left out, and why."""
+    """Number of images kept, and of images left out by reason."""
 
     kept: int = 0
     without_labels: int = 0
@@ -58,31 +62,31 @@ class Tally:
     twice: int = 0
 
     def refuse_twin(self) -> None:
-        """Count one that was kept, and is there already."""
+        """Count an image as a duplicate that was counted as kept before."""
         self.kept, self.twice = self.kept - 1, self.twice + 1
 
     def left_out(self) -> dict[str, int]:
-        """Why images were left out, and how many."""
+        """Return the number of images left out, by reason."""
         return {
             "had no labels": self.without_labels,
-            "were not looked at by the chosen source (--labels)": self.of_other_sources,
+            "were not labelled by the chosen source (--labels)": self.of_other_sources,
             "had a label that is not OK (--keep-all keeps them)": self.not_ok,
             "show a peer, but have no mask (--masks)": self.without_mask,
             "belong to no split of their source (--split)": self.in_no_split,
             "were flagged (--without)": self.flagged,
-            "are there already: same camera, time and pixels": self.twice,
+            "are in the dataset already: same camera, time and pixels": self.twice,
         }
 
 
 def count_images(path: Path) -> int:
-    """Number of images in a recording, labelled or not.
+    """Count the images of a recording, labelled or not.
 
     Raises
     ------
     MissingTopic
-        If it has no topic of images, or none of labels.
+        If the recording has no topic of images, or none of labels.
     RecordingError
-        If one of these topics holds another message.
+        If one of these topics contains another message type.
     """
     found = matching(path, PATTERNS)
     present = summary(path).topics
@@ -90,7 +94,7 @@ def count_images(path: Path) -> int:
 
 
 def sources_of(held: Contents) -> set[str]:
-    """Every source of labels that a recording has."""
+    """Return every source of labels that a recording has."""
     present: set[str] = set()
     for topic in held.topics:
         if topics.names(topics.LABELS, topic):
@@ -104,15 +108,15 @@ def _chunk(table: pa.Table, name: str) -> pa.Array:
 
 
 def label_source(held: Contents, wanted: str) -> str:
-    """The source whose labels are used for a recording.
+    """Choose the source whose labels are used for a recording.
 
     Parameters
     ----------
     held
-        A recording that `count_images` accepts, best with its labels.
+        A recording that `count_images` accepts, best with its labels loaded.
     wanted
-        One of `SOURCES`; "best" for the first of them that the recording has; "auto" for the first
-        of `TAUGHT`.
+        One of `LABEL_SOURCES`; "best" for the first of them that the recording has; "auto" for the
+        first of `TRAINING_SOURCES`.
 
     Raises
     ------
@@ -140,26 +144,26 @@ def rows_of(
     masks: bool,
     flagged: Set[Flag] = frozenset(),
 ) -> Iterator[tuple[str, Callable[[], Row]] | None]:
-    """Split and row of each image of a recording, in time order; None for one left out.
+    """Yield the split and a row builder for each image, in time order; None for one left out.
 
-    The row is made when it is called, in any thread: that decodes the image.
+    The builder decodes the image when it is called, in any thread.
 
     Parameters
     ----------
     held
-        A recording that `count_images` accepts, best with its labels: then each of its chunks is
-        unpacked once.
+        A recording that `count_images` accepts, best with its labels loaded: each of its chunks is
+        then decompressed once.
     source
-        Whose labels; see `label_source`.
+        Source of the labels; see `choose_label_source`.
     split_of
         Split of a log time.
     tally
-        Is counted up.
+        Counts of kept and excluded images; updated in place.
     keep_all
-        Labels that are not OK count as well.
+        Also use labels that are not OK.
     masks
-        Rows have masks. Images that show a peer and have none are left out: an empty mask would
-        say that nobody is there.
+        Rows have masks. Images that show a peer and have no mask are left out: an empty mask would
+        mark the peer as background.
     flagged
         Images that are left out.
     """
@@ -188,7 +192,10 @@ def rows_of(
 def labelled_images(
     held: Contents, *, masks: bool = False
 ) -> Iterator[tuple[Stamped, Any, Stamped | None]]:
-    """Each image with PeerLabels and, if asked for, masks of its robot and log time, or None."""
+    """Yield each image with its PeerLabels and, on request, its masks, or None.
+
+    Labels and masks have the robot and the log time of the image.
+    """
     labels = _labels(held)
     wanted = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
     wanted += [t for t in held.topics if masks and topics.names(topics.MASKS, t)]
@@ -211,22 +218,22 @@ def labelled_images(
 
 
 def _labels(held: Contents) -> dict[str, "_Series"]:
-    """Labels by robot."""
+    """Return the labels by robot."""
     found = ((topic, topics.names(topics.LABELS, topic)) for topic in held.topics)
     return {n["robot"]: _Series(held.messages(topic)) for topic, n in found if n is not None}
 
 
 class _Series:
-    """Messages in the order of time, looked up at times that only increase."""
+    """Messages in time order, looked up at increasing times."""
 
     def __init__(self, messages: Iterator[Stamped]) -> None:
         self._groups = groupby(messages, key=lambda stamped: stamped.time_ns)
         self._next = next(self._groups, None)
 
     def at(self, time_ns: int) -> Any:
-        """All messages of a time as one, or None.
+        """Return all messages of a time merged into one, or None.
 
-        Two recordings of the same images, merged, have each its own source.
+        Two recordings of the same images, merged, may have different sources.
         """
         while self._next is not None and self._next[0] < time_ns:
             self._next = next(self._groups, None)
@@ -240,19 +247,19 @@ class _Series:
 
 
 def _refuse_two_of_one_time(path: Path, images: list[Stamped]) -> None:
-    """Refuse two pictures of one camera at one time: the labels are of one of them."""
+    """Raise RecordingError if a camera has two images at one time: labels belong to one of them."""
     seen: set[str] = set()
     for image in images:
         if image.topic in seen:
             raise RecordingError(
-                f"{path}: {image.topic} has two images at {image.time_ns} ns, as when flights of "
-                "the same robots are merged. Give the recordings one by one"
+                f"{path}: {image.topic} has two images at {image.time_ns} ns, as in a merge of "
+                "flights of the same robots. Give the recordings one by one"
             )
         seen.add(image.topic)
 
 
 def _mask(path: Path, row: Row, covered: Stamped | None) -> Mask:
-    """Places of the row's peers in place of the numbers in their names."""
+    """Decode a mask, and replace the numbers in peers' names by indices into the row's peers."""
     shape = row.rgb.shape[:2]
     if covered is None:
         return np.zeros(shape, np.uint8)
@@ -290,7 +297,7 @@ def _row(
             f"{what} is {width_px} x {height_px} px, not a multiple of {STRIDE_PX} both ways. "
             "Scale it: dmrl convert --from images --width-px 320 --height-px 224"
         )
-    # A label as unsure as the image is wide says only that the peer may be there.
+    # A label with a sigma as large as the image gives no position.
     peers = [peer for peer in map(_peer, labels) if peer["sigma_u_px"] < width_px]
     uv_depth = np.array([[p["u_px"], p["v_px"], p["depth_m"]] for p in peers]).reshape(-1, 3)
     ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & (uv_depth[:, 2] > 0)]

@@ -1,7 +1,7 @@
-"""Which split a row belongs to: by recording, or as its source says; never by neighbours.
+"""Assign rows to splits by recording, or as the source defines; neighbours stay together.
 
-Two images a tenth of a second apart are nearly the same image: a split that puts one in
-train and the other in test measures memory, not skill.
+Two images a tenth of a second apart are nearly equal. A split that separates them into train and
+test measures memory, not skill.
 """
 
 import hashlib
@@ -13,23 +13,23 @@ from pathlib import Path
 from dmrl.errors import RecordingError
 
 SplitOf = Callable[[int], str | None]
-"""Log time, nanoseconds, to the name of a split; None for an image in no split."""
+"""Maps a log time, nanoseconds, to the name of a split; None for an image in no split."""
 
 
 def held_out(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Path]:
-    """Recordings that become the test split, whole.
+    """Choose the recordings that become the test split, whole.
 
-    Their order is a hash of content and seed, so it depends on neither names nor order.
+    Recordings are ordered by a hash of content and seed, independent of their names.
 
     Parameters
     ----------
     sha256
         Recordings and the hashes of their content.
     test_share
-        Wanted share of the recordings. At least one is held out where there are two or
-        more and the share is not 0; at least one stays.
+        Wanted share of the recordings. If the share is not 0 and there are two recordings or more,
+        at least one is held out and at least one stays.
     seed
-        Another seed, another choice.
+        Another seed gives another choice.
     """
 
     def rank(path: Path) -> str:
@@ -42,9 +42,9 @@ def held_out(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Pa
 
 
 def held_out_alone(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Path]:
-    """Recordings that become test when they are added to what is there; see `held_out`.
+    """Choose the test recordings among those that are added; see `choose_test_recordings`.
 
-    Each is drawn by its own hash, so it does not depend on which others come with it, or before.
+    The hash of each recording decides alone, so the choice does not depend on other recordings.
     """
 
     def drawn(path: Path) -> float:
@@ -55,7 +55,7 @@ def held_out_alone(sha256: Mapping[Path, str], test_share: float, seed: int) -> 
 
 
 def of_source(path: Path, own: Mapping[str, Sequence[tuple[int, int]]]) -> SplitOf:
-    """The split that a recording itself gives each log time.
+    """Return the splits that a recording itself defines, as a function of log time.
 
     Parameters
     ----------

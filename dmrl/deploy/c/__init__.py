@@ -1,4 +1,4 @@
-"""Portable C99 of an int8 network: one file and a header, with what checks and explains them."""
+"""Portable C99 of an int8 network: source and header, self-test, Makefile and README."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +15,9 @@ from dmrl.deploy.int8.network import IntegerNetwork
 __all__ = ["c_name", "write_c"]
 
 STACKS_BYTES = 8 * 1024
-"""What eight cores' stacks of a kilobyte each take of a GAP8's L1."""
+"""Bytes of a GAP8's L1 for the stacks of eight cores, one kilobyte each."""
 L1_FOR_STATE = 64 * 1024 - STACKS_BYTES
-"""Bytes of the GAP8's L1 that a state may take."""
+"""Bytes of a GAP8's L1 available for the state."""
 
 
 def write_c(
@@ -34,18 +34,18 @@ def write_c(
     Parameters
     ----------
     network
-        What it computes.
+        The network.
     folder
         An existing folder.
     images
-        (height, width, channels) images as the network takes them; the first becomes a vector
-        of the self-test, beside one of noise.
+        (height, width, channels) images in the network's format; the first becomes a vector of the
+        self-test, in addition to one of noise.
     bayer
-        Whether the C takes raw colour mosaics unless compiler flags say otherwise.
+        Whether the C takes raw Bayer mosaics by default; a compiler flag overrides it.
     refine
-        Write the C that learns on as well, see `refinement`.
+        Also write the C for on-device refinement, see `refinement_code`.
     near_bytes
-        Bytes of a near memory that the state has to fit, see `memories`. None: there is one memory.
+        Bytes of the near memory that the state must fit, see `memory_levels`. None: one memory.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def write_c(
     Raises
     ------
     ModelError
-        If the C cannot carry the network; the layer is named.
+        If the C does not support the network; the message contains the layer's name.
     SettingError
         If the near memory is too small.
     """

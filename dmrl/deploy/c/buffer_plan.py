@@ -1,7 +1,7 @@
-"""What the C of a network does row by row: its steps, its buffers, and where these lie.
+"""Buffer plan of the generated C: the steps per row, and the size and place of every buffer.
 
-A convolution that only a max-pool reads becomes one step with it. Every tensor between two
-steps is a ring of its newest rows, see `rings`.
+A convolution whose only reader is a max-pool becomes one step with it. Every tensor between two
+steps is a ring buffer of its newest rows, see `row_schedule`.
 """
 
 import re
@@ -12,36 +12,36 @@ from dmrl.deploy.int8.network import Conv, IntegerNetwork, MaxPool, Shape
 from dmrl.errors import ModelError
 
 LONGEST_SIDE = 4096
-"""Rows are counted in int16 and rings stand on small chips; no camera of this field is larger."""
+"""Largest side of an image, pixels: rows are counted in int16, and chips are small."""
 
 
 @dataclass(frozen=True, slots=True)
 class Buffer:
-    """Rows of one tensor, kept as rows of pixels, the channels of a pixel side by side.
+    """Ring buffer of rows of one tensor; rows consist of pixels, pixels of channels.
 
     Parameters
     ----------
     name
         C identifier: that of the layer that writes it, or "image".
     home
-        Member of the state that holds it. Buffers of one row that are never needed at the same
-        time share one.
+        Member of the state that contains it. Buffers of one row whose lifetimes do not overlap
+        share one.
     channels, rows, cols
-        Of the whole tensor.
+        Size of the whole tensor.
     gap
         Columns of padding before, between and behind the rows.
     pad_value
-        What they hold.
+        Value of the padding.
     above
-        Whether some layer reads rows outside the tensor.
+        Whether a layer reads rows outside the tensor.
     ring
-        Rows held at a time.
+        Number of rows held at a time.
     signed
-        Whether it holds int8.
+        Whether values are int8.
     shift
-        Place in the ring of row 0: several buffers may take turns in one.
+        Position of row 0 in the ring; several buffers may share one ring.
     far
-        Whether it lies in the far memory, see `memories`.
+        Whether it is in the far memory (L2), see `memory_levels`.
     """
 
     name: str
@@ -59,12 +59,12 @@ class Buffer:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes from the start of a row to that of the next."""
+        """Bytes from the start of a row to the start of the next."""
         return (self.gap + self.cols) * self.channels
 
     @property
     def padded_bytes(self) -> int:
-        """Bytes of a row with the padding on both of its sides."""
+        """Bytes of a row with the padding on both sides."""
         return self.row_bytes + self.gap * self.channels
 
     @property
@@ -81,14 +81,15 @@ class Plan:
     steps: tuple[Step, ...]
     buffers: tuple[Buffer, ...]
     tensors: tuple[int, ...]
-    """Buffer of every tensor of the network; -1 where a fused max-pool left none."""
+    """Buffer of every tensor of the network; -1 for a tensor inside a fused step."""
     whole: frozenset[int]
-    """Buffers that are read after the last row."""
+    """Buffers kept whole, since they are read after the last row."""
     stage: int = 0
-    """Bytes that steps work in where there are two memories, see `memories`; 0: there is one."""
+    """Bytes of scratch memory in L1 if there are two memories, see `memory_levels`; 0: one
+    memory."""
 
     def homes(self, *, far: bool) -> dict[str, int]:
-        """Members of the near or the far state that hold rings, and their bytes."""
+        """Return the members of the near or the far state that contain rings, and their bytes."""
         return {
             name: max(b.size for b in self.buffers if b.home == name)
             for name in dict.fromkeys(b.home for b in self.buffers if b.far == far)
@@ -96,12 +97,12 @@ class Plan:
 
     @property
     def zero_bytes(self) -> int:
-        """Bytes of the longest row of padding that holds zeros; 0: there is none."""
+        """Bytes of the longest padding row of zeros; 0: none."""
         rows = (b.padded_bytes for b in self.buffers if b.above and b.pad_value == 0)
         return max(rows, default=0)
 
     def state_bytes(self, *, bayer: bool) -> int:
-        """Bytes of the state for raw Bayer images or without; of the near one of two."""
+        """Return the bytes of the (near) state, with or without raw Bayer images."""
         used = 2 * len(self.buffers) + sum(self.homes(far=False).values()) + self.pad_bytes
         used += 2 + 3 * self.network.width_px if bayer else 0
         if not self.stage:
@@ -110,20 +111,20 @@ class Plan:
 
     @property
     def pad_bytes(self) -> int:
-        """Bytes of the row of padding that the image needs of its own; 0: it needs none."""
+        """Bytes of the padding row of the image; 0: none."""
         image = self.buffers[0]
         return image.padded_bytes if image.above and image.pad_value else 0
 
 
 def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
-    """How the C of a network works.
+    """Plan the buffers of a network's C.
 
     Parameters
     ----------
     network
-        What is computed.
+        The network.
     features
-        Hold all that the last layer reads, as the heads are held.
+        Keep all rows that the last layer reads, as for the heads.
 
     Raises
     ------
@@ -155,9 +156,9 @@ def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
 
 
 def _chains(steps: list[Step], buffers: list[Buffer], whole: frozenset[int]) -> list[list[int]]:
-    """Buffers whose rows may lie in one ring: each is written by a step that reads the one before.
+    """Return chains of buffers that may share a ring: each is computed from the one before.
 
-    Their rows are of one size. Where a step has a shortcut, that is the one before.
+    Their rows have equal size. A step with a shortcut is chained to the shortcut's buffer.
     """
     chains: list[list[int]] = []
     for out, step in enumerate(steps, start=1):
@@ -175,7 +176,7 @@ def _chains(steps: list[Step], buffers: list[Buffer], whole: frozenset[int]) -> 
 
 
 def _joined(buffers: list[Buffer], chain: list[int], writes: list[Write]) -> list[Buffer]:
-    """The buffers, those of a chain in one ring if that is smaller."""
+    """Return the buffers, with those of a chain in one ring if that is smaller."""
     ring, shifts = shared_ring(chain, writes)
     gap, first = max(buffers[k].gap for k in chain), buffers[chain[0]]
     joined = {
@@ -188,7 +189,7 @@ def _joined(buffers: list[Buffer], chain: list[int], writes: list[Write]) -> lis
 
 
 def _homes(passing: list[int], together: set[tuple[int, int]]) -> dict[int, str]:
-    """Members for buffers of one row; two that are needed together are never in the same."""
+    """Assign members to buffers of one row; buffers with overlapping lifetimes never share one."""
     shared: list[list[int]] = []
     for k in passing:
         for home in shared:
@@ -201,7 +202,7 @@ def _homes(passing: list[int], together: set[tuple[int, int]]) -> dict[int, str]
 
 
 def _steps(network: IntegerNetwork) -> tuple[list[Step], list[int]]:
-    """The steps, and the buffer of every tensor."""
+    """Return the steps, and the buffer of every tensor."""
     steps: list[Step] = []
     tensors = [0]
     fused = _pools_to_fuse(network)
@@ -218,7 +219,7 @@ def _steps(network: IntegerNetwork) -> tuple[list[Step], list[int]]:
 
 
 def _pools_to_fuse(network: IntegerNetwork) -> set[int]:
-    """Layers that are max-pools right after a dense convolution that nothing else reads."""
+    """Return the max-pools that follow a dense convolution with no other reader."""
     out = set()
     for index, layer in enumerate(network.layers[1:], 1):
         before = network.layers[index - 1]
@@ -230,7 +231,7 @@ def _pools_to_fuse(network: IntegerNetwork) -> set[int]:
 
 
 def _identifier(name: str, taken: list[str]) -> str:
-    """A C identifier like ``name`` that is not taken."""
+    """Return a C identifier like ``name`` that is not in ``taken``."""
     plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower()[:60] or "layer"
     plain = f"layer_{plain}" if plain.startswith(SHARED) or not plain[0].isalpha() else plain
     reserved = {*taken, *RESERVED.split()}
@@ -244,22 +245,22 @@ image image_pad stage zeros done raw raw_rows auto break case char const continu
 else enum extern float for goto if inline int long register restrict return short signed sizeof
 static struct switch typedef union unsigned void volatile while
 """
-"""Words of C, and other members of the state."""
+"""Keywords of C, and other members of the state."""
 SHARED = "passing_"
-"""How members begin that several buffers share."""
+"""Prefix of members that several buffers share."""
 
 
 def along(conv: Conv) -> bool:
-    """Whether a convolution's C slides along the row, and needs no columns of padding there."""
+    """Return whether the C of a convolution slides along the row; it needs no padding columns."""
     same = conv.stride == 1 and conv.padding == conv.dilation
     return conv.depthwise and conv.kernel == 3 and same
 
 
 def taps_of(conv: Conv) -> int:
-    """Pointers of a convolution.
+    """Return the number of row pointers of a convolution's kernel.
 
-    A pointer leads to one row of the kernel, whose columns stand side by side in memory; with
-    dilation they do not, and each weight of the kernel has a pointer of its own.
+    A pointer refers to one row of the kernel, whose columns are adjacent in memory. With dilation
+    they are not, and each weight of the kernel has its own pointer.
     """
     spread = conv.dilation > 1 and not conv.depthwise and conv.kernel > 1
     return conv.kernel**2 if spread else conv.kernel
@@ -284,5 +285,5 @@ def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
 
 
 def up(size: int, step: int) -> int:
-    """The next multiple of ``step``."""
+    """Round up to the next multiple of ``step``."""
     return -(-size // step) * step

@@ -1,4 +1,4 @@
-"""The C of convolutions: which kernel computes a step, and on which rows."""
+"""C of convolutions: the kernel of each step and the rows that it reads."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ from dmrl.deploy.int8.network import Conv
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """A kernel and the constants of a layer: layers that agree in both share its machine code.
+    """A kernel with a layer's constants; layers that agree in both share machine code.
 
     Parameters
     ----------
     name
-        Of the kernel, as its template calls it.
+        Name of the kernel in its template.
     shortcut
-        Whether it adds one.
+        Whether it adds a shortcut.
     constants
-        The arguments that say the layer's shape.
+        Arguments that define the layer's shape.
     """
 
     name: str
@@ -31,14 +31,14 @@ class Kernel:
 
 
 def templates_of(step: Step, conv: Conv) -> list[str]:
-    """Files of the kernel of a step."""
+    """Return the template files of a step's kernel."""
     if conv.depthwise:
         return ["depthwise_along.c" if along(conv) else "depthwise.c"]
     return ["dense.c", "convolve_pool.c" if step.pooled else "convolve.c"]
 
 
 def shared_kernels(plan: Plan) -> str:
-    """C functions of the kernels, each with its constants."""
+    """Generate one C function per kernel, with its constants."""
     text = ""
     for number, kernel in enumerate(_kernels(plan)):
         kinds = ["const uint8_t *const *in", "uint8_t *out", "const int8_t *weights"]
@@ -56,7 +56,7 @@ def shared_kernels(plan: Plan) -> str:
 
 
 def _kernels(plan: Plan) -> list[Kernel]:
-    """Every kernel that some step needs, each once."""
+    """Return every kernel that a step requires, without duplicates."""
     return list(dict.fromkeys(kernel for _, kernel in _convolutions(plan)))
 
 
@@ -90,9 +90,9 @@ def _kernel(plan: Plan, index: int, step: Step, conv: Conv) -> Kernel:
 
 
 def row_of_convolution(desk: Desk, index: int) -> str:
-    """Pointers to what the kernel reads, then its call.
+    """Generate the row pointers of a kernel and its call.
 
-    A pooled step makes two rows at once and so has twice as many pointers.
+    A pooled step computes two rows at once and has twice as many pointers.
     """
     step, conv = desk.plan.steps[index], desk.plan.steps[index].layer
     assert isinstance(conv, Conv)
@@ -132,12 +132,12 @@ def _call(desk: Desk, index: int) -> list[str]:
 
 
 def _row(factor: int, offset: str) -> str:
-    """Input row of output row ``row``."""
+    """Return the input row of output row ``row`` as C text."""
     return (f"{factor} * row" if factor > 1 else "row") + offset
 
 
 def _row_of_pointer(step: Step, conv: Conv, taps: int) -> str:
-    """Input row of pointer ``k``, counted from the first row under the kernel."""
+    """Return the input row of pointer ``k``, relative to the first row under the kernel."""
     terms = [f" - {conv.padding}"] if conv.padding else []
     within = f"k % {taps}" if step.pooled else "k"
     if taps > conv.kernel:

@@ -1,4 +1,4 @@
-"""A C program that runs the network on images from standard input, and what it answers."""
+"""Test harness in C, which runs the network on images from standard input; parser of its output."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import Detection
 
 MOST = 20
-"""Detections that the program asks for."""
+"""Maximum number of detections per image."""
 DETECTION = np.dtype(
     [
         ("u_q4", "<i4"),
@@ -25,16 +25,16 @@ DETECTION = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the program gave for one image.
+    """Output of the harness for one image.
 
     Parameters
     ----------
     grids
-        By head, as ``reference.run`` gives them.
+        By head, as from `run_network` of ``reference``.
     detections
-        As ``reference.decode`` gives them.
+        As from `decode_detections` of ``reference``.
     stack_bytes
-        Stack used; 0 where it was not measured.
+        Measured stack; 0 where not measured.
     """
 
     grids: dict[str, NDArray[np.int8]]
@@ -43,12 +43,12 @@ class Answer:
 
 
 def harness(network: IntegerNetwork) -> str:
-    """Text of the program."""
+    """Generate the C of the harness."""
     return fill("harness.c", **names_of(network), most=MOST)
 
 
 def answers(network: IntegerNetwork, data: bytes) -> list[Answer]:
-    """What the program wrote, image by image; an answer that was cut short is left out."""
+    """Parse the output of the harness, image by image; a truncated one at the end is dropped."""
     out, at = [], 0
     shape = network.grid_shape
     size = shape[0] * shape[1]
@@ -68,6 +68,6 @@ def answers(network: IntegerNetwork, data: bytes) -> list[Answer]:
 
 
 def detections_of(rows: NDArray[np.void]) -> list[Detection]:
-    """Detections in memory as the C lays them out."""
+    """Convert detections from the memory layout of the C."""
     names = ("u_q4", "v_q4", "depth_mm", "confidence")
     return [Detection(*(int(row[name]) for name in names)) for row in rows]

@@ -1,4 +1,4 @@
-"""The C of each step: its kernel, its function of one row, its constants."""
+"""C of each step: its kernel, its function of one row, and its constants."""
 
 from dmrl.deploy.c.buffer_plan import Plan
 from dmrl.deploy.c.convolutions import row_of_convolution, templates_of
@@ -20,23 +20,23 @@ from dmrl.errors import ModelError
 
 
 def require_carried(plan: Plan) -> None:
-    """Nothing, if the C has a kernel for every layer.
+    """Raise ModelError unless the C has a kernel for every layer.
 
     Raises
     ------
     ModelError
-        If not; the layer is named.
+        If a layer is not supported; the message contains its name.
     """
     for step in plan.steps:
         if isinstance(step.layer, Conv) and step.layer.depthwise and step.layer.kernel != 3:
             raise ModelError(
                 f"layer {step.layer.name} is a depthwise 1x1 convolution, which the C does not "
-                "carry. Fold it into the convolution before it"
+                "support. Fold it into the convolution before it"
             )
 
 
 def kernels(plan: Plan) -> str:
-    """The kernels that the steps call, each once."""
+    """Generate the kernels that the steps call, each once."""
     pools = any(s.pooled or isinstance(s.layer, MaxPool) for s in plan.steps)
     texts = [fill("largest.c")] if pools else []
     for step in plan.steps:
@@ -56,7 +56,7 @@ def _templates(step: Step) -> list[str]:
 
 
 def row_function(plan: Plan, index: int, prefix: str) -> str:
-    """C function that makes one output row of a step."""
+    """Generate the C function that computes one output row of a step."""
     step, desk = plan.steps[index], Desk(plan, loads(plan, index))
     if isinstance(step.layer, Conv):
         text = row_of_convolution(desk, index)
@@ -71,7 +71,7 @@ def row_function(plan: Plan, index: int, prefix: str) -> str:
 
 
 def describe(plan: Plan, index: int) -> str:
-    """What a step does, in words."""
+    """Describe a step in words, for comments."""
     step, out = plan.steps[index], plan.buffers[index + 1]
     source = plan.buffers[step.sources[0]]
     size = f"{source.cols} x {source.rows} x {source.channels}"
@@ -124,7 +124,7 @@ def _pool_body(desk: Desk, index: int) -> str:
 
 
 def constants(plan: Plan) -> tuple[str, int]:
-    """Definitions of every step's weights and scales, and their size in bytes."""
+    """Generate the weights and scales of every step; also return their size in bytes."""
     texts, size = [], 0
     for step in plan.steps:
         if isinstance(step.layer, Conv):
@@ -142,7 +142,7 @@ def constants(plan: Plan) -> tuple[str, int]:
 
 
 def declarations(plan: Plan) -> str:
-    """Declarations of the weights and scales, which are defined at the end of the file."""
+    """Generate declarations of weights and scales, which are defined at the end of the file."""
     lines = []
     for step in plan.steps:
         if isinstance(step.layer, Conv):

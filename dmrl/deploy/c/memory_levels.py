@@ -1,8 +1,8 @@
-"""Two memories: rings of long reach in the large, far one; in the near one what layers work on.
+"""Placement in two memories: long rings in a large far one (L2), scratch in a near one (L1).
 
-A GAP8 has 64 kB of L1, in which its cores work without waiting, and 512 kB of L2. While a step
-makes a row, its tables and the rows of far rings that it reads lie in the stage, a part of the near
-memory; what it makes of a far ring goes out from there.
+A GAP8 has 64 kB of L1, which its cores access without waiting, and 512 kB of L2. While a step
+computes a row, its tables and the rows that it reads from far rings are in the scratch buffer, a
+part of the near memory. A row of a far ring is computed there and then copied out.
 """
 
 import itertools
@@ -14,19 +14,19 @@ from dmrl.deploy.int8.network import Conv, MaxPool
 from dmrl.errors import SettingError
 
 MOST_CHOICES = 12
-"""Rings that may be far, the largest: every choice of them is tried."""
+"""Number of rings, the largest ones, that may be far; all their subsets are tried."""
 
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What of one kind lies in the stage while a step makes a row.
+    """Items of one kind in the scratch buffer while a step computes a row.
 
     Parameters
     ----------
     size_bytes, count
-        Of one, and how many.
+        Size of each, and how many.
     at
-        Where the first lies.
+        Offset of the first.
     """
 
     size_bytes: int
@@ -35,18 +35,18 @@ class Load:
 
     @property
     def end(self) -> int:
-        """Where the next kind may lie."""
+        """Offset of the next kind."""
         return up(self.at + self.size_bytes * self.count, 4)
 
 
 def loads(plan: Plan, index: int) -> dict[str, Load]:
-    """What lies in the stage while a step makes a row: its tables, and rows of far rings.
+    """Return the content of the scratch buffer of a step: its tables, and rows of far rings.
 
     Returns
     -------
     dict
-        By kind: "scales", "gains", "weights", "0" and "1" of the inputs, "out"; empty where there
-        is one memory.
+        By kind: "scales", "gains", "weights", "0" and "1" of the inputs, "out"; empty with one
+        memory.
     """
     if not plan.stage:
         return {}
@@ -69,14 +69,14 @@ def loads(plan: Plan, index: int) -> dict[str, Load]:
 
 
 def rows_read(step: Step) -> int:
-    """Rows of its first input that a step has pointers to while it makes a row."""
+    """Return the number of row pointers of a step to its first input."""
     if isinstance(step.layer, Conv):
         return taps_of(step.layer) * (2 if step.pooled else 1)
     return 2 if isinstance(step.layer, MaxPool) else 1
 
 
 def traffic_bytes(plan: Plan) -> int:
-    """Bytes that an image copies between the two memories; 0 where there is one."""
+    """Return the bytes copied between the two memories per image; 0 with one memory."""
     return sum(
         load.size_bytes * load.count * out.rows
         for index, out in enumerate(plan.buffers[1:])
@@ -85,19 +85,19 @@ def traffic_bytes(plan: Plan) -> int:
 
 
 def split(plan: Plan, most_bytes: int) -> Plan:
-    """The plan as it is where it fits; else with two memories, and the fewest bytes copied.
+    """Place rings in the far memory if the plan does not fit; fewest copied bytes win.
 
     Parameters
     ----------
     plan
-        With one memory.
+        Plan with one memory.
     most_bytes
-        That the near state may have, for raw Bayer images too.
+        Maximum size of the near state, raw Bayer images included.
 
     Raises
     ------
     SettingError
-        If it has more in any case.
+        If no placement fits.
     """
     if plan.state_bytes(bayer=True) <= most_bytes:
         return plan
@@ -112,13 +112,13 @@ def split(plan: Plan, most_bytes: int) -> Plan:
         return ways[min(fitting)[-1]]
     least = min([*sizes, plan.state_bytes(bayer=True)])
     raise SettingError(
-        f"{plan.network.name} keeps at least {least:,} bytes in the near memory, of which "
-        f"{most_bytes:,} are there beside stacks. Give more: --l1-kb"
+        f"{plan.network.name} needs at least {least:,} bytes of near memory, of which "
+        f"{most_bytes:,} are there beside the stacks. Raise --l1-kb"
     )
 
 
 def _choices(plan: Plan) -> list[tuple[str, ...]]:
-    """Sets of members of the state that may be far."""
+    """Return all sets of members of the state that may be far."""
     near, sizes = {plan.buffers[k].home for k in plan.whole | {0}}, plan.homes(far=False)
     rings = [name for name in sizes if name not in near and not name.startswith(SHARED)]
     rings = sorted(rings, key=lambda name: -sizes[name])[:MOST_CHOICES]

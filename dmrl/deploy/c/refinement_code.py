@@ -1,4 +1,4 @@
-"""C that learns on in the last layer, beside the network's own; see `dmrl.deploy.int8.refinement`."""
+"""C for on-device refinement of the last layer; see `dmrl.deploy.int8.refinement`."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from dmrl.deploy.int8.refinement import gains, last_layer
 
 
 def refinement(network: IntegerNetwork, names: dict[str, str]) -> dict[str, str]:
-    """Names and texts of the files.
+    """Generate the files of the refinement: name to text.
 
     Raises
     ------
     ModelError
-        If the last layer is not such as can be learned on.
+        If the last layer cannot be refined.
     """
     layer, planned = last_layer(network), plan(network, features=True)
     features, grid = planned.buffers[planned.steps[-1].sources[0]], planned.buffers[-1]

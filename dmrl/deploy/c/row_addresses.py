@@ -1,4 +1,4 @@
-"""Where rows lie, as C text, and what kernels are called by the types of what they read."""
+"""Addresses of rows and tables as C text, and type suffixes of kernels."""
 
 import re
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ RANGES = {False: "0, 255", True: "-128, 127"}
 
 
 def state_names(plan: Plan, prefix: str) -> dict[str, str]:
-    """Parameters and arguments that every function of the C has that sees rows of the network.
+    """Return the state parameters and arguments of the generated functions.
 
     Returns
     -------
     dict
-        ``params``; ``reads``, the same without the right to write; ``args``; ``refs``, what a
-        caller that holds the state gives.
+        ``params``; ``reads``, the same with const; ``args``; ``refs``, the arguments of a caller
+        that owns the state.
     """
     kinds = {"net": f"{prefix}_t"} | ({"away": f"{prefix}_far_t"} if plan.stage else {})
     params = ", ".join(f"{kind} *{name}" for name, kind in kinds.items())
@@ -30,17 +30,17 @@ def state_names(plan: Plan, prefix: str) -> dict[str, str]:
 
 
 def suffixes(signed: list[bool]) -> str:
-    """What tells kernels that read several tensors apart."""
+    """Return the type suffix of kernels that read several tensors."""
     return "_".join(TYPES[each][0] for each in signed)
 
 
 def target(out: Buffer) -> str:
-    """Where an output row begins, behind its padding."""
+    """Return the address of an output row, behind its padding."""
     return f"{slot(out)}{plus(out.gap * out.channels)}"
 
 
 def slot(buffer: Buffer) -> str:
-    """Where row ``row`` begins in a ring, its padding first."""
+    """Return the address of row ``row`` in a ring, including its padding."""
     home = f"{'away' if buffer.far else 'net'}->{buffer.home}"
     if buffer.ring == 1:
         return home
@@ -53,31 +53,34 @@ def slot(buffer: Buffer) -> str:
 
 
 def one_row(buffer: Buffer) -> bool:
-    """Whether only the newest row is ever read."""
+    """Return whether only the newest row is ever read."""
     return buffer.ring == 1 and not buffer.above
 
 
 @dataclass(frozen=True, slots=True)
 class Desk:
-    """Where a step finds its rows and tables, and where it writes: in the stage, or where they are.
+    """Addresses of a step's rows, tables and output: in the scratch buffer, or in place.
 
     Parameters
     ----------
     plan
         The plan.
     staged
-        What of the step lies in the stage, by kind.
+        Content of the scratch buffer for this step, by kind.
     """
 
     plan: Plan
     staged: dict[str, Load]
 
     def table(self, kind: str, name: str) -> str:
-        """Where a table of the step begins."""
+        """Return the address of a table of the step."""
         return brought(self.staged[kind], name) if kind in self.staged else name
 
     def read(self, number: int, buffer: Buffer, row: str, pointer: str = "0") -> str:
-        """Where row ``row`` of an input, or of its padding, begins; it is the step's so many-th."""
+        """Return the address of row ``row`` of an input, or of its padding.
+
+        ``number`` selects the input. A row of a far ring is first copied to place ``pointer``.
+        """
         args = state_names(self.plan, "")["args"]
         place = slot(buffer) if one_row(buffer) else f"row_of_{buffer.name}({args}, {row})"
         if not buffer.far:
@@ -85,15 +88,15 @@ class Desk:
         return f"(const uint8_t *){brought(self.staged[f'{number}'], place, pointer)}"
 
     def values(self, number: int, buffer: Buffer) -> str:
-        """Where row ``row`` of an input begins, behind its padding."""
+        """Return the address of row ``row`` of an input, behind its padding."""
         return f"{self.read(number, buffer, 'row')}{plus(buffer.gap * buffer.channels)}"
 
     def target(self, out: Buffer) -> str:
-        """Where the output row is made."""
+        """Return the address where the output row is computed."""
         return f"at_stage(net, {self.staged['out'].at})" if out.far else target(out)
 
     def sent(self, out: Buffer) -> list[str]:
-        """What follows when the output row is made."""
+        """Return the statements that copy a computed output row to a far ring."""
         if not out.far:
             return []
         load = self.staged["out"]
@@ -101,21 +104,21 @@ class Desk:
 
 
 def brought(load: Load, place: str, number: str = "0") -> str:
-    """C that brings one of a kind into the stage, and gives its place there."""
+    """Return a C expression that copies an item to the scratch buffer and gives its address."""
     at = f"{load.at}" if number == "0" else f"{load.at} + {number} * {load.size_bytes}"
     return f"brought(at_stage(net, {at}), {place}, {load.size_bytes})"
 
 
 def marked_unused(text: str, *names: str) -> str:
-    """Statements for those parameters that a function's text does not name."""
+    """Return statements for those parameters that a function's text does not use."""
     return "".join(f"    (void){n};\n" for n in names if n not in re.findall(r"\w+", text))
 
 
 def plus(number: int) -> str:
-    """A constant that is added; nothing where it is 0."""
+    """Return C text that adds a constant; empty for 0."""
     return f" + {number}" if number > 0 else f" - {-number}" if number < 0 else ""
 
 
 def body(lines: list[str]) -> str:
-    """Lines of a function."""
+    """Indent the lines of a function."""
     return "".join(f"    {line}\n" for line in lines)

@@ -1,7 +1,7 @@
-"""When every row of a network is made, and how many rows each tensor must hold for that.
+"""Row schedule of a network, and the number of rows that each tensor must keep for it.
 
-After each row of the image the deepest step that has the rows it needs makes one output row, until
-none has. `play` plays this through, and what is counted in it is exact.
+After each row of the image, the deepest step with all input rows computes one output row, until no
+step can. `schedule_rows` simulates this, so the derived buffer sizes are exact.
 """
 
 import itertools
@@ -12,18 +12,18 @@ from dmrl.deploy.int8.network import AnyLayer, Conv, MaxPool
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One output row at a time of a layer, or of a convolution and the max-pool after it.
+    """Computation of one output row of a layer, or of a convolution and its max-pool.
 
     Parameters
     ----------
     name
         C identifier.
     layer
-        What is computed.
+        Layer that it computes.
     pooled
-        Whether a 2x2 max-pool follows within the step.
+        Whether it includes a 2x2 max-pool.
     sources
-        Buffers it reads; it writes the buffer after its own index.
+        Buffers it reads; step i writes buffer i + 1.
     """
 
     name: str
@@ -54,16 +54,16 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """A row is made.
+    """Computation of one row.
 
     Parameters
     ----------
     buffer, row
-        Which.
+        The row.
     done
         Rows that each buffer has had before.
     oldest
-        First row of each buffer that some step has yet to read; as many as there are: none.
+        First row of each buffer that a step still requires; the number of rows if none.
     """
 
     buffer: int
@@ -73,7 +73,7 @@ class Write:
 
 
 def play(steps: list[Step], rows: list[int]) -> list[Write]:
-    """Every row of an image, in the order in which they are made.
+    """Simulate the computation of an image; return every row in order.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _deepest_ready(steps: list[Step], rows: list[int], done: list[int]) -> int |
 
 
 def rows_held(writes: list[Write], count: int) -> list[int]:
-    """Rows that each of so many buffers holds at a time: from the oldest needed to the newest."""
+    """Return the ring size of each buffer: rows from the oldest required to the newest."""
     rings = [1] * count
     for w in writes:
         rings[w.buffer] = max(rings[w.buffer], w.row + 1 - w.oldest[w.buffer])
@@ -122,7 +122,7 @@ def rows_held(writes: list[Write], count: int) -> list[int]:
 
 
 def needed_together(writes: list[Write]) -> set[tuple[int, int]]:
-    """(a, b): a row of b was still needed when a row of a was made."""
+    """Return pairs (a, b): a row of b was still required when a row of a was computed."""
     return {
         (w.buffer, other)
         for w in writes
@@ -132,17 +132,17 @@ def needed_together(writes: list[Write]) -> set[tuple[int, int]]:
 
 
 def shared_ring(chain: list[int], writes: list[Write]) -> tuple[int, list[int]]:
-    """Rows of a ring in which buffers take turns, and the place of row 0 of each.
+    """Return the rows of a ring that buffers share, and the position of row 0 of each.
 
-    Every row of a buffer takes the place of a row of the one before it that is no longer needed:
-    the newest such row, so that all that is needed lies close together.
+    Every row of a buffer replaces a row of the buffer before it that is no longer required: the
+    newest such row, so that all required rows are close together.
 
     Parameters
     ----------
     chain
-        The buffers, each made from the one before.
+        The buffers, each computed from the one before.
     writes
-        As `play` gives them.
+        Events from `schedule_rows`.
     """
     behind = {chain[0]: 0}
     for before, buffer in itertools.pairwise(chain):
@@ -153,7 +153,7 @@ def shared_ring(chain: list[int], writes: list[Write]) -> tuple[int, list[int]]:
 
 
 def _span(write: Write, behind: dict[int, int]) -> int:
-    """Places from the first to the last that hold a needed row, the one that is made included."""
+    """Return the distance from the first to the last position in use, the new row included."""
     places = [write.row - behind[write.buffer]]
     for buffer, lag in behind.items():
         if write.oldest[buffer] < write.done[buffer]:

@@ -1,4 +1,4 @@
-"""Vectors of the self-test: images, and what the reference makes of them."""
+"""Test vectors of the self-test: images and the reference output for them."""
 
 from collections.abc import Sequence
 
@@ -12,13 +12,13 @@ from dmrl.deploy.int8.reference import decode, run
 
 Image = NDArray[np.uint8]
 MOST = 5
-"""Detections of a vector."""
+"""Maximum number of detections of a vector."""
 
 
 def vectors(
     network: IntegerNetwork, images: Sequence[Image], names: dict[str, str], *, bayer: bool
 ) -> str:
-    """Text of the header with the vectors: one of noise, and the first of ``images``."""
+    """Generate the header with the vectors: one of noise, and the first of ``images``."""
     if not bayer:
         shape: tuple[int, ...] = (network.height_px, network.width_px, network.channels)
         raws = [noise(shape), *images[:1]]
@@ -32,7 +32,7 @@ def vectors(
 
 
 def noise(shape: tuple[int, ...]) -> Image:
-    """The image that the self-test makes for itself, by a congruential generator."""
+    """Generate the noise image of the self-test, with a linear congruential generator."""
     state, values = 1, bytearray(int(np.prod(shape)))
     for k in range(len(values)):
         state = (state * 1664525 + 1013904223) % 2**32
@@ -41,7 +41,7 @@ def noise(shape: tuple[int, ...]) -> Image:
 
 
 def checksum(grids: Sequence[NDArray[np.int8]]) -> int:
-    """FNV-1a, 32 bits, of the bytes of all grids."""
+    """Compute the 32-bit FNV-1a hash of the bytes of all grids."""
     state = 2166136261
     for byte in b"".join(grid.tobytes() for grid in grids):
         state = (state ^ byte) * 16777619 % 2**32
@@ -49,7 +49,7 @@ def checksum(grids: Sequence[NDArray[np.int8]]) -> int:
 
 
 def _vector(network: IntegerNetwork, image: Image, name: str) -> str:
-    """C initialiser of one vector."""
+    """Generate the C initialiser of one vector."""
     grids = run(network, image)
     found = [
         f"{{{d.u_q4}, {d.v_q4}, {d.depth_mm}, {d.confidence}, 0}}"

@@ -1,4 +1,4 @@
-"""The C file and its header, put together."""
+"""Assembly of the C file and its header."""
 
 from dataclasses import dataclass, replace
 
@@ -20,25 +20,25 @@ from dmrl.deploy.int8.network import SUBPIXEL, Head, IntegerNetwork
 from dmrl.learn.inference.decode_grids import SAME_PX
 
 STACK_BYTES = 640
-"""Stack that the C may use on a 32-bit core, optimised; `dmrl verify` measures it."""
+"""Maximum stack of the C on a 32-bit core, optimised; `dmrl verify` measures it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The C of a network.
+    """Generated C of a network.
 
     Parameters
     ----------
     code, header
         Text of the two files.
     state_bytes, bayer_bytes
-        Bytes of the state, the near one where there are two, and what raw Bayer images add to it.
+        Bytes of the (near) state, and bytes that raw Bayer images add.
     far_bytes, traffic_bytes
-        Bytes of the far state, and those that an image copies to it and from it; 0: there is none.
+        Bytes of the far state, and bytes copied to and from it per image; 0: none.
     constant_bytes
         Bytes of weights and tables.
     stack_bytes
-        Stack that it may use; see ``STACK_BYTES``.
+        Maximum stack; see ``MAX_STACK_BYTES``.
     """
 
     code: str
@@ -59,28 +59,28 @@ def source(
     features: bool = False,
     near_bytes: int | None = None,
 ) -> Source:
-    """The C file and the header of a network.
+    """Generate the C file and the header of a network.
 
     Parameters
     ----------
     network
-        What is computed.
+        The network.
     names
-        As ``text.names_of`` gives them.
+        Names from `template_values`.
     bayer
-        Whether images are raw colour mosaics unless the user's compiler flags say otherwise.
+        Whether images are raw Bayer mosaics by default; a compiler flag overrides it.
     features
-        Whether the state holds all that the last layer reads, for `refinement`.
+        Whether the state keeps all that the last layer reads, for `refinement_code`.
     near_bytes
-        Bytes of a near memory; what does not fit goes to a far one, see `memories`. None: one
-        memory holds all.
+        Bytes of the near memory; rings that do not fit are placed in a far one, see
+        `memory_levels`. None: one memory.
 
     Raises
     ------
     ModelError
-        If the C does not carry the network; the layer is named.
+        If the C does not support the network; the message contains the layer's name.
     SettingError
-        If the near memory is too small in any case.
+        If the near memory is too small.
     """
     planned = plan(network, features=features)
     require_carried(planned)
@@ -141,7 +141,7 @@ def _table_type(name: str) -> str:
 
 
 def _row_access(planned: Plan, buffer: Buffer, names: dict[str, str]) -> str:
-    """C function that gives a row of a buffer, or of its padding."""
+    """Generate the C function that returns a row of a buffer, or of its padding."""
     text = f"    return {slot(buffer)};\n"
     if buffer.above:
         zeros = "net->zeros" if planned.stage else "zeros"
@@ -180,7 +180,7 @@ def _schedule(planned: Plan, names: dict[str, str]) -> str:
 
 
 def _pads(planned: Plan, names: dict[str, str]) -> str:
-    """C that fills what no layer writes."""
+    """Generate the C that fills padding, which no layer writes."""
     places = {
         f"{'away' if b.far else 'net'}->{b.home}": b.pad_value for b in planned.buffers if b.gap
     }
@@ -193,7 +193,7 @@ def _pads(planned: Plan, names: dict[str, str]) -> str:
 
 
 def _store(channels: int) -> str:
-    """C that writes one pixel of the mosaic's colours."""
+    """Generate the C that stores one demosaiced pixel."""
     if channels == 1:
         grey = "(uint8_t)((77 * red + 150 * green + 29 * blue + 128) >> 8)"
         return f"        out[x] = {grey};\n"
@@ -202,7 +202,7 @@ def _store(channels: int) -> str:
 
 
 def _cell(planned: Plan, head: Head) -> str:
-    """C that reads a head's value in a cell."""
+    """Generate the C that reads a head's value in a cell."""
     buffer = planned.buffers[planned.tensors[head.tensor]]
     place = f"row * {buffer.row_bytes} + col * {buffer.channels} + {head.channel}"
     return f"(int8_t)net->{buffer.home}[{place}]"
@@ -242,7 +242,7 @@ def _decode(planned: Plan, names: dict[str, str]) -> str:
 
 
 def _head_name(names: dict[str, str], head: str) -> str:
-    """Number of a head, as the header calls it."""
+    """Return the enumerator of a head in the header."""
     return f"{names['PREFIX']}_{head.upper()}"
 
 

@@ -1,15 +1,17 @@
-"""Members of the state, as C text."""
+"""Members of the state struct, as C text."""
 
 from dmrl.deploy.c.buffer_plan import Buffer, Plan
 
 
 def members(planned: Plan, prefix: str) -> str:
-    """Members of the state, of the near one where there are two; ``prefix`` is that of macros."""
+    """Generate the members of the (near) state; ``prefix`` is that of macros."""
     stage = [
-        f"    int32_t stage[{planned.stage // 4}]; /* tables and far rows of the layer at work */"
+        f"    int32_t stage[{planned.stage // 4}]; /* tables and far rows of the current layer */"
     ]
     lines = stage if planned.stage else []
-    lines += [f"    int16_t done[{len(planned.buffers)}]; /* rows of each tensor that are there */"]
+    lines += [
+        f"    int16_t done[{len(planned.buffers)}]; /* rows of each tensor computed so far */"
+    ]
     lines += [
         f"#if {prefix}_BAYER",
         "    int16_t raw_rows;",
@@ -25,15 +27,15 @@ def members(planned: Plan, prefix: str) -> str:
 
 
 def rings(planned: Plan, *, far: bool) -> str:
-    """Members of the near or of the far state that hold rings."""
+    """Generate the ring members of the near or of the far state."""
     lines = []
     for name, size in planned.homes(far=far).items():
         held = [b for b in planned.buffers if b.home == name]
         text = _columns(held[0])
         if len(held) > 1 and held[0].ring > 1:
-            text = f"{held[0].ring} rows of {len(held)} layers, which take turns"
+            text = f"{held[0].ring} rows of {len(held)} layers, sharing one ring"
         elif len(held) > 1:
-            text = f"rows of {len(held)} layers, each read at once by the next"
+            text = f"rows of {len(held)} layers, each read immediately by the next"
         lines.append(f"    uint8_t {name}[{size}]; /* {text} */")
     return "".join(f"{line}\n" for line in lines)
 

@@ -1,4 +1,4 @@
-"""Templates, and arrays of numbers, as C text."""
+"""C text from templates and arrays."""
 
 import re
 from importlib.resources import files
@@ -12,33 +12,33 @@ from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.guards.safe_names import plain
 
 OTHER_FILES = ("main", "harness", "count")
-"""C files that stand beside the network's at one time or another."""
+"""Names of other C files in the same folder, which a network must not use."""
 LONGEST_NAME = 40
 WIDTH = 100
 
 
 def fill(template: str, **values: object) -> str:
-    """A file of ``templates/`` with its ``$names`` replaced.
+    """Fill in a template of ``templates/``: replace its ``$names``.
+
+    Untrusted values must be numbers or pass through `dmrl.guards.safe_names.comment_safe`: a value
+    becomes code, or could end a comment.
 
     Raises
     ------
     KeyError
         If a name has no value.
-
-    What comes from a file must be a number, or have gone through `dmrl.guards.safe_names.plain`: a value
-    becomes code or ends a comment.
     """
     text = files("dmrl.deploy.c").joinpath("templates", template).read_text(encoding="utf-8")
     return Template(text).substitute(values)
 
 
 def array(kind: str, name: str, values: NDArray[np.integer]) -> str:
-    """Definition of a constant array.
+    """Format the definition of a constant array.
 
     Raises
     ------
     TypeError
-        If the values are no integers: whatever else they are must not become code.
+        If the values are not integers, since anything else could inject code.
     """
     if values.dtype.kind not in "iu":
         raise TypeError(f"{name} is of {values.dtype}, not of integers")
@@ -48,7 +48,7 @@ def array(kind: str, name: str, values: NDArray[np.integer]) -> str:
 
 
 def wrapped(words: list[str], indent: str) -> list[str]:
-    """Words in lines of at most ``WIDTH`` characters."""
+    """Wrap words into lines of at most ``LINE_WIDTH`` characters."""
     lines, line = [], indent
     for word in words:
         if len(line) + len(word) > WIDTH:
@@ -59,16 +59,16 @@ def wrapped(words: list[str], indent: str) -> list[str]:
 
 
 def c_name(network: IntegerNetwork) -> str:
-    """Name of a network's C files, and prefix of their functions: that of its architecture.
+    """Return the file name and function prefix of a network's C, from its architecture.
 
-    In letters, digits and underscores, as C wants it: dmrl-nano is dmrl_nano.
+    It has letters, digits and underscores only: dmrl-nano becomes dmrl_nano.
     """
     name = re.sub(r"[^a-z0-9]+", "_", network.architecture.lower()).strip("_")[:LONGEST_NAME]
     return name if name[:1].isalpha() and name not in OTHER_FILES else f"net_{name}".rstrip("_")
 
 
 def names_of(network: IntegerNetwork) -> dict[str, str]:
-    """What every template is told of a network."""
+    """Return the values that every template uses."""
     name = c_name(network)
     return {
         "prefix": name,

@@ -1,1 +1,1 @@
-"""Post-training quantization to int8: calibration, equalisation, rounding and the reference."""
+"""Post-training int8 quantization: calibration, equalisation, rounding, and the reference."""

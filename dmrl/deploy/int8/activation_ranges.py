@@ -1,4 +1,4 @@
-"""Ranges of a network's tensors over calibration images."""
+"""Calibration: value ranges of a network's tensors over calibration images."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ranges:
-    """What calibration images gave.
+    """Ranges measured on calibration images.
 
     Parameters
     ----------
     low, high
-        (channels,) least and largest value of every channel, for each tensor.
+        (channels,) smallest and largest value of every channel, for each tensor.
     images
-        How many there were.
+        Number of images.
     height_px, width_px
-        Of the images.
+        Size of the images.
     """
 
     low: tuple[Array, ...]
@@ -33,7 +33,7 @@ class Ranges:
     width_px: int
 
     def with_more(self, other: "Ranges") -> "Ranges":
-        """The ranges over both sets of images, which are of one size."""
+        """Return the ranges over both sets of images, which have one size."""
         return Ranges(
             tuple(np.minimum(a, b) for a, b in zip(self.low, other.low, strict=True)),
             tuple(np.maximum(a, b) for a, b in zip(self.high, other.high, strict=True)),
@@ -44,21 +44,21 @@ class Ranges:
 
 
 def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
-    """Ranges of every tensor over calibration images.
+    """Measure the range of every tensor over calibration images.
 
     Parameters
     ----------
     graph
         The network.
     batches
-        (n, height, width, 3) RGB images, all of one size; a network of grey images sees them
-        in grey.
+        (n, height, width, 3) RGB images, all of one size; converted to grey for a network of grey
+        images.
 
     Raises
     ------
     SettingError
-        If there are no images, every one of them is of a single colour, or a layer is zero
-        for all of them.
+        If there are no images, each of them has a single colour, or a layer is zero for all of
+        them.
     """
     ranges: Ranges | None = None
     varied = False
@@ -70,8 +70,8 @@ def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
         raise SettingError("no images to calibrate on. Give a dataset with images")
     if not varied:
         raise SettingError(
-            f"each of the {ranges.images} calibration images is of a single colour, so nothing "
-            "can be learned of the ranges. Give images as the camera takes them"
+            f"each of the {ranges.images} calibration images is of a single colour, so ranges "
+            "cannot be measured. Give images as the camera takes them"
         )
     for layer, high, low in zip(graph.layers, ranges.high[1:], ranges.low[1:], strict=True):
         if not (high.any() or low.any()):

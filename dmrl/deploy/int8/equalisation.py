@@ -1,9 +1,9 @@
-"""Cross-layer equalisation (Nagel et al. 2019, eq. 11): channels of one tensor to like ranges.
+"""Cross-layer equalization (Nagel et al. 2019, eq. 11): like ranges for all channels of a tensor.
 
-An int8 tensor has one scale, so a channel that stays small has few levels. Dividing a channel
-by s and multiplying the weights that read it by s changes nothing in the float network, since
-ReLU and max-pool pass a positive factor on. ``s = range of the channel ^ a / range of the
-weights that read it ^ (1 - a)`` shares the loss between the two (Xiao et al. 2023, SmoothQuant).
+An int8 tensor has one scale, so a channel with small values has few levels. Dividing a channel by s
+and multiplying the weights that read it by s does not change the float network, since ReLU and
+max-pool commute with positive factors. ``s = range of the channel ^ a / range of the weights that
+read it ^ (1 - a)`` divides the rounding loss between the two (Xiao et al. 2023, SmoothQuant).
 """
 
 from dataclasses import replace
@@ -17,17 +17,18 @@ from dmrl.deploy.int8.graph import FloatConv, Graph
 Array = NDArray[np.float64]
 
 SHARE = 0.9
-"""The exponent a. 1/2 were fair, but what the weights lose, `rounding` mostly makes good."""
+"""Exponent a. 1/2 would divide the loss equally, but `rounding` compensates most of the weights'
+rounding errors."""
 MOST = 32.0
-"""Largest factor: a channel that is nearly always zero is not blown up."""
+"""Largest factor, so that a channel that is nearly always zero is not amplified without limit."""
 
 
 def equalise(graph: Graph, ranges: Ranges) -> tuple[Graph, Ranges]:
-    """The same network with like ranges of channels, and its ranges.
+    """Equalize the channel ranges of a network; return the equivalent network and its ranges.
 
-    Tensors that a sum or a max-pool ties together are divided by the same factors, which the
-    convolutions that read them make good. The image and the results stay as they are, and so does
-    what is tied to them.
+    Tensors that a sum or a max-pool connects are divided by the same factors, which the
+    convolutions that read them compensate. The image, the outputs and tensors connected to them are
+    not changed.
     """
     convs = {k: layer for k, layer in enumerate(graph.layers) if isinstance(layer, FloatConv)}
     low, high = list(ranges.low), list(ranges.high)
@@ -49,7 +50,7 @@ def equalise(graph: Graph, ranges: Ranges) -> tuple[Graph, Ranges]:
 
 
 def _tied(graph: Graph) -> list[set[int]]:
-    """All tensors, in sets whose channels must have the same factors, in the order of computing."""
+    """Return all tensors, in sets whose channels must share factors, in order of computation."""
     sets = [{tensor} for tensor in range(len(graph.layers) + 1)]
     for tensor, layer in enumerate(graph.layers, start=1):
         for other in layer.sources[1:] if isinstance(layer, FloatConv) else layer.sources:
@@ -61,7 +62,7 @@ def _tied(graph: Graph) -> list[set[int]]:
 
 
 def _factor(spans: list[Array], readers: list[FloatConv]) -> Array:
-    """(channels,) what each channel is divided by; its largest channel stays as it is."""
+    """Return (channels,) the divisor of each channel; the largest channel is not changed."""
     read = np.max([_read_by(layer) for layer in readers], axis=0)
     span = np.max([_relative(span) for span in spans], axis=0)
     ratio = span**SHARE / _relative(read) ** (1 - SHARE)
@@ -75,7 +76,7 @@ def _relative(values: Array) -> Array:
 
 
 def _read_by(layer: FloatConv) -> Array:
-    """(channels,) largest weight on each input channel."""
+    """Return (channels,) the largest weight that reads each input channel."""
     weight = np.abs(layer.weight)
     largest: Array = weight.max(axis=(1, 2, 3)) if layer.groups > 1 else weight.max(axis=(0, 2, 3))
     return largest

@@ -1,7 +1,7 @@
-"""A float network as plain layers: NumPy arrays, normalisation folded, ReLU fused.
+"""Float network as plain layers: NumPy arrays, batch normalisation folded, ReLU fused.
 
-What can be carried to integers is decided here, once: everything after takes these layers.
-Tensors are numbered as in ``integer``: 0 is the image, layer i writes tensor i + 1.
+This module alone decides which layers int8 supports; all later steps use these layers. Tensor
+numbers are those of `network`: 0 is the image, layer i writes tensor i + 1.
 """
 
 from collections import Counter
@@ -23,7 +23,7 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FloatConv:
-    """Convolution, with ReLU or without. Fields as in ``integer.Conv``, in real numbers.
+    """Convolution with an optional ReLU. Fields as in `Conv`, in real numbers.
 
     A second source is a shortcut: a tensor that is added before the ReLU.
     """
@@ -50,7 +50,7 @@ class FloatPool:
 
 @dataclass(frozen=True, slots=True)
 class FloatAdd:
-    """Sum of two tensors, with ReLU or without."""
+    """Sum of two tensors with an optional ReLU."""
 
     name: str
     sources: tuple[int, int]
@@ -67,11 +67,11 @@ class Graph:
     Parameters
     ----------
     layers
-        In the order of computing.
+        Layers in order of computation.
     outputs
         Tensor and channel of every channel of the network's output.
     channels
-        Of the image: 3 for RGB, 1 for grey.
+        Channels of the image: 3 for RGB, 1 for grey.
     """
 
     layers: tuple[FloatLayer, ...]
@@ -79,7 +79,7 @@ class Graph:
     channels: int = 3
 
     def grey(self) -> "Graph":
-        """The network on a grey image; exactly what it gives where R, G and B are equal."""
+        """Return the network for grey images; its output equals that for R = G = B."""
         layers = [
             replace(layer, weight=layer.weight.sum(axis=1, keepdims=True))
             if 0 in layer.sources and isinstance(layer, FloatConv)
@@ -99,38 +99,38 @@ WAYS_OUT = {
     "GELU": "ReLU",
     "Hardswish": "ReLU",
     "PReLU": "ReLU",
-    "Sigmoid": "the logit, as the other networks give",
-    "sigmoid": "the logit, as the other networks give",
+    "Sigmoid": "the logit, as the other networks return",
+    "sigmoid": "the logit, as the other networks return",
     "GroupNorm": "BatchNorm2d",
     "LayerNorm": "BatchNorm2d",
     "InstanceNorm2d": "BatchNorm2d",
     "Upsample": "a convolution at the finer stride",
     "interpolate": "a convolution at the finer stride",
     "mul": "a convolution, a residual sum or a 2x2 max-pool",
-    "concatenate": "a residual sum (only results can be concatenated)",
+    "concatenate": "a residual sum (only outputs can be concatenated)",
 }
 CARRIED = "convolutions (1x1 or 3x3), BatchNorm2d, ReLU, sums and 2x2 max-pools"
 
 
 class Cannot(ModelError):
-    """A layer that cannot be carried to integers; the message says what to use instead."""
+    """Error for a layer that int8 does not support; the message contains a replacement."""
 
     def __init__(self, name: str, what: str, instead: str = CARRIED) -> None:
-        super().__init__(f"layer {name} is {what}, which int8 cannot carry. Use {instead}")
+        super().__init__(f"layer {name} is {what}, which int8 does not support. Use {instead}")
 
 
 def graph_of(operations: Sequence[Op]) -> Graph:
-    """The layers that a network's operations come to.
+    """Build the layer graph of a network's operations.
 
     Parameters
     ----------
     operations
-        As ``learn.trace.operations`` gives them.
+        Operations from `trace_operations`.
 
     Raises
     ------
     ModelError
-        If one of them cannot be carried to integers; it is named, with what to use instead.
+        If int8 does not support an operation; the message contains its name and a replacement.
     """
     builder = _Builder(Counter(source for op in operations for source in op.sources))
     for op in operations:
@@ -139,7 +139,7 @@ def graph_of(operations: Sequence[Op]) -> Graph:
 
 
 class _Builder:
-    """Reads operations in order and keeps the layers that they come to."""
+    """Converts operations, in order, to layers."""
 
     def __init__(self, users: Counter[str]) -> None:
         self.users = users
@@ -150,7 +150,7 @@ class _Builder:
         self.channels = 3
 
     def take(self, op: Op) -> None:
-        """Carry the next operation."""
+        """Convert the next operation."""
         for source in op.sources:
             if source in self.parts and op.kind != "output":
                 raise Cannot(source, "a concatenation inside the network", "a residual sum")
@@ -211,7 +211,7 @@ class _Builder:
         layer = self._own(op, tensor)
         if not isinstance(layer, FloatConv) or layer.relu or len(layer.sources) > 1:
             raise Cannot(
-                op.name, "a BatchNorm2d apart from a convolution", "it after a convolution"
+                op.name, "a BatchNorm2d apart from a convolution", "a BatchNorm2d right after one"
             )
         factor, summand = op.values["factor"], op.values["summand"]
         weight = layer.weight * factor[:, None, None, None]
@@ -222,12 +222,14 @@ class _Builder:
         (tensor,) = self._sources(op)
         layer = self._own(op, tensor)
         if not isinstance(layer, FloatConv | FloatAdd):
-            raise Cannot(op.name, "a ReLU apart from a convolution or sum", "it right after one")
+            raise Cannot(
+                op.name, "a ReLU apart from a convolution or sum", "a ReLU right after one"
+            )
         self.layers[tensor - 1] = replace(layer, relu=True)
         self.tensor_of[op.name] = tensor
 
     def _own(self, op: Op, tensor: int) -> FloatLayer | None:
-        """The layer whose output this operation alone reads; None if there is no such."""
+        """Return the layer whose output only this operation reads, or None."""
         alone = self.users[op.sources[0]] == 1
         return self.layers[tensor - 1] if alone and tensor else None
 
@@ -261,7 +263,9 @@ class _Builder:
         tensor = self.tensor_of[name]
         layer = self.layers[tensor - 1] if tensor else None
         if not isinstance(layer, FloatConv) or layer.relu or len(layer.sources) > 1:
-            raise Cannot(name, "a result that no convolution gives", "a convolution without ReLU")
+            raise Cannot(
+                name, "an output that is not a convolution's", "a convolution without ReLU"
+            )
         return tuple((tensor, channel) for channel in range(len(layer.bias)))
 
     def _output(self, op: Op) -> None:
@@ -270,7 +274,7 @@ class _Builder:
 
 
 def takes_shortcut(layer: FloatLayer) -> TypeGuard[FloatConv]:
-    """Whether a sum with another tensor can be part of a layer: a dense convolution of one size."""
+    """Return whether a layer can absorb a sum: a dense convolution that keeps the size."""
     return (
         isinstance(layer, FloatConv)
         and not layer.relu
@@ -280,20 +284,20 @@ def takes_shortcut(layer: FloatLayer) -> TypeGuard[FloatConv]:
 
 
 def to_input(images: NDArray[np.uint8]) -> Float32:
-    """(N, C, H, W) input, ``x / 128 - 1``, of (N, H, W, C) images."""
+    """Normalize (N, H, W, C) images to (N, C, H, W) input, ``x / 128 - 1``."""
     planes = images.transpose(0, 3, 1, 2).astype(np.float32)
     scaled: Float32 = planes / np.float32(PIXEL_ZERO) - np.float32(1)
     return scaled
 
 
 def grey_of(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(N, H, W, 1) grey of (N, H, W, 3) RGB: ``(77 R + 150 G + 29 B + 128) >> 8``."""
+    """Convert (N, H, W, 3) RGB to (N, H, W, 1) grey: ``(77 R + 150 G + 29 B + 128) >> 8``."""
     weighted = images.astype(np.uint32) @ np.array([77, 150, 29], np.uint32)
     return ((weighted + 128) >> 8).astype(np.uint8)[..., None]
 
 
 def tensors_of(graph: Graph, images: Float32) -> list[Float32]:
-    """The input and the output of every layer, each (N, channels, rows, cols)."""
+    """Compute the input and the output of every layer, each (N, channels, rows, cols)."""
     tensors = [images]
     for layer in graph.layers:
         inputs = [tensors[k] for k in layer.sources]
@@ -308,7 +312,7 @@ def tensors_of(graph: Graph, images: Float32) -> list[Float32]:
 
 
 def outputs_of(graph: Graph, tensors: list[Float32]) -> Float32:
-    """(N, channels, rows, cols) output of the network, of what ``tensors_of`` gave."""
+    """Return the (N, channels, rows, cols) output of the network from its tensors."""
     return np.stack([tensors[tensor][:, channel] for tensor, channel in graph.outputs], axis=1)
 
 

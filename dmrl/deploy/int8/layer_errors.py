@@ -1,4 +1,4 @@
-"""How each layer of an int8 network compares with the float one, on the same images."""
+"""Quantization error of each layer: the int8 network against the float one, on the same images."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,23 +15,23 @@ from dmrl.deploy.int8.reference import Quantised
 
 @dataclass(frozen=True, slots=True)
 class LayerFigures:
-    """A layer, and what int8 does to it.
+    """Quantization error of a layer.
 
     Parameters
     ----------
     name, kind
-        Of the layer. A head, one channel of a layer's output, has the kind "head".
+        Name and kind of the layer. A head, one channel of a layer's output, has the kind "head".
     shape
         Channels, rows and columns of its output.
     products
-        Multiplications of an image.
+        Multiplications per image.
     low, high
-        Least and largest real value that it can hold.
+        Smallest and largest representable real value.
     sqnr_db
-        Power of the float values over that of the difference, decibels; all errors of the
-        layers before it are in it. None: there is no difference.
+        Signal-to-quantization-noise ratio, decibels, including errors of earlier layers. None: no
+        difference.
     saturated
-        Share of the values on the last level: above it, or exactly there, 0 to 1.
+        Fraction of the values on the last level, 0 to 1.
     """
 
     name: str
@@ -68,16 +68,16 @@ class _Sums:
 def layer_figures(
     graph: Graph, network: IntegerNetwork, images: Iterable[NDArray[np.uint8]]
 ) -> list[LayerFigures]:
-    """Figures of every layer, then of every head.
+    """Compare every layer, then every head, of the int8 and the float network.
 
     Parameters
     ----------
     graph
-        The float network.
+        Float network.
     network
-        Its int8 form.
+        Int8 network of it.
     images
-        (height, width, 3) RGB, one after another.
+        (height, width, 3) RGB images.
     """
     layers = [_Sums() for _ in network.layers]
     heads = {name: _Sums() for name in network.heads}

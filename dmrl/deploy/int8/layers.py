@@ -1,7 +1,7 @@
-"""Layers of an int8 network: their numbers, the shapes they give, and what they promise.
+"""Layers of an int8 network: parameters, output shapes, and invariants.
 
-``reference`` computes them, ``c/layers`` writes their C. A layer is checked when a network is
-made of it, so neither has to ask whether a sum can overflow.
+``reference`` computes them, ``c.layer_code`` generates their C. A network checks its layers when it
+is created, so neither has to handle overflow.
 """
 
 from dataclasses import dataclass, field
@@ -18,23 +18,24 @@ Array = NDArray[np.float64]
 Shape = tuple[int, int, int]
 
 PIXEL_ZERO = 128
-"""Pixel that is 0.0 to the network, whose input is ``x / 128 - 1``; images are padded with it."""
+"""Zero point of the image: the pixel value of input 0.0, since input is ``x / 128 - 1``. Also the
+padding of images."""
 Q_LEVELS = 256
 GAIN_SHIFT = 8
-"""Bits of a shortcut's gain behind the point: a step of the sum may be coarse beside its own."""
+"""Fractional bits of a shortcut's gain, needed where a step of the sum is larger than its own."""
 SIGNED_OFFSET = 128
-"""Levels that the sums of a signed convolution are above its output: none that
-has a level is negative, where a multiplier that is rounded up would give one too few."""
+"""Offset of a signed convolution's sums over its output, in levels. It makes all representable sums
+positive: a multiplier that is rounded up would give one level too few for negative ones."""
 
 
 class Layer(Protocol):
-    """What every layer says of itself."""
+    """Protocol of a layer."""
 
     kind: ClassVar[str]
 
     @property
     def name(self) -> str:
-        """Of the layer, as the network calls it."""
+        """Name of the layer in the network."""
 
     @property
     def sources(self) -> tuple[int, ...]:
@@ -46,46 +47,46 @@ class Layer(Protocol):
 
     @property
     def scale(self) -> float:
-        """Real value of one step of its output. Of a head: see `integer.Head`."""
+        """Real value of one step of its output. For heads, see `Head`."""
 
     def shape(self, inputs: tuple[Shape, ...]) -> Shape:
-        """Channels, rows and columns of its output."""
+        """Return channels, rows and columns of its output."""
 
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Nothing, if it keeps its promises on inputs of these shapes and types.
+        """Raise ModelError unless its invariants hold for inputs of these shapes and types.
 
         Raises
         ------
         ModelError
-            If not.
+            If an invariant is violated.
         """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conv:
-    """Convolution, and ReLU where the output is unsigned.
+    """Convolution; with ReLU where the output is unsigned.
 
-    ``acc = bias + sum(weight * x)``, with ``(gain * s) >> GAIN_SHIFT`` of a shortcut, fits in
-    int32 for every input; then, per output channel, ``q = clamp((acc * multiplier) >> shift)``, the
-    product in int64, less `SIGNED_OFFSET` before the clamp where the output is signed. Half a step,
-    which rounds, is in the bias, and so is that offset. With a shift of 32, which is nearly always,
-    q is the high word of the product.
+    ``acc = bias + sum(weight * x)``, plus ``(gain * s) >> GAIN_SHIFT`` for a shortcut, fits in
+    int32 for every input. Requantization per output channel: ``q = clamp((acc * multiplier) >>
+    shift)`` with the product in int64. A signed output subtracts `SIGNED_OFFSET` before the clamp.
+    The bias includes half a step, for rounding, and that offset. The shift is nearly always 32: q
+    is then the high word of the product.
 
     Output row r reads the input rows ``r * stride - padding + dilation * k``, columns likewise;
-    what lies outside reads as ``pad_value``. Rows: ``(h + 2 padding - dilation (k - 1) - 1) //
-    stride + 1``.
+    positions outside read as ``pad_value``. Number of rows:
+    ``(h + 2 padding - dilation (k - 1) - 1) // stride + 1``.
 
     Parameters
     ----------
     name
-        As the network calls it.
+        Name of the layer in the network.
     source
         Tensor it reads.
     weight
         (out, in / groups, k, k) int8, -127 to 127, k is 1 or 3.
     bias
-        (out,) int32. The zero point of the image, half a step of the output and the offset of a
-        signed one are folded in.
+        (out,) int32, with the zero point of the image, half a step of the output and the offset of
+        a signed output folded in.
     multiplier
         (out,) int32, 1 to 2^31 - 1. The real factor is ``multiplier / 2^shift``.
     shift
@@ -99,12 +100,12 @@ class Conv:
     pad_value
         128 for the image, else 0.
     scale
-        Real value of one step of the output; 1 where the output is read by heads alone.
+        Real value of one step of the output; 1 if only heads read the output.
     shortcut
-        Tensor of the output's shape that is added before the requantisation; -1: none. Then the
-        convolution is dense and leaves the size as it is.
+        Tensor of the output's shape that is added before the requantization; -1: none. The
+        convolution is then dense and keeps the size.
     gain
-        (out,) int32, 0 to 2^23 - 1, what the shortcut's values are multiplied by; empty without.
+        (out,) int32, 0 to 2^23 - 1, factors of the shortcut's values; empty without a shortcut.
     """
 
     kind: ClassVar[str] = "conv"
@@ -126,7 +127,7 @@ class Conv:
 
     @property
     def sources(self) -> tuple[int, ...]:
-        """Tensors it reads: its own, then the shortcut if there is one."""
+        """Tensors it reads: the input, then the shortcut if there is one."""
         return (self.source,) if self.shortcut < 0 else (self.source, self.shortcut)
 
     @property
@@ -136,18 +137,18 @@ class Conv:
 
     @property
     def depthwise(self) -> bool:
-        """Whether every channel is convolved alone."""
+        """Whether it is a depthwise convolution."""
         return self.groups > 1
 
     @property
     def divisor(self) -> Array:
-        """(out,) what sums are divided by: whole, or one over a whole number."""
+        """(out,) divisors of the sums: whole numbers, or one over a whole number."""
         factor = self.multiplier / 2.0**self.shift
         near: Array = np.rint(np.maximum(1 / factor, 1)) / np.rint(np.maximum(factor, 1))
         return near
 
     def shape(self, inputs: tuple[Shape, ...]) -> Shape:
-        """Channels, rows and columns of its output."""
+        """Return channels, rows and columns of its output."""
         reach = self.dilation * (self.kernel - 1) + 1
         rows, cols = (
             (side + 2 * self.padding - reach) // self.stride + 1 for side in inputs[0][1:]
@@ -155,12 +156,12 @@ class Conv:
         return self.weight.shape[0], rows, cols
 
     def macs(self, inputs: tuple[Shape, ...]) -> int:
-        """Multiplications that an image takes."""
+        """Return the multiply-accumulates per image."""
         channels, rows, cols = self.shape(inputs)
         return channels * rows * cols * int(np.prod(self.weight.shape[1:]))
 
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Nothing, if its shapes fit and no sum can overflow; else ModelError."""
+        """Raise ModelError unless its shapes fit and no sum can overflow."""
         channels = inputs[0][0]
         outs, ins, *kernel = self.weight.shape
         if kernel not in ([1, 1], [3, 3]) or ins * self.groups != channels:
@@ -169,10 +170,8 @@ class Conv:
             raise unsound(self, f"has {self.groups} groups of {channels} channels")
         own = (self.bias, self.multiplier, *([self.gain] if len(inputs) > 1 else []))
         if any(one.shape != (outs,) for one in own):
-            raise unsound(
-                self, f"has not one bias, multiplier and gain for each of {outs} channels"
-            )
-        # The worst input has the largest value of its type wherever the weight has its sign.
+            raise unsound(self, f"lacks a bias, multiplier or gain for some of {outs} channels")
+        # Bound on the sum: the largest input value of the type times the sum of absolute weights.
         largest_input = 128 if signed[0] else 255
         largest = largest_input * np.abs(self.weight.astype(np.int64)).sum(axis=(1, 2, 3))
         if len(inputs) > 1:
@@ -189,7 +188,7 @@ class Conv:
 
 @dataclass(frozen=True, slots=True)
 class MaxPool:
-    """Largest of each 2x2 block; an odd last row or column is left out. No rounding."""
+    """2x2 max-pool; an odd last row or column is left out. No rounding."""
 
     kind: ClassVar[str] = "max_pool"
     name: str
@@ -203,22 +202,22 @@ class MaxPool:
         return (self.source,)
 
     def shape(self, inputs: tuple[Shape, ...]) -> Shape:
-        """Channels, rows and columns of its output."""
+        """Return channels, rows and columns of its output."""
         channels, rows, cols = inputs[0]
         return channels, rows // 2, cols // 2
 
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Nothing, if its output is of the type of its input; else ModelError."""
+        """Raise ModelError unless input and output have the same type."""
         if self.signed != signed[0]:
             raise unsound(self, "changes the type of its input")
 
 
 @dataclass(frozen=True, slots=True)
 class Add:
-    """Sum of two tensors of one shape, and ReLU where the output is unsigned.
+    """Sum of two tensors of one shape; with ReLU where the output is unsigned.
 
-    ``q = clamp((a * multipliers[0] + b * multipliers[1] + 2^(shift - 1)) >> shift)``; every
-    term and the sum fit in int32.
+    ``q = clamp((a * multipliers[0] + b * multipliers[1] + 2^(shift - 1)) >> shift)``; every term
+    and the sum fit in int32.
 
     Parameters
     ----------
@@ -239,11 +238,11 @@ class Add:
     scale: float = 1.0
 
     def shape(self, inputs: tuple[Shape, ...]) -> Shape:
-        """Channels, rows and columns of its output."""
+        """Return channels, rows and columns of its output."""
         return inputs[0]
 
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Nothing, if its inputs are of one shape and its numbers in range; else ModelError."""
+        """Raise ModelError unless its inputs have one shape and its numbers are in range."""
         if inputs[0] != inputs[1]:
             raise unsound(self, f"adds {inputs[0]} to {inputs[1]}")
         low, high = sorted(self.multipliers)
@@ -255,5 +254,5 @@ AnyLayer = Conv | MaxPool | Add
 
 
 def unsound(layer: Layer, what: str) -> ModelError:
-    """The error for a layer that breaks a promise."""
+    """Return the error for a layer that violates an invariant."""
     return ModelError(f"layer {layer.name} {what}. Quantise the model again")

@@ -1,13 +1,12 @@
-"""An int8 network: what the C is generated from and what ``reference`` computes.
+"""An int8 network: the input of the C generator and of ``reference``.
 
-Tensor 0 is the image, uint8; layer i writes tensor i + 1. A tensor is (channels, rows, columns)
-of uint8, or of int8 where its layer says ``signed``. Its real values are
-``scale * (q - zero_point)``; the zero point is 0 everywhere but in the image (128, the pixel
-that stands for 0.0) and in the heads.
+Tensor 0 is the image, uint8; layer i writes tensor i + 1. A tensor is (channels, rows, columns) of
+uint8, or of int8 if its layer is ``signed``. Its real values are ``scale * (q - zero_point)``. The
+zero point is 0 except for the image (128, the pixel value of 0.0) and the heads.
 
-Every layer ends in one requantisation, of integers alone: half a step is added, then an arithmetic
-shift rounds down (so half goes up), then comes a clamp to the range of the output's type. The clamp
-of an unsigned tensor at 0 is the ReLU.
+Every layer ends in one requantization with integers only: add half a step, shift right (an
+arithmetic shift rounds down, so halves are rounded up), and clamp to the range of the output's
+type. The clamp of an unsigned tensor at 0 is the ReLU.
 """
 
 from collections import Counter
@@ -46,23 +45,23 @@ __all__ = [
 SUBPIXEL = 16
 """Steps per pixel of integer positions."""
 CONFIDENCE_ONE = 65535
-"""Integer confidence that stands for 1."""
+"""Integer confidence of 1.0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Head:
-    """One channel of a signed tensor that is a result, with its own scale.
+    """One channel of a signed tensor that is an output, with its own scale.
 
     Parameters
     ----------
     tensor, channel
-        Where it is. No layer reads a tensor that has a head.
+        Its tensor, which no layer reads, and its channel.
     scale, zero_point
         Its real value is ``scale * (q - zero_point)``.
     table
-        (256,) int32, indexed by q + 128, never falling in the confidence: what the value means
-        as an integer. Confidence: 0 to 65535 for 0 to 1. Depth: mm, 0 to 65535. Offsets: where
-        the robot is from the left (top) edge of the cell, in 1/16 px, -32768 to 32767.
+        (256,) int32, indexed by q + 128: the value in integer units. It never decreases for the
+        confidence. Confidence: 0 to 65535 for 0 to 1. Depth: mm, 0 to 65535. Offsets: position from
+        the left (top) edge of the cell, in 1/16 px, -32768 to 32767.
     """
 
     tensor: int
@@ -74,26 +73,26 @@ class Head:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntegerNetwork:
-    """A whole int8 network.
+    """A complete int8 network.
 
     Parameters
     ----------
     name
-        Of the model, for people.
+        Name of the model, for display.
     architecture
-        Of the network it came from.
+        Architecture of the float network.
     channels, height_px, width_px
-        Of the image: 3 for RGB, 1 for grey.
+        Format of the image: 3 channels for RGB, 1 for grey.
     stride_px
         Side of a grid cell.
     layers
-        In the order of computing; every layer reads tensors that are there by then.
+        Layers in order of computation; every layer reads earlier tensors.
     confidence, depth
-        The heads, all of one grid.
+        Heads, all of one grid shape.
     offset_u, offset_v
-        Heads of the sub-cell position; without them a robot is at its cell's centre.
+        Heads of the sub-cell position; without them, a robot is at the centre of its cell.
     threshold
-        Confidence from which a detection is to be believed, 0 to 1.
+        Confidence from which a detection is reported, 0 to 1.
     """
 
     name: str
@@ -114,7 +113,7 @@ class IntegerNetwork:
 
     @property
     def heads(self) -> dict[str, Head]:
-        """The heads that there are, by name."""
+        """Existing heads, by name."""
         named = {
             "confidence": self.confidence,
             "depth": self.depth,
@@ -138,7 +137,7 @@ class IntegerNetwork:
 
     @property
     def macs(self) -> int:
-        """Multiply-accumulates of an image."""
+        """Multiply-accumulates per image."""
         shapes = self.shapes
         return sum(
             layer.macs((shapes[layer.source],)) for layer in self.layers if isinstance(layer, Conv)
@@ -146,34 +145,36 @@ class IntegerNetwork:
 
     @property
     def threshold_q(self) -> int:
-        """Smallest confidence, as int8, from which a detection is to be believed; 128: none."""
+        """Smallest int8 confidence that reaches the threshold; 128: none."""
         believed = np.flatnonzero(self.confidence.table >= round(self.threshold * CONFIDENCE_ONE))
         return int(believed[0]) - 128 if believed.size else 128
 
 
 def require_sound(network: IntegerNetwork) -> None:
-    """Nothing, if the network keeps every promise of its layers.
+    """Raise ModelError unless the invariants of all layers hold.
 
     Raises
     ------
     ModelError
-        If not; the layer is named.
+        If one is violated; the message contains the layer's name.
     """
     for index, layer in enumerate(network.layers):
         if not all(0 <= k <= index for k in layer.sources):
-            raise unsound(layer, f"reads tensors {layer.sources}, of which not all are before it")
+            raise unsound(
+                layer, f"reads tensors {layer.sources}, which are not all computed before it"
+            )
     shapes = network.shapes
     signed = [False, *(layer.signed for layer in network.layers)]
     for layer, shape in zip(network.layers, shapes[1:], strict=True):
         inputs = tuple(shapes[k] for k in layer.sources)
         if min(shape) < 1:
-            raise unsound(layer, f"leaves nothing of {inputs[0][2]} x {inputs[0][1]}")
+            raise unsound(layer, f"has no output for {inputs[0][2]} x {inputs[0][1]} inputs")
         layer.require_sound(inputs, tuple(signed[k] for k in layer.sources))
     read = {k for layer in network.layers for k in layer.sources}
     for name, head in network.heads.items():
         on_grid = shapes[head.tensor][1:] == network.grid_shape
         if not signed[head.tensor] or head.tensor in read or not on_grid:
-            raise ModelError(f"head {name} is no signed tensor of the grid. Quantise again")
+            raise ModelError(f"head {name} is not a signed tensor of the grid. Quantise again")
     named = Counter(layer.name for layer in network.layers)
     if twice := [name for name, count in named.items() if count > 1]:
-        raise ModelError(f"two layers are called {shortened(twice[0])!r}. Quantise the model again")
+        raise ModelError(f"two layers are named {shortened(twice[0])!r}. Quantise the model again")

@@ -1,8 +1,8 @@
-"""A float network to int8, after training: ranges of calibration images, then rounding.
+"""Post-training quantization of a float network to int8, from calibrated ranges.
 
-Weights per output channel, activations per tensor with zero point 0, each head with a scale of
-its own; ranges are the largest values seen. (Clipping at a percentile costs accuracy: the few
-large values are the robots.)
+Weights have one scale per output channel, activations one per tensor with zero point 0, and each
+head its own scale. Ranges are the largest measured values. Clipping at a percentile costs accuracy:
+the few large values are the robots.
 """
 
 from collections.abc import Callable
@@ -42,26 +42,26 @@ HEAD_OF = {
     "offset_u": "offset_u",
     "offset_v": "offset_v",
 }
-"""The head that each channel of a network's output becomes; other channels are left behind."""
+"""Head for each channel of a network's output; other channels are dropped."""
 HEAD_ROOM = 0.05
-"""Share of its range that a head keeps free at either end, for images not seen before."""
+"""Margin of a head at either end, as a fraction of its range, for values beyond calibration."""
 LEVELS = np.arange(-128.0, 128.0)
 SHORTCUT_LOSES = 0.5
-"""Steps of the sum that rounding down a shortcut takes on average; the bias makes that good."""
+"""Mean loss of rounding down a shortcut, in steps of the sum; the bias compensates it."""
 GAIN_BITS = 16
-"""Of a shortcut's gain: its product with a value of 8 bits is then exact in float32, too."""
+"""Significant bits of a shortcut's gain. Its product with 8 bits is then exact in float32, too."""
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What an integer network says of itself.
+    """Description of an integer network.
 
     Parameters
     ----------
     name, architecture, stride_px, threshold
-        See ``IntegerNetwork``.
+        See `IntegerNetwork`.
     channels
-        What the channels of the output are, as the network's class names them.
+        Names of the output channels, as in the network's class.
     """
 
     name: str
@@ -74,26 +74,26 @@ class About:
 def quantise(
     graph: Graph, ranges: Ranges, about: About, moments: Moments | None = None
 ) -> IntegerNetwork:
-    """The int8 network of a float one.
+    """Quantize a float network to int8.
 
     Parameters
     ----------
     graph, ranges
         The network, and the ranges of its tensors.
     about
-        What it says of itself.
+        Its description.
     moments
-        Of the inputs of every convolution, for weights whose errors cancel. Without them each
-        weight goes to the nearest level.
+        Second moments of every convolution's inputs, for compensated rounding (GPTQ). Without them,
+        each weight is rounded to the nearest level.
 
     Raises
     ------
     SettingError
-        If the network gives no confidence or no depth.
+        If the network has no confidence or no depth.
     """
     heads = _heads(graph, ranges, about)
     layers: list[AnyLayer] = []
-    # Scale and type of every tensor that is there by now; the first is the image.
+    # Scale and type of every tensor so far; the first is the image.
     scales = [1 / PIXEL_ZERO]
     signed = [False]
     for index, layer in enumerate(graph.layers):
@@ -123,21 +123,23 @@ def quantise(
 
 
 def _heads(graph: Graph, ranges: Ranges, about: About) -> dict[str, Head]:
-    """The heads of a network, by name."""
+    """Build the heads of a network, by name."""
     heads = {
         HEAD_OF[channel]: _head(graph, ranges, k, HEAD_OF[channel], about.stride_px)
         for k, channel in enumerate(about.channels)
         if channel in HEAD_OF
     }
     if absent := sorted({"confidence", "depth"} - heads.keys()):
-        raise SettingError(f"{about.name} gives no {absent[0]}, which detections are made of")
+        raise SettingError(
+            f"{about.name} gives no {absent[0]}, which detections require. Use another network"
+        )
     return heads
 
 
 def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) -> Head:
-    """Scale and zero point of a head: its range, some room, and 0, on the 256 levels.
+    """Build a head; its 256 levels cover its range, a margin, and 0.
 
-    Each head has a scale of its own, since log depths and logits have other ranges.
+    Each head has its own scale, since log depths and logits have different ranges.
     """
     tensor, channel = graph.outputs[output]
     least, most = ranges.low[tensor][channel], ranges.high[tensor][channel]
@@ -160,7 +162,7 @@ def _millimetres_of(log_depth: Array, _stride_px: int) -> Array:
 
 
 def _place_of(offset: Array, stride_px: int) -> Array:
-    """Place in a cell, 1/16 px, of an offset from its centre in cells."""
+    """Return the position in a cell, 1/16 px, of an offset from the cell centre in cells."""
     return np.clip((offset + 0.5) * stride_px * SUBPIXEL, -32768, 32767)
 
 
@@ -173,7 +175,7 @@ MEANINGS: dict[str, Callable[[Array, int], Array]] = {
 
 
 def _activation_scale(ranges: Ranges, tensor: int, *, signed: bool) -> float:
-    # Symmetric, zero point 0: then no product of zero points stands in the inner sum.
+    # Symmetric, zero point 0: the inner sum then needs no zero point terms.
     low, high = float(ranges.low[tensor].min()), float(ranges.high[tensor].max())
     return max(-low, high) / 127 if signed else high / 255
 
@@ -195,7 +197,7 @@ def _conv(
         zero[head.channel] += head.zero_point
     in_scales = [scales[source] for source in layer.sources]
     weight, bias, gain, divisor = _integers(layer, in_scales, out_scale, zero, moments)
-    # The image alone has a zero point: sum(w * (q - 128)) = sum(w * q) - 128 * sum(w).
+    # Only the image has a zero point: sum(w * (q - 128)) = sum(w * q) - 128 * sum(w).
     if layer.sources[0] == 0:
         bias -= PIXEL_ZERO * weight.sum(axis=(1, 2, 3))
     multiplier, shift = _fixed_point(divisor)
@@ -221,13 +223,14 @@ def _conv(
 def _integers(
     layer: FloatConv, in_scales: list[float], out_scale: Array, zero: Array, moments: Array | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
-    """Weights, bias, gain of a shortcut, and what a sum is divided by, per channel.
+    """Return integer weights, bias, gain of a shortcut, and divisor of the sums, per channel.
 
-    The bias takes the level of zero and half of the divisor, which rounds. The scale of a channel's
-    weights is set by its largest weight; by its bias and shortcut, where these would not fit beside
-    the sum; or by the largest divisor. It is a little more then, for the divisor to be odd.
+    The bias includes the level of zero and half of the divisor, for rounding. The weight scale of a
+    channel is the smallest that satisfies three bounds: its largest weight, the room that bias and
+    shortcut need in int32, and the largest divisor. It is then raised slightly to make the divisor
+    odd.
     """
-    # What is left of an int32 for bias and shortcut beside the largest sum of weights times inputs.
+    # Room in int32 for bias and shortcut beside the largest sum of weights times inputs.
     largest = np.abs(layer.weight).max(axis=(1, 2, 3))
     room = 2**31 - 1 - 128 * 255 * (layer.weight[0].size + 1)
     in_scale, *beside = in_scales
@@ -251,30 +254,29 @@ def _integers(
 
 
 def _odd(divisor: Array) -> Array:
-    """The odd number at or below each; below 1 one over a whole number.
+    """Return the odd number at or below each divisor; below 1, one over a whole number.
 
-    Then no sum lies halfway between two levels, so all that round to the nearest agree, in integers
-    or in floats, whatever they do with halves.
+    No sum then lies halfway between two levels. All implementations that round to nearest agree, in
+    integers or floats, whatever their rule for halves.
     """
     odd: Array = 2 * np.floor((np.maximum(divisor, 1) + 1) / 2) - 1
     return odd / np.ceil(np.maximum(1 / divisor, 1))
 
 
 def _shortened(gain: Array) -> Array:
-    """Whole numbers of at most `GAIN_BITS` bits that are not zero."""
+    """Round to whole numbers with at most `MAX_GAIN_BITS` significant bits."""
     unit = np.maximum(2.0 ** (np.frexp(gain)[1] - GAIN_BITS), 1.0)
     near: Array = np.rint(gain / unit) * unit
     return near
 
 
 def _fixed_point(divisor: Array) -> tuple[Int32, int]:
-    """Requantisation factors as integers, ``multiplier / 2^shift``, the largest in 30 bits.
+    """Return requantization factors as ``multiplier / 2^shift``, the largest in 30 bits.
 
-    Integers, because they round the same on every machine, also on those without floats. The
+    Integers give the same rounding on every machine, including those without floating point. The
     shift is 32 unless a divisor is 4 or less. Multipliers are rounded up: with a shift of 32 and a
-    whole divisor to 4095 the product is the quotient, rounded down, of every sum that has a level.
-    A multiplier of few bits does for a greater one: a sum of 24 bits is off by less than a tenth of
-    a step.
+    whole divisor up to 4095, the product is the exact quotient, rounded down, of every
+    representable sum. For larger divisors, a sum of 24 bits has an error below a tenth of a step.
     """
     shift = min(32, 30 - int(np.frexp(1 / divisor.min())[1]))
     return np.ceil(2.0**shift / divisor).astype(np.int32), shift
@@ -283,7 +285,7 @@ def _fixed_point(divisor: Array) -> tuple[Int32, int]:
 def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> Add:
     signed = not layer.relu and bool((ranges.low[tensor] < 0).any())
     a, b = (scales[source] for source in layer.sources)
-    # A sum that cancels may be small; a shift below 1 cannot be.
+    # A sum that cancels may be small, but the shift must be at least 1.
     scale = max(_activation_scale(ranges, tensor, signed=signed), max(a, b) * 2.0**-19)
     # 21 bits for the larger one: two terms of 8 and 21 bits and their sum fit in int32.
     _, exponent = np.frexp(max(a, b) / scale)

@@ -1,7 +1,7 @@
-"""What an int8 network computes, bit for bit: the specification of every other backend.
+"""Reference implementation of int8 networks; every other backend must match it bit for bit.
 
-NumPy only. Sums of products are taken in float64, which holds every integer below 2^53: they
-are exact, and BLAS makes them fast.
+NumPy only. Sums of products use float64, which represents every integer below 2^53 exactly and
+makes BLAS usable.
 """
 
 from collections.abc import Iterator
@@ -16,11 +16,11 @@ from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
 from dmrl.learn.inference.decode_grids import SAME_PX
 
 Quantised = NDArray[np.int16]
-"""Values of uint8 or int8 tensors; int16 holds both."""
+"""Values of uint8 or int8 tensors, in int16, which contains both."""
 
 
 def run(network: IntegerNetwork, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
-    """Every head's grid, (rows, cols) int8, of one image.
+    """Run an int8 network on one image; return the int8 grid (rows, cols) of every head.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def run(network: IntegerNetwork, image: NDArray[np.uint8]) -> dict[str, NDArray[
 
 
 def tensors_of(network: IntegerNetwork, image: NDArray[np.uint8]) -> Iterator[Quantised]:
-    """The image and the output of every layer, in order, each (channels, rows, cols)."""
+    """Yield the image and the output of every layer, in order, each (channels, rows, cols)."""
     assert image.shape == (network.height_px, network.width_px, network.channels)
     tensors = [image.transpose(2, 0, 1).astype(np.int16)]
     yield tensors[0]
@@ -47,7 +47,7 @@ def tensors_of(network: IntegerNetwork, image: NDArray[np.uint8]) -> Iterator[Qu
 
 
 def compute(layer: AnyLayer, *inputs: Quantised) -> Quantised:
-    """Output of a layer, (channels, rows, cols)."""
+    """Compute the output of a layer, (channels, rows, cols)."""
     if isinstance(layer, Conv):
         return convolve(layer, *inputs)
     if isinstance(layer, Add):
@@ -57,14 +57,14 @@ def compute(layer: AnyLayer, *inputs: Quantised) -> Quantised:
 
 
 def convolve(layer: Conv, x: Quantised, *shortcut: Quantised) -> Quantised:
-    """Output of a convolution, requantised: ``clamp((acc * multiplier) >> shift)``, see `Conv`."""
+    """Compute a requantized convolution: ``clamp((acc * multiplier) >> shift)``, see `Conv`."""
     product = accumulate(layer, x, *shortcut) * layer.multiplier.astype(np.int64)[:, None, None]
     offset = SIGNED_OFFSET if layer.signed else 0
     return clamp((product >> layer.shift) - offset, signed=layer.signed)
 
 
 def accumulate(layer: Conv, x: Quantised, *shortcut: Quantised) -> NDArray[np.int64]:
-    """Sums of products, bias and shortcut, (out, rows, cols), before requantising."""
+    """Compute the sums (out, rows, cols) of products, bias and shortcut, before requantization."""
     pad = layer.padding
     padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad)), constant_values=layer.pad_value)
     taps = taps_of(padded, layer.kernel, layer.stride, layer.dilation).astype(np.float64)
@@ -81,26 +81,26 @@ def accumulate(layer: Conv, x: Quantised, *shortcut: Quantised) -> NDArray[np.in
 
 
 def clamp(values: NDArray[np.int64], *, signed: bool) -> Quantised:
-    """Values within int8, or within uint8."""
+    """Clip values to int8 or uint8."""
     low, high = (-128, 127) if signed else (0, 255)
     return np.clip(values, low, high).astype(np.int16)
 
 
 def real(head: Head, q: NDArray[np.int8]) -> NDArray[np.float64]:
-    """Real values (log depth, logit, offset) of a head's grid."""
+    """Dequantize a head's grid to real values (log depth, logit, offset)."""
     return head.scale * (q.astype(np.float64) - head.zero_point)
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """A robot, in integers.
+    """A detection in integer units.
 
     Parameters
     ----------
     u_q4, v_q4
         Pixel-edge coordinates, 1/16 px.
     depth_mm
-        Along the optical axis, 0 to 65535.
+        Depth along the optical axis, 0 to 65535.
     confidence
         0 to 65535 for 0 to 1.
     """
@@ -114,15 +114,15 @@ class Detection:
 def decode(
     network: IntegerNetwork, grids: dict[str, NDArray[np.int8]], most: int = 20
 ) -> list[Detection]:
-    """Detections in the grids of ``run``, best first.
+    """Decode the grids of `run_network` to detections, most confident first.
 
     A detection is a cell whose confidence q reaches ``network.threshold_q``, exceeds that of its
-    neighbours before it in raster order, and is not exceeded by the neighbours after it (3x3).
-    They go in falling q, in raster order where equal; the first ``most`` are taken.
+    3x3 neighbours before it in raster order, and is not exceeded by those after it. Detections are
+    sorted by falling q, equal ones in raster order; the first ``most`` are kept.
 
-    Where the network has offsets, the positions are clipped to the image, 0 and its sides
-    included, and, in that order, a detection less than ``SAME_PX`` from one that stays is
-    dropped: ``du^2 + dv^2 < (16 SAME_PX)^2`` in 1/16 px.
+    If the network has offsets, positions are clipped to the image, 0 and its sides included. Then,
+    in that order, a detection closer than ``DUPLICATE_RADIUS_PX`` to a kept one is dropped: ``du^2
+    + dv^2 < (16 DUPLICATE_RADIUS_PX)^2`` in 1/16 px.
     """
     q = grids["confidence"].astype(np.int64)
     rows, cols = q.shape
@@ -158,7 +158,7 @@ def _detection(network: IntegerNetwork, grids: dict[str, NDArray[np.int8]], cell
 
 
 def _without_doubles(found: list[Detection]) -> list[Detection]:
-    """The same without detections that lie by a more confident one."""
+    """Drop detections that are close to a more confident one."""
     near = int(SAME_PX * SUBPIXEL) ** 2
     kept: list[Detection] = []
     for one in found:

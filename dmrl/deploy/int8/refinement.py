@@ -1,8 +1,8 @@
-"""Learning on in the last layer, in integers: the specification of the C that does it on a drone.
+"""On-device refinement of the last layer, in integers; the specification of the generated C.
 
-A step of gradient on one labelled image. The loss is that of training, made simple: the squared
-error of the confidence, which leaves the cells around the robot's alone, and the absolute error of
-log depth and of the offsets, in the robot's cell.
+Each update is a gradient step on one labelled image. The loss is a simplified training loss: the
+squared error of the confidence, except in the cells around the robot's, plus the absolute error of
+log depth and offsets in the robot's cell.
 """
 
 from dataclasses import dataclass, replace
@@ -18,16 +18,19 @@ from dmrl.errors import ModelError
 Int64 = NDArray[np.int64]
 
 ONE = 4096
-"""A slope of 1."""
+"""Fixed-point value of a slope of 1."""
 POINT = 65536
-"""What a step of an int8 weight is in a learned weight, and a learning rate of 1 in `rate`."""
+"""Fixed-point value of a step of an int8 weight, and of a learning rate of 1."""
 LARGEST, LARGEST_BIAS = 127 * POINT, 2**30
+"""Limits of learned weights and biases."""
 GAIN_ONE = 256
+"""Fixed-point value of a gain of 1."""
 LARGEST_GAIN = 2**26
+"""Limit of gains, against overflow."""
 
 
 class Seen(NamedTuple):
-    """A robot that is known to be in an image: its centre, 1/16 px, and depth; 0 mm: nobody is."""
+    """Label of the robot in an image: its centre, 1/16 px, and depth; 0 mm: no robot."""
 
     u_q4: int
     v_q4: int
@@ -36,12 +39,12 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learned:
-    """Weights of the last layer while they are learned.
+    """Weights of the last layer during refinement.
 
     Parameters
     ----------
     weight
-        (heads, features) in 1 / `POINT` of a step of the int8 weights.
+        (heads, features) in 1 / `FIXED_POINT_ONE` of a step of the int8 weights.
     bias
         (heads,) in steps of the sum.
     """
@@ -51,12 +54,12 @@ class Learned:
 
 
 def last_layer(network: IntegerNetwork) -> Conv:
-    """The layer that gives every head.
+    """Return the layer that computes every head.
 
     Raises
     ------
     ModelError
-        If there is no such, or it is no 1x1 convolution of an unsigned tensor.
+        If there is no such layer, or it is not a 1x1 convolution of an unsigned tensor.
     """
     layer = network.layers[-1]
     at = {head.tensor for head in network.heads.values()}
@@ -64,15 +67,15 @@ def last_layer(network: IntegerNetwork) -> Conv:
     unsigned = plain and layer.sources[0] > 0 and not network.layers[layer.sources[0] - 1].signed
     if at != {len(network.layers)} or not unsigned or len(layer.sources) > 1:
         raise ModelError(
-            f"layer {layer.name} cannot be learned on: that wants one 1x1 convolution behind a "
-            "ReLU for all heads. Export without --refine"
+            f"layer {layer.name} cannot be refined: that requires one 1x1 convolution after a ReLU "
+            "for all heads. Export without --refine"
         )
     assert isinstance(layer, Conv)
     return layer
 
 
 def start(network: IntegerNetwork) -> Learned:
-    """The weights as they were exported."""
+    """Return the exported weights."""
     layer, rows = last_layer(network), _rows(network)
     weight = layer.weight[rows, :, 0, 0].astype(np.int64) * POINT
     return Learned(weight, layer.bias[rows].astype(np.int64))
@@ -83,7 +86,13 @@ def _rows(network: IntegerNetwork) -> list[int]:
 
 
 def gains(network: IntegerNetwork) -> tuple[Int64, Int64]:
-    """(heads,) by what a slope of 1 moves weights and biases at a rate of 1, in 1/256."""
+    """Compute the update of weights and of biases for a slope and a rate of 1.
+
+    Returns
+    -------
+    tuple
+        (heads,) for weights and (heads,) for biases, in 1/256.
+    """
     layer = last_layer(network)
     in_scale = network.layers[layer.source - 1].scale
     out_scale = np.array([head.scale for head in network.heads.values()])
@@ -95,7 +104,7 @@ def gains(network: IntegerNetwork) -> tuple[Int64, Int64]:
 
 
 def with_learned(network: IntegerNetwork, learned: Learned) -> IntegerNetwork:
-    """The network with learned weights, rounded to int8."""
+    """Return the network with refined weights, rounded to int8."""
     layer, rows = last_layer(network), _rows(network)
     weight, bias = layer.weight.copy(), layer.bias.copy()
     weight[rows, :, 0, 0] = (learned.weight + POINT // 2) >> 16
@@ -107,20 +116,25 @@ def with_learned(network: IntegerNetwork, learned: Learned) -> IntegerNetwork:
 def learn(
     network: IntegerNetwork, learned: Learned, features: Quantised, seen: Seen, rate: int
 ) -> Learned:
-    """One step of gradient.
+    """Take one gradient step.
 
     Parameters
     ----------
     network
-        As it was exported.
+        Exported network.
     learned
-        The weights so far.
+        Weights so far.
     features
-        (features, rows, cols) that the last layer reads of an image.
+        (features, rows, cols) input of the last layer for an image.
     seen
-        Who is there.
+        Label of the image.
     rate
-        Learning rate times `POINT`.
+        Learning rate times `FIXED_POINT_ONE`.
+
+    Returns
+    -------
+    LearnedWeights
+        Weights after the step.
     """
     layer = last_layer(with_learned(network, learned))
     out = convolve(layer, features)
@@ -137,7 +151,7 @@ def learn(
 
 
 def _slope(network: IntegerNetwork, name: str, out: Quantised, seen: Seen) -> Int64:
-    """(rows, cols) gradient of the loss to a head's output, times `ONE`."""
+    """Return (rows, cols) the gradient of the loss by a head's output, times `UNIT_SLOPE`."""
     rows, cols = network.grid_shape
     step = SUBPIXEL * network.stride_px
     value = network.heads[name].table[out.astype(np.int64) + 128].astype(np.int64)

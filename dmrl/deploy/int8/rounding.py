@@ -1,8 +1,8 @@
-"""Weights rounded so that their errors cancel (Frantar et al. 2022, GPTQ, after OBQ).
+"""Compensated weight rounding (GPTQ, Frantar et al. 2022, after OBQ).
 
-Rounding to the nearest level is best for a weight alone. But the inputs of a convolution are
-correlated: weights that are not yet rounded can correct the error of one that is, and the bias
-corrects the rest. How the inputs are correlated is measured on calibration images.
+Rounding to the nearest level is optimal for a single weight only. The inputs of a convolution are
+correlated: weights that are not rounded yet compensate the error of one that is, and the bias
+compensates the rest. The correlations are measured on calibration images.
 """
 
 from collections.abc import Iterable
@@ -15,16 +15,17 @@ from dmrl.deploy.int8.windows import taps_of
 
 Array = NDArray[np.float64]
 Moments = dict[int, Array]
-"""By the number of a layer, (groups, n + 1, n + 1): mean products of any two of the n inputs of
-an output, and of 1, which stands for the bias and comes last."""
+"""Second moments by layer index, (groups, n + 1, n + 1): mean products of any two of the n inputs
+of an output and of the constant 1, which is last and represents the bias."""
 
 LARGEST = 127
+"""Largest integer weight."""
 DAMPING = 1e-4
-"""Share of the mean square of the inputs added to each: no weight makes good at any cost."""
+"""Fraction of the inputs' mean square added to the diagonal. It limits the compensation."""
 
 
 def moments_of(graph: Graph, images: Iterable[NDArray[np.uint8]]) -> Moments:
-    """What the inputs of every convolution are like over (height, width, 3) images."""
+    """Measure the second moments of every convolution's inputs over (height, width, 3) images."""
     sums: Moments = {}
     count = 0
     for image in images:
@@ -51,7 +52,7 @@ def _moments(layer: FloatConv, x: NDArray[np.float32]) -> Array:
 
 
 def rounded(layer: FloatConv, scale: Array, moments: Array) -> tuple[NDArray[np.int64], Array]:
-    """Integer weights of a convolution, and the bias that suits them.
+    """Round the weights of a convolution; return integer weights and the matching bias.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def rounded(layer: FloatConv, scale: Array, moments: Array) -> tuple[NDArray[np.
     scale
         (out,) real value of one step of the weights.
     moments
-        Of its inputs, as `moments_of` gives them.
+        Second moments of its inputs, from `measure_moments`.
     """
     outs = len(layer.bias)
     wanted = np.column_stack([layer.weight.reshape(outs, -1) / scale[:, None], layer.bias / scale])
@@ -75,10 +76,11 @@ def rounded(layer: FloatConv, scale: Array, moments: Array) -> tuple[NDArray[np.
 
 
 def _rounded(wanted: Array, moments: Array) -> Array:
-    """Rows of weights, and a bias each, in steps: all but the bias rounded, one after another.
+    """Round rows of weights, one column after another; the last column, the bias, stays real.
 
-    The largest input goes first, since most can still be made good. With H the moments and
-    U'U = H^-1, what column j lost weighs ``U[j, k] / U[j, j]`` on column k.
+    The weights of the largest input are rounded first, since most other weights can still
+    compensate. With H the moments and U'U = H^-1, the error of column j has weight ``U[j, k] / U[j,
+    j]`` on column k.
     """
     last = len(moments) - 1
     square = np.diag(moments)[:last]

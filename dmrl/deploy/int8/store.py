@@ -1,4 +1,4 @@
-"""Integer networks on disk: one .npz of arrays and a JSON description; nothing is pickled."""
+"""Integer networks on disk: one .npz of arrays and a JSON description, without pickle."""
 
 import json
 import math
@@ -27,15 +27,15 @@ DAMAGES = (
     *(TypeError, ValueError, LookupError, ArithmeticError, AttributeError, RecursionError),
     *(OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error),
 )
-"""What reading a file of a stranger can raise: of zipfile RuntimeError where it is encrypted, and
-NotImplementedError where it is packed in a way that Python does not know."""
+"""Errors from reading an untrusted file. zipfile raises RuntimeError for an encrypted file and
+NotImplementedError for an unsupported compression."""
 
 Arrays = dict[str, NDArray[Any]]
 Part = TypeVar("Part")
 
 
 def save(network: IntegerNetwork, path: Path) -> None:
-    """Write a network. Same network, same bytes."""
+    """Write a network; equal networks give equal bytes."""
     arrays: Arrays = {}
     layers = [
         {"kind": layer.kind, **_packed(layer, f"layer{k}", arrays)}
@@ -49,7 +49,7 @@ def save(network: IntegerNetwork, path: Path) -> None:
 
 
 def _packed(part: AnyLayer | Head, prefix: str, arrays: Arrays) -> dict[str, Any]:
-    """The plain fields of a part; its arrays go to ``arrays``."""
+    """Return the plain fields of a part and add its arrays to ``arrays``."""
     plain = {}
     for field in fields(part):
         value = getattr(part, field.name)
@@ -61,23 +61,23 @@ def _packed(part: AnyLayer | Head, prefix: str, arrays: Arrays) -> dict[str, Any
 
 
 def load(path: Path) -> IntegerNetwork:
-    """The network of a file that ``save`` wrote.
+    """Load a network from a file written by `save_network`.
 
     Parameters
     ----------
     path
-        The file, or a folder that holds one: a quantised model or an export folder.
+        The file, or a folder that contains one: a quantised model or an export folder.
 
     Raises
     ------
     ModelError
-        If there is none, or it is damaged or not sound.
+        If there is none, it is damaged, or an invariant is violated.
     """
     refuse_pipes(path)
     file = path / INTEGER_NAME if path.is_dir() else path
     if not file.is_file():
         missing = f"{file.name} in {path}" if path.is_dir() else str(path)
-        raise ModelError(f"no {missing}. Make one with: dmrl quantize, and of it dmrl export")
+        raise ModelError(f"no {missing}. Make one with: dmrl quantize, then dmrl export")
     try:
         arrays = load_npz(file)
         said = parse_json(arrays.pop("description").tobytes())
@@ -116,12 +116,12 @@ def _unpacked(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, A
 
 
 def _checked(part: Part) -> Part:
-    """The part, if its fields are of their types: they become numbers and names of C.
+    """Return the part if its fields have their declared types; they become numbers and names in C.
 
     Raises
     ------
     TypeError
-        If one is not.
+        If one does not.
     """
     for field, kind in get_type_hints(type(part)).items():
         if field not in ("kind", "layers", *HEADS) and not _is_of(getattr(part, field), kind):

@@ -1,4 +1,4 @@
-"""The windows that a convolution or a max-pool sees, as arrays. Any numbers."""
+"""Sliding windows of convolutions and max-pools as arrays, for any number type."""
 
 from typing import Any, TypeVar
 
@@ -9,7 +9,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 def taps_of(padded: NDArray[Number], kernel: int, stride: int, dilation: int) -> NDArray[Number]:
-    """Every input of every output of a convolution.
+    """Extract every input of every output of a convolution (im2col).
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ def taps_of(padded: NDArray[Number], kernel: int, stride: int, dilation: int) ->
     Returns
     -------
     NDArray
-        (..., channels, kernel * kernel, out_rows, out_cols), kernel places in raster order.
+        (..., channels, kernel * kernel, out_rows, out_cols), kernel positions in raster order.
     """
     reach = dilation * (kernel - 1)
     rows, cols = ((side - reach - 1) // stride + 1 for side in padded.shape[-2:])
@@ -39,7 +39,7 @@ def taps_of(padded: NDArray[Number], kernel: int, stride: int, dilation: int) ->
 
 
 def largest_of_blocks(x: NDArray[Number]) -> NDArray[Number]:
-    """(..., rows // 2, cols // 2) largest value of each 2x2 block."""
+    """Return (..., rows // 2, cols // 2) the maximum of each 2x2 block."""
     rows, cols = x.shape[-2] // 2, x.shape[-1] // 2
     blocks = x[..., : 2 * rows, : 2 * cols].reshape(*x.shape[:-2], rows, 2, cols, 2)
     out: NDArray[Any] = blocks.max(axis=(-3, -1))

@@ -1,1 +1,1 @@
-"""Write ONNX files, float and int8, and run them with onnxruntime."""
+"""Export to ONNX, float and int8, and inference with onnxruntime."""

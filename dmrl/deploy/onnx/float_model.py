@@ -1,4 +1,4 @@
-"""A trained model as float ONNX: the way from torch to a file in one call."""
+"""Export of a trained model to float ONNX."""
 
 from dmrl.deploy.int8.graph import Graph, graph_of
 from dmrl.deploy.onnx.graph_writer import float_onnx
@@ -7,13 +7,13 @@ from dmrl.learn.networks.trace import operations
 
 
 def float_graph(model: Model, *, grey: bool) -> Graph:
-    """The layers of a model, for RGB images or grey ones."""
+    """Build the layer graph of a model, for RGB or grey images."""
     graph = graph_of(operations(model.network))
     return graph.grey() if grey else graph
 
 
 def float_onnx_of(model: Model, *, grey: bool) -> bytes:
-    """The ONNX file of a model, for images of the size it was trained on."""
+    """Build the ONNX file of a model, for images of its training size."""
     cell_px = model.network.stride_px
     return float_onnx(
         float_graph(model, grey=grey),

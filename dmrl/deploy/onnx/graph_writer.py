@@ -1,7 +1,7 @@
-"""Networks as ONNX: float, and int8 as QDQ (quantise and dequantise pairs). A home of onnx.
+"""ONNX files of networks: float, and int8 as QDQ (QuantizeLinear and DequantizeLinear pairs).
 
-Both take ``image``, (N, height, width, channels) uint8 as it comes from the camera, and give
-one (N, rows, cols) float32 output per channel, see ``OUTPUT_OF``.
+Both take ``image``, (N, height, width, channels) uint8 as from the camera. They return one
+(N, rows, cols) float32 output per channel, see ``OUTPUT_OF``.
 """
 
 from collections.abc import Sequence
@@ -30,11 +30,11 @@ OUTPUT_OF = {
     "offset_v": "offset_v",
 }
 """Name of the ONNX output of each channel."""
-OPSET, IR_VERSION = 17, 8  # old enough for every onnxruntime of the last years
+OPSET, IR_VERSION = 17, 8  # supported by every onnxruntime of the last years
 
 
 class _Writer:
-    """Collects nodes and constants; a value is known by its name."""
+    """Collects nodes and constants of a graph; values are identified by name."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
@@ -42,19 +42,19 @@ class _Writer:
         self.made: set[str] = set()
 
     def constant(self, name: str, values: NDArray[Any]) -> str:
-        """The name of a constant; one that is there already is not written again."""
+        """Add a constant unless its name exists; return the name."""
         if name not in self.constants:
             self.constants[name] = numpy_helper.from_array(values.copy(order="C"), name)
         return name
 
     def node(self, kind: str, inputs: Sequence[str], output: str, **settings: Any) -> str:
-        """Append a node; the name of its output comes back."""
+        """Append a node and return the name of its output."""
         self.nodes.append(helper.make_node(kind, list(inputs), [output], output, **settings))
         self.made.add(output)
         return output
 
     def model(self, name: str, image: Sequence[int], outputs: dict[str, tuple[int, int]]) -> bytes:
-        """The whole file."""
+        """Serialize the graph as an ONNX file."""
         graph = helper.make_graph(
             self.nodes,
             name,
@@ -75,7 +75,7 @@ class _Writer:
 
 
 class _Levels(NamedTuple):
-    """The name of a uint8 tensor, what a step of it is and which level is zero."""
+    """Name, scale and zero point of a uint8 tensor."""
 
     name: str
     scale: float
@@ -85,14 +85,14 @@ class _Levels(NamedTuple):
 def float_onnx(
     graph: Graph, channels: Sequence[str], *, size_px: tuple[int, int], grid_shape: tuple[int, int]
 ) -> bytes:
-    """An ONNX file of a float network.
+    """Build the ONNX file of a float network.
 
     Parameters
     ----------
     graph
         The network.
     channels
-        What the channels of its output are.
+        Names of the channels of its output.
     size_px
         Height and width of the images.
     grid_shape
@@ -113,7 +113,7 @@ def float_onnx(
         if isinstance(layer, FloatConv):
             weights = layer.weight.astype(np.float32)
             if inputs[0] == centred:
-                weights /= np.float32(PIXEL_ZERO)  # a power of two: the same bits as of the pixels
+                weights /= np.float32(PIXEL_ZERO)  # a power of two: bit-identical to scaled pixels
             weight = out.constant(f"{layer.name}.weight", weights)
             bias = out.constant(f"{layer.name}.bias", layer.bias.astype(np.float32))
             value = f"{name}.conv" if inputs[1:] else name
@@ -135,7 +135,7 @@ def float_onnx(
 
 
 def _weights_scale(graph: Graph) -> bool:
-    """Whether only convolutions take the image, so that their weights can scale it."""
+    """Return whether only convolutions read the image, so that weights can absorb its scale."""
     takes = [layer for layer in graph.layers if 0 in layer.sources]
     convolved = all(isinstance(one, FloatConv) and 0 not in one.sources[1:] for one in takes)
     return convolved and all(tensor for tensor, _ in graph.outputs)
@@ -156,13 +156,14 @@ def _max_pool(out: _Writer, source: str, name: str) -> str:
 
 
 def int8_onnx(network: IntegerNetwork) -> bytes:
-    """An ONNX file of an int8 network, in pairs of QuantizeLinear and DequantizeLinear.
+    """Build the QDQ ONNX file of an int8 network.
 
-    What runs it may fuse the pairs into integer operations. Sums of the quantiser's networks never
-    lie halfway between two levels: rounded to the nearest, they give those of ``reference``. A
-    signed tensor is written as uint8 around 128, since onnxruntime fuses a convolution only where
-    its input and output are of one type. With a shortcut the sum of products, whole numbers that
-    float32 holds, is left as it is until the shortcut is added. An `Add` is rounded from floats.
+    Runtimes can fuse each pair of QuantizeLinear and DequantizeLinear into integer operations. No
+    sum of these networks lies halfway between two levels, so rounding to nearest gives the levels
+    of ``reference``. A signed tensor is written as uint8 around 128: onnxruntime fuses a
+    convolution only if input and output have the same type. With a shortcut, the sum of products
+    (integers that float32 represents exactly) is not scaled before the shortcut is added. An `Add`
+    is rounded from floats.
     """
     out = _Writer()
     planes = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
@@ -172,7 +173,7 @@ def int8_onnx(network: IntegerNetwork) -> bytes:
         inputs = [tensors[k] for k in layer.sources]
         zero = SIGNED_OFFSET if layer.signed else 0
         if index + 1 in of_heads:
-            tensors.append(inputs[0])  # read by heads alone, which are written one by one
+            tensors.append(inputs[0])  # read only by heads, which are written separately
         elif isinstance(layer, Conv):
             every = np.arange(len(layer.bias))
             tensors.append(_convolved(out, layer, inputs, every, layer.scale, zero, layer.name))
@@ -211,7 +212,7 @@ def _convolved(
     zero_point: int,
     name: str,
 ) -> _Levels:
-    """The chosen channels of a convolution, with the shortcut that it may have."""
+    """Add a convolution, limited to the chosen output channels, with its optional shortcut."""
     weight, divisor = layer.weight[chosen], layer.divisor[chosen]
     bias = layer.bias[chosen].astype(np.float64) - divisor // 2 - np.rint(zero_point * divisor)
     if layer.source == 0:
@@ -241,7 +242,7 @@ def _convolved(
 def _gained(
     out: _Writer, layer: Conv, shortcut: _Levels, chosen: NDArray[np.integer], name: str
 ) -> str:
-    """What a shortcut adds to the sums of the chosen channels."""
+    """Add the nodes that scale a shortcut for the sums of the chosen channels."""
     levels = _real(out, shortcut._replace(scale=1.0))
     if len(chosen) < len(layer.bias):
         places = out.constant(f"{name}.places", chosen.astype(np.int64))
@@ -256,7 +257,7 @@ def _gained(
 def _constant_levels(
     out: _Writer, name: str, levels: NDArray[Any], scale: NDArray[np.float64]
 ) -> str:
-    """Real values of constants, with a scale for each of the first axis."""
+    """Add a dequantized constant with one scale per index of its first axis."""
     inputs = [
         out.constant(f"{name}.levels", levels),
         out.constant(f"{name}.scale", scale.astype(np.float32)),
@@ -266,7 +267,7 @@ def _constant_levels(
 
 
 def _real(out: _Writer, tensor: _Levels) -> str:
-    """Real values of a tensor; those of one scale are computed once."""
+    """Add the dequantization of a tensor, once per scale."""
     name = f"{tensor.name}.by.{tensor.scale:.9g}"
     if name not in out.made:
         scale = out.constant(f"{name}.scale", np.array(tensor.scale, np.float32))
@@ -285,7 +286,7 @@ def _quantised(out: _Writer, value: str, name: str, scale: float, zero_point: in
 def _levels_of(
     out: _Writer, value: str, name: str, divisor: NDArray[np.float64], zero_point: int
 ) -> str:
-    """The levels of sums, each channel with a divisor of its own."""
+    """Add the quantization of sums with one divisor per channel."""
     scale_name = out.constant(f"{name}.divisor", divisor.astype(np.float32))
     zeros = out.constant(f"{name}.zero", np.full(len(divisor), zero_point, np.uint8))
     return out.node("QuantizeLinear", [value, scale_name, zeros], f"{name}.levels", axis=1)

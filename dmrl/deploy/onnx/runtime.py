@@ -1,4 +1,4 @@
-"""ONNX files through onnxruntime: the fast way on a computer. The home of onnxruntime."""
+"""Inference with onnxruntime, the fastest backend on a computer; no other module imports it."""
 
 import os
 from pathlib import Path
@@ -15,11 +15,11 @@ except ImportError as e:
     raise MissingExtra("onnxruntime", "deploy", "running ONNX") from e
 
 CHANNEL_OF = {"confidence_logit": "confidence"}
-"""Channel of an ONNX output, where it is not the output's own name."""
+"""Channel of an ONNX output, if it differs from the output's name."""
 
 
 class OnnxRun:
-    """A backend on an ONNX file that dmrl wrote, float or int8.
+    """Backend for an ONNX file written by dmrl, float or int8.
 
     Parameters
     ----------
@@ -28,23 +28,23 @@ class OnnxRun:
     where
         Its name in errors.
     threads
-        Of onnxruntime; 0: as many as there are cores.
+        Threads of onnxruntime; 0: OMP_NUM_THREADS or, if that is not set, one per core.
 
     Raises
     ------
     ModelError
-        If it cannot be run, or is not a network that dmrl wrote.
+        If it cannot be run, or was not written by dmrl.
     """
 
     def __init__(self, model: Path | bytes, where: object = "the model", threads: int = 0) -> None:
         options = onnxruntime.SessionOptions()
-        # As all numeric libraries do, but this one by itself not.
+        # Other numeric libraries read OMP_NUM_THREADS; onnxruntime does not.
         given = os.environ.get("OMP_NUM_THREADS", "")
         options.intra_op_num_threads = threads or (int(given) if given.isdecimal() else 0)
         options.log_severity_level = 3
         if not _has_vnni():
-            # Such processors add pairs of products in 16 bits, which overflow; the slower way
-            # does not.
+            # Without VNNI, pairs of products are added in 16 bits, which overflow. This option
+            # selects the slower exact kernels.
             options.add_session_config_entry("session.x64quantprecision", "1")
         source = model if isinstance(model, bytes) else str(model)
         try:
@@ -57,13 +57,13 @@ class OnnxRun:
         inputs = self._session.get_inputs()
         self.names = [output.name for output in self._session.get_outputs()]
         if [i.name for i in inputs] != ["image"] or "confidence_logit" not in self.names:
-            raise ModelError(f"{where} is not a network that dmrl export wrote. Give one")
+            raise ModelError(f"{where} is not a network that dmrl export wrote. Use one")
         self.height_px, self.width_px, self.channels = (int(side) for side in inputs[0].shape[1:])
 
     def outputs(self, images: Images) -> Outputs:
-        """Output for (N, height, width, 3) RGB images."""
-        # One by one: the layers of one image fit a processor's cache, those of 16 take 1.3 times as
-        # long, and the values are the same bits. So nothing has to be stacked either.
+        """Compute the output for (N, height, width, 3) RGB images."""
+        # One by one: the layers of one image fit into the cache. A batch of 16 takes 1.3 times as
+        # long per image and gives the same bits.
         ones = [image[None] for image in images] or [np.asarray(images)]
         seen = map(grey_of, ones) if self.channels == 1 else map(np.ascontiguousarray, ones)
         each = [self._session.run(self.names, {"image": image}) for image in seen]
@@ -74,7 +74,7 @@ class OnnxRun:
 
 
 def _has_vnni() -> bool:
-    """Whether the processor is known to multiply bytes without overflow."""
+    """Return whether the processor is known to multiply bytes without overflow."""
     try:
         return "vnni" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:

@@ -1,1 +1,1 @@
-"""Calibrate cameras: intrinsics, mount and delay."""
+"""Calibrate camera intrinsics from chessboard images, and mount and delay from flights."""

@@ -1,10 +1,10 @@
-"""How a camera is mounted, and how late its images are stamped, from flights. Arrays only.
+"""Calibrate a camera's mount and image delay from flights. Arrays only.
 
-The network says where a peer is in the image; ranges and odometry say where it is in the
-horizontal frame. What is left between the two, over a whole flight, is the mount's rotation and
-the clock's offset: the bias that Li et al. saw in their labels and left there. Which detection is
-of which peer depends on both, so several delays are tried, the best is refined, and where two
-explain the images alike neither is believed.
+The network gives the peer's position in the image; ranges and odometry give it in the horizontal
+frame. Over a whole flight the difference between them is the rotation of the mount and the offset
+of the clock: the bias that Li et al. observed in their labels and did not correct. The matching of
+detections and peers depends on both. So several delays are tried and the best one is refined. Two
+delays that fit equally well raise an error.
 """
 
 from collections.abc import Sequence
@@ -28,46 +28,55 @@ from dmrl.estimation.calibration.observations import (
 from dmrl.geometry.frames import Array, Camera
 
 TRIED_S = np.arange(-5, 6) * 0.08
-"""Delays that are tried: their images of a peer that crosses the view still overlap."""
+"""Delays that are tried, seconds. Neighbours overlap in the images of a peer that crosses the view.
+"""
 TRIED_IMAGES = 600
-"""Images, of all peers and flights, that tell a good start from a bad one."""
+"""Number of images, over all peers and flights, that rank the tried delays. No record of how the
+value was chosen."""
 WIDE_PX, RADII_PX = 60.0, (60.0, 60.0)
-"""How far a detection may be from where its peer is expected: at first, and round by round."""
+"""Largest distance of a match, pixels: while delays are ranked, and in each round of refinement. A
+radius of 25 px had cut off one side of the errors."""
 WORST = 9.0
-"""Squared residual, whitened, of a detection that is nobody's."""
+"""Largest squared whitened residual, that of a false detection. Three standard deviations; no other
+record of how the value was chosen."""
 ALIKE = 0.1
-"""Tries that fit worse by more than this share are not refined."""
+"""Candidates with a misfit larger than the best by this share are not refined. No record of how the
+value was chosen."""
 REFINED = 4
-"""Tries that are refined at most."""
+"""Largest number of refined candidates. No record of how the value was chosen."""
 SAME_S = 0.015
-"""Delays so near to each other are one."""
+"""Delays closer than this are the same, seconds. No record of how the value was chosen."""
 LIKELY = 4.0
-"""Two delays are not told apart if their log-likelihoods differ by less: one in fifty."""
+"""Smallest difference of the log likelihoods of two delays that are distinguishable: odds of one in
+fifty."""
 ASIDE, LEAST_WORSE = (-4.0, -2.0, 2.0, 4.0), 0.1
-"""Standard errors aside at which the likelihood is asked how wide it is."""
+"""Offsets, in standard errors, at which the width of the likelihood of the delay is measured; and
+smallest increase of the cost there. No record of how the values were chosen."""
 SAMPLED = 0.25
-"""Share of the time between two samples of attitude that no delay is better known than."""
+"""Lower bound of the delay's standard error, as a share of the interval between attitude samples.
+No record of how the value was chosen."""
 LEAST = 50
-"""Fewest matched detections that are worth a calibration."""
+"""Fewest matched detections of a calibration. No record of how the value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """The camera, and how well it is known.
+    """Calibrated camera with standard errors.
 
     Parameters
     ----------
     camera
-        With its mount and delay.
+        Camera with its mount and delay.
     mount_std_rad
         (3,) standard errors of roll, pitch and yaw. Errors of positions last for seconds, and
-        partly for a flight (`dmrl.estimation.calibration.mount_solver`): a count of images would promise too much.
+        partly for a flight (`dmrl.estimation.calibration.mount_solver`), so they do not fall with
+        the number of images.
     delay_std_s
-        Of the delay: at least a small share of a sample of attitude.
+        Standard error of the delay: at least a small share of an attitude sample.
     matched
-        How many detections were used.
+        Number of detections used.
     before_px, after_px
-        Median distance of those from where their peers were expected.
+        Median distance between these and their predictions.
     """
 
     camera: Camera
@@ -80,23 +89,23 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class _Try:
-    """Where one start ended: mount and delay, and how badly the images fit, from 0 to `WORST`."""
+    """Result of one initial delay: mount and delay, and misfit from 0 to `MAX_SQUARED_RESIDUAL`."""
 
     values: Array
     misfit: float
 
 
 def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibration | None:
-    """The mount's rotation and the delay; None where too few detections fit.
+    """Calibrate the mount's rotation and the delay; return None with too few matches.
 
     Parameters
     ----------
     flights
         Detections, attitude, and positions of the peers.
     camera
-        Intrinsics, and the mount and delay to start from.
+        Intrinsics, and the initial mount and delay.
     noise
-        Of detections and attitude.
+        Noise of detections and attitude.
 
     Raises
     ------
@@ -128,7 +137,7 @@ def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibr
 
 
 def _tries(views: Sequence[View], camera: Camera, start: Array, noise: Noise) -> list[_Try]:
-    """Where each start ends, the best first."""
+    """Fit every initial delay; return the candidates, best first."""
     found = []
     views = [(flight.thinned(TRIED_IMAGES // len(views)), peer) for flight, peer in views]
     for delay_s in (start[3], *TRIED_S):
@@ -141,10 +150,10 @@ def _tries(views: Sequence[View], camera: Camera, start: Array, noise: Noise) ->
 
 
 def _misfit(views: Sequence[View], camera: Camera, values: Array, noise: Noise) -> float:
-    """Mean squared residual of the images in which a peer is expected, each at most `WORST`.
+    """Return the mean squared residual of images with a peer, each at most `MAX_SQUARED_RESIDUAL`.
 
-    A start that explains few images well must not beat one that explains most: an image without
-    a detection near counts as the worst there is.
+    An image without a nearby detection counts as the maximum. Otherwise a start that explains few
+    images well would beat one that explains most.
     """
     matched = match(views, mounted(camera, values), WIDE_PX, noise)
     apart = (matched.whiten @ residual(views, camera, matched, values)[..., None])[..., 0]
@@ -154,7 +163,7 @@ def _misfit(views: Sequence[View], camera: Camera, values: Array, noise: Noise) 
 
 
 def _rough(views: Sequence[View], camera: Camera, matched: Matched, start: Array) -> Array:
-    """(4,) mount and delay of the greatest likelihood, were all errors of single images."""
+    """Fit mount and delay (4,) by maximum likelihood, as if all errors were new in every image."""
 
     def white(values: Array) -> Array:
         apart = residual(views, camera, matched, values)
@@ -172,7 +181,7 @@ def _rough(views: Sequence[View], camera: Camera, matched: Matched, start: Array
 
 
 def _apart(tries: Sequence[_Try]) -> list[_Try]:
-    """The best tries, of each delay one."""
+    """Return the best candidates, one for each delay."""
     kept: list[_Try] = []
     for one in tries:
         alone = all(abs(one.values[3] - other.values[3]) > SAME_S for other in kept)
@@ -184,10 +193,10 @@ def _apart(tries: Sequence[_Try]) -> list[_Try]:
 def _ends(
     views: Sequence[View], camera: Camera, tries: Sequence[_Try], noise: Noise
 ) -> list[tuple[Mount, Matched]]:
-    """Where the best tries end, the likeliest first.
+    """Refine the best candidates; return the results, likeliest first.
 
-    How far off single detections are is what is left of them at the likeliest end; all are then
-    solved, and held against each other, with that.
+    The likeliest result gives the error of a single detection. With it all candidates are solved
+    again and compared.
     """
     spread_px = float(np.hypot(noise.pixel_std_px, noise.attitude_std_rad * camera.fx_px))
     refined = [_refined(views, camera, one, noise, spread_px) for one in _apart(tries)]
@@ -202,7 +211,7 @@ def _ends(
 def _refined(
     views: Sequence[View], camera: Camera, one: _Try, noise: Noise, spread_px: float
 ) -> tuple[Mount, Matched] | None:
-    """One start, matched again as it gets better; None where too few detections are near."""
+    """Refine one candidate with repeated matching; return None with too few matches."""
     values, end = one.values, None
     for radius_px in RADII_PX:
         matched = match(views, mounted(camera, values), radius_px, noise)
@@ -216,10 +225,10 @@ def _refined(
 def _delay_std_s(
     views: Sequence[View], camera: Camera, matched: Matched, found: Mount, noise: Noise
 ) -> float:
-    """Standard error of the delay: by how much worse others explain the images.
+    """Return the standard error of the delay, from the likelihood of nearby delays.
 
-    At the best delay alone the likelihood may be sharper than it is wide: a short flight has a few
-    quick tilts, and each draws the delay to where it fits that one.
+    At the best delay the likelihood may be narrower than overall. A short flight has a few quick
+    tilts, and each one pulls the delay to its own optimum.
     """
     std_s = float(np.sqrt(found.covariance[3, 3]))
     widest_s = std_s
@@ -233,13 +242,12 @@ def _delay_std_s(
 
 
 def _refuse_alike(ends: Sequence[Mount]) -> None:
-    """Refuse where a start ended at another delay that is about as likely."""
+    """Raise SettingError if another delay is about as likely as the best."""
     best = ends[0]
     for other in ends[1:]:
         apart_s = abs(float(other.values[3] - best.values[3]))
         if other.cost < best.cost + LIKELY and apart_s > SAME_S:
             raise SettingError(
                 f"delays of {1e3 * best.values[3]:.0f} and {1e3 * other.values[3]:.0f} ms explain "
-                "the images alike. Calibrate with more flights, or such in which peers cross "
-                "the view faster"
+                "the images alike. Add flights, best with peers that cross the image faster"
             )

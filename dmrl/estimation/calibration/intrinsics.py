@@ -1,4 +1,4 @@
-"""Intrinsics of a camera from pictures of a chessboard, by OpenCV (Zhang 2000)."""
+"""Calibrate camera intrinsics from chessboard images, by OpenCV (Zhang 2000)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,31 +14,35 @@ try:
 except ImportError as e:
     raise MissingExtra("cv2", "calibrate", "dmrl calibrate") from e
 
-cv2.setNumThreads(1)  # sums of several threads come in any order: the last digits would change
+cv2.setNumThreads(1)  # threads would add in a random order and change the last digits
 
 LEAST_BOARDS = 5
-"""Fewer views leave focal length and distortion to chance."""
+"""Fewest views of a board. With fewer, focal length and distortion are up to chance."""
 WINDOW = 0.45
-"""Half the side of the window in which a corner is refined, of the distance to its neighbours: as
-much of the edges as there is, none of another corner's."""
+"""Half the side of the refinement window of a corner, relative to the distance of its neighbours.
+It contains as much of the edges as possible and nothing of another corner."""
 LEAST_WINDOW_PX, LARGEST_WINDOW_PX = 2, 11
+"""Bounds of that half side, pixels. No record of how the values were chosen."""
 LARGE_PIXELS = 4_000_000
+"""Largest image in which a board is detected, pixels. Larger ones are shrunk, as a blank one of
+8,000 x 8,000 kept the detector busy for minutes."""
 REFINED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
+"""Stop criteria of the corner refinement: iterations and pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """A camera, and how well it is known.
+    """Calibrated intrinsics with standard errors.
 
     Parameters
     ----------
     camera
-        Focal lengths, centre and distortion; k3 is zero, since corners rarely reach as far out as
-        would be needed to tell it from k1 and k2.
+        Focal lengths, centre and distortion. k3 is zero, since corners rarely reach far enough out
+        to separate it from k1 and k2.
     focal_std_px, centre_std_px
         (2,) standard errors.
     rms_px
-        Root mean square distance of corners from where the camera puts them.
+        Root mean square distance between corners and their projections.
     """
 
     camera: Camera
@@ -48,27 +52,27 @@ class Intrinsics:
 
 
 def corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.float32] | None:
-    """(columns x rows, 2) inner corners of a board in a picture; None where there is none.
+    """Find the (columns x rows, 2) inner corners of a board in an image; None without a board.
 
     Parameters
     ----------
     grey
-        (H, W) picture.
+        (H, W) image.
     columns, rows
         Inner corners of the board.
 
     Returns
     -------
     Array
-        Pixel-edge coordinates: OpenCV's, and half a pixel.
+        Pixel-edge coordinates: those of OpenCV plus half a pixel.
     """
-    # Not CALIB_CB_NORMALIZE_IMAGE: stretching flat backgrounds hides boards in front of them.
+    # Not CALIB_CB_NORMALIZE_IMAGE: it stretches flat backgrounds and hides boards in front of them.
     small, times = _copy(grey)
     found, at = cv2.findChessboardCornersSB(small, (columns, rows), flags=cv2.CALIB_CB_EXHAUSTIVE)
     if not found:
         return None
     # The sector-based detector finds boards that others miss, but its corners are off by up to
-    # 2 px, alike within a board. The gradients around a corner (Foerstner) have no such bias.
+    # 2 px, all in the same way within a board. The gradients at a corner (Foerstner) are unbiased.
     rough = np.asarray(at, np.float32).reshape(rows, columns, 2)
     rough = rough * np.float32(times) + np.float32((times - 1) / 2)  # centres of pixels
     half_px = int(np.clip(WINDOW * _spacing(rough), LEAST_WINDOW_PX, LARGEST_WINDOW_PX))
@@ -78,9 +82,9 @@ def corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.floa
 
 
 def _copy(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
-    """A picture in which a board is looked for, and how many times larger the whole one is.
+    """Return a smaller copy of a large image, and the scale to the original.
 
-    The detector takes a third of a second for a million pixels.
+    The detector takes a third of a second per million pixels.
     """
     times = max(1, int(np.ceil(np.sqrt(grey.size / LARGE_PIXELS))))
     if times == 1 or min(grey.shape) < times:
@@ -91,7 +95,7 @@ def _copy(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
 
 
 def _spacing(at: NDArray[np.float32]) -> float:
-    """Shortest distance between neighbours among (rows, columns, 2) corners, pixels."""
+    """Return the shortest distance between neighbours among (rows, columns, 2) corners, pixels."""
     steps = (np.linalg.norm(np.diff(at, axis=axis), axis=2).min() for axis in (0, 1))
     return float(min(steps))
 
@@ -101,7 +105,7 @@ def intrinsics(
     shape: tuple[int, int],
     size_px: tuple[int, int],
 ) -> Intrinsics:
-    """The camera that saw boards.
+    """Calibrate the camera from views of a board.
 
     Parameters
     ----------
@@ -110,7 +114,7 @@ def intrinsics(
     shape
         Columns and rows of inner corners.
     size_px
-        Width and height of the pictures.
+        Width and height of the images.
     """
     columns, rows = shape
     flat = np.zeros((columns * rows, 3), np.float32)

@@ -1,11 +1,9 @@
-"""Mount, delay and errors of positions in one solve: what camera_pose ends with. Arrays only.
+"""Solve for mount, delay and position errors together, the last step of `extrinsics`. Arrays only.
 
-Positions that were estimated are off for seconds, and partly for a whole flight: a bias of the
-ranges, of a height sensor. So is the attitude that was logged. Taken as errors of single images,
-hundreds of detections would promise a mount to a hundredth of a degree. So the error of every
-peer's path is solved for as well, as a part that stays and one that fades (a first-order
-Gauss-Markov process), both as large as the covariance of the positions says, and a level of every
-flight; the standard errors of mount and delay are what is left.
+Errors of estimated positions and of the attitude last for seconds, and partly for a whole flight.
+Treated as errors of single images, hundreds of detections would promise a mount to a hundredth of a
+degree. So the error of every path is a state too: a constant part and a decaying one (a first-order
+Gauss-Markov process), both as large as the covariance of the positions, and a tilt of every flight.
 """
 
 from collections.abc import Sequence
@@ -35,35 +33,40 @@ from dmrl.estimation.calibration.observations import (
 from dmrl.geometry.frames import Array, Camera
 
 STAYS = np.array([0.6, 0.2, 0.3])
-"""Variance of the part of an error that stays, along the line of sight, across it and up, by the
-covariance of the position. Of labelled flights, half with calibrated, half with realistic sensors:
-0.6, 0.2 and 0.2; a height's error is its sensor's bias."""
+"""Variance of the constant part along the line of sight, across it and up, relative to the
+position's. Simulated labelled flights, half calibrated, half realistic, gave 0.6, 0.2 and 0.2; a
+height's error is its sensor's bias."""
 FADES, FADES_S = 0.55, 3.5
-"""Variance of the part that fades, across the line of sight, and its correlation time: of the same
-flights 0.55 and 3 to 4 s. Along it nothing fades."""
+"""Relative variance of the decaying part, across the line of sight, and its correlation time,
+seconds. The same flights gave 0.55 and 3 to 4 s, and none along the line of sight."""
 LEVEL = 0.5
-"""Share of attitude's standard deviation that stays for a flight: how level its log is."""
+"""Share of the attitude's standard deviation that is a constant tilt of a flight. No record of how
+the value was chosen."""
 NEAREST_M = 0.1
+"""Smallest horizontal distance of a peer, metres, against a division by zero."""
 TURNS = 0.016
-"""Variance of a turn of the whole path, of that of a bearing: what of a yaw no flight tells."""
+"""Variance of a rotation of the whole path, relative to that of a bearing. No record of how the
+value was chosen."""
 KNOT_S = 0.2
-"""Between its values the part that fades is interpolated."""
+"""Spacing of the values of the decaying part, seconds. No record of how the value was chosen."""
 CAUCHY = 2.4
-"""Residuals beyond so many standard deviations count less: 95 % efficient if all are Gaussian."""
+"""Scale of the Cauchy loss in standard deviations: 95 % efficient if all errors are Gaussian."""
 MEDIAN = 2 * np.log(2.0)
-"""Of the squared length of a Gaussian vector in the plane, by the variance of either axis."""
+"""Median squared length of a 2D Gaussian vector, relative to the variance of either axis."""
 STEPS = np.array([1e-3, 1e-3, 1e-3, 5e-3])
-"""Of the numeric derivatives: radians and seconds."""
+"""Steps of the numeric derivatives: radians and seconds."""
 NOTHING = 1e-6
-"""Information about a delay, 1/s^2: none."""
+"""Information about a fixed delay, 1/s^2: practically none."""
 ROUNDS, SETTLED = 30, 1e-4
+"""Largest number of iterations, and largest change, radians or seconds, that ends them. No record
+of how the values were chosen."""
 LARGEST = np.array([0.35, 0.35, 0.35, 0.5])
-"""Mount and delay that are believed: radians and seconds."""
+"""Bounds of mount and delay: radians and seconds. No record of how the values were chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """What detections say of a camera.
+    """Estimate of mount and delay from detections.
 
     Parameters
     ----------
@@ -72,10 +75,10 @@ class Mount:
     covariance
         (4, 4) of these.
     cost
-        Negative logarithm of the likelihood there, to a constant: of the detections that were
-        matched, of those that were missed, and of the errors of the paths.
+        Negative log likelihood, up to a constant, of matched and missed detections and of path
+        errors.
     spread_px
-        Standard deviation of single detections, in u and in v, from what is left of them.
+        Standard deviation of single detections, in u and in v, from the residuals.
     """
 
     values: Array
@@ -86,12 +89,11 @@ class Mount:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """Detections of one peer in one flight, and the errors of its path.
+    """Detections of one peer in one flight, and the errors of its path, sparse.
 
-    ``errors`` (2 N, E) turns the errors' normalised values into pixels, u and v of a detection
-    below each other; ``level`` (2 N, 2) the flight's errors of roll and pitch; ``prior`` (E, E) is
-    the information of the former: unit variance, fading. Sparse: a flight of an hour has
-    thousands of errors, and a detection sees five.
+    ``errors`` (2 N, E) maps the normalized errors to pixels, u and v of a detection below each
+    other. ``level`` (2 N, 2) does so for the flight's errors of roll and pitch. ``prior`` (E, E) is
+    the information of the errors: unit variance, decaying.
     """
 
     flight: int
@@ -103,7 +105,7 @@ class _Path:
 
 @dataclass(slots=True)
 class _Errors:
-    """What is solved for beside mount and delay: of each path, and (F, 2) levels of the flights."""
+    """Nuisance states beside mount and delay: of each path, and (F, 2) tilts of the flights."""
 
     paths: list[Array]
     levels: Array
@@ -119,7 +121,9 @@ def solve(
     *,
     held: bool = False,
 ) -> Mount:
-    """Mount, delay and the errors of all paths of the greatest likelihood.
+    """Solve for mount, delay and path errors by iteratively reweighted least squares.
+
+    The Schur complement eliminates the errors of each path, then of each flight.
 
     Parameters
     ----------
@@ -130,19 +134,13 @@ def solve(
     matched
         Detections with their peers.
     start
-        (4,) mount and delay to start from.
+        (4,) initial mount and delay.
     noise
-        Of attitude.
+        Noise of the attitude.
     spread_px
         Standard deviation of a single detection.
-    held
-        The delay stays as it is.
-
-    Returns
-    -------
-    Mount
-        Iterated, reweighted least squares with Cauchy's weights; the errors of each path, then of
-        each flight, leave the normal equations by the Schur complement, as they touch no other.
+    fix_delay
+        Whether the delay keeps its value.
     """
     paths = _paths(views, camera, matched, start)
     flights = 1 + max(path.flight for path in paths)
@@ -174,12 +172,12 @@ def solve(
 
 
 def _charge(square: Array) -> float:
-    """Cauchy's loss of squared, normalised residuals, summed."""
+    """Return the summed Cauchy loss of squared, normalized residuals."""
     return float(0.5 * CAUCHY**2 * np.log1p(square / CAUCHY**2).sum())
 
 
 def _left(paths: Sequence[_Path], errors: _Errors, apart: Array) -> Array:
-    """(N, 2) residuals of all detections without what the errors explain, pixels."""
+    """Return (N, 2) residuals of all detections without the part of the path errors, pixels."""
     out = apart.copy()
     for path, error in zip(paths, errors.paths, strict=True):
         explained = path.errors @ error + path.level @ errors.levels[path.flight]
@@ -195,13 +193,13 @@ def _step(
     slopes: Array,
     spread_px: float,
 ) -> tuple[Array, Array]:
-    """(4, 4) information and (4,) step of mount and delay; ``errors`` take theirs."""
+    """Return information (4, 4) and step (4,) of mount and delay; update ``errors`` in place."""
     left = _left(paths, errors, apart)
     halves = [
         _normal(path, error, left[path.rows], slopes[path.rows], spread_px)
         for path, error in zip(paths, errors.paths, strict=True)
     ]
-    # A delay that is held has no slope: this keeps it where it is.
+    # A fixed delay has no derivative; this term keeps the matrix regular.
     information, score, rests = np.diag([0.0, 0.0, 0.0, NOTHING]), np.zeros(4), []
     for flight, held in enumerate(errors.levels):
         mine = [half for path, half in zip(paths, halves, strict=True) if path.flight == flight]
@@ -223,10 +221,10 @@ def _step(
 
 @dataclass(frozen=True, slots=True)
 class _Half:
-    """Normal equations of one path, its errors eliminated: mount, delay, level of the flight.
+    """Normal equations of one path in mount, delay and tilt, with its errors eliminated.
 
-    ``own`` (E,) is the step of the errors if those stay, ``cross`` (E, 6) what a step of those
-    takes from it.
+    ``own`` (E,) is the step of the errors at fixed mount, delay and tilt. ``cross`` (E, 6) is the
+    negated derivative of that step by them.
     """
 
     information: Array
@@ -235,12 +233,13 @@ class _Half:
     cross: Array
 
     def follow(self, step: Array) -> Array:
-        """(E,) step of the errors, given the step of mount, delay and level."""
+        """Return (E,) the step of the errors, given the step of mount, delay and tilt."""
         return np.asarray(self.own - self.cross @ step)
 
 
 def _normal(path: _Path, error: Array, left: Array, slopes: Array, spread_px: float) -> _Half:
-    # Cauchy's weight 1 / (1 + r^2 / c^2), as its root on either side of the normal equations.
+    """Build the reduced normal equations of one path."""
+    # The Cauchy weight 1 / (1 + r^2 / c^2), as its root on either side of the normal equations.
     far = (left**2).sum(axis=1) / (CAUCHY * spread_px) ** 2
     root = np.repeat(1.0 / (spread_px * np.sqrt(1.0 + far)), 2)
     errors = csr_array(path.errors.multiply(root[:, None]))
@@ -254,7 +253,7 @@ def _normal(path: _Path, error: Array, left: Array, slopes: Array, spread_px: fl
 
 
 def _paths(views: Sequence[View], camera: Camera, matched: Matched, start: Array) -> list[_Path]:
-    """How the errors of each peer's path show in the image, where the peer was seen."""
+    """Linearize the errors of each peer's path at its detections."""
     flights = {id(flight): k for k, (flight, _) in enumerate(views)}
     seen = [number for number in range(len(views)) if (matched.view == number).any()]
     order = list(dict.fromkeys(flights[id(views[number][0])] for number in seen))
@@ -267,7 +266,7 @@ def _paths(views: Sequence[View], camera: Camera, matched: Matched, start: Array
 def _path(
     view: View, flight: int, number: int, camera: Camera, matched: Matched, start: Array
 ) -> _Path:
-    """How the errors of one peer's path show in the image."""
+    """Linearize the errors of one peer's path."""
     rows = np.flatnonzero(matched.view == number)
     time_s = matched.time_s[rows]
     at_s = time_s - start[3]
@@ -283,7 +282,7 @@ def _path(
         (np.r_[1 - share, share], (np.r_[here, here], np.r_[after - 1, after])),
         shape=(len(rows), len(knots)),
     )
-    # Rows u and v of each detection below each other, as the residuals lie.
+    # Rows u and v of each detection below each other, in the order of the residuals.
     fading = kron(hats, np.ones((2, 1)), format="csr").multiply(
         (shown[:, :, 1] * np.sqrt(FADES)).reshape(-1, 1)
     )
@@ -299,9 +298,10 @@ def _path(
 
 
 def _axes(xyz_m: Array, spread: Array) -> tuple[Array, Array]:
-    """Standard deviations along the level line of sight, across it and up; and of a turn.
+    """Return the standard deviations along, across and above the line of sight, and of a rotation.
 
-    (N, 3, 3) in metres; (N,) what one of a turn of the whole path is of that across.
+    (N, 3, 3) in metres; (N,) the effect of a unit rotation of the whole path, relative to that
+    across.
     """
     level = np.maximum(np.linalg.norm(xyz_m[:, :2], axis=1), NEAREST_M)
     x, y, none = xyz_m[:, 0] / level, xyz_m[:, 1] / level, np.zeros(len(xyz_m))
@@ -312,9 +312,9 @@ def _axes(xyz_m: Array, spread: Array) -> tuple[Array, Array]:
 
 
 def _chain(count: int) -> csr_array:
-    """(count, count) information of a Gauss-Markov process of unit variance, knot by knot."""
-    # x_k = keeps x_(k-1) + noise of variance 1 - keeps^2. A knot is tied to its two neighbours
-    # alone, so the inverse of the covariance is tridiagonal; the ends have one neighbour.
+    """Return the (count, count) information of a Gauss-Markov process of unit variance."""
+    # x_k = keeps x_(k-1) + noise of variance 1 - keeps^2. A knot depends on its two neighbours
+    # only, so the inverse of the covariance is tridiagonal; the ends have one neighbour.
     keeps = np.exp(-KNOT_S / FADES_S)
     middle = np.full(count, 1 + keeps**2)
     middle[[0, -1]] = 1.0
@@ -324,8 +324,8 @@ def _chain(count: int) -> csr_array:
 
 
 def slopes_of(views: Sequence[View], camera: Camera, matched: Matched, values: Array) -> Array:
-    """(N, 2, 4) derivatives of the expected pixel by roll, pitch, yaw and delay."""
-    # A residual is what was seen less what is expected: its slope is the expectation's, negated.
+    """Return (N, 2, 4) derivatives of the predicted pixel by roll, pitch, yaw and delay."""
+    # A residual is detection minus prediction, so its derivative is the prediction's, negated.
     sides = [
         residual(views, camera, matched, values - step)
         - residual(views, camera, matched, values + step)

@@ -1,4 +1,4 @@
-"""What cameras saw of peers, flight by flight, and where they are expected. Arrays only."""
+"""Detections of peers, flight by flight, and their predicted pixels. Arrays only."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,16 +11,18 @@ from scipy.ndimage import median_filter
 from dmrl.geometry.frames import Array, Camera, inside, pixels_from_horizontal
 
 LONGEST_GAP_S = 0.25
-"""Positions are not interpolated over longer gaps."""
+"""Longest gap over which positions are interpolated, seconds. No record of how the value was
+chosen."""
 WIDTH, APART, TIMES = 2.0, 3.0, 3
-"""Of the smoothing of attitude: standard deviation of its window in samples; how many standard
-deviations of the noise values differ by that hardly count; rounds. At 100 Hz the noise moves a peer
-in the image further from sample to sample than the flight does."""
+"""Attitude smoothing: std of the window, samples; similarity scale, std of the noise; iterations.
+
+At 100 Hz the noise moves a peer in the image further from sample to sample than the flight does. No
+record of how the values were chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class PeerPath:
-    """Where one peer was.
+    """Path of one peer.
 
     Parameters
     ----------
@@ -29,7 +31,7 @@ class PeerPath:
     xyz_m
         (N, 3) in the observer's horizontal frame.
     covariance
-        (N, 3, 3) m^2; zero where it is exact.
+        (N, 3, 3) m^2; zero if exact.
     """
 
     time_s: Array
@@ -37,15 +39,15 @@ class PeerPath:
     covariance: Array
 
     def at(self, at_s: Array) -> Array:
-        """(N, 3) positions between those that are known."""
+        """Interpolate (N, 3) positions."""
         return np.column_stack([np.interp(at_s, self.time_s, axis) for axis in self.xyz_m.T])
 
     def spread(self, at_s: Array) -> Array:
-        """(N, 3, 3) covariance of the position at the nearest times."""
+        """Return (N, 3, 3) covariances of the position at the nearest times."""
         return self.covariance[np.clip(np.searchsorted(self.time_s, at_s), 0, len(self.time_s) - 1)]
 
     def covers(self, at_s: Array) -> NDArray[np.bool_]:
-        """(N,) whether the position is known shortly before and after a time."""
+        """Return (N,) whether the path has positions shortly before and after a time."""
         after = np.searchsorted(self.time_s, at_s)
         known = (after > 0) & (after < len(self.time_s))
         after = np.clip(after, 1, len(self.time_s) - 1)
@@ -54,7 +56,7 @@ class PeerPath:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """What one observer saw, and where everything was.
+    """Detections of one observer, its attitude and the paths of its peers.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ class Flight:
     attitude_s, attitude_rad
         (A,) and (A, 2) roll and pitch of the observer.
     peers
-        By name.
+        Paths by name.
     """
 
     image_s: Array
@@ -78,15 +80,15 @@ class Flight:
     peers: Mapping[str, PeerPath]
 
     def smoothed(self) -> "Flight":
-        """The flight with its attitude smoothed, over what changes at once too.
+        """Return the flight with smoothed attitude, edges preserved.
 
-        A window alone would round that off: a drone tilts at once and comes back slowly, so its
-        tilts would seem to be late, or early.
+        A plain window would round the edges. A drone tilts at once and comes back slowly, so its
+        tilts would appear late, or early.
         """
         return replace(self, attitude_rad=_smoothed(self.attitude_rad))
 
     def thinned(self, most: int) -> "Flight":
-        """The flight with at most so many of its images, evenly spread."""
+        """Return the flight with a limited number of evenly spaced images."""
         step = -(-len(self.image_s) // max(most, 1))
         kept = self.image % step == 0
         return replace(
@@ -98,14 +100,14 @@ class Flight:
 
 
 def _smoothed(values: Array) -> Array:
-    """(N, C) values without their noise: a bilateral filter (Tomasi and Manduchi 1998), repeated.
+    """Smooth (N, C) values by an iterated bilateral filter (Tomasi and Manduchi 1998).
 
-    How large the noise is their second differences tell, whose median no jump moves.
+    The noise level comes from the median of the second differences, which is robust to jumps.
     """
     if len(values) < 3:
         return values
-    # Of white noise the second difference has 1 + 4 + 1 times the variance; 1.4826 turns the median
-    # of absolute values into a standard deviation.
+    # The second difference of white noise has 1 + 4 + 1 times its variance; 1.4826 converts the
+    # median of absolute values to a standard deviation.
     bends = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0)
     noise = np.maximum(1.4826 * bends / np.sqrt(6.0), 1e-9)[:, None]
     side = np.ceil(3 * WIDTH).astype(int)
@@ -120,7 +122,7 @@ def _smoothed(values: Array) -> Array:
 
 
 def _around(values: Array, side: int) -> Array:
-    """(N, C, 2 side + 1) values around each of (N, C); beyond an end stands the last one."""
+    """Return (N, C, 2 side + 1) windows around each of (N, C) values; the ends repeat."""
     padded = np.pad(values, ((side, side), (0, 0)), mode="edge")
     return sliding_window_view(padded, 2 * side + 1, axis=0)
 
@@ -135,7 +137,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """Detections with their peers.
+    """Detections matched to their peers.
 
     Parameters
     ----------
@@ -144,14 +146,13 @@ class Matched:
     uv
         (N, 2) pixels.
     view
-        (N,) number of the view, that is of peer and flight.
+        (N,) index of the view, one for each peer and flight.
     whiten
-        (N, 2, 2) matrices that turn pixel errors into ones of unit variance, if all errors were
-        of single images.
+        (N, 2, 2) matrices that whiten pixel errors, if all errors were new in every image.
     expected
-        Images, of all views, in which a peer was expected.
+        Number of images, over all views, with a peer in the image.
     radius_px
-        How far a detection could be from there.
+        Largest distance of a match.
     """
 
     time_s: Array
@@ -167,13 +168,13 @@ View = tuple[Flight, PeerPath]
 
 
 def mounted(camera: Camera, values: Array) -> Camera:
-    """The camera with (4,) roll, pitch, yaw (radians) and delay (seconds) of its own."""
+    """Return the camera with (4,) roll, pitch, yaw (radians) and delay (seconds)."""
     roll, pitch, yaw, delay_s = values.tolist()
     return replace(camera, mount_rad=(roll, pitch, yaw), delay_s=delay_s)
 
 
 def expected(flight: Flight, camera: Camera, peer: PeerPath, time_s: Array) -> tuple[Array, Array]:
-    """(N, 2) pixels of a peer in images stamped so; (N, 3, 5) with the derivatives."""
+    """Predict (N, 2) pixels of a peer in images with log times; also (N, 3, 5) derivatives."""
     at_s = time_s - camera.delay_s
     xyz = peer.at(at_s)
     roll, pitch = (np.interp(at_s, flight.attitude_s, a) for a in flight.attitude_rad.T)
@@ -182,7 +183,7 @@ def expected(flight: Flight, camera: Camera, peer: PeerPath, time_s: Array) -> t
 
 
 def match(views: Sequence[View], camera: Camera, radius_px: float, noise: Noise) -> Matched:
-    """The nearest detection of every peer in every image, if it is near."""
+    """Match every peer in every image to the nearest detection within a radius."""
     parts, count = [], 0
     for number, (flight, peer) in enumerate(views):
         uv, jacobian = expected(flight, camera, peer, flight.image_s)
@@ -205,7 +206,7 @@ def match(views: Sequence[View], camera: Camera, radius_px: float, noise: Noise)
 
 
 def _whitening(jacobian: Array, covariance: Array, noise: Noise) -> Array:
-    """(N, 2, 2) matrices that turn pixel errors into ones of unit variance."""
+    """Return (N, 2, 2) matrices that whiten pixel errors."""
     joint = np.zeros((len(jacobian), 5, 5))
     joint[:, :3, :3] = covariance
     joint[:, [3, 4], [3, 4]] = noise.attitude_std_rad**2
@@ -215,7 +216,7 @@ def _whitening(jacobian: Array, covariance: Array, noise: Noise) -> Array:
 
 
 def residual(views: Sequence[View], camera: Camera, matched: Matched, values: Array) -> Array:
-    """(N, 2) detection minus expectation, pixels."""
+    """Return (N, 2) detections minus predictions, pixels."""
     out = np.empty_like(matched.uv)
     for number, (flight, peer) in enumerate(views):
         mine = matched.view == number
@@ -225,6 +226,6 @@ def residual(views: Sequence[View], camera: Camera, matched: Matched, values: Ar
 
 
 def median_px(views: Sequence[View], camera: Camera, matched: Matched, values: Array) -> float:
-    """Median distance of detections from where their peers are expected, pixels."""
+    """Return the median distance of detections from their predictions, pixels."""
     apart = residual(views, camera, matched, values)
     return float(np.median(np.linalg.norm(apart, axis=1)))

@@ -1,1 +1,1 @@
-"""Recursive estimators: the published EKF, its keyframe form and smoothers."""
+"""Kalman filters of a pair and an Ornstein-Uhlenbeck smoother."""

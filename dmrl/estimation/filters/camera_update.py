@@ -1,4 +1,4 @@
-"""What cameras saw, for the filters that tell starts apart: some images, whatever fits best."""
+"""Camera updates of the keyframe filters, with the candidate nearest to each filter."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,27 +11,31 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.camera_residuals import Looks, toward
 
 LOOK_S = 0.4
-"""One image of either camera in so long a time is looked at."""
+"""Interval between the images of either camera that are used, seconds. No record of how the value
+was chosen."""
 LOOK_STD: Array = np.array([0.05, 0.05, 0.05])
-"""Of azimuth, elevation and log distance, as the image is up to 0.05 s from the keyframe."""
+"""Added standard deviations of azimuth, elevation (rad) and log distance. An image is up to 0.05 s
+from its keyframe."""
 LOOK_GATE = 16.0
-"""Squared distance within which a candidate moves a filter."""
+"""Gate on the squared distance of a candidate that updates a filter: four standard deviations. No
+record of how the value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Glance:
-    """An image of one pair, for the filters of that pair. C candidates.
+    """Image of one pair, for the filters of that pair. C candidates.
 
     Parameters
     ----------
-    key
-        Keyframe.
-    side
-        1 where the observer saw, -1 where the peer did.
-    polar, std
-        (C, 3) azimuth, elevation (rad), log distance of the candidates seen at the keyframe.
-    first, copies
-        First filter of the pair, and how many there are.
+    keyframe
+        Keyframe nearest to the image.
+    observer_sign
+        1 for the observer's camera, -1 for the peer's.
+    bearing, std
+        (C, 3) azimuth, elevation (rad), log distance of the candidates, as measured from the
+        keyframe.
+    first_filter, copies
+        First filter of the pair, and the number of its filters.
     """
 
     key: int
@@ -43,17 +47,18 @@ class Glance:
 
 
 Glances = Mapping[int, Sequence[Glance]]
-"""By keyframe."""
+"""Camera updates by keyframe."""
 NOTHING: Glances = MappingProxyType({})
+"""No camera updates."""
 
 
 def glances_of(looks: Sequence[Looks | None]) -> Glances:
-    """Some images of several pairs.
+    """Select camera updates from the images of several pairs.
 
     Parameters
     ----------
-    looks
-        What the cameras of each pair saw.
+    cameras
+        Camera measurements of each pair.
     """
     out: dict[int, list[Glance]] = {}
     for number, mine in enumerate(looks):
@@ -63,7 +68,7 @@ def glances_of(looks: Sequence[Looks | None]) -> Glances:
 
 
 def repeated(glances: Glances, copies: int) -> Glances:
-    """The same for filters that stand ``copies`` times side by side for every pair."""
+    """Return the updates for ``copies`` filters side by side for every pair."""
     return {
         key: [replace(glance, first=glance.first * copies, copies=copies) for glance in here]
         for key, here in glances.items()
@@ -71,7 +76,7 @@ def repeated(glances: Glances, copies: int) -> Glances:
 
 
 def _glances(looks: Looks, number: int) -> list[Glance]:
-    """Some images of a pair, each at the keyframe next to it."""
+    """Return the updates of one pair, each at the keyframe nearest to its image."""
     out = []
     for side in (1.0, -1.0):
         last_s = -np.inf
@@ -89,9 +94,9 @@ def _glances(looks: Looks, number: int) -> list[Glance]:
 def glanced(
     state: Array, covariance: Array, height_m: Array, glance: Glance, log_likelihood: Array
 ) -> None:
-    """Put the candidate of an image in that is nearest to each filter, in place.
+    """Update filters in place with the candidate of an image that is nearest to each.
 
-    It moves a filter by its azimuth alone, and none that is far from it.
+    The update uses the azimuth alone. A filter far from every candidate stays as it is.
     """
     polar, slope = toward(state[:, :3], np.full(len(state), glance.side), height_m)
     row, farther = slope[:, 0], slope[:, 2, :2]

@@ -1,7 +1,7 @@
-"""The published relative EKF (Li et al. 2020): filterpy's, and a vectorised twin.
+"""Published relative EKF (Li et al. 2020): filterpy's implementation and a vectorized twin.
 
-State (x, y, psi); inputs are both robots' velocities and yaw rates. Both start at (0, 0, 0),
-as published, which is why they can settle in the wrong place.
+State (x, y, psi); the inputs are both robots' velocities and yaw rates. The filters start at (0, 0,
+0), as published, which is why they can converge to a wrong position.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,8 @@ from filterpy.kalman import ExtendedKalmanFilter
 from dmrl.estimation.model.pair import Array, Mask, Pair
 
 SMALLEST_M = 1e-4
-"""Keeps the range away from zero at the start (0, 0); as in the firmware."""
+"""Added to every range, metres. It avoids a division by zero at the start (0, 0), as in the
+firmware."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +27,9 @@ class Preset:
     range_std_m
         Standard deviation of a range, metres.
     initial_var
-        Variances of the start: x, y (m^2), psi (rad^2).
+        Initial variances of x, y (m^2), psi (rad^2).
     use_height
-        Whether the height difference is part of the range.
+        Whether the range contains the height difference.
     """
 
     velocity_var: float
@@ -42,20 +43,21 @@ PRESETS = {
     "published-sim": Preset(0.25**2, 0.4**2, 0.1, (10.0, 10.0, 0.1), use_height=False),
     "published-firmware": Preset(1.0, 0.7, 2.0, (1000.0, 1000.0, 1.0), use_height=True),
 }
+"""Noise of the publication's simulation and of its firmware."""
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Inputs of B filters at K steps; ``pair_steps`` makes them for one pair.
+    """Inputs of B filters at K steps. `build_steps` makes them for one pair.
 
     Parameters
     ----------
     inputs
         (K, B, 6): vx, vy, yaw rate of the peer, then of the observer.
     height_m
-        (K, B) peer's height less the observer's, metres.
+        (K, B) peer's height minus the observer's, metres.
     range_m
-        (K, B) range that arrived with the step, metres; NaN where none did.
+        (K, B) range that arrived with the step, metres; NaN without one.
     dt_s
         Seconds per step.
     """
@@ -67,9 +69,10 @@ class Steps:
 
 
 def pair_steps(pair: Pair, preset: Preset) -> Steps:
-    """Inputs of the filter for one pair, B = 1.
+    """Build the inputs of the filter for one pair, B = 1.
 
-    Ranges go to the nearest step; of several in one, as where both robots range, the last counts.
+    Ranges go to the nearest step. If several fall on one step, as where both robots range, the last
+    counts.
     """
     own, peer = pair.own, pair.peer
     inputs = np.column_stack(
@@ -83,7 +86,7 @@ def pair_steps(pair: Pair, preset: Preset) -> Steps:
 
 
 def stack(steps: list[Steps]) -> Steps:
-    """Several pairs of equal length side by side."""
+    """Stack pairs of equal length side by side."""
     return Steps(
         np.concatenate([s.inputs for s in steps], axis=1),
         np.concatenate([s.height_m for s in steps], axis=1),
@@ -93,7 +96,7 @@ def stack(steps: list[Steps]) -> Steps:
 
 
 def moved(state: Array, inputs: Array, dt_s: float) -> tuple[Array, Array, Array]:
-    """State one step later and its Jacobians, for B filters at once.
+    """Propagate B filters by one step; return the states and their Jacobians.
 
     Parameters
     ----------
@@ -133,20 +136,20 @@ def moved(state: Array, inputs: Array, dt_s: float) -> tuple[Array, Array, Array
 
 
 def measured(state: Array, height_m: Array) -> tuple[Array, Array]:
-    """(B,) range of B states, metres, and its (B, 3) Jacobian."""
+    """Return the predicted range (B,) of B states, metres, and its Jacobian (B, 3)."""
     x, y = state[:, 0], state[:, 1]
     range_m = np.sqrt(x**2 + y**2 + height_m**2) + SMALLEST_M
     return range_m, np.stack([x / range_m, y / range_m, np.zeros_like(x)], axis=-1)
 
 
 def input_variance(preset: Preset) -> Array:
-    """(6, 6) covariance of the inputs."""
+    """Return the (6, 6) covariance of the inputs."""
     v, r = preset.velocity_var, preset.yaw_rate_var
     return np.diag([v, v, r, v, v, r])
 
 
 class _Relative(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
-    """filterpy's EKF with the relative motion as its prediction."""
+    """Extended Kalman filter of filterpy with the relative motion as its prediction."""
 
     def __init__(self, preset: Preset, dt_s: float) -> None:
         super().__init__(dim_x=3, dim_z=1)
@@ -157,7 +160,7 @@ class _Relative(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no 
         self._dt_s = dt_s
 
     def predict_x(self, u: Array) -> None:
-        """Move the state; called by filterpy's ``predict`` before it moves the covariance."""
+        """Propagate the state. filterpy's ``predict`` calls this before it moves the covariance."""
         state, by_state, by_input = moved(self.x[None], u[None], self._dt_s)
         self.F = by_state[0]
         self.Q = by_input[0] @ self._noise @ by_input[0].T
@@ -165,22 +168,22 @@ class _Relative(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no 
 
 
 def filter_reference(steps: Steps, preset: Preset) -> tuple[Array, Array]:
-    """States (K, 3) and covariances (K, 3, 3) after every step, by filterpy.
+    """Filter one pair with filterpy; return states (K, 3) and covariances (K, 3, 3).
 
-    ``predict`` then ``update``: filterpy's ``predict_update`` takes the range's Jacobian
-    before the prediction.
+    It calls ``predict`` and then ``update``, because filterpy's ``predict_update`` evaluates the
+    Jacobian of the range before the prediction.
 
     Parameters
     ----------
     steps
-        Of one pair (B = 1).
+        Inputs of one pair (B = 1).
     preset
-        Noise and start.
+        Noise and initial variances.
 
     Raises
     ------
     AssertionError
-        If filterpy turned the state into a column, which it does to one of another shape.
+        If filterpy turned the state into a column, as it does with a state of another shape.
     """
     ekf = _Relative(preset, steps.dt_s)
     states, covariances = np.empty((len(steps.inputs), 3)), np.empty((len(steps.inputs), 3, 3))
@@ -203,14 +206,16 @@ def filter_reference(steps: Steps, preset: Preset) -> tuple[Array, Array]:
 
 
 def filter_many(steps: Steps, preset: Preset) -> tuple[Array, Array]:
-    """States (K, B, 3) and covariances (K, B, 3, 3) of B filters: the twin of the reference.
+    """Run B filters; return states (K, B, 3) and covariances (K, B, 3, 3).
+
+    This is the vectorized twin of `filter_reference`.
 
     Parameters
     ----------
     steps
-        Of B pairs.
+        Inputs of B pairs.
     preset
-        Noise and start.
+        Noise and initial variances.
     """
     count, filters = steps.height_m.shape
     noise = input_variance(preset)
@@ -231,7 +236,7 @@ def filter_many(steps: Steps, preset: Preset) -> tuple[Array, Array]:
 def _update(
     state: Array, covariance: Array, steps: Steps, k: int, arrived: Mask, variance: float
 ) -> None:
-    """Put step k's ranges into the filters they arrived at, in place (Joseph form)."""
+    """Update the filters with the ranges of step k, in place (Joseph form)."""
     expected, row = measured(state[arrived], steps.height_m[k, arrived])
     prior = covariance[arrived]
     cross = np.einsum("bij,bj->bi", prior, row)

@@ -1,4 +1,4 @@
-"""A robust EKF over keyframes for many starts and pairs at once, and its RTS smoother."""
+"""Robust EKF over keyframes for many guesses and pairs at once, and its RTS smoother."""
 
 from dataclasses import dataclass, fields
 from typing import Self
@@ -12,17 +12,20 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.keyframes import Noise, Problem
 
 SIZE = 5
+"""Number of states: x, y, psi and the biases of both yaw rates."""
 SHADOWED_M = 0.3
-"""Standard deviation of a range once its level is taken off."""
+"""Standard deviation of a range after its step offset is removed, metres. No record of how the
+value was chosen."""
 INNOVATION_LIMIT = 2.0
-"""Standard deviations beyond which an innovation is weighted down."""
+"""Innovation beyond which an update is down-weighted, in standard deviations. No record of how the
+value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """What B filters are fed at K keyframes.
+    """Inputs of B filters at K keyframes.
 
-    There is one range per keyframe: the median, which an outlier does not move.
+    Every keyframe has one range: the median, which is robust to an outlier.
 
     Parameters
     ----------
@@ -31,15 +34,15 @@ class Inputs:
     own_turn_rad, peer_turn_rad
         (K, B) turn from this keyframe to the next; the last is zero.
     own_shift_m, peer_shift_m
-        (K, B, 2) the same of the position.
+        (K, B, 2) shift from this keyframe to the next; the last is zero.
     step_var
         (K, B, 5) variance that the step adds to the state.
     range_m, range_var
-        (K, B) range, metres, NaN where there was none, and its variance, m^2.
+        (K, B) range, metres, NaN without one, and its variance, m^2.
     own_to_range_m, peer_to_range_m
         (K, B, 2) motions from the keyframe to the mean time of its ranges.
     height_m
-        (K, B) peer's height less the observer's.
+        (K, B) peer's height minus the observer's.
     """
 
     step_s: Array
@@ -55,18 +58,19 @@ class Inputs:
     height_m: Array
 
     def repeated(self, copies: int, keyframes: int) -> Self:
-        """The first keyframes, every pair ``copies`` times side by side."""
+        """Return the first keyframes, with every pair repeated ``copies`` times side by side."""
         columns = (getattr(self, field.name)[:keyframes] for field in fields(self))
         return type(self)(*(np.repeat(column, copies, axis=1) for column in columns))
 
 
 def inputs_of(problems: list[Problem], noise: Noise) -> Inputs:
-    """Inputs of one filter per problem. All need the same number of keyframes."""
+    """Build the inputs of one filter per problem. All need the same number of keyframes."""
     rows = [_inputs(problem, noise) for problem in problems]
     return Inputs(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
 
 
 def _inputs(problem: Problem, noise: Noise) -> tuple[Array, ...]:
+    """Return the columns of `Inputs` for one pair."""
     count = len(problem.key_s)
     per_key = np.bincount(problem.range_key, minlength=count)
     many = np.maximum(per_key, 1)
@@ -77,7 +81,7 @@ def _inputs(problem: Problem, noise: Noise) -> tuple[Array, ...]:
     def means(values: Array) -> Array:
         return np.column_stack([mean(column) for column in values.T])
 
-    # pi/2 / n is the variance of a median; half the bias is what the first guess cannot know.
+    # The variance of a median of n is pi/2 / n of a single one. 0.05 m: unknown range bias.
     variance = 1.5 * noise.range_std_m**2 / many + 0.05**2
     steps_s = np.append(problem.steps_s, 0.0)
     shifts = (problem.own.shift_m, problem.peer.shift_m, step_variance(problem, noise))
@@ -96,7 +100,7 @@ def _inputs(problem: Problem, noise: Noise) -> tuple[Array, ...]:
 
 
 def _medians(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) -> Array:
-    """(K,) median of the values of each key, NaN where there are none."""
+    """Return (K,) the median of the values of each keyframe, NaN where there are none."""
     ordered = np.append(values[np.lexsort((values, key))], np.nan)
     first = np.cumsum(per_key) - per_key
     middle = np.stack([first + (per_key - 1) // 2, first + per_key // 2])
@@ -104,7 +108,7 @@ def _medians(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) ->
 
 
 def step_variance(problem: Problem, noise: Noise) -> Array:
-    """(K - 1, 5) variance that each step adds to x, y (m^2), psi (rad^2) and the biases."""
+    """Return (K - 1, 5) variances that each step adds to x, y (m^2), psi (rad^2) and the biases."""
     steps_s, gap_s = problem.steps_s, problem.gap_s
     shift = 2 * noise.velocity_psd * steps_s + noise.gap_speed_mps**2 * gap_s
     turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * gap_s
@@ -113,19 +117,19 @@ def step_variance(problem: Problem, noise: Noise) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Filtered:
-    """B filters over K keyframes.
+    """Result of B filters over K keyframes.
 
     Parameters
     ----------
     state, covariance
         (K, B, 5), (K, B, 5, 5) of x, y, psi and the biases of the observer's and the peer's yaw
-        rate, after the keyframe's range.
+        rate, after the update with the keyframe's range.
     prior, prior_covariance
-        The same before it.
+        The same before the update.
     step
         (K, B, 5, 5) Jacobian of the step to the next keyframe.
     log_likelihood
-        (B,) of the innovations, robust.
+        (B,) robust log likelihood of the innovations.
     """
 
     state: Array
@@ -137,18 +141,18 @@ class Filtered:
 
 
 def run(inputs: Inputs, start: Array, start_std: Array, glances: Glances = NOTHING) -> Filtered:
-    """Filter from B starts.
+    """Filter a flight from B initial states.
 
     Parameters
     ----------
     inputs
-        Of B filters.
+        Inputs of B filters.
     start
         (B, 3) x, y (m), psi (rad) at the first keyframe.
     start_std
         (5,) standard deviations of these and of the biases, rad/s.
-    glances
-        What cameras saw, by keyframe.
+    updates
+        Camera updates by keyframe.
     """
     count, filters = inputs.range_m.shape
     states = (np.empty((count, filters, SIZE)) for _ in range(2))
@@ -173,7 +177,7 @@ def run(inputs: Inputs, start: Array, start_std: Array, glances: Glances = NOTHI
 
 
 def _moved(state: Array, inputs: Inputs, k: int) -> tuple[Array, Array]:
-    """(B, 5) states at the next keyframe, and the (B, 5, 5) Jacobian."""
+    """Return (B, 5) states at the next keyframe and the (B, 5, 5) Jacobian."""
     seconds = inputs.step_s[k]
     own_turn = inputs.own_turn_rad[k] - seconds * state[:, 3]
     peer_turn = inputs.peer_turn_rad[k] - seconds * state[:, 4]
@@ -192,7 +196,7 @@ def _moved(state: Array, inputs: Inputs, k: int) -> tuple[Array, Array]:
 
 
 def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelihood: Array) -> None:
-    """Put keyframe k's ranges in, in place; far innovations count less."""
+    """Update the filters with keyframe k's range, in place. Large innovations are down-weighted."""
     seen = np.isfinite(inputs.range_m[k])
     peer = rotate(rotation(state[:, 2]), inputs.peer_to_range_m[k])
     offset = state[:, :2] + peer - inputs.own_to_range_m[k]
@@ -212,7 +216,7 @@ def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelih
 
 
 def smoothed(filtered: Filtered) -> tuple[Array, Array]:
-    """States (K, B, 5) and covariances (K, B, 5, 5) given the whole flight (RTS)."""
+    """Smooth the filtered states (RTS); return states (K, B, 5) and covariances (K, B, 5, 5)."""
     state, covariance = filtered.state.copy(), filtered.covariance.copy()
     for k in range(len(state) - 2, -1, -1):
         ahead = np.linalg.inv(filtered.prior_covariance[k + 1])

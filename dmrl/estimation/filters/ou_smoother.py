@@ -1,4 +1,4 @@
-"""An error that fades (Ornstein and Uhlenbeck 1930), found by a Kalman filter and RTS smoother."""
+"""Kalman filter and RTS smoother of an Ornstein-Uhlenbeck process (1930)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from dmrl.estimation.model.pair import Array
 def faded(
     time_s: Array, std: Array, fade_s: float, rows: NDArray[np.intp], off: Array, noise: Array
 ) -> tuple[Array, Array]:
-    """An error at all times, from measurements of it at some.
+    """Smooth an Ornstein-Uhlenbeck error from sparse measurements.
 
     Parameters
     ----------
@@ -17,18 +17,18 @@ def faded(
         (N,) ascending, seconds.
     std
         (N,) standard deviation of the error.
-    fade_s
-        Time in which it fades to 1/e, seconds.
+    time_constant_s
+        Time in which the error decays to 1/e, seconds.
     rows
-        (M,) times that are measured, each once.
-    off, noise
-        (M,) measurements and their standard deviations.
+        (M,) indices of the measured times, each once.
+    offset, noise
+        (M,) measurements of the error and their standard deviations.
 
     Returns
     -------
     error, variance : Array
-        (N,) each. Measurements may share an error, so they never tell more than one of them would
-        alone; nor does the variance grow.
+        (N,) each. Measurements may share an error, so the variance never falls below that of one
+        measurement. It never exceeds the prior.
     """
     fade = np.exp(-np.diff(time_s) / fade_s)
     measured, spread = np.full(len(std), np.nan), np.ones(len(std))

@@ -1,1 +1,1 @@
-"""Estimate every pair of a flight: initial guesses, multi-start, data association."""
+"""Estimate a whole flight: initial guesses, solutions, segments and the swarm."""

@@ -1,8 +1,8 @@
-"""Candidates that two peers of one camera both took for theirs.
+"""Resolve candidates that the solutions of two peers of one camera share.
 
-Every pair is solved by itself, and takes what fits. Where two solutions took the same candidates,
-one of them is wrong, or does not see its own peer: they stay with the one whom they fit better over
-the whole flight, and the other is to be solved again without them.
+Every pair is solved by itself and uses the candidates that fit. If two solutions use the same
+candidates, one of them is wrong, or its own peer is out of view. The candidates stay with the peer
+whom they fit better over the whole flight. The other pair is solved again without them.
 """
 
 from collections.abc import Mapping
@@ -17,20 +17,21 @@ from dmrl.estimation.solver.estimate import Estimate
 
 Names = tuple[str, str]
 CONTESTED = 0.1
-"""A pair is solved again where another has a better claim to so large a share of what it saw."""
+"""Smallest share of a pair's associated images that another pair fits better, from which it is
+solved again. No record of how the value was chosen."""
 
 
 def told_apart(
     pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]
 ) -> dict[Names, Pair]:
-    """The pairs that are to be solved again, without what is another peer's.
+    """Return the pairs to solve again, without candidates claimed by another peer.
 
     Parameters
     ----------
     pairs
-        By names, with what their cameras showed; each pair of robots once.
+        Pairs by names, with the bearings of their cameras; each pair of robots once.
     estimates
-        Of every ordered pair.
+        Estimates of every ordered pair.
     """
     out: dict[Names, Pair] = {}
     for robot in sorted({name for names in pairs for name in names}):
@@ -57,13 +58,14 @@ def told_apart(
 
 
 def _sees(robot: str, names: Names, pair: Pair) -> Sightings | None:
+    """Return the bearing measurements of one robot of a pair."""
     return pair.own_sees if names[0] == robot else pair.peer_sees
 
 
 def _claim(
     robot: str, names: Names, pair: Pair, estimates: Mapping[Names, Estimate]
 ) -> Claim | None:
-    """What a robot's camera showed of a peer; None where it showed nothing."""
+    """Associate a robot's images with its peer; None without images."""
     sees = _sees(robot, names, pair)
     if sees is None or not len(sees.time_s):
         return None

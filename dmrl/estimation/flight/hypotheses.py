@@ -1,4 +1,4 @@
-"""Where a pair may have started: many guesses on the range circle, told apart by likelihood."""
+"""Initial guesses of a pair on the range circle, and mirrored copies of its solutions."""
 
 from itertools import pairwise
 
@@ -14,57 +14,64 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.levenberg_marquardt import near
 
 BEARINGS, HEADINGS = 12, 8
-"""96 starts: bearings of the peer, each with headings of the peer."""
+"""Number of bearings of the peer, and of headings for each bearing: 96 guesses. No record of how
+the values were chosen."""
 FIRST_S = 20.0
-"""How long all starts are followed."""
+"""Time over which all guesses are filtered, seconds. No record of how the value was chosen."""
 KEPT = 6
-"""Starts that are followed to the end."""
+"""Number of guesses that are filtered to the end. No record of how the value was chosen."""
 START_STD: Array = np.array([0.35, 0.35, 0.45, 0.01, 0.01])
-"""Half the distance to the next start, roughly: m, m, rad; and of the yaw rates' biases, rad/s."""
+"""Initial standard deviations of x, y (m), psi (rad): roughly half the distance to the next guess.
+Then those of both yaw rate biases, rad/s."""
 APART_M, APART_RAD = 0.4, 0.5
-"""Starts nearer than both are one."""
+"""Guesses closer than both are the same, metres and radians. No record of how the values were
+chosen."""
 PASS_M = 0.35
-"""Two passes nearer than this leave open on which side the peer was in between."""
+"""Largest distance of a pass that leaves the side of the peer open, metres. Two such passes enclose
+a segment that may be mirrored. No record of how the value was chosen."""
 MIRRORED = 4
-"""Stretches between passes that are tried on the other side, the shortest."""
+"""Largest number of mirrored segments, shortest first. No record of how the value was chosen."""
 BESIDE_M, ROUND_M = 0.5, 0.4
-"""A pass nearer than this may have been on the other side; it begins and ends so much farther."""
+"""Largest distance of a pass whose side is flipped, metres; and increase of the distance, metres,
+at which the flip begins and ends. No record of how the values were chosen."""
 BESIDE = 6
-"""So often this is tried, the nearest passes first."""
+"""Largest number of flipped passes, nearest first. No record of how the value was chosen."""
 COST_UNIT = 4.0
-"""Costs of solutions differ by this much for no good reason: the robust loss and the noise are
-not quite the sensors'. A solution that costs this much more counts 1 / e of the better one."""
+"""Cost difference at which a solution has 1 / e of the weight of the best one.
+
+Costs differ by this much without reason, because the robust loss and the noise model are
+approximations. No record of how the value was chosen."""
 
 
 def starts(range_m: float, height_m: float) -> Array:
-    """(96, 3) starts x, y (m), psi (rad) around an observer.
+    """Return (96, 3) guesses x, y (m), psi (rad) of the peer around an observer.
 
     Parameters
     ----------
     range_m
         First range, metres.
     height_m
-        Peer's height less the observer's, metres.
+        Peer's height minus the observer's, metres.
     """
     radius = np.sqrt(max(range_m**2 - height_m**2, 0.05**2))
     bearing = np.repeat(np.arange(BEARINGS) * 2 * np.pi / BEARINGS, HEADINGS)
     heading = np.tile(np.arange(HEADINGS) * 2 * np.pi / HEADINGS, BEARINGS)
-    # Neighbouring bearings get headings half a step apart, which fills the space better.
+    # The headings of neighbouring bearings are half a step apart, which fills the space better.
     heading = heading + np.repeat(np.arange(BEARINGS) % 2, HEADINGS) * np.pi / HEADINGS
     return np.column_stack([radius * np.cos(bearing), radius * np.sin(bearing), heading])
 
 
 def candidates(inputs: Inputs, rate_hz: float, glances: Glances = NOTHING) -> Array:
-    """(P, KEPT, 3) likely starts of P pairs, best first, distinct as far as there are such.
+    """Select the likely and distinct guesses of P pairs, (P, KEPT_GUESSES, 3), best first.
 
     Parameters
     ----------
     inputs
-        Of P pairs.
+        Filter inputs of P pairs.
     rate_hz
         Keyframes per second.
-    glances
-        What cameras saw, of each pair.
+    updates
+        Camera updates of each pair.
     """
     keyframes = min(len(inputs.range_m), int(FIRST_S * rate_hz))
     first = [_first(inputs, pair, keyframes) for pair in range(inputs.range_m.shape[1])]
@@ -80,6 +87,7 @@ def candidates(inputs: Inputs, rate_hz: float, glances: Glances = NOTHING) -> Ar
 
 
 def _first(inputs: Inputs, pair: int, keyframes: int) -> Array:
+    """Return the guesses of one pair, from its first ranges."""
     ranges = inputs.range_m[:keyframes, pair]
     seen = np.flatnonzero(np.isfinite(ranges))
     # The median of the first second: a single first range may be an outlier.
@@ -88,16 +96,16 @@ def _first(inputs: Inputs, pair: int, keyframes: int) -> Array:
 
 
 def distinct(states: Array, order: NDArray[np.intp], count: int) -> list[int]:
-    """Numbers of ``count`` states, in order, that differ; the last is repeated to fill up.
+    """Return the indices of ``count`` distinct states, in order. The last one fills up the rest.
 
     Parameters
     ----------
     states
         (N, 3) x, y, psi.
     order
-        (N,) their numbers, best first.
+        (N,) their indices, best first.
     count
-        How many.
+        Number of indices to return.
     """
     kept: list[int] = []
     for number in order.tolist():
@@ -110,18 +118,18 @@ def distinct(states: Array, order: NDArray[np.intp], count: int) -> list[int]:
 
 
 def alike(one: Array, other: Array) -> bool:
-    """Whether two states are the same solution."""
+    """Return whether two states are the same solution."""
     turn = np.angle(np.exp(1j * (one[2] - other[2])))
     return bool(np.hypot(*(one - other)[:2]) < APART_M and abs(turn) < APART_RAD)
 
 
 def spread_of(cost: Array, states: Array) -> Array:
-    """(K, 3, 3) covariance that the choice between several solutions adds to the best one's.
+    """Return the (K, 3, 3) covariance that the choice between solutions adds to the best one.
 
     Parameters
     ----------
     cost
-        (S,) of each, lowest first: half the sum of squares, or less the log likelihood.
+        (S,) cost of each, lowest first: half the sum of squares, or the negative log likelihood.
     states
         (S, K, 3) x, y (m), psi (rad).
     """
@@ -136,14 +144,14 @@ def spread_of(cost: Array, states: Array) -> Array:
 
 
 def _passes(state: Array, rate_hz: float, within_m: float) -> tuple[Array, NDArray[np.intp]]:
-    """(K,) distances of the peer, and the keyframes at which it is nearest and so near."""
+    """Return (K,) distances of the peer, and the keyframes of local minima within a distance."""
     distance = np.hypot(*state[:, :2].T)
     least = minimum_filter1d(distance, 2 * round(rate_hz) + 1)
     return distance, np.flatnonzero((distance == least) & (distance < within_m))
 
 
 def mirrored(state: Array, rate_hz: float) -> list[Array]:
-    """Copies of a solution with the peer on the other side between two close passes.
+    """Mirror a solution between two close passes; return one copy for each such segment.
 
     Parameters
     ----------
@@ -159,14 +167,14 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
         way = state[min(end + second // 2, len(state) - 1), :2] - state[end - second // 2, :2]
         aside = QUARTER_TURN @ way / max(float(np.hypot(*way)), 1e-6)
         copy = state.copy()
-        # p - 2 (n p) n, a mirror along the way: ranges stay as they are, odometry does not.
+        # p - 2 (n p) n mirrors at the line of motion: it keeps the ranges and changes the odometry.
         copy[start:end, :2] -= 2 * np.outer(copy[start:end, :2] @ aside, aside)
         out.append(copy)
     return out
 
 
 def passed_by(state: Array, rate_hz: float) -> list[Array]:
-    """Copies of a solution, each with the peer going past the observer on the other side once.
+    """Flip the side of each close pass; return one copy of the solution for each pass.
 
     Parameters
     ----------
@@ -183,7 +191,7 @@ def passed_by(state: Array, rate_hz: float) -> list[Array]:
         end = int(farther[farther > at].min(initial=len(state)))
         way = state[min(at + 2, len(state) - 1), :2] - state[max(at - 2, 0), :2]
         aside = QUARTER_TURN @ way / max(float(np.hypot(*way)), 1e-6)
-        # Wholly mirrored where it is nearest, less and less from there on: a way without a jump.
+        # Fully mirrored at the closest point and gradually less away from it, without a jump.
         near = np.cos((distance[start:end] - distance[at]) / ROUND_M * np.pi / 2)
         copy = state.copy()
         copy[start:end, :2] -= np.outer(2 * near * (copy[start:end, :2] @ aside), aside)

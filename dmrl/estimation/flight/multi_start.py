@@ -1,4 +1,4 @@
-"""Where a flight's solve may end: from every likely start, and past what it sticks at."""
+"""Multi-start solve of a flight: from every likely guess, and out of local minima."""
 
 from collections.abc import Sequence
 
@@ -12,32 +12,35 @@ from dmrl.estimation.solver.levenberg_marquardt import ROUGH, Solution, near, so
 from dmrl.estimation.solver.residuals import BIAS, OWN_GYRO, PEER_GYRO, RANGE_ERROR, SIZE
 
 HOPELESS = 100.0
-"""Smoothed starts whose log likelihood is this far below the best's are not solved."""
+"""Guesses whose log likelihood is this far below the best are not solved. No record of how the
+value was chosen."""
 BESIDE_PIECES = 2
-"""So many starts of a flight are solved beside what its stretches led to."""
+"""Number of guesses that are solved beside the joined segments of a flight. No record of how the
+value was chosen."""
 STUCK, AGAIN = 200.0, 4
-"""Solutions that cost at most so much more than the best, and so many, are solved afresh: the true
-one was seen to stick 130 above a wrong one."""
+"""Largest cost above the best, and largest number, of solutions that are solved again from zero
+constants. A simulated flight had its true solution stuck 130 above a wrong one."""
 CHEAPER = 0.5
-"""A solution that costs so much less is another one, and its passes are tried again."""
+"""Smallest cost reduction that makes a solution a new one, whose passes are flipped again. No
+record of how the value was chosen."""
 
 
 def solutions(
     flight: Problem, noise: Noise, starts: Starts, pieced: Sequence[Array]
 ) -> list[Solution]:
-    """What likely starts lead to, best first.
+    """Find the solutions of a flight from its likely guesses, best first.
 
-    Even starts that look alike half-way may pass the peer on different sides: all are solved that
-    are not hopeless, each until it comes to a solution that another one led to.
+    Guesses that agree halfway may still pass the peer on different sides. So every guess that is
+    not hopeless is solved, until it reaches a solution found before.
 
     Parameters
     ----------
     flight, noise
-        The flight, and what is believed about its sensors.
+        Keyframes of the flight, and the noise model.
     starts
-        Of this flight.
+        Initial guesses of this flight.
     pieced
-        (K, 6) states each, joined of what stretches of the flight led to.
+        (K, 6) states each, joined from solved segments of the flight.
     """
     begun: list[Array] = []
     found = [solve_batch(flight, noise, start, tolerance=ROUGH) for start in pieced]
@@ -59,14 +62,14 @@ def solutions(
 
 
 def distinct(found: Sequence[Solution], within: float) -> list[Solution]:
-    """Solutions that differ, best first, whose costs are at most so far above the best's.
+    """Return the distinct solutions within a cost margin of the best, best first.
 
     Parameters
     ----------
     found
         Solutions of one flight.
     within
-        How far.
+        The margin.
     """
     ordered = sorted(found, key=lambda s: s.cost)
     out: list[Solution] = []
@@ -78,7 +81,7 @@ def distinct(found: Sequence[Solution], within: float) -> list[Solution]:
 
 
 def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Solution]:
-    """Solutions, and what the best leads to with the peer past the observer on the other side."""
+    """Return the solutions, with those that the best one leads to when its passes are flipped."""
     found, best, tried = [*found], None, 0
     while best is None or min(s.cost for s in found) < best.cost - CHEAPER:
         best = min(found, key=lambda s: s.cost)
@@ -91,10 +94,9 @@ def _passed_by(flight: Problem, noise: Noise, found: list[Solution]) -> list[Sol
 
 
 def _afresh(flight: Problem, state: Array) -> Array:
-    """States (K, 6) with the ranges' errors of the first guess.
+    """Return states (K, 6) with the range errors of the first guess.
 
-    Solved again from there, with constants of zero, what stuck on its way may come free, and what
-    is worse now may be the best then.
+    A solve that got stuck may succeed from there, with constants of zero, and become the best.
     """
     out = state.copy()
     out[:, RANGE_ERROR] = 0.0
@@ -103,7 +105,10 @@ def _afresh(flight: Problem, state: Array) -> Array:
 
 
 def _start(flight: Problem, track: Array, offset_m: float) -> tuple[Array, Array]:
-    """States (K, 6) and globals (G,) that a smoothed track (K, 5) says, with jumped ranges."""
+    """Return states (K, 6) and constants (G,) of a smoothed track (K, 5).
+
+    The range error starts at the detected step offset.
+    """
     state, constants = np.zeros((len(track), SIZE)), np.zeros(len(GLOBALS))
     state[:, :3] = track[:, :3]
     state[flight.range_key, RANGE_ERROR] = flight.range_level_m

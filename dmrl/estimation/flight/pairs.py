@@ -1,4 +1,4 @@
-"""Relative positions of many pairs with covariance and status: the entrance of this room."""
+"""Estimate relative positions of many pairs with covariance and status: the entry point."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,29 +30,35 @@ from dmrl.estimation.solver.noise_selection import noise_of, with_range_noise
 from dmrl.estimation.solver.residuals import BIAS, RANGE_ERROR
 
 INFLATION = 1.03
-"""Sigmas of the batch solve are multiplied by this: the 95 % ellipse in view holds 93 to 99 %."""
+"""Factor on the sigmas of the batch solve. Chosen on simulated flights in view: 93 to 99 % of the
+true positions are inside the 95 % ellipse."""
 GATE_SIGMA = 0.75
-"""The gate goes by sigmas this much smaller: those of the ellipse expect more bad positions than
-there are, as they make room for what is constant."""
+"""Factor on the sigmas that the gate uses. The written sigmas leave room for constant errors and so
+predict more bad positions than there are. No figure of the choice is recorded."""
 WORSE, FADED_M = (1.1, 1.5), 0.1
-"""Velocities this many times as noisy as the default's: with the first the gate goes by those
-smaller sigmas, with the second by all of them, as where errors of ranges larger than this seem to
-fade. What lasts of the errors of worse sensors than are usual is not known either, and what looks
-best of such a flight is mostly luck."""
+"""Velocity noise relative to the default model, and standard deviation of correlated range errors,
+metres.
+
+At the first ratio the gate uses the smaller sigmas, at the second the written ones, and in between
+it interpolates. Beyond the range error it uses the written ones. The lasting errors of unusually
+bad sensors are unknown, and the best-looking part of their flights is mostly chance. The range
+error was raised because one of six realistic flights without a fault had been lost."""
 SMOOTHER_INFLATION = 1.5
+"""Factor on the sigmas of the smoother. No record of how the value was chosen."""
 STILL, ALIKE = 0.022, 0.04
-"""Mean squares, (m/s)^2, of the observer's velocity and of the relative one, below which a
-flight tells no bearing: bad logs of robots that stand still show 0.018 and 0.03."""
+"""Smallest mean square, (m/s)^2, of the observer's velocity and of the relative velocity that make
+the bearing observable. Bad logs of robots at rest reach 0.018 and 0.03."""
 LOOKED_S = 3.0
-"""A camera that saw the other for so long tells the bearing of a flight that has no motion."""
+"""Shortest time with consistent images that makes the bearing of a motionless flight observable,
+seconds. No record of how the value was chosen."""
 STEADY, REACH_M = 10, 0.5
-"""A position is held against the medians of so many ranges before and after, and may be this
-much farther."""
+"""Number of ranges before and after in the median that bounds a position; and margin of that bound,
+metres. No record of how the values were chosen."""
 RIVAL, RIVALS = 8.0, 3
-"""Solutions that cost at most so much more, and so many, are weighed again once it is known how
-good the sensors are."""
+"""Largest cost above the best, and largest number, of other solutions that are solved under the
+selected noise. No record of how the values were chosen."""
 MOST = 0.5
-"""A share of a flight that says why nothing of it is OK."""
+"""Share of a flight that determines the reason for its rejection."""
 
 
 def estimate_pairs(
@@ -62,18 +68,18 @@ def estimate_pairs(
     noise: Noise | None = None,
     gate_m: float = GATE_M,
 ) -> list[tuple[Estimate, Estimate]]:
-    """Estimates of several pairs: of the peer by the observer, and of the observer by the peer.
+    """Estimate both directions of several pairs: peer by observer, and observer by peer.
 
     Parameters
     ----------
     pairs
-        Any number; those of equal length share work.
+        Any number of pairs. Pairs of equal length share work.
     method
-        The batch solve, or the smoother that it starts from.
+        The batch solve, or the smoother that provides its initial guesses.
     noise
-        What the sensors are like. None: found from the flight.
+        Noise model of the sensors. None: selected for each flight.
     gate_m
-        A position that is off by more than this is a bad one, metres.
+        Largest error of a good position, metres.
     """
     problems = [problem(pair, KEY_HZ) for pair in pairs]
     made = []
@@ -82,8 +88,8 @@ def estimate_pairs(
         if method == "smoother":
             made.append(_both(flight, _from_smoother(flight, noise or Noise(), starts), gate_m))
             continue
-        # Where a flight has gaps, each stretch between them is solved first, as a flight of its
-        # own. Put together they are one more start for the whole.
+        # The segments between long dropouts are solved first, as flights of their own. Joined,
+        # they are one more initial guess of the whole flight.
         cut = stretches(pair)
         parts = estimate_pairs(cut, noise=noise, gate_m=gate_m) if cut else []
         pieced = [joined(flight, [here for here, _ in parts])] if parts else []
@@ -93,16 +99,16 @@ def estimate_pairs(
 
 
 def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate, Estimate]:
-    """Estimates seen from either robot, with their statuses."""
+    """Return the estimates of both robots, with their statuses."""
     estimate, far = within_reach(flight, estimate)
     own, peer, relative = restlessness(flight, estimate.state)
     looks = trusted(flight.looks, estimate.state)
     looked = [
         agreeing(looks, estimate.state, side, flight.key_s, LONGEST_GAP_S) for side in (1, -1)
     ]
-    # Where a camera sees the other, ranges may be silent.
+    # Consistent images replace missing ranges.
     silent = flight.silent | (flight.unheard & ~(looked[0] | looked[1]))
-    # What does not move tells no bearing. A camera that sees the other tells it.
+    # Without motion the bearing is unobservable, unless the camera detects the peer.
     enough = [at.sum() >= LOOKED_S * KEY_HZ for at in looked]
     why = [
         None if seen else unmoved(moved, relative)
@@ -116,12 +122,12 @@ def _both(flight: Problem, estimate: Estimate, gate_m: float) -> tuple[Estimate,
 
 
 def gate_sigma(noise: Noise) -> float:
-    """By sigmas how many times as large as those written the gate goes.
+    """Return the factor on the written sigmas that the gate uses.
 
     Parameters
     ----------
     noise
-        What the sensors turned out to be like.
+        Selected noise model of the sensors.
     """
     usual = Noise()
     if noise.range_error_std_m > FADED_M:
@@ -131,12 +137,12 @@ def gate_sigma(noise: Noise) -> float:
 
 
 def unmoved(moved: float, relative: float) -> Refused | None:
-    """Why a motion tells no bearing; None where it does.
+    """Return the reason why a motion leaves the bearing unobservable; None if it does not.
 
     Parameters
     ----------
     moved, relative
-        Mean squares of the observer's velocity and of the peer's against it, (m/s)^2.
+        Mean squares of the observer's velocity and of the relative velocity, (m/s)^2.
     """
     if moved < STILL:
         return "still"
@@ -152,22 +158,22 @@ def with_status(
     far: Mask | None = None,
     sigma: float = 1.0,
 ) -> Estimate:
-    """An estimate with its statuses, and why nothing of it is OK where that is so.
+    """Return an estimate with its statuses and, if no position is OK, the reason.
 
     Parameters
     ----------
     estimate
-        What was found.
+        Estimate of a pair.
     silent
-        (K,) whether a sensor of either robot, or their ranges, were silent.
+        (K,) whether a sensor of either robot, or their ranges, dropped out.
     why
-        Why its motion tells no bearing; None where it does.
+        Reason why the motion leaves the bearing unobservable; None if it does not.
     gate_m
-        A position that is off by more than this is a bad one, metres.
+        Largest error of a good position, metres.
     far
-        (K,) where the estimate was farther than ranges allow; None: nowhere.
+        (K,) where the estimate was farther than the ranges allow. None: nowhere.
     sigma
-        The gate goes by sigmas so much as large.
+        Factor on the sigmas that the gate uses.
     """
     status = statuses(estimate.state, estimate.covariance * sigma**2, gate_m)
     floor = silent if far is None else silent | far
@@ -179,6 +185,7 @@ def with_status(
 
 
 def _refused(status: Statuses, why: Refused | None, silent: bool) -> Refused | None:
+    """Return the reason why no position is OK; None if any is."""
     if (status == OK).any():
         return None
     if why:
@@ -189,14 +196,14 @@ def _refused(status: Statuses, why: Refused | None, silent: bool) -> Refused | N
 
 
 def within_reach(flight: Problem, estimate: Estimate) -> tuple[Estimate, Mask]:
-    """An estimate no farther than the ranges around it allow, and (K,) where it was.
+    """Clip an estimate to the distance that the ranges allow, and return where it exceeded it.
 
     Parameters
     ----------
     flight
-        The flight.
+        Keyframes of the flight.
     estimate
-        Its solution.
+        Estimate of the flight.
     """
     if not len(flight.range_m):
         return estimate, np.zeros(len(flight.key_s), bool)
@@ -212,12 +219,12 @@ def within_reach(flight: Problem, estimate: Estimate) -> tuple[Estimate, Mask]:
 
 
 def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> list[Estimate]:
-    """Estimates by the published filter, at every step of the pairs' time grids.
+    """Estimate pairs with the published filter, at every step of their time grids.
 
     Parameters
     ----------
     pairs
-        Any number.
+        Any number of pairs.
     preset
         One of ``ekf.PRESETS``.
     gate_m
@@ -238,6 +245,7 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
 
 
 def _from_smoother(flight: Problem, noise: Noise, starts: Starts) -> Estimate:
+    """Return the estimate of the smoother, with the spread between its guesses."""
     order = np.argsort(-starts.score)
     best = int(order[0])
     ends = starts.tracks[..., :3].swapaxes(0, 1)[order]
@@ -257,6 +265,7 @@ def _from_smoother(flight: Problem, noise: Noise, starts: Starts) -> Estimate:
 def _from_batch(
     flight: Problem, noise: Noise | None, starts: Starts, pieced: Sequence[Array]
 ) -> Estimate:
+    """Return the estimate of the batch solve, with the selected noise model."""
     known = () if flight.known_std is None else tuple(flight.known_std.tolist())
     first = noise or Noise(known_std=known)
     ends = solutions(flight, first, starts, pieced)
@@ -279,9 +288,9 @@ def _from_batch(
 def _weighed(
     flight: Problem, noise: Noise, best: Solution, ends: Sequence[Solution]
 ) -> list[Solution]:
-    """Solutions of a flight under the noise that was found, best first.
+    """Solve again under the selected noise model; return the solutions, best first.
 
-    How much worse another solution is depends on how good the sensors are.
+    The cost difference between solutions depends on the noise model.
     """
     found = [solve_batch(flight, noise, best.state, best.constants)]
     for end in distinct(ends, RIVAL)[1 : 1 + RIVALS]:

@@ -1,9 +1,9 @@
-"""What several flights agree on of what each found to be constant.
+"""Pool the constants of several flights.
 
-Every flight tells some combinations of its constants well and others not at all, so each counts
-with its whole information, less that of the prior it was solved with. From flight to flight a
-constant may change: how much is found with the means, by expectation maximisation of a Gaussian
-model with random effects (Laird and Ware 1982).
+Every flight determines some combinations of its constants well and others not at all. So each one
+contributes its whole information matrix, minus the prior it was solved with. A constant may change
+from flight to flight. That variance is estimated together with the means, by expectation
+maximization of a Gaussian model with random effects (Laird and Ware 1982).
 """
 
 from collections.abc import Sequence
@@ -18,26 +18,29 @@ from dmrl.estimation.solver.keyframes import GLOBALS, Noise
 from dmrl.estimation.solver.robust_loss import PRIOR, curvature_of, curved
 
 FIRST_SHARE, FIRST_COUNT = 1 / 3, 2.0
-"""What is known of the change from flight to flight before any: this share of the prior's standard
-deviation, as if seen so often. Two flights that agree by chance do not make it nothing."""
+"""Prior of the change from flight to flight: share of the prior's standard deviation, and its
+weight in flights. It keeps two flights that agree by chance from making the change zero. No record
+of how the values were chosen."""
 ROUNDS, SETTLED = 200, 1e-3
-"""Of expectation maximisation, at most, and the change at which it ends."""
+"""Largest number of EM iterations, and the relative change that ends them. No record of how the
+values were chosen."""
 KINDS = np.array([0, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5])
-"""Of what is constant, in the order of ``GLOBALS``: what changes alike from flight to flight."""
+"""Group of each constant, in the order of ``GLOBALS``. The constants of a group share one relative
+change."""
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What one flight of a pair tells of its constants, apart from the prior.
+    """Information of one flight of a pair about its constants, without the prior.
 
     Parameters
     ----------
     information
         (G, G) in the order of ``GLOBALS``; positive semi-definite.
-    pull
-        (G,) the information times the values that are likeliest.
+    information_vector
+        (G,) the information times the likeliest values.
     column
-        (G,) which of the means each of them is.
+        (G,) index of the mean of each constant.
     """
 
     information: Array
@@ -47,16 +50,17 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
-    """M means over flights.
+    """Means of M constants over flights.
 
     Parameters
     ----------
     mean
-        (M,).
+        (M,) means.
     std
-        (M,) of the next flight about it: of the mean, and of the change from flight to flight.
+        (M,) of the next flight about the mean: of the mean, and of the change from flight to
+        flight.
     flights
-        (M,) in how many each was solved for.
+        (M,) number of flights with each constant.
     """
 
     mean: Array
@@ -65,35 +69,35 @@ class Pooled:
 
 
 def told(estimate: Estimate, column: NDArray[np.intp]) -> Told:
-    """What a batch solve tells, apart from the prior of its constants.
+    """Return the information of a batch solve about its constants, without their prior.
 
     Parameters
     ----------
     estimate
-        By the batch solve, so that it has a covariance of its constants.
+        Estimate of the batch solve, which has a covariance of the constants.
     column
-        (G,) which of the means each of them is.
+        (G,) index of the mean of each constant.
     """
     assert estimate.constants_covariance is not None
     found, noise = estimate.constants, estimate.noise
     bent = np.linalg.inv(estimate.constants_covariance) - np.diag(curvature_of(noise, found))
     values, vectors = np.linalg.eigh((bent + bent.T) / 2)
     information = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    # At the solution the likelihood pulls outwards as hard as the prior pulls back.
+    # At the solution the gradients of likelihood and prior cancel.
     out = found / noise.prior_std()
     prior = out / noise.prior_std() / (1 + out**2 / PRIOR)
     return Told(information, information @ found + prior, column)
 
 
 def pooled(flights: Sequence[Told], kind: NDArray[np.intp]) -> Pooled:
-    """Means of M constants over flights, and how exactly the next flight is known.
+    """Pool M constants over flights, with the standard deviation of the next flight.
 
     Parameters
     ----------
     flights
-        What each tells.
+        Information of each flight.
     kind
-        (M,) of each constant: which of ``GLOBALS`` it is, any of those that are alike.
+        (M,) index of each constant among ``GLOBALS``; any of those in its group.
     """
     usual, limit, group = Noise().prior_std()[kind], PRIOR[kind], KINDS[kind]
     mean: Array = np.zeros(len(kind))
@@ -101,14 +105,14 @@ def pooled(flights: Sequence[Told], kind: NDArray[np.intp]) -> Pooled:
     counts = np.bincount(np.concatenate([flight.column for flight in flights]), minlength=len(kind))
     for _ in range(ROUNDS):
         information, pull = _total(flights, change)
-        # The prior of one flight's constants: mostly small, and at times not. Where flights tell
-        # the difference of two robots alone, it is one of them that is off, not both by half.
+        # The heavy-tailed prior of a single flight. If flights determine only the difference of
+        # two robots, it attributes the whole error to one of them.
         weight = 1 / (1 + (mean / usual) ** 2 / limit) / usual**2
         mean = np.asarray(np.linalg.solve(information + np.diag(weight), pull), float)
         bent = np.diag(curved((mean / usual) ** 2 / limit) / usual**2)
         covariance = np.asarray(np.linalg.pinv(information + bent, hermitian=True), float)
         squares = _squares(flights, mean, covariance, change)
-        # What changes alike has one standard deviation, in units of its prior's.
+        # A group has one standard deviation, relative to that of the prior.
         relative = np.bincount(group, squares / usual**2)
         seen = np.bincount(group, counts) + FIRST_COUNT
         share = np.sqrt((relative + FIRST_COUNT * FIRST_SHARE**2) / seen)
@@ -119,9 +123,9 @@ def pooled(flights: Sequence[Told], kind: NDArray[np.intp]) -> Pooled:
 
 
 def _total(flights: Sequence[Told], change: Array) -> tuple[Array, Array]:
-    """(M, M) information of all flights on the means, and (M,) their pull.
+    """Return (M, M) information of all flights about the means, and its vector (M,).
 
-    ``change`` (M,) is how much each differs from flight to flight.
+    ``change`` (M,) is the standard deviation of each constant from flight to flight.
     """
     information, pull = np.zeros((len(change),) * 2), np.zeros(len(change))
     for flight in flights:
@@ -133,13 +137,13 @@ def _total(flights: Sequence[Told], change: Array) -> tuple[Array, Array]:
 
 
 def _squares(flights: Sequence[Told], mean: Array, covariance: Array, change: Array) -> Array:
-    """(M,) sums over flights of the expected squares of what differs from the means."""
+    """Return (M,) sums over flights of the expected squared deviations from the means."""
     out = np.zeros(len(mean))
     for flight in flights:
         held = change[flight.column] ** -2.0
         spread = np.linalg.inv(flight.information + np.diag(held))
         found = spread @ (flight.pull + held * mean[flight.column])
-        # How unsure the mean is comes in by as much as the flight leaves to it.
+        # The covariance of the mean enters by the weight that the flight leaves to the mean.
         left = spread * held
         own = np.eye(len(held)) - left
         shared = own @ covariance[np.ix_(flight.column, flight.column)] @ own.T

@@ -1,9 +1,9 @@
-"""A flight in which ranges or odometry were silent for long, stretch by stretch.
+"""Solve a flight with long dropouts of ranges or odometry segment by segment.
 
-Through a silence dead reckoning is off by a metre, and what comes after may fit a wrong side of the
-observer as well as the right one. So every stretch between silences is solved by itself too, and
-they are joined to a start of the whole flight's solve. Where a stretch alone is sure all the same
-and the whole flight contradicts it, the stretch counts.
+Dead reckoning through a dropout is off by a metre. The rest of the flight may then fit on the wrong
+side of the observer as well as on the right one. So every segment between dropouts is also solved
+by itself, and the joined segments are an initial guess of the whole flight. If a segment alone is
+confident and the whole flight contradicts it, the segment is kept.
 """
 
 from collections.abc import Sequence
@@ -22,21 +22,23 @@ from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.keyframes import Problem
 
 SILENCE_S = 3.0
-"""Ranges or odometry that are silent for so long part a flight."""
+"""Shortest dropout of ranges or odometry that splits a flight, seconds. No record of how the value
+was chosen."""
 LEAST_S, LEAST_RANGES = 10.0, 20
-"""Shorter stretches tell nothing by themselves."""
+"""Shortest segment, seconds, and fewest ranges of a segment that is solved by itself. No record of
+how the values were chosen."""
 INSIDE, CONTRADICTED = 0.99, 0.2
-"""A solution is not believed where more than this share of another's sure positions lie outside
-that one's 99 % ellipse."""
+"""A solution is rejected if more than the second share of another one's OK positions have it
+outside their ellipse of the first probability. No record of how the values were chosen."""
 
 
 def contradicts(whole: Estimate, sure: Estimate) -> bool:
-    """Whether one solution lies where another, where it was sure, says that nobody was.
+    """Return whether a solution fails a chi-square test against another one's confident positions.
 
     Parameters
     ----------
     whole
-        The solution that is doubted.
+        Solution to test.
     sure
         Another solution of the same ordered pair, of the same time or a part of it.
     """
@@ -46,18 +48,18 @@ def contradicts(whole: Estimate, sure: Estimate) -> bool:
         return False
     apart = (xy - sure.state[:, :2])[known]
     information = np.linalg.inv(sure.covariance[known, :2, :2])
-    # Squared Mahalanobis distances: chi-square with two degrees of freedom, if both are right.
+    # Squared Mahalanobis distances are chi-square with two degrees of freedom if both are right.
     squared = np.einsum("ki,kij,kj->k", apart, information, apart)
     return bool((squared > chi2.ppf(INSIDE, 2)).mean() > CONTRADICTED)
 
 
 def stretches(pair: Pair) -> list[Pair]:
-    """The parts of a flight between long silences; none where there is no such silence.
+    """Split a flight at long dropouts; return no segment if there is no such dropout.
 
     Parameters
     ----------
     pair
-        What both measured.
+        Sensor data of both robots.
     """
     heard_s = np.concatenate([pair.time_s[:1], pair.range_time_s, pair.time_s[-1:]])
     after = np.searchsorted(heard_s[1:-1], pair.time_s) + 1
@@ -75,14 +77,14 @@ def stretches(pair: Pair) -> list[Pair]:
 
 
 def joined(flight: Problem, parts: Sequence[Estimate]) -> Array:
-    """(K, 6) states of a flight that stretches of it say, by dead reckoning in between.
+    """Join solved segments to states (K, 6) of the whole flight, by dead reckoning in between.
 
     Parameters
     ----------
     flight
-        The whole flight.
+        Keyframes of the whole flight.
     parts
-        Solutions of one stretch or more, in order of time.
+        Estimates of one segment or more, in order of time.
     """
     key_s, (heading, place), (turned, way) = flight.key_s, path_of(flight.own), path_of(flight.peer)
     ways = []
@@ -91,7 +93,7 @@ def joined(flight: Problem, parts: Sequence[Estimate]) -> Array:
         columns = (*part.state[:, :2].T, np.unwrap(part.state[:, 2]))
         known = np.column_stack([np.interp(key_s[at], part.time_s, c) for c in columns])
         seen = rotate(rotation(heading[at]), known[:, :2]) + place[at]
-        # Before and after it, the peer goes on as its log says, from either end.
+        # Before and after the segment the peer follows its odometry, from either end.
         near = np.clip(np.arange(len(key_s)), at[0], at[-1]) - at[0]
         turn = (heading[at] + known[:, 2] - turned[at])[near]
         there = seen[near] + rotate(rotation(turn), way - way[at][near])
@@ -106,7 +108,7 @@ def joined(flight: Problem, parts: Sequence[Estimate]) -> Array:
 
 
 def _errors(key_s: Array, parts: Sequence[Estimate]) -> Array:
-    """(K,) by how much ranges were too long, as the stretches found; 0 between them."""
+    """Return (K,) range errors of the segments; 0 between them."""
     out = np.zeros(len(key_s))
     for part in parts:
         at = (key_s >= part.time_s[0]) & (key_s <= part.time_s[-1])
@@ -118,14 +120,14 @@ def _errors(key_s: Array, parts: Sequence[Estimate]) -> Array:
 def mended(
     both: tuple[Estimate, Estimate], parts: Sequence[tuple[Estimate, Estimate]]
 ) -> tuple[Estimate, Estimate]:
-    """Both directions of a pair, with the stretches that are surer alone.
+    """Replace parts of a solution that contradict a confident segment, in both directions.
 
     Parameters
     ----------
     both
-        The solution of the whole flight.
+        Estimates of the whole flight, of either robot.
     parts
-        Those of its stretches.
+        Estimates of its segments.
     """
     here, there = both
     for own, peer in parts:
@@ -135,7 +137,7 @@ def mended(
 
 
 def _with(whole: Estimate, part: Estimate) -> Estimate:
-    """The whole flight's solution with that of a part of it."""
+    """Return the estimate of the whole flight with one segment replaced."""
     at = (whole.time_s >= part.time_s[0]) & (whole.time_s <= part.time_s[-1])
     time_s = whole.time_s[at]
     near = np.clip(np.searchsorted(part.time_s, time_s), 0, len(part.time_s) - 1)
@@ -147,6 +149,7 @@ def _with(whole: Estimate, part: Estimate) -> Estimate:
 
 
 def _cut(pair: Pair, start_s: float, end_s: float) -> Pair:
+    """Crop a pair to an interval."""
     at = (pair.time_s >= start_s) & (pair.time_s <= end_s)
     time_s = pair.time_s[at]
     inside = (pair.range_time_s >= time_s[0]) & (pair.range_time_s <= time_s[-1])
@@ -166,6 +169,7 @@ def _cut(pair: Pair, start_s: float, end_s: float) -> Pair:
 
 
 def _cut_track(track: Track, at: Mask) -> Track:
+    """Crop the signals of one robot."""
     vx, vy, yaw_rate, height = (signal[at] for signal in track.values())
     silent = None if track.height_gap is None else track.height_gap[at]
     return Track(vx, vy, yaw_rate, height, track.gap[at], silent)

@@ -1,7 +1,7 @@
-"""More than pairs: all robots of a flight in one frame, by all their ranges at once.
+"""Estimate all robots of a flight in one frame, from all their ranges at once.
 
-Solutions of the pairs say where to start. What a pair cannot tell, a third robot often can: its
-ranges cross theirs, and everybody's odometry is used once instead of once in each pair.
+The solutions of the pairs are the initial guess. A third robot often resolves a bearing that a pair
+leaves open: its ranges cross theirs, and each robot's odometry enters once instead of in each pair.
 """
 
 from collections.abc import Mapping
@@ -31,22 +31,23 @@ from dmrl.estimation.solver.residuals import BIAS, OF_OBSERVER, OWN_GYRO, PEER_G
 
 Names = tuple[str, str]
 LEAST_S = 5.0
-"""Shortest time that all robots share and that is worth a solve."""
+"""Shortest time with data of all robots that is solved, seconds. No record of how the value was
+chosen."""
 
 
 def estimate_swarm(
     pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], *, gate_m: float = GATE_M
 ) -> dict[Names, Estimate]:
-    """Estimates of every ordered pair; those of robots in no group of three stay as they are.
+    """Estimate every ordered pair; robots in no group of three keep their estimates.
 
     Parameters
     ----------
     pairs
-        What robots measured, each pair once; a robot's log is the same in all of them.
+        Sensor data, each pair once. A robot's log is the same in all of them.
     estimates
-        Of every ordered pair, by pairs.
+        Estimates of every ordered pair, by pairs.
     gate_m
-        A position that is off by more than this is a bad one, metres.
+        Largest error of a good position, metres.
     """
     out = dict(estimates)
     for group in _groups(pairs):
@@ -57,14 +58,14 @@ def estimate_swarm(
         if len(group) > 2 and shared_s >= LEAST_S:
             theirs = {names: e for names, e in estimates.items() if names[0] in group}
             together = _estimates(mine, theirs, gate_m)
-            # What the solve over all has no model of bends it: then it stands against the pairs.
+            # An error without a model bends the joint solve, which then contradicts a pair.
             bent = any(contradicts(together[names], found) for names, found in theirs.items())
             out |= {} if bent else together
     return out
 
 
 def _groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
-    """Robots that ranges connect."""
+    """Return groups of robots that ranges connect."""
     groups: list[set[str]] = []
     for names in pairs:
         touched = [group for group in groups if group & set(names)]
@@ -76,8 +77,9 @@ def _groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
 def _estimates(
     pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], gate_m: float
 ) -> dict[Names, Estimate]:
+    """Return the estimates of one group, from the solve over all its robots."""
     flight = flight_of(pairs, estimates)
-    # How good the sensors are: as the pair in the middle found them.
+    # The noise model is that of the pair with the median velocity noise.
     ordered = sorted(estimates.values(), key=lambda estimate: estimate.noise.velocity_std_mps)
     noise = ordered[len(ordered) // 2].noise
     found = solved(flight, noise, _start(flight, estimates))
@@ -90,7 +92,7 @@ def _estimates(
         none = np.zeros(len(state), np.int8)
         seen = Estimate(flight.key_s, state, covariance, none, constants, noise)
         pair = pairs[one, other] if (one, other) in pairs else pairs[other, one]
-        # Two that fly alike are told apart by a third.
+        # A third robot resolves two that move alike, so only the own motion is tested.
         why = unmoved(_moved(flight, place[one]), np.inf)
         silent = silence(pair, flight.key_s) | unheard(pair, flight.key_s)
         out[one, other] = with_status(seen, silent, why, gate_m)
@@ -98,7 +100,7 @@ def _estimates(
 
 
 def flight_of(pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]) -> Flight:
-    """Keyframes of the time that all robots share.
+    """Build the keyframes of the time that all robots share.
 
     Parameters
     ----------
@@ -125,7 +127,7 @@ def flight_of(pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]) 
         shifts = [ways[name].increments(key_s[key], at_s).shift_m for name in (one, other)]
         height_m = np.interp(at_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
         both = names.index(one), names.index(other)
-        # Behind something, ranges are too long for seconds: the pair's solve tells by how much.
+        # An obstacle lengthens ranges for seconds. The pair's solve has estimated the excess.
         range_m = pair.range_m[inside] - _error(estimates.get((one, other)), at_s)
         links.append(Link(both, key, range_m, shifts[0], shifts[1], height_m))
     moves = [ways[name].increments(key_s[:-1], key_s[1:]) for name in names]
@@ -134,7 +136,7 @@ def flight_of(pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]) 
 
 
 def _known_std(names: list[str], pairs: Mapping[Names, Pair]) -> Array:
-    """(4 N + 2 L,) what pairs know of their constants, in the order of a swarm's."""
+    """Return (4 N + 2 L,) standard deviations of the constants from the pairs, in swarm order."""
     robots = np.full((len(names), ROBOT), np.inf)
     shared = np.full((len(pairs), SHARED), np.inf)
     for number, (both, pair) in enumerate(pairs.items()):
@@ -148,14 +150,14 @@ def _known_std(names: list[str], pairs: Mapping[Names, Pair]) -> Array:
 
 
 def _error(estimate: Estimate | None, at_s: Array) -> Array:
-    """(R,) by how much ranges are too long, as the pair's own solve found, metres."""
+    """Return (R,) range errors of the pair's own solve, metres."""
     if estimate is None or estimate.range_error_m is None:
         return np.zeros(len(at_s))
     return np.interp(at_s, estimate.time_s, estimate.range_error_m)
 
 
 def _start(flight: Flight, estimates: Mapping[Names, Estimate]) -> Array:
-    """(K, N, 5) states from the pairs' solutions, along the tree of the surest."""
+    """Return (K, N, 5) states from the pairs' solutions, along the tree of smallest sigmas."""
     sigma_m = {
         names: float(np.median(np.linalg.eigvalsh(e.covariance[:, :2, :2])[:, -1]))
         for names, e in estimates.items()
@@ -179,7 +181,7 @@ def _start(flight: Flight, estimates: Mapping[Names, Estimate]) -> Array:
 
 
 def _calmed(flight: Flight, state: Array, energy: float) -> Array:
-    """The states on paths without what may be noise: each robot's own, and against all others'."""
+    """Return the states on paths without probable noise, own and relative."""
     step_s = float(np.median(np.diff(flight.key_s)))
     velocity = np.diff(state[:, :, :2], axis=0) / step_s
     robots = range(len(flight.names))
@@ -194,7 +196,7 @@ def _calmed(flight: Flight, state: Array, energy: float) -> Array:
 
 
 def _relative(state: Array, spread: Array, one: int, other: int) -> tuple[Array, Array]:
-    """(K, 3) where a robot is in another's horizontal frame, and the covariance (K, 3, 3)."""
+    """Return the pose (K, 3) of a robot in another's horizontal frame, and its covariance."""
     here, there = state[:, one], state[:, other]
     back = rotation(-here[:, 2])
     xy = rotate(back, there[:, :2] - here[:, :2])
@@ -207,7 +209,7 @@ def _relative(state: Array, spread: Array, one: int, other: int) -> tuple[Array,
 
 
 def _moved(flight: Flight, robot: int) -> float:
-    """Mean square of a robot's averaged velocity, (m/s)^2."""
+    """Return the mean square of a robot's averaged velocity, (m/s)^2."""
     step_s = float(np.median(np.diff(flight.key_s)))
     velocity = np.diff(flight.paths[robot][1], axis=0) / step_s
     slow = uniform_filter1d(velocity, round(RESTLESS_S / step_s), axis=0, mode="nearest")
@@ -215,7 +217,7 @@ def _moved(flight: Flight, robot: int) -> float:
 
 
 def _constants(flight: Flight, found: Swarm, one: int, other: int) -> Array:
-    """(G,) what the solve says of a pair, in the order of ``GLOBALS``; zeros where it does not."""
+    """Return (G,) constants of a pair in the order of ``GLOBALS``; zeros where not estimated."""
     out = np.zeros(len(GLOBALS))
     out[OWN_GYRO], out[PEER_GYRO] = found.constants[[one * ROBOT, other * ROBOT]]
     for number, link in enumerate(flight.links):

@@ -1,1 +1,1 @@
-"""Measurement models: odometry, bearings, the pair and its status."""
+"""Measurement models of a pair: odometry, bearings, position metrics and status."""

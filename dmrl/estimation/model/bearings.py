@@ -1,4 +1,4 @@
-"""Bearings and distances that a camera showed, beside positions that are known."""
+"""Camera bearings and distances, and their association with estimated positions."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from dmrl.estimation.model.pair import Array, Mask, Sightings
 
 AGREES = 11.3
-"""Squared distance within which a candidate is the robot: 99 % of three numbers."""
+"""Gate on the squared Mahalanobis distance of a candidate. The 99 % point of chi-square with three
+degrees of freedom."""
 
 
 def polar_of(xyz_m: Array) -> Array:
-    """(N, 3) azimuth, elevation (rad) and log distance of (N, 3) places, metres."""
+    """Return (N, 3) azimuth, elevation (rad) and log distance of (N, 3) positions, metres."""
     x, y, z = xyz_m.T
     level2 = np.maximum(x * x + y * y, 1e-6)
     up = np.arctan2(z, np.sqrt(level2))
@@ -21,12 +22,12 @@ def polar_of(xyz_m: Array) -> Array:
 
 
 def polar_variance(xyz_m: Array, covariance: Array) -> Array:
-    """(N, 3) variances of azimuth, elevation and log distance of places that are uncertain.
+    """Return (N, 3) variances of azimuth, elevation and log distance of uncertain positions.
 
     Parameters
     ----------
     xyz_m, covariance
-        (N, 3) metres, (N, 3, 3).
+        (N, 3) metres, and (N, 3, 3) square metres.
     """
     x, y, z = xyz_m.T
     level2 = np.maximum(x * x + y * y, 1e-6)
@@ -38,37 +39,38 @@ def polar_variance(xyz_m: Array, covariance: Array) -> Array:
 
 
 def difference(there: Array, here: Array) -> Array:
-    """(..., 3) azimuth, elevation, log distance there less here, azimuths the short way round."""
+    """Return (..., 3) differences of azimuth (wrapped to +-pi), elevation and log distance."""
     off = np.asarray(there - here)
     off[..., 0] = (off[..., 0] + np.pi) % (2 * np.pi) - np.pi
     return off
 
 
 class Claim(NamedTuple):
-    """Which candidate of each of I images a place in it goes with best."""
+    """Candidate of each of I images that is nearest to an expected position."""
 
     nearest: NDArray[np.intp]
-    """(I,) its number."""
+    """(I,) index of the candidate."""
     squared: Array
     """(I,) squared Mahalanobis distance."""
     log_likelihood: Array
-    """(I,) of it."""
+    """(I,) log likelihood of the association."""
 
     @property
     def agrees(self) -> Mask:
-        """(I,) whether it may be the robot."""
+        """(I,) whether the distance is inside the gate."""
         return np.asarray(self.squared < AGREES)
 
 
 def claim(sightings: Sightings, xyz_m: Array, covariance: Array) -> Claim:
-    """Candidates that are nearest to known places.
+    """Associate every image with the candidate nearest to an expected position.
 
     Parameters
     ----------
     sightings
-        Of I images.
+        Candidates of I images.
     xyz_m, covariance
-        (I, 3) metres and (I, 3, 3), in the horizontal frame of the robot that saw, at the images.
+        (I, 3) metres and (I, 3, 3), in the horizontal frame of the robot with the camera, at the
+        times of the images.
     """
     off = difference(sightings.polar, polar_of(xyz_m)[:, None])
     variance = polar_variance(xyz_m, covariance)[:, None] + sightings.std**2
@@ -80,14 +82,14 @@ def claim(sightings: Sightings, xyz_m: Array, covariance: Array) -> Claim:
 
 
 def within(sightings: Sightings | None, start_s: float, end_s: float) -> Sightings | None:
-    """Those of a part of a flight.
+    """Crop bearing measurements to an interval; None stays None.
 
     Parameters
     ----------
     sightings
-        Of the flight.
+        Measurements of the flight.
     start_s, end_s
-        First and last time of the part, seconds.
+        First and last time of the interval, seconds.
     """
     if sightings is None:
         return None
@@ -96,16 +98,16 @@ def within(sightings: Sightings | None, start_s: float, end_s: float) -> Sightin
 
 
 def without(sightings: Sightings, images: Mask, candidates: NDArray[np.intp]) -> Sightings:
-    """Those that are left without a candidate of some images.
+    """Remove one candidate from some images; drop images without any other candidate.
 
     Parameters
     ----------
     sightings
-        Of I images.
+        Candidates of I images.
     images
-        (I,) which of them lose one.
+        (I,) images that lose a candidate.
     candidates
-        (I,) number of the candidate.
+        (I,) index of the candidate to remove.
     """
     polar = sightings.polar.copy()
     polar[np.flatnonzero(images), candidates[images]] = np.nan

@@ -1,7 +1,8 @@
-"""Motion between keyframes, integrated once at 100 Hz, so that estimators step at 10 Hz.
+"""Preintegrate odometry between keyframes.
 
-Odometry of a robot runs in a frame fixed at its start. The increment from a keyframe k to a
-time t, seen from the robot at k, is then exact for any t.
+The logs are integrated once at 100 Hz, so that the estimators step at 10 Hz. Odometry of a robot
+runs in a frame fixed at its start. The relative motion from a keyframe k to a time t, in the
+robot's frame at k, is then exact for any t.
 """
 
 from dataclasses import dataclass
@@ -11,11 +12,11 @@ import numpy as np
 from dmrl.estimation.model.pair import Array, Track
 
 QUARTER_TURN: Array = np.array([[0.0, -1.0], [1.0, 0.0]])
-"""The derivative of a rotation by its angle is QUARTER_TURN @ rotation."""
+"""Rotation by 90 degrees. The derivative of a rotation by its angle is QUARTER_TURN @ rotation."""
 
 
 def rotation(angle_rad: Array) -> Array:
-    """(..., 2, 2) rotations by angles, counter-clockwise."""
+    """Return (..., 2, 2) counter-clockwise rotation matrices of angles in radians."""
     out = np.empty((*np.shape(angle_rad), 2, 2))
     out[..., 0, 0] = out[..., 1, 1] = np.cos(angle_rad)
     out[..., 1, 0] = np.sin(angle_rad)
@@ -35,8 +36,8 @@ class Odometry:
         (K,) integral of the yaw rate, radians.
     position_m
         (K, 2) integral of the velocity in the frame of the start, metres.
-    drift_s
-        (K, 2, 2) what the position gains per m/s of velocity bias, seconds.
+    bias_jacobian_s
+        (K, 2, 2) derivative of the position by a velocity bias, metres per m/s.
     """
 
     time_s: Array
@@ -45,7 +46,7 @@ class Odometry:
     drift_s: Array
 
     def at(self, time_s: Array) -> tuple[Array, Array, Array]:
-        """Heading (N,), position (N, 2) and drift (N, 2, 2) at times in the grid."""
+        """Interpolate heading (N,), position (N, 2) and bias Jacobian (N, 2, 2) at times."""
         step = (time_s - self.time_s[0]) / (self.time_s[1] - self.time_s[0])
         low = np.clip(step.astype(int), 0, len(self.time_s) - 2)
         share = step - low
@@ -57,7 +58,7 @@ class Odometry:
         return between(self.heading_rad), between(self.position_m), between(self.drift_s)
 
     def increments(self, from_s: Array, to_s: Array) -> "Increments":
-        """Motion from some times to others, seen from the robot at the first."""
+        """Return the motion between pairs of times, in the robot's frame at the first of each."""
         heading, position, drift = self.at(from_s)
         later_heading, later, later_drift = self.at(to_s)
         back = rotation(-heading)
@@ -70,16 +71,16 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """Motions of one robot.
+    """Relative motions of one robot.
 
     Parameters
     ----------
     turn_rad
         (N,) change of heading, radians.
     shift_m
-        (N, 2) change of position, in the robot's frame at the start of each, metres.
-    drift_s
-        (N, 2, 2) change of the shift per m/s of velocity bias, seconds.
+        (N, 2) change of position in the robot's frame at the start of each motion, metres.
+    bias_jacobian_s
+        (N, 2, 2) derivative of the shift by a velocity bias, metres per m/s.
     """
 
     turn_rad: Array
@@ -88,14 +89,14 @@ class Increments:
 
 
 def odometry(track: Track, time_s: Array) -> Odometry:
-    """Dead reckoning of a robot, by the trapezium rule.
+    """Integrate a robot's velocity and yaw rate by the trapezoidal rule.
 
     Parameters
     ----------
     track
-        What it measured.
+        Sensor signals of the robot.
     time_s
-        (K,) its uniform time grid, seconds.
+        (K,) uniform time grid of the signals, seconds.
     """
     dt_s = np.diff(time_s)
 
@@ -112,5 +113,5 @@ def odometry(track: Track, time_s: Array) -> Odometry:
 
 
 def rotate(matrices: Array, vectors: Array) -> Array:
-    """Apply (..., 2, 2) matrices to (..., 2) vectors, pair by pair."""
+    """Multiply (..., 2, 2) matrices with (..., 2) vectors, pair by pair."""
     return np.asarray((matrices @ vectors[..., None])[..., 0])

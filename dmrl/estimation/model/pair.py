@@ -1,4 +1,4 @@
-"""What two robots measured, on one clock: the input of every estimator here."""
+"""Sensor data of two robots on one clock, the input of every estimator."""
 
 from dataclasses import dataclass
 
@@ -9,31 +9,32 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 RATE_HZ = 100.0
-"""Rate of the common time grid."""
+"""Rate of the common time grid, Hz. No record of how the value was chosen."""
 LONGEST_GAP_S = 0.5
-"""Silence of a sensor that is bridged without a word."""
+"""Longest dropout that is interpolated without a warning, seconds. No record of how the value was
+chosen."""
 LONGEST_RANGE_M = 60.0
-"""Beyond the reach of UWB: 65535 and other fill values."""
+"""Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
 SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
-"""Order of ``GLOBALS`` seen from the peer."""
+"""Permutation of ``GLOBALS`` that exchanges observer and peer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """One robot's own sensors on a uniform time grid of K samples.
+    """Sensor signals of one robot on a uniform time grid of K samples.
 
     Parameters
     ----------
     vx_mps, vy_mps
         (K,) velocity in the robot's horizontal frame, m/s.
     yaw_rate_radps
-        (K,) turning rate about the vertical, positive to the left, rad/s.
+        (K,) yaw rate about the vertical, positive to the left, rad/s.
     height_m
         (K,) height above the floor, metres.
-    gap
-        (K,) whether velocity or yaw rate was silent; the values there are only filled in.
-    height_gap
-        (K,) whether the height was; None: nowhere.
+    dropout
+        (K,) whether velocity or yaw rate dropped out. The values there are interpolated.
+    height_dropout
+        (K,) whether the height dropped out. None: at no time.
     """
 
     vx_mps: Array
@@ -44,21 +45,21 @@ class Track:
     height_gap: Mask | None = None
 
     def values(self) -> tuple[Array, Array, Array, Array]:
-        """The four signals."""
+        """Return vx, vy, yaw rate and height, (K,) each."""
         return self.vx_mps, self.vy_mps, self.yaw_rate_radps, self.height_m
 
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """What a robot's camera showed that may be the other robot. I images, up to C candidates.
+    """Candidate detections of the peer in one camera: I images with up to C candidates.
 
     Parameters
     ----------
     time_s
-        (I,) when the images that show a candidate were taken, seconds, never going back.
-    polar
-        (I, C, 3) azimuth, elevation (rad) in the horizontal frame of the robot that saw, and the
-        logarithm of the distance in metres; NaN where an image has no more candidates.
+        (I,) capture times of the images with a candidate, seconds, non-decreasing.
+    bearing
+        (I, C, 3) azimuth, elevation (rad) in the horizontal frame of the robot with the camera, and
+        the natural logarithm of the distance in metres. NaN pads images with fewer candidates.
     std
         (I, C, 3) standard deviations of these.
     """
@@ -70,30 +71,30 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """An observer, its peer, and the ranges between them.
+    """Signals of an observer and its peer, and the ranges between them.
 
     Parameters
     ----------
     time_s
         (K,) uniform time grid, seconds.
     own, peer
-        What either robot measured at those times.
+        Sensor signals of either robot at these times.
     range_time_s
-        (R,) times of the ranges, seconds, inside the grid, never going back.
+        (R,) times of the ranges, seconds, inside the grid, non-decreasing.
     range_m
         (R,) measured distances, metres.
-    own_sees, peer_sees
-        What the camera of either showed; None: nothing, or it has none. Images outside the grid
-        do not count.
-    known_std
-        (G,) standard deviations of what is constant over the flight, in the order of ``GLOBALS``,
-        where they are known to be smaller than usual; None: nowhere.
+    own_bearings, peer_bearings
+        Candidates of either camera. None: no camera, or no candidate. Images outside the grid are
+        ignored.
+    calibrated_std
+        (G,) standard deviations of the constants of the flight, in the order of ``GLOBALS``, where
+        a calibration makes them smaller than the default. None: no calibration.
 
     Raises
     ------
     ValueError
-        If a value is not finite, a length is wrong, time goes back or leaves the grid, or a
-        range is not in (0, 60] m: use ``usable_ranges`` and ``resample`` first.
+        If a value is not finite, a length is wrong, a time decreases or leaves the grid, or a range
+        is not in (0, 60] m. Use ``usable_ranges`` and ``resample`` first.
     """
 
     time_s: Array
@@ -109,21 +110,26 @@ class Pair:
         count = len(self.time_s)
         steps = np.diff(self.time_s)
         if count < 2 or not np.allclose(steps, steps[0], rtol=1e-3) or steps[0] <= 0:
-            raise ValueError("the time grid is not uniform and forward. Use `resample`")
+            raise ValueError("time_s: the grid is not uniform and increasing. Use `resample`")
         for name, track in (("own", self.own), ("peer", self.peer)):
             for signal in (*track.values(), track.gap):
                 if signal.shape != (count,) or not np.isfinite(signal).all():
-                    raise ValueError(f"{name} signals are not {count} finite numbers each")
+                    raise ValueError(
+                        f"{name}: signals are not {count} finite numbers each. Use `resample`"
+                    )
         self._check_ranges()
 
     def _check_ranges(self) -> None:
         if len(self.range_time_s) != len(self.range_m):
-            raise ValueError("as many range times as ranges are needed")
+            raise ValueError("range_time_s: pass as many range times as ranges")
         if not usable_ranges(self.range_time_s, self.range_m).all():
-            raise ValueError("ranges are not finite, positive and in time order")
+            raise ValueError(
+                "range_m: ranges are not finite, in (0, 60] m and in time order. "
+                "Use `usable_ranges`"
+            )
         outside = (self.range_time_s < self.time_s[0]) | (self.range_time_s > self.time_s[-1])
         if outside.any():
-            raise ValueError(f"{outside.sum()} ranges lie outside the time grid")
+            raise ValueError(f"range_time_s: {outside.sum()} ranges lie outside the time grid")
 
     @property
     def dt_s(self) -> float:
@@ -131,7 +137,7 @@ class Pair:
         return float(self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)
 
     def swapped(self) -> "Pair":
-        """The same ranges seen from the peer."""
+        """Return the pair with observer and peer exchanged."""
         ranges = self.range_time_s, self.range_m
         sees = self.peer_sees, self.own_sees
         known_std = None if self.known_std is None else self.known_std[SWAPPED]
@@ -139,7 +145,7 @@ class Pair:
 
 
 def usable_ranges(time_s: Array, range_m: Array) -> Mask:
-    """(R,) which ranges are finite, in (0, 60] m, and no earlier than any range before them.
+    """Return (R,) whether ranges are finite, in (0, 60] m, and in time order.
 
     Parameters
     ----------
@@ -154,9 +160,9 @@ def usable_ranges(time_s: Array, range_m: Array) -> Mask:
 
 
 def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:
-    """A signal on a time grid, interpolated, and where it was silent.
+    """Interpolate signals on a time grid and mark dropouts.
 
-    Samples that are not finite, or do not go forward in time, are left out.
+    Samples that are not finite, or whose time does not increase, are ignored.
 
     Parameters
     ----------
@@ -170,20 +176,20 @@ def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:
     Returns
     -------
     signal : Array
-        (K, C); held at the ends.
-    gap : Mask
+        (K, C); the first and the last value extend to the ends of the grid.
+    dropout : Mask
         (K,) whether the nearest samples on both sides are over 0.5 s apart.
 
     Raises
     ------
     ValueError
-        If nothing is left.
+        If no sample is usable.
     """
     latest = np.fmax.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]
     good = np.isfinite(values).all(axis=1) & np.isfinite(time_s) & (time_s > latest)
     time_s, values = time_s[good], values[good]
     if not len(time_s):
-        raise ValueError("no sample is finite and forward in time")
+        raise ValueError("values: no sample is finite with an increasing time")
     signal = np.column_stack([np.interp(grid_s, time_s, column) for column in values.T])
     after = np.searchsorted(time_s, grid_s)
     before_s = np.concatenate([[-np.inf], time_s])[after]

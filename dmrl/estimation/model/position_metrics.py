@@ -1,8 +1,7 @@
-"""Errors of estimated positions against the ground truth, and whether their covariance fits.
+"""Compare estimated positions and their covariance with the ground truth.
 
-Horizontal errors only.
-
-The vertical comes straight from two height sensors and says nothing about an estimator.
+Only horizontal errors count. The vertical comes straight from two height sensors and does not
+depend on the estimator.
 """
 
 from collections.abc import Mapping
@@ -17,18 +16,22 @@ Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
 
 GOOD_M = 0.3
-"""A label that is off by more than this is a bad one."""
+"""Largest horizontal error of a good label, metres. No record of how the value was chosen; it
+equals ``GATE_M``."""
 WRONG_SHARE = 0.5
-"""A pair is in the wrong basin when half of its errors are over this share of the distance."""
+"""A pair is in the wrong basin if its median error exceeds this share of the median distance. No
+record of how the value was chosen."""
 CHI2_95_OF_2 = 5.991
+"""95 % point of chi-square with two degrees of freedom."""
 GAP_S = 0.25
-"""Truth is not interpolated over longer gaps."""
+"""Longest gap over which the truth is interpolated, seconds. No record of how the value was chosen.
+"""
 
 DEFINITIONS = {
     "rmse_m": "root of the mean squared horizontal error, after the settling time",
     "p95_m": "95th percentile of the horizontal error, after the settling time",
     "wrong_basin": "median horizontal error over half the median distance, after settling",
-    "nees": "mean of the squared horizontal error over its covariance; 2 if that is honest",
+    "nees": "mean of the squared horizontal error over its covariance; 2 if that is right",
     "coverage_95": "share of true positions inside the 95 % ellipse, after the settling time",
     "good": f"share of all samples, from the start, with an error of at most {GOOD_M} m",
     "kept": "share of all samples, from the start, with status OK",
@@ -37,22 +40,23 @@ DEFINITIONS = {
     "kept_coverage_95": "share of true positions inside the 95 % ellipse, kept samples",
     "kept_rmse_m": "root of the mean squared horizontal error of the kept samples",
 }
+"""Definition of each figure, printed beside it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorTrace:
-    """Errors over time, to be drawn.
+    """Errors over time, for a plot.
 
     Parameters
     ----------
     title, name
-        Words above the figure, and its file's name.
+        Title of the figure, and its file name.
     time_s
-        (N,).
+        (N,) seconds.
     sigma_m
-        (N, A) standard deviations along A axes, as the estimator has them.
+        (N, A) standard deviations along A axes, as estimated.
     errors_m
-        (N, A) errors by what made them, NaN where there are none; the last is drawn on top.
+        (N, A) errors by estimator, NaN where there are none. The last one is drawn on top.
     """
 
     title: str
@@ -69,15 +73,15 @@ class Judged:
     Parameters
     ----------
     time_s
-        From the first estimate of the recording.
+        Seconds from the first estimate of the recording.
     error_m
         (N, 2) estimate minus truth, x and y of the observer's horizontal frame.
     covariance
-        (N, 2, 2) of x and y, square metres; NaN where it is not known.
+        (N, 2, 2) of x and y, square metres; NaN where there is none.
     distance_m
         True horizontal distance.
     kept
-        Whether the estimator believes it.
+        Whether the status is OK.
     """
 
     time_s: Array
@@ -88,18 +92,18 @@ class Judged:
 
     @property
     def size_m(self) -> Array:
-        """(N,) lengths of the errors."""
+        """(N,) Euclidean norm of the errors, metres."""
         return np.asarray(np.linalg.norm(self.error_m, axis=1))
 
     @property
     def sigma_m(self) -> Array:
-        """(N, 2) standard deviations of x and y."""
+        """(N, 2) standard deviations of x and y, metres."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What ``DEFINITIONS`` explains; NaN where there is nothing to measure."""
+    """Values of the figures in ``DEFINITIONS``; NaN without data."""
 
     samples: int
     rmse_m: float
@@ -116,14 +120,14 @@ class Figures:
 
 
 def figures(judged: Judged, settle_s: float) -> Figures:
-    """Figures of one pair.
+    """Compute the figures of one pair.
 
     Parameters
     ----------
     judged
         Estimates beside the truth.
     settle_s
-        Errors before this time count for the gate only.
+        Settling time. Earlier errors count for the figures of the gate only.
     """
     size_m, settled = judged.size_m, judged.time_s >= settle_s
     late, distance = size_m[settled], judged.distance_m[settled]
@@ -149,7 +153,10 @@ def figures(judged: Judged, settle_s: float) -> Figures:
 
 
 def squared_distances(judged: Judged) -> Array:
-    """(N,) squared errors over their covariances; NaN where a covariance is of no use."""
+    """Return (N,) squared Mahalanobis distances of the errors.
+
+    They are NaN where a covariance is not positive definite.
+    """
     (a, b), (_, d) = judged.covariance.transpose(1, 2, 0)
     x, y = judged.error_m.T
     determinant = a * d - b * b
@@ -159,10 +166,10 @@ def squared_distances(judged: Judged) -> Array:
 
 
 def overall(pairs: list[Figures]) -> Figures:
-    """Figures over all pairs.
+    """Combine the figures of several pairs.
 
-    RMSE and percentile are medians of the pairs, the share of wrong basins is one of pairs;
-    shares of samples count every sample of every pair once.
+    RMSE and percentile are medians over pairs. The share of wrong basins counts pairs. Shares of
+    samples count every sample of every pair once.
     """
     samples = np.array([f.samples for f in pairs], float)
     kept = samples * [f.kept for f in pairs]
@@ -206,7 +213,7 @@ def _root(values: Array) -> float:
 
 
 def inside_truth(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
-    """(N,) whether truth lies close on both sides of a time."""
+    """Return (N,) whether true positions exist shortly before and after a time."""
     if not len(true_ns):
         return np.zeros(len(time_ns), bool)
     after = np.searchsorted(true_ns, time_ns)

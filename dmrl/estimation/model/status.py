@@ -1,8 +1,8 @@
-"""Which positions are good enough to label.
+"""Select the positions that are precise enough to label.
 
-A limit on sigma passes what lies just below it, and where a whole flight does, too many of its
-labels are bad. So each flight has a budget instead: the best positions are taken for as long as
-few enough of them are expected to be far off.
+A limit on sigma passes positions just below it. A flight that is just below it throughout then has
+too many bad labels. Therefore each flight has a budget: positions are accepted in the order of
+their probability of being bad, as long as the expected share of bad ones stays small.
 """
 
 import numpy as np
@@ -11,29 +11,34 @@ from numpy.typing import NDArray
 from dmrl.estimation.model.pair import Array, Mask
 
 OK, UNCONVERGED, AMBIGUOUS = range(3)
-"""Values of ``status``; the same as in ``dmrl.v1.Status``."""
+"""Values of ``status``, equal to those of ``dmrl.v1.Status``."""
 
 GATE_M = 0.3
-"""A position that is off by more than this is a bad one."""
+"""Default of the largest horizontal error of a good position, metres. No record of how the value
+was chosen."""
 EXPECTED_SHARE = 0.045
-"""Share of a flight's OK positions that may be expected to be bad. Most flights with calibrated
-sensors are good from end to end and spend little of it: over all of them it is below 1 %."""
+"""Largest expected share of bad positions among the OK positions of a flight.
+
+Most flights with calibrated sensors are good throughout and use little of it: over all of them the
+share is below 1 %. Raised on simulated flights, where fewer positions were bad than expected."""
 WORST_SHARE = 0.12
-"""Probability of being bad that no OK position exceeds."""
+"""Largest probability of being bad of an OK position. Raised together with ``EXPECTED_SHARE``."""
 OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
-"""Sigma over distance beyond which a bearing is open rather than imprecise; and the median
-over a flight beyond which the motion of the whole flight leaves it open."""
+"""Largest sigma over distance of an observable bearing; and largest median of it over a flight.
+Above the median, the motion of the whole flight leaves the bearing open. No record of how the
+values were chosen."""
 NEAR_M = 0.5
-"""Distances are taken as at least this: nearer, no one flies and any sigma is an angle."""
+"""Smallest distance in sigma over distance, metres. Robots do not fly nearer, and the ratio would
+diverge. No record of how the value was chosen."""
 ANGLES = 64
-"""Directions over which a probability is summed: three digits while one sigma is up to some
-twenty times the other."""
+"""Number of directions in the sum of `probability_beyond`. It gives three digits while one sigma is
+up to some twenty times the other."""
 
 Statuses = NDArray[np.int8]
 
 
 def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
-    """(K,) from the covariance.
+    """Return (K,) the status of every position, from its covariance.
 
     Parameters
     ----------
@@ -42,7 +47,7 @@ def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
     covariance
         (K, 3, 3) of the state.
     gate_m
-        A position that is off by more than this is a bad one, metres.
+        Largest error of a good position, metres.
     """
     xy, spread = state[:, :2], covariance[:, :2, :2]
     good = within_budget(probability_beyond(spread, gate_m), EXPECTED_SHARE)
@@ -55,10 +60,11 @@ def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
 
 
 def probability_beyond(covariance: Array, error_m: float) -> Array:
-    """(K,) probability that a normal error is longer than a limit.
+    """Return (K,) the probability that a Gaussian error is longer than a limit.
 
-    In a direction where the inverse covariance is q the length is Rayleigh's: exp(-q r^2 / 2).
-    The mean over directions weighs each by how often an error points there, 1 / q.
+    In a direction with inverse covariance q the length has a Rayleigh distribution: P(length > r) =
+    exp(-q r^2 / 2). The mean over directions is weighted by 1 / q, the density of errors in that
+    direction.
 
     Parameters
     ----------
@@ -76,14 +82,14 @@ def probability_beyond(covariance: Array, error_m: float) -> Array:
 
 
 def within_budget(probability: Array, share: float) -> Mask:
-    """(K,) the largest set of the best whose mean probability of being bad is small enough.
+    """Return (K,) the largest set of best positions whose mean probability is within the budget.
 
     Parameters
     ----------
     probability
-        (K,) of being bad.
+        (K,) probability of being bad.
     share
-        The largest mean.
+        Budget: the largest mean.
     """
     ordered = np.sort(probability)
     mean = np.cumsum(ordered) / np.arange(1, len(ordered) + 1)

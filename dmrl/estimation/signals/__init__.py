@@ -1,1 +1,1 @@
-"""Prepare sensor signals: clocks, image motion, step detection."""
+"""Preprocess sensor signals: clocks, image motion and step detection."""

@@ -1,8 +1,8 @@
-"""Clocks that differ by an offset and a drift, found from what two of them both saw.
+"""Estimate offset and drift between clocks from signals that two of them recorded.
 
-Two robots that range to each other measure one distance, each by its own clock; a camera and
-a gyroscope see one turn. The two series, laid over each other, tell how the clocks differ:
-roughly by cross-correlation, then by Gauss-Newton with Huber's weights.
+Two robots that range to each other measure one distance, each on its own clock. A camera and a
+gyroscope measure one rotation. The two series are aligned by cross-correlation first, then by
+Gauss-Newton with Huber weights.
 """
 
 from dataclasses import dataclass
@@ -14,46 +14,53 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 STEP_S = 0.05
-"""Both series are compared on a grid of such steps."""
+"""Step of the common grid of both series, seconds. No record of how the value was chosen."""
 SMOOTH_S = 0.15
-"""Standard deviation of the Gaussian that both series are smoothed with."""
+"""Standard deviation of the Gaussian that smooths both series, seconds. No record of how the value
+was chosen."""
 SLOW_S = 20.0
-"""Slower than this tells little of an offset: removed before the rough search."""
+"""Window of the running mean that is removed before the cross-correlation, seconds. Slower changes
+inform little about an offset. No record of how the value was chosen."""
 GAP_S = 1.0
-"""A series is not known between samples further apart than this."""
+"""Samples further apart than this leave a gap in a series, seconds. No record of how the value was
+chosen."""
 OVERLAP_S = 20.0
-"""Two series must share at least so much."""
+"""Shortest overlap of two series, seconds. No record of how the value was chosen."""
 ITERATIONS = 30
+"""Largest number of Gauss-Newton iterations. No record of how the value was chosen."""
 HUBER = 1.5
-"""Residuals beyond so many standard deviations count less."""
+"""Residual beyond which the Huber weight falls, in standard deviations. No record of how the value
+was chosen."""
 TOGETHER = 2 * np.sqrt(np.pi) * SMOOTH_S / STEP_S
-"""Samples of smoothed white noise that count as one: the integral of its autocorrelation."""
+"""Number of neighbouring samples that count as one: the integral of the autocorrelation of smoothed
+white noise."""
 DRIFT_STD = 30e-6
-"""Standard deviation of the drift of two quartz clocks, before anything is seen."""
+"""Prior standard deviation of the drift between two quartz clocks, seconds per second."""
 CONVINCING = 0.5
-"""Least correlation of the two series that is taken for the same thing seen twice."""
+"""Smallest correlation of two series that are accepted as the same signal. No record of how the
+value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """What to do to one clock's times to make them the other's.
+    """Correction of one clock's times to another clock.
 
     Parameters
     ----------
     offset_s
-        Added at ``at_s``.
+        Seconds to add at ``at_s``.
     drift
-        Added per second from ``at_s`` on: 20e-6 is 20 ppm.
+        Seconds to add per second after ``at_s``: 20e-6 is 20 ppm.
     at_s
-        Middle of the time that both saw, on the clock that is corrected.
+        Middle of the overlap, on the corrected clock.
     sigma_s
         Standard deviation of the offset at ``at_s``.
     sigma_drift
         Standard deviation of the drift.
     correlation
-        Of the two series, aligned; 1 is perfect.
+        Correlation of the two aligned series; 1 is perfect.
     by
-        What both saw.
+        Signal that both clocks recorded.
     """
 
     offset_s: float
@@ -65,11 +72,11 @@ class Clock:
     by: str = ""
 
     def corrected(self, time_s: Array) -> Array:
-        """(N,) times on the other clock."""
+        """Return (N,) times on the other clock."""
         return np.asarray(time_s + self.offset_s + self.drift * (time_s - self.at_s))
 
     def after(self, first: "Clock") -> "Clock":
-        """The clock that corrects by ``first`` and then by this one."""
+        """Return the correction by ``first``, followed by this one."""
         at = first.at_s
         middle = float(first.corrected(np.array([at]))[0])
         offset = float(self.corrected(np.array([middle]))[0]) - at
@@ -84,7 +91,7 @@ class Clock:
         )
 
     def inverse(self) -> "Clock":
-        """The clock that undoes this one."""
+        """Return the inverse correction."""
         drift = 1 / (1 + self.drift) - 1
         return Clock(
             -self.offset_s,
@@ -100,19 +107,19 @@ class Clock:
 def estimate_clock(
     reference_s: Array, reference: Array, time_s: Array, values: Array
 ) -> Clock | None:
-    """How to correct the times of a series to those of another that saw the same.
+    """Estimate the correction of a series' times to those of another series of the same signal.
 
     Parameters
     ----------
     reference_s, reference
-        (N,) times on the right clock, increasing, and values.
+        (N,) times on the reference clock, increasing, and values.
     time_s, values
         (M,) the same on the clock to correct. Its values may be biased and scaled.
 
     Returns
     -------
     Clock | None
-        None where the two share too little, or do not look like one thing seen twice.
+        None if the overlap is too short, or the series do not correlate.
     """
     if min(len(reference_s), len(time_s)) < 10:
         return None
@@ -126,7 +133,7 @@ def estimate_clock(
 
 @dataclass(frozen=True, slots=True)
 class _Series:
-    """A smoothed series on a grid of ``STEP_S``, with where it is known."""
+    """A smoothed series on a grid of ``GRID_STEP_S``, with the samples that are not in a gap."""
 
     start_s: float
     values: Array
@@ -138,11 +145,12 @@ class _Series:
 
     @classmethod
     def of(cls, time_s: Array, values: Array) -> "_Series | None":
+        """Resample and smooth a series; None if it is too short."""
         count = int((time_s[-1] - time_s[0]) / STEP_S) + 1
         if count * STEP_S < OVERLAP_S:
             return None
         grid = time_s[0] + STEP_S * np.arange(count)
-        # The median of three is deaf to single outliers, which ranges have.
+        # The median of three removes single outliers, which ranges have.
         inner = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
         clean = np.concatenate([values[:1], inner, values[-1:]])
         after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
@@ -151,6 +159,7 @@ class _Series:
 
 
 def _smooth(values: Array, std_s: float) -> Array:
+    """Convolve with a Gaussian of a standard deviation in seconds."""
     reach = int(4 * std_s / STEP_S)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * STEP_S / std_s) ** 2)
     padded = np.pad(values, reach, mode="edge")
@@ -158,30 +167,30 @@ def _smooth(values: Array, std_s: float) -> Array:
 
 
 def _rough(one: _Series, other: _Series) -> float | None:
-    """Seconds to add to the other's times, to a step; None: nothing fits."""
+    """Return the seconds to add to the other's times, to one step; None without correlation."""
     a, b = (np.where(s.known, s.values - _slow(s.values), 0.0) for s in (one, other))
     size = 1 << int(np.ceil(np.log2(len(a) + len(b))))
 
     def correlated(x: Array, y: Array) -> Array:
         return np.asarray(np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size))
 
-    # At every lag, the correlation coefficient over the samples that both know: sums of products
-    # and of squares are correlations too, so an FFT gives those of all lags at once.
+    # The correlation coefficient of every lag, over the samples outside gaps of both. Sums of
+    # products and of squares are correlations too, so an FFT computes them for all lags at once.
     shared = correlated(one.known.astype(float), other.known.astype(float))
     energy = correlated(a**2, other.known.astype(float)) * correlated(one.known.astype(float), b**2)
     score = correlated(a, b) / np.sqrt(np.maximum(energy, 1e-12))
     score[shared * STEP_S < OVERLAP_S] = -1
     best = int(np.argmax(score))
-    # Half as much as in the end: this search knows neither the drift nor parts of a step.
+    # Half the final threshold: this search ignores the drift and fractions of a step.
     if score[best] < CONVINCING / 2:
         return None
-    # The second half of a circular correlation has the negative lags.
+    # The second half of a circular correlation contains the negative lags.
     lag = best if best < size // 2 else best - size
     return one.start_s - other.start_s + lag * STEP_S
 
 
 def _slow(values: Array) -> Array:
-    """A running mean, cheap for its length."""
+    """Return a running mean, at a cost independent of its window."""
     width = min(int(SLOW_S / STEP_S), len(values)) | 1
     padded = np.pad(values, width // 2, mode="edge")
     total = np.cumsum(np.concatenate([[0.0], padded]))
@@ -189,7 +198,7 @@ def _slow(values: Array) -> Array:
 
 
 class _Fit(NamedTuple):
-    """Normal equations of offset, drift, scale and bias, and how well the series agree."""
+    """Normal equations of offset, drift, scale and bias; variance and correlation of the series."""
 
     normal: Array
     gradient: Array
@@ -198,7 +207,7 @@ class _Fit(NamedTuple):
 
 
 def _linearised(one: _Series, then: Array, from_middle: Array, wanted: Array, drift: float) -> _Fit:
-    """What one series at the times ``then`` tells of another's values ``wanted``."""
+    """Linearize one series at the times ``then`` against another's values ``wanted``."""
     seen = np.interp(then, one.time_s, one.values)
     known = np.interp(then, one.time_s, one.known) > 0.5
     rate = np.interp(then, one.time_s, np.gradient(one.values, STEP_S))
@@ -210,11 +219,11 @@ def _linearised(one: _Series, then: Array, from_middle: Array, wanted: Array, dr
     spread = 1.4826 * np.median(np.abs(residual)) + 1e-12
     weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-12))
     full = jacobian * (scale_bias[0], scale_bias[0], 1.0, 1.0)
-    # Smoothing ties neighbours together: so many of them count as one.
+    # Smoothing correlates neighbouring samples: this many of them count as one.
     variance = float((weight * residual**2).mean()) * TOGETHER
     normal = full.T @ (weight[:, None] * full)
     gradient = full.T @ (weight * residual)
-    # The prior of the drift, in the units of the normal equations: short flights tell little of it.
+    # The prior of the drift, in the units of the normal equations. Short flights barely observe it.
     normal[1, 1] += variance / DRIFT_STD**2
     gradient[1] -= variance / DRIFT_STD**2 * drift
     correlation = float(np.corrcoef(seen[known], wanted[known])[0, 1])
@@ -222,6 +231,7 @@ def _linearised(one: _Series, then: Array, from_middle: Array, wanted: Array, dr
 
 
 def _refined(one: _Series, other: _Series, lag_s: float) -> Clock | None:
+    """Refine a lag by Gauss-Newton; None if the series do not correlate."""
     time_s, grid_s = other.time_s, one.time_s
     share = other.known & (time_s + lag_s > grid_s[0]) & (time_s + lag_s < grid_s[-1])
     time_s, wanted = time_s[share], other.values[share]
@@ -246,19 +256,19 @@ def _refined(one: _Series, other: _Series, lag_s: float) -> Clock | None:
 
 
 def connected(pairs: dict[tuple[str, str], Clock], reference: str) -> dict[str, Clock]:
-    """Clocks of all robots that pairs tie to a reference, by the surest links.
+    """Connect the clocks of all robots to a reference, by the most certain links.
 
     Parameters
     ----------
     pairs
-        By (reference, robot): how to correct the robot's times to the reference's.
+        By (reference, robot): correction of the robot's times to the reference's.
     reference
-        Whose times stay.
+        Robot whose times stay.
 
     Returns
     -------
     dict
-        By robot, with the reference itself; robots that nothing ties to it are not there.
+        Correction by robot, the reference included. Robots without a connection are missing.
     """
     links = pairs | {(b, a): clock.inverse() for (a, b), clock in pairs.items()}
     found = {reference: Clock(0.0)}

@@ -1,7 +1,7 @@
-"""How a camera turned between pictures, from the pictures alone.
+"""Measure how the scene shifts between images by phase correlation.
 
-Phase correlation (Kuglin and Hines, 1975) of small grey pictures: what moves is the whole
-scene, so it takes no features and no calibration.
+Phase correlation (Kuglin and Hines, 1975) of small grey images needs no features and no
+calibration. The shift of the whole scene follows the rotation of the camera.
 """
 
 import numpy as np
@@ -10,15 +10,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 WIDTH_PX = 80
-"""Pictures are shrunk to about this width: noise goes, and turns remain."""
+"""Approximate width of the shrunk images, pixels. Shrinking removes noise and keeps rotations. No
+record of how the value was chosen."""
 CHANCE = 7.0
-"""Peaks of two pictures of noise are lower than this over the root of their pixels."""
+"""Upper bound of the correlation peak of two noise images, times the root of their pixels. Chosen
+to reject chance matches at any image size."""
 LONGEST_S = 0.5
-"""Pictures further apart than this are not compared."""
+"""Largest interval between two compared images, seconds. No record of how the value was chosen."""
 
 
 def small(pixels: NDArray[np.uint8]) -> Array:
-    """A picture as `shifts` wants it.
+    """Shrink an image to the input of `estimate_shift`.
 
     Parameters
     ----------
@@ -28,7 +30,7 @@ def small(pixels: NDArray[np.uint8]) -> Array:
     Returns
     -------
     Array
-        (h, w) means of squares of pixels, some ``WIDTH_PX`` wide.
+        (h, w) means of square blocks of pixels, about ``TARGET_WIDTH_PX`` wide.
     """
     grey = pixels.mean(axis=2) if pixels.ndim == 3 else pixels.astype(float)
     side = max(round(grey.shape[1] / WIDTH_PX), 1)
@@ -38,17 +40,17 @@ def small(pixels: NDArray[np.uint8]) -> Array:
 
 
 def shift(before: Array, after: Array) -> tuple[float, float] | None:
-    """By how much the scene moved from one picture to the next.
+    """Estimate the shift of the scene from one image to the next.
 
     Parameters
     ----------
     before, after
-        (h, w), see `small`.
+        (h, w), see `shrink_image`.
 
     Returns
     -------
     tuple | None
-        Right and down, in their pixels; None where the two have too little in common.
+        Shift right and down, in their pixels; None if the images have too little in common.
     """
     height, width = before.shape
     if after.shape != before.shape or min(height, width) < 8:
@@ -57,7 +59,7 @@ def shift(before: Array, after: Array) -> tuple[float, float] | None:
     one, other = (np.fft.rfft2((p - p.mean()) * window) for p in (before, after))
     cross = other * np.conj(one)
     size = np.abs(cross)
-    # Where both have next to nothing, the phase is noise.
+    # Frequencies without energy have a random phase.
     cross /= np.maximum(size, 0.01 * size.mean() + 1e-12)
     peaks = np.fft.irfft2(cross, s=before.shape)
     row, col = np.unravel_index(int(peaks.argmax()), peaks.shape)
@@ -70,19 +72,19 @@ def shift(before: Array, after: Array) -> tuple[float, float] | None:
 
 
 def rates(time_s: Array, moved: Array) -> tuple[Array, Array]:
-    """Speed of the scene, from its shifts.
+    """Convert shifts to velocities of the scene in the image.
 
     Parameters
     ----------
     time_s
-        (N,) of the pictures, increasing.
+        (N,) times of the images, increasing.
     moved
-        (N - 1, 2) shifts from each to the next, NaN where none was found.
+        (N - 1, 2) shifts from each to the next, NaN where there is none.
 
     Returns
     -------
     tuple
-        (M,) times in the middle of two pictures, (M, 2) pixels per second, right and down.
+        (M,) times halfway between two images, (M, 2) pixels per second, right and down.
     """
     step = np.diff(time_s)
     good = np.isfinite(moved).all(axis=1) & (step > 0) & (step < LONGEST_S)
@@ -90,11 +92,12 @@ def rates(time_s: Array, moved: Array) -> tuple[Array, Array]:
 
 
 def _vertex(values: Array) -> float:
-    """Where the parabola through three values has its top, from the middle one."""
+    """Return the peak of the parabola through three values, relative to the middle one."""
     left, middle, right = values.tolist()
     bend = left - 2 * middle + right
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
 
 
 def _signed(place: float, length: int) -> float:
+    """Wrap a shift of a circular correlation to a signed one."""
     return place - length if place > length / 2 else place

@@ -1,8 +1,8 @@
-"""Signals that jump where what they measure cannot: a shadowed range, a height over a table.
+"""Detect steps of signals, such as a shadowed range or a height over a table.
 
-What changes far faster than it did the second before is not the robot, and what came at once
-mostly goes at once: between two jumps a signal is off by about as much as it jumped. Said here
-from the data alone, before any solution is known that such a signal could bend.
+A change much faster than the trend of the second before is not the robot's motion. An offset that
+appears at once mostly disappears at once: between two jumps the signal is off by about the size of
+the jump. The detection uses the data alone, before any solution exists that the offset could bend.
 """
 
 import numpy as np
@@ -12,19 +12,24 @@ from scipy.ndimage import median_filter
 from dmrl.estimation.model.pair import Array
 
 BACK_SHARE = 0.5
-"""After a jump down, what is left of a level below this share of the jump is none."""
+"""After a jump down, an offset below this share of the jump counts as zero. No record of how the
+value was chosen."""
 TREND_S = 1.0
-"""Half the time over which a signal's trend is taken: a robot's velocity lasts that long."""
+"""Half the window of a signal's trend, seconds: a robot keeps its velocity for about that long. No
+record of how the value was chosen."""
 LONGEST_S = 30.0
-"""What does not come back for so long was no jump, or the way back was missed."""
+"""Longest offset, seconds. A longer one was no jump, or its end was missed. No record of how the
+value was chosen."""
 HEIGHT_REACH_S, HEIGHT_NOISE_M = 0.05, 0.12
-"""Over how long a height is held against itself, and what may be noise at least."""
+"""Length of the medians of a height before and after a step, seconds; and smallest step, metres, as
+smaller ones may be noise. No record of how the values were chosen."""
 NOISE_SIGMAS = 5.0
-"""Standard deviations of a sample's change that a jump exceeds."""
+"""Smallest jump, in standard deviations of a sample's change. No record of how the value was
+chosen."""
 
 
 def levels(values: Array, step_s: float, least: float, reach: int) -> Array:
-    """(N,) by how much a signal is too large, piecewise constant, mostly 0.
+    """Return (N,) the excess of a signal: piecewise constant, mostly 0.
 
     Parameters
     ----------
@@ -33,9 +38,9 @@ def levels(values: Array, step_s: float, least: float, reach: int) -> Array:
     step_s
         Seconds between samples.
     least
-        Jumps are larger than this, and than the signal's noise.
+        Smallest jump. Jumps must also exceed the signal's noise.
     reach
-        Medians of so many samples before and after are compared.
+        Number of samples in the medians before and after.
     """
     if len(values) < 4 * reach:
         return np.zeros(len(values))
@@ -54,9 +59,9 @@ def levels(values: Array, step_s: float, least: float, reach: int) -> Array:
 
 
 def _between(jumps: list[tuple[int, float]], count: int, longest: int) -> Array:
-    """(count,) levels between jumps, each the first sample after it and how far it went."""
+    """Return (count,) offsets between jumps, given as the first sample after each and its size."""
     out, start = np.zeros(count), 0
-    level = max(0.0, -jumps[0][1]) if jumps else 0.0  # it may begin while it is too large
+    level = max(0.0, -jumps[0][1]) if jumps else 0.0  # the signal may begin with an offset
     for k, (at, jump) in enumerate(jumps):
         out[start:at] = level if at - start < longest else 0.0
         later = [one for when, one in jumps[k:] if when - at < longest]
@@ -66,7 +71,7 @@ def _between(jumps: list[tuple[int, float]], count: int, longest: int) -> Array:
 
 
 def _comes_down(level: float, jumps: list[float]) -> bool:
-    """Whether jumps, each on top of the last, end where the signal is right again."""
+    """Return whether jumps on top of each other return to a correct signal."""
     for jump in jumps:
         level += jump
         if level <= -BACK_SHARE * jump:
@@ -75,10 +80,10 @@ def _comes_down(level: float, jumps: list[float]) -> bool:
 
 
 def _after(level: float, jump: float, on_top: bool) -> float:
-    """The level after a jump. Nothing is ever too small.
+    """Return the offset after a jump, never negative.
 
-    What jumps up twice lies on top of what was there if both come down again; else the way back
-    between them was missed.
+    A second jump up adds to the first offset if both come down again. Otherwise the end of the
+    first one was missed.
     """
     if jump > 0:
         return level + jump if on_top else jump
@@ -86,20 +91,20 @@ def _after(level: float, jump: float, on_top: bool) -> float:
 
 
 def _runs(marked: Array) -> list[tuple[int, int]]:
-    """First and one past the last of each run of what is marked."""
+    """Return start and end (exclusive) of each run of marked samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def levelled_height(time_s: Array, height_m: Array) -> Array:
-    """(N,) heights above the floor, metres, where a robot flew over something as well.
+    """Return (N,) heights above the floor, metres, with objects under the robot removed.
 
     Parameters
     ----------
     time_s
-        (N,) going forward, seconds.
+        (N,) increasing, seconds.
     height_m
-        (N,) as measured: above what is below.
+        (N,) measured heights above the surface below.
     """
     if len(time_s) < 3:
         return height_m

@@ -1,4 +1,4 @@
-"""Clocks from ranging exchanges that both robots of a pair logged, one by one."""
+"""Align the clocks of two robots by single ranging exchanges that both logged."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,21 +6,26 @@ from numpy.typing import NDArray
 from dmrl.estimation.signals.clock_alignment import HUBER, ITERATIONS, Array, Clock, estimate_clock
 
 SAME_M = 0.002
-"""Two logs of one exchange differ by no more: one may be in whole millimetres."""
+"""Largest difference between two logs of one exchange, metres. One of them may be rounded to
+millimetres."""
 SAME_S = 0.3
-"""Nor by more than this, after the rough alignment."""
+"""Largest time difference of one exchange after the rough alignment, seconds. No record of how the
+value was chosen."""
 SHARE = 0.3
+"""Smallest share of the ranges that must match. No record of how the value was chosen."""
 POLLED_S = 0.01
+"""Smallest spread of the log times in the robust fit, seconds: a polled log is late by whole
+periods. No record of how the value was chosen."""
 
 
 def estimate_from_exchanges(
     reference_s: Array, reference: Array, time_s: Array, values: Array
 ) -> Clock | None:
-    """How to correct the times of ranges to those of the other robot of the pair.
+    """Estimate the correction of a robot's range times to those of the other robot.
 
-    Where both robots log the same exchanges, each gives the difference of the clocks to the
-    jitter of the log; the series as a whole says which is which. Where they do not, the series
-    is all there is.
+    If both robots log the same exchanges, each exchange gives the clock difference to the jitter of
+    the log. The rough alignment of the series pairs the exchanges. Otherwise the series alone are
+    aligned.
 
     Parameters
     ----------
@@ -30,7 +35,7 @@ def estimate_from_exchanges(
     Returns
     -------
     Clock | None
-        None where the two share too little.
+        None if the overlap is too short.
     """
     rough = estimate_clock(reference_s, reference, time_s, values)
     if rough is None:
@@ -39,7 +44,7 @@ def estimate_from_exchanges(
     index, apart_s = _same_exchange(reference_s, reference, start, values)
     if len(index) < SHARE * len(time_s):
         return rough
-    # Of each exchange: by how much the reference's log is later than the rough correction says.
+    # The remaining time difference of each exchange, after the rough correction.
     from_middle = time_s[index] - rough.at_s
     slope, middle, sigmas = _line(from_middle, apart_s)
     return Clock(
@@ -55,7 +60,7 @@ def estimate_from_exchanges(
 def _same_exchange(
     reference_s: Array, reference: Array, time_s: Array, values: Array
 ) -> tuple[NDArray[np.intp], Array]:
-    """Which values the other has too, at about the time, and by how much it is later."""
+    """Match values that both logs contain; return their indices and time differences."""
     first = np.searchsorted(reference_s, time_s - SAME_S)
     last = np.searchsorted(reference_s, time_s + SAME_S)
     best = np.full(len(time_s), np.inf)
@@ -66,21 +71,21 @@ def _same_exchange(
         nearer = differ < best
         best[nearer], apart[nearer] = differ[nearer], (reference_s[at] - time_s)[nearer]
     found = np.flatnonzero(best <= SAME_M)
-    # Chance hits are anywhere in +-SAME_S; true ones lie together.
+    # Chance matches spread over +-MAX_TIME_DIFFERENCE_S; true ones are close to each other.
     middle = np.median(apart[found]) if len(found) else 0.0
     found = found[np.abs(apart[found] - middle) < SAME_S / 4]
     return found, apart[found]
 
 
 def _line(x: Array, y: Array) -> tuple[float, float, tuple[float, float]]:
-    """Slope and value at 0 of a line through most of the points, and their deviations."""
+    """Fit a robust line; return its slope, its value at 0 and their standard deviations."""
     design = np.stack([x, np.ones(len(x))], axis=1)
     weight = np.ones(len(x))
     for _ in range(ITERATIONS):
         normal = design.T @ (weight[:, None] * design)
         slope, middle = np.linalg.solve(normal, design.T @ (weight * y))
         residual = np.abs(y - slope * x - middle)
-        # Logs that are polled are late by whole periods: that is no outlier.
+        # A polled log is late by whole periods, which are no outliers.
         spread = max(1.4826 * float(np.median(residual)), POLLED_S)
         weight = np.minimum(1.0, HUBER * spread / np.maximum(residual, 1e-9))
     covariance = np.linalg.inv(normal) * float((weight * residual**2).mean())

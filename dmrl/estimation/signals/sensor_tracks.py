@@ -1,4 +1,4 @@
-"""A robot's logs as they came, on a time grid, without what no robot can have done."""
+"""Resample a robot's logs on a time grid, without physically impossible readings."""
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
@@ -7,22 +7,27 @@ from dmrl.estimation.model.pair import LONGEST_GAP_S, RATE_HZ, Array, Mask, Trac
 from dmrl.estimation.signals.jump_detection import levelled_height
 
 SMOOTHED_S = 0.5
-"""Window over which heights are smoothed, by parabolas: a range finder errs by 2 cm in every
-sample, which is 4 px at 1 m, and a drone climbs slowly."""
+"""Window of the parabolic smoothing of heights, seconds. The noise of a range finder is 2 cm in
+every sample, 4 px of a label at 1 m, and a drone climbs slowly."""
 FAST_MPS, FAST_RADPS, TIMES_USUAL, LASTING_S = 3.0, 5.0, 4.0, 0.2
-"""An estimate runs away after a crash: beyond these, and so many times the flight's median, for so
-long. The robot lies still then, so its rates count as zero and as unknown."""
+"""Limits of a runaway state estimate: speed, yaw rate, ratio to the flight's median, and duration.
+
+An estimate runs away after a crash. The robot then lies still, so its rates are set to zero and
+marked as dropout. In logs of real crashes the estimate reached 9 m/s. No record of how the values
+were chosen."""
 AROUND = 2 * round(RATE_HZ) + 1
-"""Samples of a second before and after, in which the rates may be those of a fall already."""
+"""Window around a runaway estimate, samples: one second before and after, which may belong to the
+fall."""
 FROZEN_SHARE = 0.5
-"""Where more of a log than this repeats itself, that is how it is written."""
+"""A log that repeats more than this share of its samples is written that way. No record of how the
+value was chosen."""
 
 Signals = tuple[Array, Array]
 """Times (N,), seconds, and (N, C) values."""
 
 
 def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) -> Track:
-    """One robot's sensors on a time grid.
+    """Build the signals of one robot on a time grid.
 
     Parameters
     ----------
@@ -31,7 +36,7 @@ def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) 
     velocity
         Forward, left, m/s.
     height
-        Column 0: metres. Steps in it are taken out, and it is smoothed.
+        Column 0: metres. Steps are removed, and the result is smoothed.
     grid_s
         (K,) uniform grid at 100 Hz, seconds.
     """
@@ -49,14 +54,14 @@ def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) 
 
 
 def wild(size: Array, fast: float) -> Mask:
-    """(K,) where a rate at 100 Hz, and a second around, is far beyond the flight's: it ran away.
+    """Return (K,) where a rate at 100 Hz ran away, with one second around.
 
     Parameters
     ----------
     size
-        (K,) its size.
+        (K,) absolute value of the rate.
     fast
-        What is slower never is.
+        Rate below which no estimate has run away.
     """
     limit = max(fast, TIMES_USUAL * float(np.median(size)))
     lasting = median_filter(size, round(LASTING_S * RATE_HZ), mode="mirror") > limit
@@ -64,19 +69,21 @@ def wild(size: Array, fast: float) -> Mask:
 
 
 def down(lost: Mask) -> Mask:
-    """(K,) where a robot whose estimate ran away for good lies on the floor, at a height of zero.
+    """Return (K,) where a crashed robot lies on the floor, at a height of zero.
 
     Parameters
     ----------
     lost
-        (K,) where it ran away, and a second around, at 100 Hz.
+        (K,) where its estimate ran away, and a second around, at 100 Hz.
     """
     ran = minimum_filter1d(lost, AROUND)
     return np.asarray(np.logical_and.accumulate(ran[::-1])[::-1])
 
 
 def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
-    """(K,) where a signal did not change for over half a second though it has noise elsewhere.
+    """Return (K,) where a signal repeats one value for over half a second.
+
+    Logs that mostly repeat values are written that way and count as not frozen.
 
     Parameters
     ----------
@@ -85,7 +92,7 @@ def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
     values
         (N, C) signals.
     grid_s
-        (K,) times asked for, seconds.
+        (K,) times to test, seconds.
     """
     same = (np.diff(values, axis=0) == 0).all(axis=1)
     if len(time_s) < 2 or same.mean() > FROZEN_SHARE:
@@ -99,8 +106,8 @@ def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
 
 
 def _smoothed(values: Array, reach: int) -> Array:
-    """Each of (N,) values on the parabola through those within reach (Savitzky and Golay 1964)."""
-    # SciPy's savgol_filter, whose package takes a second to import.
+    """Smooth (N,) values by a parabola through those within reach (Savitzky and Golay 1964)."""
+    # Equal to SciPy's savgol_filter, whose package takes a second to import.
     weights = np.linalg.pinv(np.vander(np.arange(-reach, reach + 1), 3))[-1]
     padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
     return np.convolve(padded, weights, mode="valid")

@@ -1,1 +1,1 @@
-"""Batch least squares: residuals, robust loss, linear algebra and covariance."""
+"""Factor solver of a flight: residuals, robust losses, marginals and noise selection."""

@@ -1,4 +1,4 @@
-"""Block-tridiagonal normal equations with a border of globals: solve, and invert in part."""
+"""Bordered block-tridiagonal normal equations: assembly, solution and marginal covariances."""
 
 from dataclasses import dataclass
 
@@ -14,20 +14,20 @@ from dmrl.estimation.solver.robust_loss import Weights
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """J^T J of a flight, and J^T e.
+    """Normal equations of a flight: J^T J and J^T e.
 
     Parameters
     ----------
     diagonal
         (K, n, n) blocks of the keyframes.
-    above
-        (K - 1, n, n) blocks between a keyframe and the next.
-    border
-        (K, n, G) blocks between keyframes and globals.
-    corner
-        (G, G).
-    gradient, corner_gradient
-        (K, n), (G,).
+    off_diagonal
+        (K - 1, n, n) blocks between each keyframe and the next.
+    coupling
+        (K, n, G) blocks between keyframes and constants.
+    globals_block
+        (G, G) block of the constants.
+    gradient, globals_gradient
+        (K, n) and (G,) right-hand sides.
     """
 
     diagonal: Array
@@ -39,7 +39,7 @@ class Normal:
 
 
 def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior: Array) -> Normal:
-    """Normal equations without the globals' prior.
+    """Assemble the normal equations without the prior of the constants.
 
     Parameters
     ----------
@@ -48,9 +48,9 @@ def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior:
     range_key
         (R,) keyframe of each range.
     weights
-        Of the squared residuals.
+        Weights of the squared residuals.
     prior
-        (n,) information on every keyframe; tiny, so that there is always a solution.
+        (n,) information added to every keyframe. A tiny value keeps the system positive definite.
     """
     steps, ranges, width = linear.steps, linear.ranges, len(prior)
     size = steps.shape[2] - 2 * width - 1
@@ -78,18 +78,18 @@ def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior:
 
 
 def add_looks(equations: Normal, looks: Looks, found: Seen, weight: Array) -> None:
-    """Put what was seen into normal equations, in place.
+    """Add the camera residuals to normal equations, in place.
 
     Parameters
     ----------
     equations
-        Of a flight's ranges and motions.
-    looks
-        Of I images, each between two keyframes.
-    found
-        The images' rows.
+        Normal equations of a flight's ranges and motions.
+    camera
+        Measurements of I images, each between two keyframes.
+    residuals
+        Rows of the images.
     weight
-        (I,) of their squares.
+        (I,) weights of their squares.
     """
     products = found.rows[..., :3].swapaxes(1, 2) @ (found.rows * weight[:, None, None])
     after = looks.part[:, None, None]
@@ -100,13 +100,13 @@ def add_looks(equations: Normal, looks: Looks, found: Seen, weight: Array) -> No
 
 
 def _summed(key: NDArray[np.intp], parts: Array) -> tuple[NDArray[np.intp], Array]:
-    """The keys that occur, and the sum of the parts of each. Keys never go back."""
+    """Return the distinct keyframes and the sum of the parts of each. Keyframes must be sorted."""
     first = np.flatnonzero(np.diff(key, prepend=-1))
     return key[first], np.add.reduceat(parts, first, axis=0) if len(key) else parts
 
 
 def bands(diagonal: Array, above: Array) -> Array:
-    """(2n, K n) upper bands of a matrix of (K, n, n) blocks, as SciPy wants them."""
+    """Return (2n, K n) upper bands of a matrix of (K, n, n) blocks, in the layout of SciPy."""
     size = diagonal.shape[1]
     width = 2 * size - 1
     out = np.zeros((width + 1, len(diagonal), size))
@@ -119,12 +119,12 @@ def bands(diagonal: Array, above: Array) -> Array:
 
 
 def log_determinant(equations: Normal) -> float:
-    """Logarithm of the determinant of the whole matrix, border and corner included.
+    """Return the log determinant of the whole matrix, coupling and constants included.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If the equations are not positive definite.
+        If the matrix is not positive definite.
     """
     size = len(equations.corner)
     factor = cholesky_banded(bands(equations.diagonal, equations.above))
@@ -135,23 +135,23 @@ def log_determinant(equations: Normal) -> float:
 
 
 def solve(equations: Normal) -> tuple[Array, Array, Array, Array]:
-    """The Gauss-Newton step, and what the covariance needs.
+    """Solve for the Gauss-Newton step and the terms of the covariance.
 
     Returns
     -------
     state : Array
         (K, n) change of the keyframes.
     constants : Array
-        (G,) change of the globals.
+        (G,) change of the constants.
     response : Array
-        (K, n, G) change of the keyframes per change of the globals, negated.
+        (K, n, G) negated derivative of the keyframes by the constants.
     covariance : Array
-        (G, G) of the globals.
+        (G, G) of the constants.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If the equations are not positive definite.
+        If the matrix is not positive definite.
     """
     size, width = len(equations.corner), equations.diagonal.shape[1]
     factor = cholesky_banded(bands(equations.diagonal, equations.above))
@@ -170,9 +170,9 @@ def solve(equations: Normal) -> tuple[Array, Array, Array, Array]:
 
 
 def block_inverse(diagonal: Array, above: Array) -> Array:
-    """(K, ..., n, n) diagonal blocks of the inverse of a block-tridiagonal matrix.
+    """Return (K, ..., n, n) diagonal blocks of the inverse of a block-tridiagonal matrix.
 
-    By elimination from both ends, for many matrices at once.
+    The matrix is eliminated from both ends, for many matrices at once.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def block_inverse(diagonal: Array, above: Array) -> Array:
     above
         (K - 1, ..., n, n).
     """
-    # Backwards is forwards in a mirror.
+    # The backward elimination is a forward elimination of the reversed matrix.
     left = np.stack([diagonal, diagonal[::-1]], axis=1)
     right = np.stack([above, above[::-1].swapaxes(-1, -2)], axis=1)
     under = right.swapaxes(-1, -2)

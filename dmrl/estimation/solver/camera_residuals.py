@@ -1,12 +1,12 @@
-"""What cameras saw, beside the ranges of one solve: bearings and distances of candidates.
+"""Camera bearings and distances as residuals of the pair solver.
 
-An image shows some candidates; one of them may be the other robot, another one another robot or
-nothing at all. At every linearisation the candidate of an image counts that lies nearest to the
-solution, with one Cauchy loss for its three numbers, so that what fits nowhere hardly counts.
+An image contains several candidates. One of them may be the peer; others are other robots or false
+detections. Every linearization uses the candidate nearest to the solution, with one Cauchy loss for
+its three values. A candidate that fits nowhere then hardly counts.
 
-Azimuths tell what ranges do not. Distances and elevations mostly tell which candidate it is: their
-errors, of a network's scale, of heights and of attitudes, last for the whole flight, so all images
-of a camera together tell of the place what one of them would.
+Azimuths add information that ranges lack. Distances and elevations mainly select the candidate.
+Their errors (scale of a network, heights, attitudes) last for the whole flight, so all images of a
+camera together inform the position as much as a single one.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -19,42 +19,48 @@ from dmrl.estimation.model.bearings import AGREES, difference, within
 from dmrl.estimation.model.pair import Array, Mask, Pair
 
 ALIKE_S = 0.3
-"""Errors of a network last while it sees the same: images of this time count as one together."""
+"""Time over which a network repeats its errors, seconds. The images in it count as one. No record
+of how the value was chosen."""
 KNOWN = 9.0
-"""Squares of elevation and distance beyond which they make a candidate count less, in full."""
+"""Largest square of the elevation and distance residual that is down-weighted as correlated. The
+excess counts in full as mismatch of the candidate. Three standard deviations; no other record of
+how the value was chosen."""
 TRUSTED, LEAST = 0.25, 10
-"""A camera counts where so large a share of its images, and so many, agree with the solution.
-Images of other things agree with a wrong one too, by chance: one in twenty was seen to."""
+"""Smallest share, and smallest number, of consistent images of a camera that is used. Images of
+other objects also agree with a wrong solution by chance: one in twenty did. No record of how the
+values were chosen."""
 FAR, OPEN_RAD = 25.0, 0.05
-"""Squared distance beyond which an image shows something else and pulls no more, with what a solve
-that goes on may be off by in azimuth besides."""
+"""Squared distance beyond which an image is an outlier without weight; and azimuth error of an
+unfinished solve that is added, radians. Added because wrong detections bent flights that a camera
+rarely covers."""
 LIMIT = 4.0
-"""Squared distance of a candidate, in its sigmas, at which it counts half."""
+"""Loss scale: squared distance of a candidate, in standard deviations, at which it has half its
+weight. No record of how the value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """The images of both cameras of a pair that show a candidate. I images, up to C candidates.
+    """Bearing measurements of both cameras of a pair. I images, up to C candidates.
 
     Parameters
     ----------
     time_s
-        (I,) when they were taken, ascending, seconds.
-    key
+        (I,) capture times, ascending, seconds.
+    keyframe
         (I,) keyframe before each.
-    part
-        (I,) of the way from there to the next one.
-    side
-        (I,) 1 where the observer saw, -1 where the peer did.
+    fraction
+        (I,) fraction of the interval from there to the next one.
+    observer_sign
+        (I,) 1 for the observer's camera, -1 for the peer's.
     height_m
-        (I,) peer's height less the observer's, metres.
-    share
-        (I,) by how much an image counts.
-    lasting
-        (I,) by how much its elevation and distance do besides.
-    polar, std
-        (I, C, 3) azimuth, elevation (rad) and log distance of the candidates, NaN where there
-        are no more; and their standard deviations.
+        (I,) peer's height minus the observer's, metres.
+    weight
+        (I,) weight of an image among those with the same errors.
+    correlated_weight
+        (I,) further weight of its elevation and distance.
+    bearing, std
+        (I, C, 3) azimuth, elevation (rad) and log distance of the candidates, NaN where there are
+        fewer; and their standard deviations.
     """
 
     time_s: Array
@@ -69,14 +75,14 @@ class Looks:
 
 
 class Seen(NamedTuple):
-    """Looks at one solution."""
+    """Whitened camera residuals and Jacobians at one solution."""
 
     rows: Array
-    """(I, 3, 4) whitened Jacobians by x, y, psi, and the residual, of each image's nearest."""
+    """(I, 3, 4) Jacobians by x, y, psi, and the residual, of each image's nearest candidate."""
     beyond: Array
-    """(I,) squared distance in elevation and distance that tells nothing of the place."""
+    """(I,) squared distance in elevation and log distance that does not inform the position."""
     share: Array
-    """(I,) by how much each counts."""
+    """(I,) weight of each image."""
 
     @property
     def squared(self) -> Array:
@@ -85,16 +91,16 @@ class Seen(NamedTuple):
 
 
 def looks_of(pair: Pair, key_s: Array, height_std_m: float) -> Looks | None:
-    """Both cameras' images of a pair; None where there are none.
+    """Collect the images of both cameras of a pair; None if there are none.
 
     Parameters
     ----------
     pair
-        What both measured and saw.
-    key_s
+        Sensor data and bearings of both robots.
+    keyframe_s
         (K,) times of the keyframes, seconds.
     height_std_m
-        Error of the difference of heights, metres.
+        Standard deviation of the height difference, metres.
     """
     both = (within(s, pair.time_s[0], pair.time_s[-1]) for s in (pair.own_sees, pair.peer_sees))
     sides = [(s, sign) for s, sign in zip(both, (1, -1), strict=True) if s and len(s.time_s)]
@@ -105,11 +111,9 @@ def looks_of(pair: Pair, key_s: Array, height_std_m: float) -> Looks | None:
     order = np.argsort(time_s, kind="stable")
     time_s = time_s[order]
     side = np.concatenate([np.full(len(s.time_s), float(sign)) for s, sign in sides])[order]
-    polar, std = (
-        np.concatenate([_padded(getattr(s, name), count) for s, _ in sides])[order]
-        for name in ("polar", "std")
-    )
-    # An elevation tells as much as the heights that it is held against.
+    polar = np.concatenate([_padded(s.polar, count) for s, _ in sides])[order]
+    std = np.concatenate([_padded(s.std, count) for s, _ in sides])[order]
+    # The elevation residual also contains the error of the height difference.
     std[..., 1] = np.hypot(std[..., 1], height_std_m / np.exp(polar[..., 2]))
     place = np.interp(time_s, key_s, np.arange(len(key_s)))
     key = np.minimum(place.astype(np.intp), len(key_s) - 2)
@@ -132,26 +136,31 @@ def looks_of(pair: Pair, key_s: Array, height_std_m: float) -> Looks | None:
 
 
 def _padded(values: Array, count: int) -> Array:
-    """(I, count, 3) of (I, C, 3), NaN behind."""
+    """Pad (I, C, 3) with NaN to (I, count, 3)."""
     missing = count - values.shape[1]
     return np.asarray(np.pad(values, ((0, 0), (0, missing), (0, 0)), constant_values=np.nan))
 
 
 def _shares(time_s: Array) -> Array:
-    """(I,) one over the number of images around each that see the same."""
+    """Return (I,) one over the number of images near each that share its errors."""
     around = [np.searchsorted(time_s, time_s + s * ALIKE_S / 2) for s in (-1, 1)]
     return np.asarray(1 / np.maximum(around[1] - around[0], 1))
 
 
 def expected(looks: Looks, state: Array) -> tuple[Array, Array]:
-    """Where the robot that looks should see the other, as `toward`, at the time of each image.
+    """Predict bearings and log distances of a solution, at the time of each image.
 
     Parameters
     ----------
-    looks
-        Of I images.
+    camera
+        Measurements of I images.
     state
         (K, 6) x, y (m), psi (rad), ...
+
+    Returns
+    -------
+    bearing, slope : Array
+        As in `bearing_to_peer`.
     """
     part = looks.part[:, None]
     at = (1 - part) * state[looks.key, :3] + part * state[looks.key + 1, :3]
@@ -159,20 +168,20 @@ def expected(looks: Looks, state: Array) -> tuple[Array, Array]:
 
 
 def toward(at: Array, side: Array, height_m: Array) -> tuple[Array, Array]:
-    """Where one robot of a pair should see the other.
+    """Return the bearing and log distance from one robot of a pair to the other.
 
     Parameters
     ----------
-    at
+    pose
         (N, 3) x, y (m), psi (rad) of the peer in its observer's frame.
-    side
-        (N,) 1 where the observer looks, -1 where the peer does.
+    observer_sign
+        (N,) 1 for the observer's camera, -1 for the peer's.
     height_m
-        (N,) peer's height less the observer's, metres.
+        (N,) peer's height minus the observer's, metres.
 
     Returns
     -------
-    polar : Array
+    bearing : Array
         (N, 3) azimuth, elevation (rad), log distance.
     slope : Array
         (N, 3, 3) their derivatives by x, y, psi.
@@ -193,12 +202,12 @@ def toward(at: Array, side: Array, height_m: Array) -> tuple[Array, Array]:
 
 
 def seen(looks: Looks, state: Array) -> Seen:
-    """Each image's nearest candidate at a solution.
+    """Linearize each image's nearest candidate at a solution.
 
     Parameters
     ----------
-    looks
-        Of I images.
+    camera
+        Measurements of I images.
     state
         (K, 6) x, y (m), psi (rad), ...
     """
@@ -220,7 +229,7 @@ def seen(looks: Looks, state: Array) -> Seen:
 
 
 def _candidates(looks: Looks, polar: Array) -> tuple[Array, NDArray[np.intp], Array]:
-    """(I, C, 3) how far candidates are off, in sigmas; (I,) the nearest, (I,) its square."""
+    """Return whitened residuals (I, C, 3), index of the nearest (I,) and its square (I,)."""
     off = difference(looks.polar, polar[:, None]) / looks.std
     squared = (off**2).sum(axis=-1)
     squared[np.isnan(squared)] = np.inf
@@ -228,14 +237,14 @@ def _candidates(looks: Looks, polar: Array) -> tuple[Array, NDArray[np.intp], Ar
 
 
 def picked(looks: Looks, state: Array) -> Looks:
-    """The looks with each image's nearest candidate alone.
+    """Keep the candidate of each image that is nearest to a solution.
 
     Parameters
     ----------
-    looks
-        Of I images.
+    camera
+        Measurements of I images.
     state
-        (K, 6) the solution.
+        (K, 6) states of the solution.
     """
     at = _candidates(looks, expected(looks, state)[0])[1][:, None, None]
     polar, std = (np.take_along_axis(v, at, axis=1) for v in (looks.polar, looks.std))
@@ -243,21 +252,21 @@ def picked(looks: Looks, state: Array) -> Looks:
 
 
 def _squared(looks: Looks, state: Array) -> Array:
-    """(I,) squared distance of each image's nearest candidate from a solution."""
+    """Return (I,) squared distance of each image's nearest candidate from a solution."""
     return _candidates(looks, expected(looks, state)[0])[2]
 
 
 def trusted(looks: Looks | None, state: Array) -> Looks | None:
-    """The images of those cameras of which enough agree with a solution; None where none do.
+    """Return the images of cameras consistent with the solution, or None.
 
-    Images that are far off are left out: where ranges tell little, each would still pull.
+    Outlier images are removed: where the ranges inform little, each of them would still bend it.
 
     Parameters
     ----------
-    looks
-        Of a flight.
+    camera
+        Measurements of a flight.
     state
-        (K, 6) its solution.
+        (K, 6) states of the solution.
     """
     if looks is None:
         return None
@@ -273,20 +282,20 @@ def trusted(looks: Looks | None, state: Array) -> Looks | None:
 
 
 def agreeing(looks: Looks | None, state: Array, side: int, key_s: Array, within_s: float) -> Mask:
-    """(K,) keyframes near which a robot's camera saw the other where a solution has it.
+    """Return (K,) keyframes near an image of one camera that is consistent with a solution.
 
     Parameters
     ----------
-    looks
-        Of a flight.
+    camera
+        Measurements of a flight.
     state
-        (K, 6) its solution.
-    side
-        1: the observer's camera, -1: the peer's.
-    key_s
+        (K, 6) states of the solution.
+    observer_sign
+        1 for the observer's camera, -1 for the peer's.
+    keyframe_s
         (K,) times of the keyframes, seconds.
     within_s
-        How near, seconds.
+        Largest time difference, seconds.
     """
     if looks is None:
         return np.zeros(len(key_s), bool)

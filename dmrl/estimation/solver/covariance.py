@@ -1,13 +1,12 @@
-"""Covariances that are large enough: noise in a robot's log does not count as motion.
+"""Covariance of a solution, taken where measurement noise does not count as motion.
 
-A robot's motion tells in which direction its peer is: if the whole solution is turned, the ranges
-no longer fit the motion. Gauss-Newton takes the measured motion for the true one. So the noise in
-the log of a robot that stands still seems to fix the bearing, as a flight would.
+The motion of a robot makes the bearing to its peer observable: if the whole solution is turned, the
+ranges no longer fit the motion. Gauss-Newton treats the measured motion as exact. So the noise in
+the log of a robot at rest seems to fix the bearing, as a flight would.
 
-Therefore the covariance is not taken at the solution, but at a smoothed copy of it. There,
-motion is averaged over most of a second. The observer's motion, and the peer's relative to it,
-are shrunk where they are no larger than their noise. A static observer or a parallel flight then
-leaves the bearing open.
+Therefore the covariance is computed at a smoothed copy of the solution. Its motion is averaged over
+most of a second. The observer's motion, and the peer's motion relative to it, are shrunk where they
+do not exceed their noise. A static observer or a parallel flight then leaves the bearing open.
 """
 
 from dataclasses import replace
@@ -25,23 +24,36 @@ from dmrl.estimation.solver.residuals import BIAS, SCALE, linearise
 from dmrl.estimation.solver.robust_loss import curvature_of, weights_of
 
 CALM_S = 0.8
-"""Moving average: what is faster than robots fly is noise."""
+"""Window of the moving average of velocities, seconds. Robots do not change their velocity faster
+than this. No record of how the value was chosen."""
 RESTLESS_S = 1.5
-"""The same, where it is asked whether a robot moves at all."""
+"""Window of the same average when the motion of a robot is measured, seconds. No record of how the
+value was chosen."""
 WINDOW_S = 10.0
-"""Over which motion is held against its noise."""
+"""Window over which motion is compared with its noise, seconds. No record of how the value was
+chosen."""
 NOISE_FACTOR = 1.8
-"""Motion must exceed its noise's energy by this: 10 s of noise reach it in a few per cent."""
+"""Motion must exceed the energy of its noise by this factor. 10 s of pure noise reach it in a few
+per cent of all cases."""
 NOISE, CONSTANT_RANGE, CONSTANT = 1.25, 1.15, 1.4
-"""Sigmas that come from noise, from offset and scale of the ranges, and from what else is constant,
-are this much larger. No noise of a sensor is quite what the solve believes; and no average over a
-flight makes an error smaller that is constant, so where it is outside its ellipse, all of the
-flight is. Real velocities have larger scales and biases than their priors say, and scales that
-differ by axis."""
+"""Factors of the sigmas: of errors from noise, of offset and scale of the ranges, of all other
+constants.
+
+The noise of a real sensor differs from its model. An average over a flight does not reduce a
+constant error, so a flight whose constant is outside its ellipse is outside throughout. Real
+velocities have larger scales and biases than their priors, and scales that differ by axis. Chosen
+for fewer bad labels among the kept ones on every simulated set."""
 
 
 def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Array, Array]:
-    """Covariances of a solution's keyframes and globals.
+    """Compute the covariances of a solution's keyframes and constants.
+
+    Parameters
+    ----------
+    problem, noise
+        Keyframes of the flight, and the noise model.
+    solution
+        Solution of the flight.
 
     Returns
     -------
@@ -55,7 +67,7 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
     at_solution = linearise(problem, noise, solution.state, solution.constants)
     calm, state = calmed(problem, noise, solution.state)
     linear = linearise(calm, noise, state, solution.constants)
-    # The calmed copy does not fit the ranges; their weights come from the solution.
+    # The denoised copy does not fit the ranges, so their weights come from the solution.
     linear.ranges[:, -1] = at_solution.range
     if linear.seen is not None and at_solution.seen is not None:
         linear.seen.rows[..., -1] = at_solution.seen.rows[..., -1]
@@ -71,10 +83,10 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
 
 
 def _shared(equations: Normal, looks: Looks, found: Seen, weight: Array) -> Array:
-    """(K, 6, 6) what an error adds that all images of a camera share: of a mount, or a network.
+    """Return (K, 6, 6) the covariance from an error that all images of a camera share.
 
-    It is not solved for, but considered (Schmidt 1966): one as large as that of a single image in
-    azimuth, for either camera.
+    Such errors come from a mount or a network. They are considered, not solved for (Schmidt 1966):
+    one for either camera, as large as the azimuth error of a single image.
     """
     out = np.zeros_like(equations.diagonal)
     for side in (1, -1):
@@ -90,6 +102,7 @@ def _shared(equations: Normal, looks: Looks, found: Seen, weight: Array) -> Arra
 
 
 def _inverse(equations: Normal) -> tuple[Array, Array]:
+    """Return inflated covariances of keyframes (K, n, n) and plain ones of the constants (G, G)."""
     *_, response, constants = solve(equations)
     keyframes = NOISE**2 * block_inverse(equations.diagonal, equations.above)
     wider = np.full(len(constants), CONSTANT)
@@ -99,14 +112,14 @@ def _inverse(equations: Normal) -> tuple[Array, Array]:
 
 
 def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array]:
-    """A flight and its solution without what may be noise, to linearise at.
+    """Return a flight and its solution without probable noise, for the linearization.
 
     Parameters
     ----------
     problem, noise
-        The flight, and what is believed about its sensors.
+        Keyframes of the flight, and the noise model.
     state
-        (K, 6) its solution.
+        (K, 6) states of the solution.
     """
     step_s = float(np.median(problem.steps_s))
     own_heading, own = path_of(problem.own)
@@ -121,7 +134,7 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
     out[:, :2] = rotate(rotation(-own_heading), path)
     out[:, 2] = state[:, 2]
     own_shift = rotate(rotation(-own_heading[:-1]), own_steps)
-    # The peer's own way is the observer's and the relative one, turned into the peer's frame.
+    # The peer's own path is the observer's plus the relative one, rotated into the peer's frame.
     peer_heading = own_heading[:-1] + state[:-1, 2]
     peer_shift = rotate(rotation(-peer_heading), own_steps + relative_steps)
     return replace(
@@ -132,15 +145,15 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
 
 
 def noise_energy(noise: Noise) -> float:
-    """Mean square of one velocity's noise after the moving average, both axes, (m/s)^2.
+    """Return the mean square of one velocity's noise after the average, both axes, (m/s)^2.
 
-    At least that of the default: motion that shows how good the logs are is enough motion.
+    It is at least that of the default model: motion that reveals good logs is sufficient motion.
     """
     return 2 * max(noise.velocity_psd, Noise().velocity_psd) / CALM_S
 
 
 def shrunk(velocity: Array, energy: float, step_s: float) -> Array:
-    """(K - 1, 2) averaged velocities, shrunk towards zero by their share of noise.
+    """Return (K - 1, 2) averaged velocities, shrunk towards zero by their share of noise.
 
     Parameters
     ----------
@@ -149,25 +162,25 @@ def shrunk(velocity: Array, energy: float, step_s: float) -> Array:
     energy
         Mean square of their noise after the average, (m/s)^2.
     step_s
-        Seconds between them.
+        Seconds between samples.
     """
     slow = uniform_filter1d(velocity, max(1, round(CALM_S / step_s)), axis=0, mode="nearest")
     window = max(1, round(WINDOW_S / step_s))
     seen = uniform_filter1d((slow**2).sum(axis=1), window, mode="nearest")
-    # What was seen is motion and noise, whose energies add: motion's share is the rest.
+    # The energies of motion and noise add up to the measured one, so motion's share is the rest.
     share = np.sqrt(np.maximum(1 - NOISE_FACTOR * energy / np.maximum(seen, 1e-12), 0.0))
     return np.asarray(slow * share[:, None])
 
 
 def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
-    """Mean squares of the averaged velocities of observer, peer, and one against the other.
+    """Return mean squares of the averaged own, peer and relative velocity.
 
     Parameters
     ----------
     problem
-        The flight.
+        Keyframes of the flight.
     state
-        (K, 3) or (K, 6) its solution.
+        (K, 3) or (K, 6) states of the solution.
 
     Returns
     -------
@@ -188,7 +201,7 @@ def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
 
 
 def path_of(moves: Increments) -> tuple[Array, Array]:
-    """Heading (K,) and position (K, 2) of a robot in the frame of its first keyframe."""
+    """Return heading (K,) and position (K, 2) of a robot in the frame of its first keyframe."""
     heading = np.concatenate([[0.0], np.cumsum(moves.turn_rad)])
     steps = rotate(rotation(heading[:-1]), moves.shift_m)
     return heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])

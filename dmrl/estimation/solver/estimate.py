@@ -1,4 +1,4 @@
-"""What an estimator says of a flight, seen from one robot or from the other."""
+"""Estimated trajectory of a peer, and the same trajectory from the other robot."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -12,13 +12,16 @@ from dmrl.estimation.solver.keyframes import Noise
 from dmrl.estimation.solver.residuals import CLOCK
 
 Refused = Literal["still", "alike", "silent", "open", "imprecise"]
-"""Why nothing is OK: the observer hardly moves; one moves as the other; sensors were silent for
-most of it; the motion leaves the bearing open, or other solutions fit; nothing is exact enough."""
+"""Reason why no position is OK.
+
+still: the observer hardly moves. alike: both robots move alike. silent: sensors dropped out for
+most of the flight. open: the motion leaves the bearing open, or other solutions fit. imprecise: no
+position is precise enough."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Where a peer was, over a flight. K keyframes or steps.
+    """Trajectory of a peer over a flight, K keyframes or steps.
 
     Parameters
     ----------
@@ -29,19 +32,18 @@ class Estimate:
     covariance
         (K, 3, 3) of the state.
     status
-        (K,) OK, UNCONVERGED (not precise enough to label) or AMBIGUOUS (more than one
-        solution).
+        (K,) OK, UNCONVERGED (not precise enough to label) or AMBIGUOUS (more than one solution).
     constants
-        (G,) what was constant, as in ``GLOBALS``; zeros where the method estimates none.
+        (G,) constants of the flight, in the order of ``GLOBALS``; zeros if the method estimates
+        none.
     noise
-        What the sensors turned out to be like.
+        Selected noise model of the sensors.
     range_error_m
-        (K,) by how much the ranges were too long for a while, as behind something; None where the
-        method does not say.
-    refused
-        Why nothing is OK; None where something is.
+        (K,) temporary excess of the ranges, as behind an obstacle, metres. None: not estimated.
+    rejection_reason
+        Reason why no position is OK; None if any is.
     constants_covariance
-        (G, G) of what was constant; None where the method does not say.
+        (G, G) of the constants. None: not estimated.
     """
 
     time_s: Array
@@ -55,9 +57,9 @@ class Estimate:
     constants_covariance: Array | None = None
 
     def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
-        """Positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
+        """Interpolate positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
 
-        Outside the flight the ends are held, and the status is UNCONVERGED at best.
+        Outside the flight the nearest end is used, and the status is UNCONVERGED at best.
         """
         place = np.interp(time_s, self.time_s, np.arange(len(self.time_s)))
         low = np.clip(place.astype(int), 0, len(self.time_s) - 2)
@@ -71,23 +73,23 @@ class Estimate:
 
 
 def from_peer(state: Array) -> Array:
-    """(K, 3) the same states seen from the peer."""
+    """Return (K, 3) the states of the observer in the peer's horizontal frame."""
     out = -state
     out[:, :2] = rotate(rotation(-state[:, 2]), out[:, :2])
     return out
 
 
 def swapped(estimate: Estimate) -> Estimate:
-    """The same flight seen from the peer. The status stays that of the observer."""
+    """Return the same flight with the peer as observer. The status stays that of the observer."""
     state = from_peer(estimate.state)
-    # Seen from the peer p' = -R(-psi) p and psi' = -psi; the derivative of p' by psi is -Q p', with
-    # Q a quarter turn. First order: the covariance of the swapped state is J C J^T.
+    # In the peer's frame p' = -R(-psi) p and psi' = -psi. The derivative of p' by psi is -Q p',
+    # with Q a quarter turn. To first order the covariance of the new state is J C J^T.
     by_state = np.zeros((len(state), 3, 3))
     by_state[:, :2, :2], by_state[:, 2, 2] = -rotation(-estimate.state[:, 2]), -1.0
     by_state[:, :2, 2] = -state[:, :2] @ QUARTER_TURN.T
     covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
     constants = estimate.constants[SWAPPED]
-    constants[CLOCK] *= -1  # an offset between two clocks has the other sign from the other side
+    constants[CLOCK] *= -1  # the offset of the other clock has the opposite sign
     return replace(
         estimate,
         state=state,

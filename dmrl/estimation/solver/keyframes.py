@@ -1,4 +1,4 @@
-"""A pair cut into keyframes: what the filter, the smoother and the batch solve work on."""
+"""Cut a pair into keyframes for the filter, the smoother and the batch solve."""
 
 from dataclasses import dataclass, replace
 
@@ -11,18 +11,21 @@ from dmrl.estimation.signals.jump_detection import levels
 from dmrl.estimation.solver.camera_residuals import Looks, looks_of
 
 KEY_HZ = 10.0
-"""Keyframes per second."""
+"""Keyframes per second, Hz. No record of how the value was chosen."""
 BLOCK_S, REACH = 0.1, 3
-"""Ranges jump between medians of so many blocks of this length."""
+"""Length of the blocks of ranges, seconds, and the number of block medians on either side of a
+step. No record of how the values were chosen."""
 JUMP_M = 0.45
-"""Smaller ones are left to the solve."""
+"""Smallest detected step of the ranges, metres. Smaller steps are left to the solve. Added for
+bursts of long ranges; no record of how the value was chosen."""
 SHIFT_S = 0.02
-"""Half the time difference behind the derivative by the peer's clock."""
+"""Half the time difference of the numeric derivative by the peer's clock, seconds. No record of how
+the value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What the estimators believe about the sensors; one standard deviation each.
+    """Noise model of the sensors; one standard deviation each unless a unit shows otherwise.
 
     Parameters
     ----------
@@ -34,15 +37,16 @@ class Noise:
         White noise of either yaw rate, rad^2/s.
     range_std_m
         White noise of a range.
-    cauchy_m
-        Residual at which a range counts half.
+    range_loss_scale_m
+        Residual at which a range has half its weight.
     range_error_std_m, range_tau_s
         Coloured noise of the ranges, and its correlation time.
-    jump
-        A change of that noise this many standard deviations large counts half: it may jump.
-    free_m, free_weight
-        It may jump by anything, but mostly goes back to none: at every keyframe it is held against
-        zero with this weight, and counts half where it is so large.
+    range_step_sigmas
+        Change of that noise at which a step has half its weight, in standard deviations. The loss
+        lets the error jump.
+    range_error_loss_scale_m, range_error_weight
+        Weak prior that pulls the coloured range error back to zero at every keyframe: the error at
+        which it has half its weight, and the weight.
     bias_std_m, scale_std
         Offset and scale of a pair's ranges.
     gyro_std_radps
@@ -53,11 +57,11 @@ class Noise:
         Offset of the peer's clock.
     height_std_m
         Height difference.
-    gap_speed_mps, gap_turn_radps
-        How a robot may move while its sensors are silent, per square root of a second.
-    known_std
-        Of what is constant, in the order of ``GLOBALS``, where it is known from other flights;
-        empty where nothing is.
+    dropout_speed_mps, dropout_turn_radps
+        Motion of a robot during a dropout of its sensors, per square root of a second.
+    calibrated_std
+        Constants of the flight, in the order of ``GLOBALS``, as known from other flights. Empty: no
+        calibration.
     """
 
     velocity_std_mps: float = 0.08
@@ -84,11 +88,19 @@ class Noise:
 
     @property
     def velocity_psd(self) -> float:
-        """Either velocity's noise at low frequency: variance per second, m^2/s."""
+        """Low-frequency noise of either velocity: variance per second, m^2/s."""
         return 2 * self.velocity_tau_s * self.velocity_std_mps**2 + self.velocity_white_psd
 
     def graded(self, grade: float, constants: float | None = None) -> "Noise":
-        """The same with velocities this many times as noisy, and constants, as much if None."""
+        """Return the model with scaled velocity noise and scaled priors of the constants.
+
+        Parameters
+        ----------
+        grade
+            Factor of the velocity noise.
+        constants
+            Factor of the priors of the scales. None: the same factor.
+        """
         worse = grade if constants is None else constants
         return replace(
             self,
@@ -99,11 +111,11 @@ class Noise:
         )
 
     def with_range_noise(self, times: float) -> "Noise":
-        """The same with ranges this many times as noisy."""
+        """Return the model with the white range noise multiplied by a factor."""
         return replace(self, range_std_m=self.range_std_m * times, cauchy_m=self.cauchy_m * times)
 
     def prior_std(self) -> Array:
-        """(11,) of the globals, in the order of ``GLOBALS``."""
+        """Return (11,) prior standard deviations of the constants, in the order of ``GLOBALS``."""
         pairwise = [self.gyro_std_radps] * 2 + [self.velocity_scale_std] * 2
         velocity = [self.velocity_bias_std_mps] * 4
         usual = [self.bias_std_m, self.scale_std, *pairwise, *velocity, self.clock_std_s]
@@ -123,7 +135,7 @@ GLOBALS = (
     "peer_vy_bias_mps",
     "peer_clock_s",
 )
-"""What is constant over a flight, in this order in every vector of globals."""
+"""Constants of a flight, in the order of every vector of globals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,32 +144,32 @@ class Problem:
 
     Parameters
     ----------
-    key_s
+    keyframe_s
         (K,) times of the keyframes, seconds.
     own, peer
-        K - 1 motions from a keyframe to the next.
-    peer_by_clock
-        (K - 1, 2) change of the peer's shift per second of clock offset, m/s.
-    gap_s
-        (K - 1,) share of the interval, in seconds, in which a robot's sensors were silent.
-    silent
-        (K,) whether any sensor of a robot, heights too, was silent for over half a second.
-    unheard
-        (K,) whether the ranges were.
-    range_key
+        K - 1 motions from each keyframe to the next.
+    peer_clock_derivative
+        (K - 1, 2) derivative of the peer's shift by its clock offset, m/s.
+    dropout_s
+        (K - 1,) part of the interval, in seconds, with a dropout of velocity or yaw rate.
+    dropout
+        (K,) whether any sensor of a robot, heights included, dropped out for over half a second.
+    range_dropout
+        (K,) whether the ranges dropped out.
+    range_keyframe
         (R,) keyframe at or before each range.
     range_m
         (R,) measured ranges, metres.
     own_to_range, peer_to_range
         R motions from that keyframe to the range.
-    range_level_m
-        (R,) by how much ranges seem to have jumped, metres: a first guess.
+    range_offset_guess_m
+        (R,) detected step offset of the ranges, metres: a first guess.
     height_m
-        (R,) peer's height less the observer's, metres.
-    looks
-        What cameras saw; None: nothing.
-    known_std
-        As of the pair.
+        (R,) peer's height minus the observer's, metres.
+    camera
+        Camera measurements. None: no images.
+    calibrated_std
+        As in `Pair`.
     """
 
     key_s: Array
@@ -183,12 +195,12 @@ class Problem:
 
 
 def problem(pair: Pair, rate_hz: float = KEY_HZ) -> Problem:
-    """Keyframes of a pair.
+    """Build the keyframes of a pair.
 
     Parameters
     ----------
     pair
-        What both measured.
+        Sensor data of both robots.
     rate_hz
         Keyframes per second.
     """
@@ -224,14 +236,14 @@ def problem(pair: Pair, rate_hz: float = KEY_HZ) -> Problem:
 
 
 def silence(pair: Pair, time_s: Array) -> Mask:
-    """(K,) whether a sensor of either robot was silent for over half a second.
+    """Return (K,) whether a sensor of either robot dropped out for over half a second.
 
     Parameters
     ----------
     pair
-        What both measured.
+        Sensor data of both robots.
     time_s
-        (K,) times asked for, seconds.
+        (K,) times to test, seconds.
     """
     gap = pair.own.gap | pair.peer.gap
     for track in (pair.own, pair.peer):
@@ -242,14 +254,14 @@ def silence(pair: Pair, time_s: Array) -> Mask:
 
 
 def unheard(pair: Pair, time_s: Array) -> Mask:
-    """(K,) whether the ranges were silent for over half a second.
+    """Return (K,) whether the ranges dropped out for over half a second.
 
     Parameters
     ----------
     pair
-        What both measured.
+        Sensor data of both robots.
     time_s
-        (K,) times asked for, seconds.
+        (K,) times to test, seconds.
     """
     edges = np.concatenate([[-np.inf], pair.range_time_s, [np.inf]])
     after = np.clip(np.searchsorted(edges, time_s), 1, len(edges) - 1)
@@ -257,12 +269,12 @@ def unheard(pair: Pair, time_s: Array) -> Mask:
 
 
 def range_levels(pair: Pair) -> Array:
-    """(R,) by how much ranges jumped, metres.
+    """Return (R,) the detected step offset of every range, metres.
 
     Parameters
     ----------
     pair
-        What both measured.
+        Sensor data of both robots.
     """
     if not len(pair.range_m):
         return pair.range_m

@@ -1,4 +1,4 @@
-"""Gauss-Newton over a whole flight: keyframe states and what is constant, together."""
+"""Levenberg-Marquardt over a whole flight, for keyframe states and constants together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,24 +27,28 @@ from dmrl.estimation.solver.residuals import (
 from dmrl.estimation.solver.robust_loss import cost_of, weights_of
 
 ITERATIONS = 25
+"""Largest number of iterations. No record of how the value was chosen."""
 TOLERANCE, ROUGH = 1e-5, 1e-4
-"""Relative change of the cost at which the iteration ends; and where solutions are but compared."""
+"""Relative change of the cost that ends the iteration; the second where solutions are only
+compared. No record of how the values were chosen."""
 SAME_M = 0.05
-"""Solutions that are nowhere further apart are one."""
+"""Largest distance between two paths that count as the same solution, metres. No record of how the
+value was chosen."""
 WEAK: Array = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1.0])
-"""Information on every keyframe, in inverse squares of its units: next to none."""
+"""Information added to every keyframe, in inverse squares of its units. It is practically none and
+keeps the equations positive definite."""
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """A flight's solution.
+    """Maximum a posteriori estimate of a flight.
 
     Parameters
     ----------
     state
         (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m) at the keyframes.
     constants
-        (G,) as in ``GLOBALS``.
+        (G,) in the order of ``GLOBALS``.
     cost
         Half the sum of the losses.
     """
@@ -62,20 +66,20 @@ def solve_batch(
     known: Sequence[Solution] = (),
     tolerance: float = TOLERANCE,
 ) -> Solution:
-    """The most likely flight near a first guess (Levenberg-Marquardt).
+    """Find the most likely flight near a first guess.
 
     Parameters
     ----------
     problem, noise
-        The flight, and what is believed about its sensors.
+        Keyframes of the flight, and the noise model.
     state
         (K, 3) or (K, 6) first guess.
     constants
-        (G,) first guess, zeros if None.
-    known
-        Solutions that were found before: where the iteration comes to one of them, it ends.
+        (G,) first guess. None: zeros.
+    previous
+        Solutions found before. The iteration ends when it reaches one of them.
     tolerance
-        Relative change of the cost at which the iteration ends.
+        Relative change of the cost that ends the iteration.
     """
     constants = np.zeros(len(GLOBALS)) if constants is None else constants
     if state.shape[1] == 3:
@@ -102,17 +106,17 @@ def solve_batch(
 
 
 def near(state: Array, other: Array) -> bool:
-    """Whether two flights are nowhere so far apart that they are two solutions."""
+    """Return whether two paths are everywhere so close that they are the same solution."""
     return bool(np.hypot(*(state - other)[:, :2].T).max() <= SAME_M)
 
 
 def evidence(problem: Problem, noise: Noise, solution: Solution) -> float:
-    """Logarithm of how likely the measurements are under a noise model (Laplace).
+    """Return the Laplace approximation of the log evidence of a noise model.
 
-    Up to a constant that depends on the flight alone, so that noise models can be compared.
+    It lacks a constant that depends on the flight alone, so noise models can be compared.
     """
     linear = linearise(problem, noise, solution.state, solution.constants)
-    # That the ranges' errors mostly go back to none is no density, so it says nothing here.
+    # The pull of range errors to zero is not a normalized density, so it is no evidence.
     noise = replace(noise, free_weight=0.0)
     cost = cost_of(linear, noise, solution.constants)
     equations = equations_of(problem, noise, linear, solution.constants)
@@ -125,7 +129,7 @@ def evidence(problem: Problem, noise: Noise, solution: Solution) -> float:
 
 
 def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Array) -> Normal:
-    """Normal equations with the losses' weights and the globals' prior."""
+    """Build normal equations with the weights of the losses and the prior of the constants."""
     weights = weights_of(linear, noise, constants)
     equations = normal(linear, problem.range_key, weights, WEAK)
     if problem.looks is not None and linear.seen is not None and weights.seen is not None:
@@ -141,7 +145,7 @@ def equations_of(problem: Problem, noise: Noise, linear: Linear, constants: Arra
 
 
 def damped(equations: Normal, damping: float) -> Normal:
-    """The same equations with a step that is shorter, and steeper."""
+    """Return the equations with Levenberg-Marquardt damping: a shorter, steeper step."""
     if damping == 0.0:
         return equations
     diagonal = equations.diagonal + damping * np.eye(len(WEAK)) * equations.diagonal

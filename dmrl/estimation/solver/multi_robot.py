@@ -1,9 +1,9 @@
-"""Gauss-Newton over all robots of a flight: normal equations banded by time.
+"""Levenberg-Marquardt over all robots of a flight, with normal equations banded by time.
 
-Robot r's part of a keyframe is (x, y, theta, wx, wy): its pose in a frame that all robots share,
-and the error of its measured velocity in its own horizontal frame, which fades with its
-correlation time. Measured motion is (1 + scale) times the true one, so that a scale cannot shrink
-path and noise together.
+Robot r's part of a keyframe is (x, y, theta, wx, wy). The pose is in a frame that all robots share.
+w is the error of the measured velocity in the robot's horizontal frame, which decays with its
+correlation time. Measured motion is (1 + scale) times the true motion, so that a scale cannot
+shrink path and noise together.
 """
 
 from dataclasses import dataclass, replace
@@ -17,13 +17,18 @@ from dmrl.estimation.solver.block_tridiagonal import Normal, block_inverse, solv
 from dmrl.estimation.solver.keyframes import Noise
 
 OWN, ROBOT, SHARED = 5, 4, 2
-"""States of a robot at a keyframe; its constants (bias of the yaw rate, scale and bias of the
-velocity); those of a link (offset and scale of its ranges)."""
+"""States of a robot at a keyframe; its constants (bias of the yaw rate, scale and two biases of the
+velocity); constants of a link (offset and scale of its ranges)."""
 ITERATIONS, TOLERANCE = 20, 1e-4
+"""Largest number of iterations, and relative change of the cost that ends them. No record of how
+the values were chosen."""
 WEAK = (1e-4, 1e-4, 1e-3, 1e-3, 1e-3)
+"""Information added to every state of every robot, in inverse squares of its units; practically
+none."""
 ANCHOR = 1e6
-"""Information on the first robot's first pose: the frame is its own there."""
+"""Information on the first robot's first pose, which defines the shared frame."""
 MOST_DAMPING = 1e4
+"""Damping beyond which the iteration ends. No record of how the value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +38,15 @@ class Link:
     Parameters
     ----------
     robots
-        Their numbers.
-    key
+        Indices of the two robots.
+    keyframe
         (R,) keyframe at or before each range.
     range_m
-        (R,) as measured.
+        (R,) measured ranges.
     own_shift_m, peer_shift_m
-        (R, 2) motion of either from that keyframe to the range, in its own frame.
+        (R, 2) motion of either robot from that keyframe to the range, in its own frame.
     height_m
-        (R,) the second's height less the first's.
+        (R,) height of the second robot minus that of the first.
     """
 
     robots: tuple[int, int]
@@ -59,20 +64,20 @@ class Flight:
     Parameters
     ----------
     names
-        Of the robots.
-    key_s
+        Names of the robots.
+    keyframe_s
         (K,) times, seconds.
-    moves
+    motions
         K - 1 motions of each robot.
     paths
-        Heading (K,) and position (K, 2) of each by dead reckoning.
-    gap_s
-        (N, K - 1) seconds of each interval in which a robot's sensors were silent.
+        Heading (K,) and position (K, 2) of each robot by dead reckoning.
+    dropout_s
+        (N, K - 1) seconds of each interval in which a robot's sensors dropped out.
     links
-        Ranges.
-    known_std
-        (4 N + 2 L,) standard deviations of the constants, in their order, where they are known from
-        other flights, infinite where not; None: nowhere.
+        Ranges, pair by pair.
+    calibrated_std
+        (4 N + 2 L,) standard deviations of the constants, in their order, as known from other
+        flights; infinite elsewhere. None: no calibration.
     """
 
     names: list[str]
@@ -86,7 +91,7 @@ class Flight:
 
 @dataclass(frozen=True, slots=True)
 class Swarm:
-    """A solution: states (K, N, 5), constants (4 N + 2 L,), and half the sum of the losses."""
+    """Solution: states (K, N, 5), constants (4 N + 2 L,), and half the sum of the losses."""
 
     state: Array
     constants: Array
@@ -102,12 +107,12 @@ class _Rows:
 
 
 def solved(flight: Flight, noise: Noise, state: Array) -> Swarm:
-    """The most likely flight near a first guess (Levenberg-Marquardt).
+    """Find the most likely flight near a first guess.
 
     Parameters
     ----------
-    flight, noise
-        What was measured, and what is believed about the sensors.
+    problem, noise
+        Keyframes of the flight, and the noise model.
     state
         (K, N, 5) first guess.
     """
@@ -135,14 +140,14 @@ def solved(flight: Flight, noise: Noise, state: Array) -> Swarm:
 
 
 def inverse(flight: Flight, noise: Noise, found: Swarm, calm: Array) -> Array:
-    """(K, 5 N, 5 N) covariances of the keyframes.
+    """Return (K, 5 N, 5 N) marginal covariances of the keyframes.
 
     Parameters
     ----------
-    flight, noise, found
-        A flight and its solution, which says how much each range counts.
-    calm
-        (K, N, 5) the solution without what may be noise, at which motion is counted.
+    problem, noise, solution
+        A flight, its noise model and its solution, which determines the weights of the ranges.
+    denoised
+        (K, N, 5) the solution without probable noise, where the equations are linearized.
     """
     weights = _weights(noise, _rows(flight, noise, found.state, found.constants))
     rows = _rows(flight, noise, calm, found.constants)
@@ -219,11 +224,12 @@ def _ranges(link: Link, noise: Noise, state: Array, constants: Array) -> Array:
 
 
 def _limit(noise: Noise) -> float:
+    """Return the loss scale of the whitened ranges."""
     return (noise.cauchy_m / noise.range_std_m) ** 2
 
 
 def _weights(noise: Noise, rows: _Rows) -> list[Array]:
-    """Cauchy's weight of every range."""
+    """Return the Cauchy weight of every range."""
     return [1 / (1 + ranges[:, -1] ** 2 / _limit(noise)) for ranges in rows.ranges]
 
 

@@ -1,4 +1,4 @@
-"""How good the sensors were: the noise under which a flight is likeliest."""
+"""Select the noise model with the highest evidence."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,61 +10,73 @@ from dmrl.estimation.solver.levenberg_marquardt import ROUGH, Solution, evidence
 from dmrl.estimation.solver.residuals import OWN_GYRO, PEER_GYRO, linearise
 
 _Z = np.linspace(-8.0, 8.0, 1601)
+"""Quadrature points of a standard normal distribution, in standard deviations."""
 GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
-"""Noise against the default's, weighed by how likely each makes the flight."""
+"""Scales of the velocity noise that are tried, relative to the default model. No record of how the
+values were chosen."""
 TAKEN = (
     (0.41, 0.55, 0.65, 0.80, 2.80),
     (0.55, 0.60, 1.00, 1.00, 3.50),
     (0.80, 0.90, 1.20, 1.20, 3.50),
     (0.08, 0.08, 0.15, 0.15, 0.35),
 )
-"""The likeliest grade, the grade that velocities are taken for, that of scales, and the standard
-deviation of the ranges' offset, metres: who calibrated one sensor will have measured the other.
-The likeliest is a fifth too low and scatters by a tenth, so that the flights that look best
-would be believed too much: sensors are taken for the default's unless they are clearly better.
-A flight shows a scale once at most: real flow with little noise was seen to be 7 % off."""
+"""Correction table of the best scale of a flight, four rows of interpolation points.
+
+Rows: the best scale; the scale used for the velocities; the scale used for the prior of the
+constant scales; the prior std of the range offset, metres. The best scale is a fifth too low and
+scatters by a tenth, so the flights that look best would get too small a covariance. Sensors keep
+the default scale unless they are clearly better. Row 3 never falls below 0.8: one flight reveals a
+constant scale once at most, and real flow with little noise was measured 7 % off. Row 4: an
+operator who calibrated one sensor probably measured the others too."""
 SHARP, DOUBT = 0.09, 2.0
-"""A flight of 100 s tells the logarithm of its grade to this standard deviation. One that tells it
-worse is taken for so many times the difference worse: flights of 20 s tell it to 0.2, and those
-that looked calibrated by luck were kept from end to end, and wrong."""
+"""Standard deviation of the log scale that 100 s determine; and penalty of shorter flights.
+
+The scale of a less certain flight is raised by the penalty times the excess of its standard
+deviation. Flights of 20 s determine the log scale to 0.2. Those that looked calibrated by chance
+were accepted throughout, with a tenth of the labels bad."""
 
 FADING_M, FADING_S = (0.03, 0.06), 1.0
-"""Errors of ranges that fade, as where reflections or antennas make them: 0.1 m, and gone after one
-or two seconds, was seen between robots on the ground. Standard deviations that are tried."""
+"""Standard deviations of correlated range errors that are tried, metres, and their correlation
+time, seconds. Chosen on ranges between ground robots: reflections or antennas made errors of 0.1 m
+that lasted one or two seconds."""
 GRADED = "velocity_std_mps", "velocity_white_psd", "velocity_scale_std", "scale_std", "bias_std_m"
-"""What one flight can hardly tell from errors of ranges that fade: taken half-way, as a geometric
-mean, between what it would be with them and without. Heights over a table were taken for them."""
+"""Fields that one flight can hardly separate from correlated range errors. They become the
+geometric mean of the values with and without such errors. Heights over a table looked like them."""
 OFF, UNMEASURED = 5.0, (0.25, 0.1)
-"""A yaw rate that is biased by so many standard deviations was not calibrated, and who did not
-calibrate that will not have measured ranges and flow: their offset, metres, and scale."""
+"""A yaw rate bias of this many standard deviations marks an uncalibrated robot; and the priors that
+it then gets, of the range offset, metres, and of the velocity scales. Added for simulated short
+flights with several sensors off, which were accepted and wrong."""
 SURE, TAILED = 15.0, 2.0
-"""So much more evidence, a logarithm, it takes: clean ranges were seen to have some. Steps with
-Cauchy's loss leave half of their spread to its tails."""
+"""Log evidence that correlated range errors must gain, as clean ranges show some; and factor of
+their standard deviation. With a Cauchy loss, half of the spread of the steps is in its tails. No
+other record of how the values were chosen."""
 NOISIER, NOTICED = 4, 1.1
-"""So often ranges may turn out noisier, and by how much for another solve: less of what is wrong
-with them hides in the solution each time."""
+"""Largest number of updates of the range noise, and the smallest ratio that leads to another solve.
+Each solve hides less of the range errors in the solution. No record of how the values were chosen.
+"""
 CORRELATED_S, SOME, FAR = 1.0, 4, 2.0
-"""Ranges are held against their mean over this time where there are some of them. A residual of so
-many standard deviations counts half, one much further off next to nothing: outliers are no noise
-that lasts, and on one side they would seem to be."""
+"""Averaging of range residuals: time, seconds; fewest ranges; residual with half weight, in sigmas.
+
+A residual much further off counts next to nothing. Otherwise outliers on one side would look like
+correlated noise: flights with 25 % outliers lost all labels, of which 99 % are good."""
 ONE = float(np.average((_Z / (1 + (_Z / FAR) ** 2)) ** 2, weights=np.exp(-(_Z**2) / 2)))
-"""Mean square of what so counts of residuals that are as large as was believed."""
+"""Mean square of nominal residuals after the weighting by the outlier limit."""
 
 
 def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
-    """What the sensors are like: the noise under which the flight is likeliest.
+    """Select the noise model with the highest evidence, and return it with a solution.
 
-    That of the velocities first; then it is asked whether the ranges' errors fade within a second,
-    and if so, how good the velocities are under that. And a solution under a similar noise.
+    The scale of the velocity noise is searched first. Then the same search runs with range errors
+    that are correlated over a second. The solution belongs to a similar noise model.
 
     Parameters
     ----------
     flight
-        The flight.
+        Keyframes of the flight.
     noise
-        A first guess.
+        First guess of the noise model.
     solution
-        The flight's solution under that guess.
+        Solution under that guess.
     """
     found, number, likely, solution = _graded(flight, noise, solution)
     found = _unmeasured(found, solution)
@@ -83,7 +95,7 @@ def noise_of(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, 
 
 
 def _unmeasured(noise: Noise, solution: Solution) -> Noise:
-    """The noise where nobody seems to have measured sensors: one is far off, others may be."""
+    """Return the noise model with wider priors if a yaw rate bias shows uncalibrated sensors."""
     turns = np.abs(solution.constants[[OWN_GYRO, PEER_GYRO]]) / noise.prior_std()[OWN_GYRO]
     if turns.max() < OFF:
         return noise
@@ -96,13 +108,20 @@ def _unmeasured(noise: Noise, solution: Solution) -> Noise:
 
 
 def _fading(noise: Noise, std_m: float) -> Noise:
+    """Return the noise model with range errors that are correlated over a second."""
     return replace(noise, range_error_std_m=std_m, range_tau_s=FADING_S, free_weight=0.0)
 
 
 def _graded(
     flight: Problem, noise: Noise, solution: Solution
 ) -> tuple[Noise, int, float, Solution]:
-    """The noise with its likeliest grade; the nearest of ``GRADES``, its evidence and solution."""
+    """Search the scale of the velocity noise with the highest evidence.
+
+    Returns
+    -------
+    noise, index, evidence, solution
+        Scaled noise model; the best of ``NOISE_SCALES``, its log evidence and its solution.
+    """
     tried: dict[int, float] = {}
     solved: dict[int, Solution] = {}
     middle, last = 2, len(GRADES) - 2
@@ -125,14 +144,14 @@ def _graded(
 
 
 def _likely(grades: Sequence[float], found: Sequence[float]) -> float | None:
-    """The likeliest grade, or a larger one where the flight tells it badly; None: it has no top.
+    """Return the scale at the peak of the evidence, raised if the peak is blunt; None without peak.
 
     Parameters
     ----------
     grades, found
-        Three grades around it, and the evidence for each.
+        Three scales around the peak, and their log evidence.
     """
-    # The top of a parabola. How sharp it is says how exactly the flight tells.
+    # The peak of a parabola. Its curvature gives the standard deviation of the log scale.
     bend, slope, _ = np.polyfit(np.log(grades), found, 2)
     if bend >= 0:
         return None
@@ -141,16 +160,16 @@ def _likely(grades: Sequence[float], found: Sequence[float]) -> float | None:
 
 
 def with_range_noise(flight: Problem, noise: Noise, solution: Solution) -> tuple[Noise, Solution]:
-    """The same noise with ranges as noisy as their residuals say, and the solution under it.
+    """Fit the range noise to the residuals; return the noise model and the solution under it.
 
     Parameters
     ----------
     flight
-        The flight.
+        Keyframes of the flight.
     noise
-        What was found but for the ranges.
+        Noise model with the selected velocity noise.
     solution
-        A solution under a similar noise.
+        Solution under a similar noise model.
     """
     for _ in range(NOISIER):
         solution = solve_batch(flight, noise, solution.state, solution.constants)
@@ -162,17 +181,17 @@ def with_range_noise(flight: Problem, noise: Noise, solution: Solution) -> tuple
 
 
 def excess(flight: Problem, noise: Noise, solution: Solution) -> float:
-    """How many times as noisy the ranges are as was believed, over a second.
+    """Return the ratio of the range noise over a second to its model, at least 1.
 
-    A mean of n independent errors has an n-th of their variance. Where reflections stay with the
-    robots for a second it has more, and a range tells as much less.
+    The mean of n independent errors has 1/n of their variance. Reflections that last for a second
+    give it more, and the ranges carry correspondingly less information.
 
     Parameters
     ----------
     flight, noise
-        The flight, and what was believed about its sensors.
+        Keyframes of the flight, and the noise model.
     solution
-        The flight's solution.
+        Solution of the flight.
     """
     residual = linearise(flight, noise, solution.state, solution.constants).range
     second = ((flight.key_s[flight.range_key] - flight.key_s[0]) / CORRELATED_S).astype(int)

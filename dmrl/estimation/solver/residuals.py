@@ -1,12 +1,12 @@
-"""Residuals of a flight and their analytic Jacobians, by keyframe state and by global.
+"""Residuals of a flight and their analytic Jacobians, by keyframe state and by constant.
 
-A keyframe is (x, y, psi, wx, wy, b): w is the error of the measured relative velocity, in the
-observer's frame, which fades with its correlation time. White noise in its place would cost
-half of what the ranges tell. b is by how much ranges are too long at the time: what shadows a
-range shadows it for seconds.
+A keyframe state is (x, y, psi, wx, wy, b). w is the error of the measured relative velocity in the
+observer's frame, which decays with its correlation time. White noise in its place would discard
+half of the information of the ranges. b is the temporary excess of the ranges: an obstacle
+lengthens ranges for seconds.
 
-With s the velocity scales, the process residual is divided by 1 / (1 + s): without that, a
-scale that shrinks the path shrinks the noise with it and is always welcome.
+With s the velocity scales, the process residual is divided by 1 / (1 + s). Without that division a
+scale that shrinks the path would also shrink its noise and always reduce the cost.
 """
 
 from dataclasses import dataclass
@@ -19,36 +19,41 @@ from dmrl.estimation.solver.camera_residuals import Seen, seen
 from dmrl.estimation.solver.keyframes import GLOBALS, Noise, Problem
 
 BIAS, SCALE, OWN_GYRO, PEER_GYRO, OWN_SCALE, PEER_SCALE = range(6)
+"""Index among ``GLOBALS`` of offset and scale of the ranges, biases of the yaw rates, scales of the
+velocities."""
 SIZE = 6
+"""Number of states of a keyframe."""
 RANGED = [0, 1, 2, 5]
-"""States that a range depends on."""
+"""Index of the states on which a range depends."""
 RANGE_ERROR = 5
-"""Of states and of the residuals of a step."""
+"""Index of the range error b among the states, and among the residuals of a step."""
 METRIC = [0, 1, 3, 4]
-"""Residuals of a step that the velocity scales divide."""
+"""Index of the residuals of a step that the velocity scales divide."""
 OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
+"""Index among ``GLOBALS`` of the velocity biases and of the peer's clock offset."""
 OF_OBSERVER = [OWN_GYRO, OWN_SCALE, 6, 7]
-"""Places among ``GLOBALS`` of what is the observer's alone; ``pair.SWAPPED`` of them the peer's."""
+"""Index among ``GLOBALS`` of the observer's own constants; `GLOBALS_FROM_PEER` maps them to the
+peer's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """Whitened residuals and Jacobians at one solution. K keyframes, R ranges, G globals.
+    """Whitened residuals and Jacobians at one solution. K keyframes, R ranges, G constants.
 
-    Each Jacobian stands beside its residuals in one array, so that all products of a row come
-    from one multiplication.
+    Each Jacobian is stored beside its residuals in one array, so that one multiplication computes
+    all products of a row.
 
     Parameters
     ----------
     steps
-        (K - 1, 6, 6 + 6 + G + 1) of x, y, psi, wx, wy, b between neighbouring keyframes: by the
-        keyframe before, by the one after, by the globals; the residual.
+        (K - 1, 6, 6 + 6 + G + 1) rows of x, y, psi, wx, wy, b between neighbouring keyframes:
+        Jacobians by the first keyframe, by the second, by the constants; residual.
     ranges
-        (R, 4 + 2 + 1) by x, y, psi, b; by bias and scale of the ranges; the residual.
+        (R, 4 + 2 + 1) Jacobians by x, y, psi, b and by offset and scale of the ranges; residual.
     error_m
         (K,) b, metres.
-    seen
-        What cameras saw; None: nothing.
+    camera
+        Residuals of the cameras. None: no images.
     """
 
     steps: Array
@@ -68,16 +73,16 @@ class Linear:
 
 
 def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) -> Linear:
-    """Residuals and Jacobians.
+    """Compute residuals and Jacobians at a solution.
 
     Parameters
     ----------
     problem, noise
-        The flight, and what is believed about its sensors.
+        Keyframes of the flight, and the noise model.
     state
         (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m).
     constants
-        (G,) as in ``GLOBALS``.
+        (G,) in the order of ``GLOBALS``.
     """
     steps = _steps(problem, noise, state, constants)
     ranges = _ranges(problem, noise, state, constants)
@@ -87,14 +92,14 @@ def linearise(problem: Problem, noise: Noise, state: Array, constants: Array) ->
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """What the steps between keyframes do under a solution. S = K - 1 steps.
+    """Propagation of a solution from each keyframe to the next. S = K - 1 steps.
 
-    ``own_gain`` and ``peer_gain`` are 1 / (1 + scale) of either velocity; ``own`` and ``peer``
-    (S, 2) the corrected shifts and ``own_turn``, ``peer_turn`` (S,) turns; ``heading`` and
-    ``turned`` (S, 2, 2) rotate by the peer's heading and by the observer's turn; ``ahead`` and
-    ``error_ahead`` (S, 2) are the next keyframe's position and velocity error seen from this one;
-    ``half_s``, ``kept`` and ``range_kept`` (S, 1) half the step's time and what it leaves of a
-    velocity error and of a range's.
+    ``own_gain`` and ``peer_gain`` are 1 / (1 + scale) of either velocity. ``own`` and ``peer`` (S,
+    2) are the corrected shifts, ``own_turn`` and ``peer_turn`` (S,) the corrected turns.
+    ``heading`` and ``turned`` (S, 2, 2) rotate by the peer's heading and by the observer's turn.
+    ``ahead`` and ``error_ahead`` (S, 2) are position and velocity error of the next keyframe in the
+    frame of this one. ``half_s`` (S, 1) is half the step. ``kept`` and ``range_kept`` (S, 1) are
+    the factors by which a velocity error and a range error decay over the step.
     """
 
     own_gain: float
@@ -113,6 +118,7 @@ class _Steps:
 
 
 def _moves(problem: Problem, noise: Noise, state: Array, constants: Array) -> _Steps:
+    """Propagate the states by the measured motion, corrected by the constants."""
     steps_s = problem.steps_s
     own_gain, peer_gain = 1 / (1 + constants[[OWN_SCALE, PEER_SCALE]])
     clock = problem.peer_by_clock * constants[CLOCK]
@@ -138,6 +144,7 @@ def _moves(problem: Problem, noise: Noise, state: Array, constants: Array) -> _S
 
 
 def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> Array:
+    """Return (S, 6, 6 + 6 + G + 1) whitened rows of the steps."""
     moves = _moves(problem, noise, state, constants)
     share = np.sqrt((moves.own_gain**2 + moves.peer_gain**2) / 2)
     weight = 1 / np.sqrt(step_variance(problem, noise))
@@ -148,26 +155,27 @@ def _steps(problem: Problem, noise: Noise, state: Array, constants: Array) -> Ar
     _by_states(moves, by_start, by_end)
     _by_globals(moves, problem, by_globals)
     out *= weight[:, :, None]
-    # The division by the share depends on the scales too.
+    # The whitening itself depends on the scales.
     for column, gain in ((OWN_SCALE, moves.own_gain), (PEER_SCALE, moves.peer_gain)):
         by_globals[:, METRIC, column] += out[:, METRIC, -1] * gain**3 / (2 * share**2)
     return out
 
 
 def _residual(moves: _Steps, state: Array) -> Array:
+    """Return (S, 6) residuals of the steps before whitening."""
     error = state[:-1, 3:5]
-    # Relative motion in the observer's frame: p' = p + peer's way - own way + half_s (w + w'), the
-    # velocity's error by the trapezium rule. psi is the peer's heading less the observer's.
+    # Relative motion in the observer's frame: p' = p + peer's shift - own shift + half_s (w + w'),
+    # with the velocity error by the trapezoidal rule. psi: the peer's heading minus the observer's.
     shift = moves.ahead - state[:-1, :2] - moves.peer + moves.own
     shift = shift - moves.half_s * (error + moves.error_ahead)
     turn = state[1:, 2] - state[:-1, 2] - moves.peer_turn + moves.own_turn
-    # Gauss-Markov: what is left of an error after a step, and new noise, which is the residual.
+    # Gauss-Markov process: an error decays over a step; the residual is the new noise.
     longer = state[1:, RANGE_ERROR:] - moves.range_kept * state[:-1, RANGE_ERROR:]
     return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error, longer])
 
 
 def _by_states(moves: _Steps, by_start: Array, by_end: Array) -> None:
-    """Fill in (S, 6, 6) zeros each."""
+    """Fill (S, 6, 6) zeros each with the Jacobians by both keyframes."""
     by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
     by_start[:, :2, 2] = -moves.peer @ QUARTER_TURN.T
     by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -moves.half_s, -moves.kept
@@ -178,7 +186,7 @@ def _by_states(moves: _Steps, by_start: Array, by_end: Array) -> None:
 
 
 def _by_globals(moves: _Steps, problem: Problem, out: Array) -> None:
-    """Fill in (S, 6, G) zeros."""
+    """Fill (S, 6, G) zeros with the Jacobian by the constants."""
     steps_s, heading = problem.steps_s, moves.heading
     moved = moves.ahead - moves.half_s * moves.error_ahead
     out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER_TURN.T)
@@ -192,7 +200,7 @@ def _by_globals(moves: _Steps, problem: Problem, out: Array) -> None:
 
 
 def step_variance(problem: Problem, noise: Noise) -> Array:
-    """(K - 1, 6) variance of each step's residuals, before whitening."""
+    """Return (K - 1, 6) variances of the residuals of each step, before whitening."""
     steps_s = problem.steps_s
     shift = 2 * noise.velocity_white_psd * steps_s + noise.gap_speed_mps**2 * problem.gap_s
     turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * problem.gap_s
@@ -203,6 +211,7 @@ def step_variance(problem: Problem, noise: Noise) -> Array:
 
 
 def _ranges(problem: Problem, noise: Noise, state: Array, constants: Array) -> Array:
+    """Return (R, 4 + 2 + 1) whitened rows of the ranges."""
     at = state[problem.range_key]
     peer = _apply(rotation(state[:, 2])[problem.range_key], problem.peer_to_range.shift_m)
     offset = at[:, :2] + peer - problem.own_to_range.shift_m

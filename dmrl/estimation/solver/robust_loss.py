@@ -1,7 +1,7 @@
-"""Robust losses: for residuals with outliers, and for errors that are constant over a flight.
+"""Robust losses for residuals with outliers and for the constants of a flight.
 
-Every residual r has Cauchy's loss L log(1 + r^2 / L) with a limit L of its own: a square where
-r^2 is small against L, a logarithm beyond. It is the likelihood of Student's t, up to factors.
+Every residual r has the Cauchy loss L log(1 + r^2 / L) with its own scale L: quadratic where r^2 is
+small against L, logarithmic beyond. It is the log likelihood of Student's t, up to factors.
 """
 
 from dataclasses import dataclass
@@ -14,17 +14,21 @@ from dmrl.estimation.solver.keyframes import Noise
 from dmrl.estimation.solver.residuals import RANGE_ERROR, SIZE, Linear
 
 MOTION = 25.0
-"""Limit of the motion's residuals: five sigmas are no noise."""
+"""Loss scale of the motion residuals. Five standard deviations are no noise."""
 
 SQUARE = 1e9
+"""Loss scale of a quadratic loss: practically infinite."""
 PRIOR: Array = np.array([2.0, SQUARE, 4.0, 4.0, *[SQUARE] * 6, 4.0])
-"""Limits of what is constant, as in ``GLOBALS``. Offsets of ranges, biases of yaw rates and clocks
-are mostly small, and at times not. A scale that may be anything would shrink the path away."""
+"""Loss scales of the constants, in the order of ``GLOBALS``.
+
+Offsets of ranges, biases of yaw rates and clock offsets are mostly small and sometimes large. The
+scales keep a quadratic loss: a scale without a firm prior would shrink the path to nothing. No
+record of how the values were chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """By how much each squared residual counts.
+    """IRLS weights of the squared residuals.
 
     Parameters
     ----------
@@ -35,11 +39,11 @@ class Weights:
     first
         Of the first range error, per square metre.
     free
-        (K,) of every range error, likewise.
+        (K,) of the pull of every range error to zero, per square metre.
     prior
-        (G,) of what is constant.
-    seen
-        (I,) of what was seen in each image; None: nothing.
+        (G,) of the constants.
+    camera
+        (I,) of the images. None: no images.
     """
 
     step: Array
@@ -51,14 +55,14 @@ class Weights:
 
 
 def limits(noise: Noise) -> tuple[Array, float]:
-    """Limits of a step's residuals (6,), and of a range's."""
+    """Return the loss scales of a step's residuals (6,) and of a range's."""
     step = np.full(SIZE, MOTION)
     step[RANGE_ERROR] = noise.jump**2
     return step, (noise.cauchy_m / noise.range_std_m) ** 2
 
 
 def cost_of(linear: Linear, noise: Noise, constants: Array) -> float:
-    """Half the sum of the losses."""
+    """Return half the sum of the losses."""
     step, ranges = limits(noise)
     total = (step * np.log1p(linear.step**2 / step)).sum()
     total += ranges * np.log1p(linear.range**2 / ranges).sum()
@@ -71,7 +75,7 @@ def cost_of(linear: Linear, noise: Noise, constants: Array) -> float:
 
 
 def weights_of(linear: Linear, noise: Noise, constants: Array) -> Weights:
-    """Weights with which squares have the losses' slopes."""
+    """Return the IRLS weight of every residual: weighted squares have the slope of the losses."""
     step, ranges = limits(noise)
     looked = linear.seen
     return Weights(
@@ -85,20 +89,20 @@ def weights_of(linear: Linear, noise: Noise, constants: Array) -> Weights:
 
 
 def curvature_of(noise: Noise, constants: Array) -> Array:
-    """(G,) information that the prior of what is constant holds of it, where that is.
+    """Return (G,) information of the prior about the constants, from the curvature of its loss.
 
-    The weight says where the slope is that of a square. The loss itself is bent less: what is as
-    far out as the prior is wide, the prior hardly holds.
+    The IRLS weight matches the slope of the loss. The curvature is smaller: the prior hardly
+    constrains a constant that is as far out as the prior is wide.
     """
     return curved((constants / noise.prior_std()) ** 2 / PRIOR) * noise.prior_std() ** -2
 
 
 def curved(out: Array) -> Array:
-    """By how much the loss is bent where r^2 / L is that, against a square."""
+    """Return the curvature of the loss at r^2 / L, relative to a square."""
     # Half of the second derivative of L log(1 + r^2 / L) is (1 - r^2 / L) / (1 + r^2 / L)^2.
     return np.asarray(np.maximum(1 - out, 0.0) / (1 + out) ** 2)
 
 
 def _first(linear: Linear, noise: Noise) -> float:
-    """The first range error's square against what may jump."""
+    """Return the square of the first range error, relative to the scale of a step."""
     return float(linear.error_m[0] / (noise.jump * noise.range_error_std_m)) ** 2

@@ -1,4 +1,4 @@
-"""Which robot a track is: the one whose measured distance keeps fitting."""
+"""Assign robot names to tracks by the ranges that keep fitting their distance."""
 
 from collections.abc import Iterable, Mapping
 
@@ -8,12 +8,16 @@ from scipy.optimize import linear_sum_assignment
 from dmrl.estimation.tracking.tracker import Track
 
 RANGE_STD_M = 0.2
-"""Error of a UWB range, its bias included."""
+"""Standard deviation of a UWB range, its bias included, metres. No record of how the value was
+chosen."""
 MEMORY_S = 2.0
+"""Time constant of the average misfit, seconds. No record of how the value was chosen."""
 WORST = 9.0
-"""Misfit of a range, in variances, beyond which it counts no more: a detour."""
+"""Largest misfit of a range, in variances. It bounds the effect of a detour. Three standard
+deviations; no other record of how the value was chosen."""
 FITS, CLEARER = 4.0, 1.5
-"""Mean misfit of a name that can be right; how much worse every other name must fit."""
+"""Largest mean misfit of an accepted name; and margin by which every other name must fit worse. No
+record of how the values were chosen."""
 
 
 class Identity:
@@ -25,14 +29,14 @@ class Identity:
     def names(
         self, tracks: Iterable[Track], range_m: Mapping[str, float], dt_s: float
     ) -> dict[int, str]:
-        """Name by number of those tracks whose robot is clear.
+        """Assign names to the tracks whose robot is unambiguous; return them by track number.
 
         Parameters
         ----------
         tracks
-            All that are confirmed.
+            All confirmed tracks.
         range_m
-            Measured distance by peer; peers that were not heard are missing.
+            Measured distance by peer. Peers without a range are missing.
         dt_s
             Seconds since the last call.
         """
@@ -49,6 +53,7 @@ class Identity:
         return self._assigned(tracks)
 
     def _assigned(self, tracks: list[Track]) -> dict[int, str]:
+        """Assign names one to one by the total misfit, and keep the unambiguous ones."""
         peers = sorted({peer for _, peer in self._misfit})
         cost = np.full((len(tracks), len(peers)), WORST)
         for k, track in enumerate(tracks):
@@ -63,7 +68,7 @@ class Identity:
 
 
 def _misfit(track: Track, measured_m: float) -> float:
-    """Squared difference of a range from the track's distance, over its variance."""
+    """Return the squared difference of a range and the track's distance, over its variance."""
     distance_m = max(float(np.linalg.norm(track.position_m)), 1e-3)
     along = track.position_m / distance_m
     variance = RANGE_STD_M**2 + float(along @ track.covariance @ along)

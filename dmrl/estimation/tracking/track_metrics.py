@@ -1,4 +1,4 @@
-"""Errors of tracks against the ground truth, beside those of single images."""
+"""Compare tracks with the ground truth, beside detections of single images."""
 
 import math
 from dataclasses import dataclass
@@ -12,8 +12,10 @@ from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.geometry.frames import Array
 
 NEAR_M = 1.0
-"""A track further from every peer than this is nobody's."""
+"""Largest distance between a track and its peer, metres. Tracks farther from every peer are false.
+No record of how the value was chosen."""
 CHI2_95_OF_3 = 7.815
+"""95 % point of chi-square with three degrees of freedom."""
 
 DEFINITIONS = {
     "in_view": "true positions of peers inside the image, one for each peer and image",
@@ -24,35 +26,36 @@ DEFINITIONS = {
     "reduction": "by how much less the tracks' is, over that of the detections",
     "median_m, single_median_m": "medians of those errors",
     "coverage_95": "share of those peers inside their track's 95 % ellipsoid",
-    "nees": "mean of the squared error over its covariance; 3 if that is honest",
+    "nees": "mean of the squared error over its covariance; 3 if that is right",
     "followed, detected": "share of the peers in view with a track, a detection within "
     f"{NEAR_M:g} m",
-    "false_tracks_per_min": f"tracks more than {NEAR_M:g} m from every peer, in view or not, for "
-    "more than half of their life, a minute",
-    "named_right": "share of the named tracks of peers in view that bear the right name",
+    "false_tracks_per_min": f"tracks more than {NEAR_M:g} m from every peer, in view or not, "
+    "for more than half of their life, a minute",
+    "named_right": "share of the named tracks of peers in view that have the right name",
 }
+"""Definition of each figure, printed beside it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """What one observer's tracks are worth, one row for each peer in view of an image.
+    """Tracks of one observer beside the truth, one row for each peer in view of an image.
 
     Parameters
     ----------
     robot
         The observer.
     time_s
-        (N,) from the first image.
+        (N,) seconds from the first image.
     peer, named
-        (N,) which peer it is, and the name of its track; empty where it has none.
+        (N,) the peer, and the name of its track; empty without a name.
     error_m, single_error_m
-        (N, 3) of the track and of the detection matched to it; NaN where there is none.
+        (N, 3) errors of the track and of the detection matched to it; NaN without one.
     covariance
         (N, 3, 3) of the track, m^2.
     false_tracks
-        How many were nobody's.
+        Number of tracks without a peer.
     length_s
-        Time between the first and the last image.
+        Seconds between the first and the last image.
     """
 
     robot: str
@@ -67,7 +70,7 @@ class Judged:
 
     @property
     def trace(self) -> ErrorTrace:
-        """Errors over time, the tracks' apart from those of single images."""
+        """Errors over time, those of tracks and of single images apart."""
         errors = {"single images": self.single_error_m, "tracks": self.error_m}
         sigma_m = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         title, name = f"{self.robot}: tracks minus truth", f"track-error-{self.robot}"
@@ -75,14 +78,14 @@ class Judged:
 
 
 def assigned(truth_m: Array, found_m: Array, radius_m: float = math.inf) -> NDArray[np.int64]:
-    """(J,) which of (D, 3) positions belongs to each of (J, 3) true ones, -1 for none.
+    """Match true and estimated positions; return (J,) indices of the estimates, -1 for none.
 
     Parameters
     ----------
     truth_m, found_m
-        Positions, metres; NaN: not known, and matched to nothing.
+        (J, 3) and (D, 3) positions, metres. NaN: unknown, never matched.
     radius_m
-        Largest distance of the two.
+        Largest distance of a match.
     """
     out = np.full(len(truth_m), -1, np.int64)
     distance_m = np.linalg.norm(truth_m[:, None] - found_m, axis=-1)
@@ -94,14 +97,14 @@ def assigned(truth_m: Array, found_m: Array, radius_m: float = math.inf) -> NDAr
 
 
 def figures(judged: Judged, settle_s: float) -> dict[str, float | None]:
-    """What ``DEFINITIONS`` explains; None where there is nothing to measure.
+    """Compute the figures of ``DEFINITIONS``; None without data.
 
     Parameters
     ----------
     judged
         Tracks beside the truth.
     settle_s
-        Images before this time do not count, but for false tracks.
+        Settling time. Earlier images count for false tracks only.
     """
     late = judged.time_s >= settle_s
     error_m, single_m = judged.error_m[late], judged.single_error_m[late]

@@ -1,12 +1,12 @@
-"""Peers followed over time: detections in, tracks with covariance out. Arrays only.
+"""Track peers over time from detections, with covariance. Arrays only.
 
-One extended Kalman filter (filterpy's) per track. State: position of the peer and its velocity
-over ground, both along the axes of the observer's horizontal frame, and the share by which the
-network misjudges this peer's depth at the moment. That error stays for seconds, since the
-picture hardly changes; taken for white noise it would make every track too sure of itself.
+One extended Kalman filter (filterpy's) runs per track. Its state is the position of the peer and
+its velocity over ground, both along the axes of the observer's horizontal frame, and the relative
+depth error of the network for this peer. The depth error lasts for seconds, since the image hardly
+changes. As white noise it would make every covariance too small.
 
-Birth, confirmation and death follow the score of a track: the log of how much more likely its
-detections are if it is a peer than if they are false alarms (Blackman and Popoli 1999, 6.2).
+Birth, confirmation and death follow the score of a track: the log likelihood ratio of its
+detections between a peer and false alarms (Blackman and Popoli 1999, 6.2).
 """
 
 from collections.abc import Sequence
@@ -27,35 +27,37 @@ from dmrl.geometry.frames import (
 )
 
 P, V, BIAS = slice(0, 3), slice(3, 6), 6
+"""Index of position, velocity and depth error in the state."""
 DEPTH_SPAN = np.log(20.0)
-"""False alarms have any depth from near to twenty times that, evenly in its logarithm."""
+"""Range of the log depth of false alarms, uniform from near to twenty times that. No record of how
+the value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tuning:
-    """What the tracker expects of detector, robots and sensors.
+    """Expected errors of detector, robots and sensors.
 
     Parameters
     ----------
     pixel_std_px
         Error of a detection in u and in v.
     depth_std_ratio, depth_bias_ratio, depth_bias_s
-        Error of a detection's depth over the depth: what is new in every image, where the
-        detection does not say; what stays; for how long it stays.
+        Error of a detection's depth over the depth: the part that is new in every image, unless the
+        detection has its own; the part that lasts; its correlation time.
     speed_std_mps, acceleration_std_mps2
-        How fast a peer is when first seen, and how it changes its velocity (in a second).
+        Initial speed of a peer, and change of its velocity (in a second).
     own_velocity_std_mps, yaw_rate_std_radps, attitude_std_rad
-        Errors of the observer's own sensors; those of roll and pitch last for one image.
+        Errors of the observer's own sensors. Those of roll and pitch are new in every image.
     detection_share
-        Share of the images with a peer in view that it is detected in, 0 to 1.
+        Share of the images with a peer in view in which it is detected, 0 to 1.
     false_per_image
-        False alarms per image, on average.
+        Mean number of false alarms per image.
     gate
-        Share of a peer's own detections that are let through to it, 0 to 1.
+        Probability that a peer's own detection passes the gate, 0 to 1.
     confirm_odds, lost_odds
-        Odds that a track is a peer, from which it counts; and by which they may fall again.
+        Odds at which a track is confirmed, and drop of the odds at which it is deleted.
     lost_std_m
-        A track whose position is this uncertain is given up.
+        Standard deviation of the position at which a track is deleted.
     """
 
     pixel_std_px: float = 4.0
@@ -76,7 +78,10 @@ class Tuning:
 
 
 class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
-    """filterpy's EKF; its prediction is linear, with the observer's shift as the input."""
+    """Extended Kalman filter of filterpy with a linear prediction.
+
+    The input is the observer's shift.
+    """
 
     def __init__(self, state: Array, covariance: Array) -> None:
         super().__init__(dim_x=7, dim_z=3)
@@ -89,14 +94,14 @@ class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no ty
 
 @dataclass(slots=True)
 class Track:
-    """One peer, followed.
+    """Track of one peer.
 
     Parameters
     ----------
     number
-        Stays the same while the track lives.
+        Unique number of the track.
     filter
-        Its state and covariance.
+        State and covariance.
     score, best
         Log odds that it is a peer, now and at their highest.
     confirmed
@@ -126,14 +131,14 @@ class Track:
 
 
 class Tracker:
-    """Tracks of one observer.
+    """Tracker of one observer.
 
     Parameters
     ----------
     camera
-        The observer's; ``distortion`` empty if the images have none any more.
+        Camera of the observer; ``distortion`` is empty for undistorted images.
     tuning
-        See `Tuning`.
+        Expected errors, see `Tuning`.
     """
 
     def __init__(self, camera: Camera, tuning: Tuning) -> None:
@@ -145,14 +150,14 @@ class Tracker:
         self._gate = float(chi2.ppf(tuning.gate, 3))
 
     def step(self, motion: Motion, view: View) -> list[Track]:
-        """Confirmed tracks after the observer has moved and taken another image.
+        """Return the confirmed tracks after the observer has moved and taken another image.
 
         Parameters
         ----------
         motion
-            Since the last image.
+            Motion since the last image.
         view
-            What was detected in this one, and the attitude.
+            Detections of this image, and the attitude.
         """
         for track in self.tracks:
             self._predict(track, motion)
@@ -162,18 +167,18 @@ class Tracker:
         return [track for track in self.tracks if track.confirmed]
 
     def _predict(self, track: Track, motion: Motion) -> None:
-        """Constant velocity over ground, seen from a frame that moves and turns."""
+        """Predict with constant velocity over ground, in a frame that moves and turns."""
         t, dt = self.tuning, motion.dt_s
         c, s = np.cos(motion.turn_rad), np.sin(motion.turn_rad)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # new from old axes
-        # The depth error is a first-order Gauss-Markov process: it fades with ``depth_bias_s``,
-        # and its noise below makes up for that, so that its variance stays.
+        # The depth error is a first-order Gauss-Markov process: it decays with ``depth_bias_s``,
+        # and the noise below compensates for that, so that its variance stays constant.
         keep = np.exp(-dt / t.depth_bias_s)
         ekf = track.filter
         ekf.F = np.zeros((7, 7))
         ekf.F[P, P], ekf.F[P, V], ekf.F[V, V], ekf.F[BIAS, BIAS] = turn, dt * turn, turn, keep
         x, y, _ = ekf.x[P]
-        # A wrong yaw rate moves the peer sideways, the more the further away it is.
+        # A wrong yaw rate moves the peer sideways, in proportion to its distance.
         across = np.array([y, -x, 0.0]) * t.yaw_rate_std_radps * dt
         own = (t.own_velocity_std_mps * dt) ** 2 * np.diag([1.0, 1.0, 0.0])
         power = t.acceleration_std_mps2**2 * np.eye(3)
@@ -188,7 +193,7 @@ class Tracker:
         ekf.predict(shift)
 
     def _measured(self, track: Track, view: View) -> tuple[Array, Array, Array]:
-        """(3,) expected u, v, log depth; (3, 7) its Jacobian; (3, 3) noise but for the depth's."""
+        """Predict u, v, log depth (3,), their Jacobian (3, 7) and the noise except the depth's."""
         t = self.tuning
         attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
         uv, depth_m, by = pixels_from_horizontal(track.position_m[None], *attitude, self.camera)
@@ -202,7 +207,7 @@ class Tracker:
             return np.array([*uv[0], np.log(depth_m[0]) + track.filter.x[BIAS]]), row, noise
 
     def _of_depth(self, view: View) -> Array:
-        """(N, 3, 3) noise of each detection's log depth."""
+        """Return (N, 3, 3) noise of each detection's log depth."""
         ratio = np.full(len(view.depth_m), self.tuning.depth_std_ratio)
         if view.sigma_depth_m is not None:
             known = view.sigma_depth_m > 0
@@ -212,7 +217,7 @@ class Tracker:
         return noise
 
     def _associate(self, view: View) -> list[int]:
-        """Give every track the detection that suits it best; return those nobody took."""
+        """Update every track with its best detection; return the detections without a track."""
         seen = np.column_stack([view.uv, np.log(view.depth_m)])
         of_depth = self._of_depth(view)
         expected = [self._measured(track, view) for track in self.tracks]
@@ -222,7 +227,7 @@ class Tracker:
                 spread = row @ track.filter.P @ row.T + noise + of_depth
                 gain[k] = self._likelihood(seen - mean, spread)
         free = set(range(len(seen)))
-        # The solver refuses rows without any finite entry, so "never" is a large loss here.
+        # The solver rejects rows without any finite entry, so "never" is a large loss here.
         rows, columns = linear_sum_assignment(np.maximum(gain, -1e6), maximize=True)
         taken = {k: j for k, j in zip(rows, columns, strict=True) if np.isfinite(gain[k, j])}
         for k, track in enumerate(self.tracks):
@@ -231,13 +236,13 @@ class Tracker:
                 free.discard(taken[k])
                 self._update(track, seen[taken[k]], mean, row, noise + of_depth[taken[k]])
                 track.score += gain[k, taken[k]]
-            # Unseen counts against a peer only where the camera looks.
+            # A missed detection counts only if the peer is in view.
             elif np.isfinite(mean).all() and self._in_view(mean):
                 track.score += np.log1p(-self.tuning.detection_share)
         return sorted(free)
 
     def _likelihood(self, difference: Array, spread: Array) -> Array:
-        """(N,) log of how much likelier detections are from a track; -inf outside its gate."""
+        """Return (N,) log likelihood ratios of detections and a track; -inf outside its gate."""
         squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
         density = -0.5 * (squared + np.linalg.slogdet(2 * np.pi * spread)[1])
         ratio = np.log(self.tuning.detection_share / self._false_density) + density
@@ -251,21 +256,21 @@ class Tracker:
         assert track.filter.x.shape == (7,), "filterpy changed the state's shape"
 
     def _bury(self) -> None:
-        """Forget tracks that their peers have left."""
+        """Confirm tracks, and delete those whose peers are gone."""
         allowed = np.log(self.tuning.lost_odds)
         kept = []
         for track in self.tracks:
             track.best = max(track.best, track.score)
             track.confirmed |= track.score >= np.log(self.tuning.confirm_odds)
             spread_m = np.sqrt(np.linalg.eigvalsh(track.covariance)[-1])
-            # A newborn may lose no more than it was born with.
+            # A new track may lose no more than its first score.
             lost = track.best - track.score > (allowed if track.confirmed else track.best)
             if not lost and spread_m < self.tuning.lost_std_m:
                 kept.append(track)
         self.tracks = kept
 
     def _bear(self, view: View, free: Sequence[int]) -> None:
-        """Start a track at every detection that no track explains."""
+        """Start a track at every detection without one."""
         t = self.tuning
         attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
         of_depth = self._of_depth(view)
@@ -281,8 +286,8 @@ class Tracker:
             _, row, noise = self._measured(track, view)
             noise += of_depth[k]
             noise[2, 2] += t.depth_bias_ratio**2
-            # The first position is the detection turned round: position = inverse of (seen - bias).
-            # So it carries the noise of the pixels, and its bias with the sign reversed.
+            # The first position inverts the measurement model: position = inverse of (seen - bias).
+            # So it contains the noise of the pixels, and the bias with the opposite sign.
             by_pixel = np.linalg.inv(row[:, P])
             ekf.P[P, P] = by_pixel @ noise @ by_pixel.T
             ekf.P[P, BIAS] = ekf.P[BIAS, P] = -by_pixel[:, 2] * t.depth_bias_ratio**2

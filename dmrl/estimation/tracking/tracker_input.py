@@ -1,4 +1,4 @@
-"""The tracker's input: an observer's motion between two images, and its detections."""
+"""Input of the tracker: the observer's motion between two images, and its detections."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ from dmrl.geometry.frames import Array
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What the observer did between two images.
+    """Motion of the observer between two images.
 
     Parameters
     ----------
     dt_s
         Seconds.
     shift_m
-        (3,) how far it moved over ground, along the axes of its horizontal frame before.
+        (3,) motion over ground, along the axes of its horizontal frame before.
     turn_rad
-        How far it turned, positive to the left.
+        Turn, positive to the left.
     """
 
     dt_s: float
@@ -26,7 +26,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One image's detections and the attitude they were taken with.
+    """Detections of one image, and the attitude of the observer.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class View:
     roll_rad, pitch_rad
         Attitude of the observer.
     sigma_depth_m
-        (N,) standard deviation of the depth, 0 where it is not known. None: nowhere.
+        (N,) standard deviation of the depth, 0 where unknown. None: unknown for all.
     """
 
     uv: Array

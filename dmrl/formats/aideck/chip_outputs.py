@@ -1,8 +1,8 @@
-"""Maps that a chip computed of pictures, in a folder beside them.
+"""Output maps of a chip for images, in a folder beside them.
 
-``gap8-maps/posNNNNN.ppm`` and ``depNNNNN.ppm`` beside ``imgNNNNN.ppm``: binary PGM, a byte a cell
-of 8 x 8 pixels, 128 is 0. One scale for all of the network's output: a level is `STEP`, in the
-logit of the confidence and in the logarithm of the depth (metres).
+``gap8-maps/posNNNNN.ppm`` and ``depNNNNN.ppm`` beside ``imgNNNNN.ppm`` are binary PGM, one byte
+per cell of 8 x 8 pixels, with 0 stored as 128. Both outputs share one scale: a level is
+`LEVEL_STEP`, in the logit of the confidence and in the logarithm of the depth (metres).
 """
 
 from pathlib import Path
@@ -18,24 +18,24 @@ from dmrl.samples.sample import Sample
 
 FOLDER = "gap8-maps"
 STEP = 0.211
-"""Of the published network on the GAP8."""
+"""Size of a quantization level of the published network on the GAP8."""
 NAMES = ("pos", "dep")
 
 
 def chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
-    """The maps of a picture as a GridMap at its time; None where there are none.
+    """Load the maps of an image as a GridMap at its time; None if it has none.
 
     Parameters
     ----------
     picture
-        Path of the picture.
+        Path of the image.
     time_ns, robot
-        Its log time, and whose camera took it.
+        Its log time, and the robot whose camera took it.
 
     Raises
     ------
     SourceError
-        If one of the two is missing, cannot be read, or is of another size than the other.
+        If one of the two maps is missing or cannot be read, or their sizes differ.
     """
     number = picture.stem.removeprefix("img")
     files = [picture.parent / FOLDER / f"{name}{number}.ppm" for name in NAMES]
@@ -43,7 +43,7 @@ def chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
         return None
     logit, log_depth = (STEP * _levels(file) for file in files)
     if logit.shape != log_depth.shape:
-        raise SourceError(f"{files[1]} is of another size than {files[0].name}. Remove both")
+        raise SourceError(f"{files[1]} differs in size from {files[0].name}. Remove both")
     maps = np.stack((1 / (1 + np.exp(-logit)), np.exp(log_depth)))
     fields = {
         "rows": logit.shape[0],
@@ -56,9 +56,9 @@ def chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
 
 
 def _levels(file: Path) -> NDArray[np.float64]:
-    """(rows, cols) levels of a map, -128 to 127."""
+    """Load the (rows, cols) levels of a map, -128 to 127."""
     try:
         data = file.read_bytes()
     except OSError:
-        raise SourceError(f"no {file}: its other half is there. Add it, or remove both") from None
+        raise SourceError(f"no {file} beside its other map. Add it, or remove both") from None
     return codec.decode(data, file)[..., 0].astype(float) - 128.0

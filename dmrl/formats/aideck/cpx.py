@@ -1,13 +1,13 @@
-"""The AI-deck's image stream: the images in CPX packets.
+"""Images of the AI-deck's stream, decoded from CPX packets.
 
-Three layouts of images are known:
+Three layouts of images are supported:
 
-* ``plain``     an 11-byte header (size, kind), then chunks: no time in it;
-* ``stamped``   25 bytes: the camera's time in ms and the robot's position besides;
+* ``plain``     an 11-byte header (size, kind), then chunks, without a time;
+* ``stamped``   25 bytes: adds the camera's time in ms and the robot's position;
 * ``streamer``  nanocockpit's: 148 bytes of metadata before the pixels, with the frame's number
   (uint8), its time in us (uint32, wraps in 71.6 min) and the robot's last state.
 
-Nothing here opens a socket or a file: bytes go in, images come out.
+This module opens no socket and no file: it converts bytes to images.
 """
 
 import binascii
@@ -50,15 +50,15 @@ class Image:
         Its size.
     encoding
         "raw": one byte per pixel, row by row, behind red, green / green, blue filters on the
-        colour version of the camera; "jpeg".
+        colour version of the camera; or "jpeg".
     data
         The pixels, or the JPEG.
     time_us
-        When it was taken on the camera's clock, microseconds, unwrapped; None: not told.
+        Time of exposure on the camera's clock, microseconds, unwrapped; None: not sent.
     frame_id
-        Its number, unwrapped: a step of more than one is a loss; None: not told.
+        Its number, unwrapped, so that a step of more than one is a loss; None: not sent.
     state
-        What the robot last told the camera; None: nothing.
+        Last state that the robot sent to the camera; None: none yet.
     """
 
     width_px: int
@@ -71,19 +71,19 @@ class Image:
 
     @property
     def robot_time_us(self) -> int | None:
-        """When it was taken on the robot's clock, as far as the state tells; or None."""
+        """Time of exposure on the robot's clock, derived from the state; None without a state."""
         if self.time_us is None or self.state is None:
             return None
         return self.time_us - self.state.received_us + 1000 * self.state.robot_ms
 
 
 class ImageReader:
-    """Images out of a stream's bytes, whichever layout it has.
+    """Decoder of images from a stream's bytes, in any layout.
 
     Attributes
     ----------
     broken
-        Images that were begun and never whole, or are not what their header says.
+        Number of images that are incomplete or contradict their header.
     """
 
     def __init__(self) -> None:
@@ -96,24 +96,24 @@ class ImageReader:
 
     @property
     def skipped_bytes(self) -> int:
-        """Bytes that belonged to no packet."""
+        """Number of bytes that belonged to no packet."""
         return self._packets.skipped_bytes
 
     def feed(self, data: bytes) -> Iterator[Image]:
-        """The images that are whole with these bytes."""
+        """Yield the images that these bytes complete."""
         for packet in self._packets.feed(data):
             image = self.take(packet)
             if image is not None:
                 yield image
 
     def finish(self) -> None:
-        """Nothing more comes: an image that was begun counts as broken."""
+        """End the stream. An incomplete image counts as broken."""
         amid = self._packets.finish()
         self.broken += amid or self._begun is not None
         self._begun = None
 
     def take(self, packet: Packet) -> Image | None:
-        """The image that a packet completes, if it does."""
+        """Add a packet; return the image that it completes, or None."""
         if packet.function == APP:
             return self._take_app(packet.data)
         if packet.function == STREAMER and packet.data:
@@ -125,7 +125,7 @@ class ImageReader:
         if len(data) not in (HEADER.size, HEADER.size + STAMP.size) or data[0] != MAGIC:
             return self._append(data)
         header = self._app_header(data)
-        # Amid an image, pixels may look like a header; before one, they are a broken header.
+        # Within an image, pixels may look like a header; before one, they are a broken header.
         if begun is not None and (header is None or len(data) == begun.missing):
             return self._append(data)
         self._begin(header)
@@ -170,7 +170,7 @@ class ImageReader:
         begun = self._begun
         if begun is None:
             return None
-        # The streamer fills its last packet up to a multiple of four; nobody else may.
+        # Only the streamer pads its last packet to a multiple of four.
         spare = 3 if begun.image is None else 0
         if len(data) > begun.missing + spare:
             self._drop()
@@ -207,7 +207,7 @@ class ImageReader:
 
 @dataclass(slots=True)
 class _Begun:
-    """An image whose chunks are coming; ``image`` is None while metadata is among them."""
+    """Incomplete image; ``image`` is None while its chunks contain metadata."""
 
     size: int
     image: Image | None
@@ -229,6 +229,6 @@ def _sane(width_px: int, height_px: int, size: int) -> bool:
 
 
 def checksum(data: bytes) -> int:
-    """CRC-32 of an image, as the streamer sends it."""
-    # 0 says that there is none, so a checksum of 0 is sent as all ones.
+    """Compute the CRC-32 of an image, as the streamer sends it."""
+    # 0 means that there is no CRC, so a CRC of 0 is sent as all ones.
     return binascii.crc32(data) or 0xFFFFFFFF

@@ -1,4 +1,4 @@
-"""Images packed into CPX packets, as the AI-deck sends them: the inverse of ``cpx``."""
+"""Encoding of images as CPX packets, as the AI-deck sends them: the inverse of ``cpx``."""
 
 from collections.abc import Iterator
 
@@ -12,13 +12,13 @@ NO_STATE = (0,) * 14
 
 
 def pack_image(image: Image, layout: Layout = "plain") -> bytes:
-    """All packets of an image, one behind the other.
+    """Return all packets of an image, concatenated.
 
     Parameters
     ----------
     image
-        "streamer" sends raw ones only; times, number and state are sent as far as the layout
-        has room for them.
+        "streamer" supports raw images only. Times, number and state are sent as far as the layout
+        has fields for them.
     layout
         See ``cpx``.
     """
@@ -39,7 +39,7 @@ def _app_chunks(image: Image, layout: Layout) -> Iterator[bytes]:
         time_ms = (image.time_us or 0) // 1000
         header += cpx.STAMP.pack(time_ms % UINT32, *state[1:4], state[10] % UINT32)
     yield header
-    # The firmware goes on until a packet is not full: a whole number of them ends with none.
+    # The firmware sends until a packet is not full, so full packets are followed by an empty one.
     for start in range(0, len(image.data) + 1, cpx.CHUNK_BYTES):
         yield image.data[start : start + cpx.CHUNK_BYTES]
 

@@ -1,7 +1,7 @@
-"""CPX packets, the AI-deck's, out of a stream's bytes and back.
+"""CPX packets of the AI-deck, decoded from a stream's bytes and encoded.
 
 A packet is ``u16 length | u8 dst:3 src:3 last:1 | u8 function:6 version:2 | data``. Over TCP,
-Bitcraze's firmware counts the two bytes of routing in the length; the nanocockpit firmware
+Bitcraze's firmware includes the two bytes of routing in the length; the nanocockpit firmware
 does not.
 """
 
@@ -16,13 +16,13 @@ APP, STREAMER = 5, 6
 ROUTE = struct.Struct("<HBB")
 PACKET_MAX_BYTES = 4094
 
-# To the host, from any chip; the functions that are defined; version 0. Little else looks so.
+# Routes from any chip to the host, with a defined function and version 0: few other bytes match.
 PLAUSIBLE = re.compile(rb"[\x0b\x13\x23\x4b\x53\x63][\x01-\x06\x0e\x0f]")
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One CPX packet: where from, where to, for what, and its data."""
+    """One CPX packet: its source, destination, function and data."""
 
     source: int
     destination: int
@@ -32,12 +32,12 @@ class Packet:
 
 
 class PacketReader:
-    """Packets out of a stream's bytes; finds its step again after bytes that are none.
+    """Decoder of packets from a stream's bytes. It resynchronizes after other bytes.
 
     Attributes
     ----------
     skipped_bytes
-        Bytes that belonged to no packet.
+        Number of bytes that belonged to no packet.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class PacketReader:
         self._streamer = False
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """The packets that are whole with these bytes."""
+        """Yield the packets that these bytes complete."""
         self._buffer += data
         at = 0
         while (step := self._step(at)) is not None:
@@ -57,21 +57,20 @@ class PacketReader:
         del self._buffer[:at]
 
     def finish(self) -> bool:
-        """Nothing more comes: whether it ends amid a packet. What is left counts as skipped."""
+        """End the stream; return whether a packet is incomplete. Its bytes count as skipped."""
         left = len(self._buffer)
         self._buffer.clear()
         self.skipped_bytes += left
         return left > 0
 
     def _step(self, at: int) -> tuple[int, Packet | None] | None:
-        """Where to go on, with a packet if there is one at ``at``; None: more bytes wanted."""
+        """Return the offset after a step, with the packet at ``at`` if any; None: too few bytes."""
         size = self._size(at)
         if size is None:
             return None
         end = at + ROUTE.size + size
         if size >= 0 and not self._in_step:
-            # Four bytes may look like a header by chance; two in a row at the right distance
-            # do not.
+            # Four bytes may match a header by chance. Two headers at the right distance do not.
             after = self._size(end)
             if after is None:
                 return None
@@ -87,7 +86,7 @@ class PacketReader:
         return end, Packet(route >> 3 & 7, route & 7, function & 63, data, bool(route & 64))
 
     def _size(self, at: int) -> int | None:
-        """Bytes of data behind a header; -1 if it is none, None if it is not all there."""
+        """Return the data bytes behind a header; -1: no header, None: incomplete."""
         if len(self._buffer) < at + ROUTE.size:
             return None
         length, _, function = ROUTE.unpack_from(self._buffer, at)
@@ -104,16 +103,18 @@ class PacketReader:
 
 
 def pack_packet(packet: Packet) -> bytes:
-    """The bytes of a packet over TCP.
+    """Encode a packet for TCP.
 
     Raises
     ------
     ValueError
-        If its data is longer than a packet can be.
+        If its data is longer than a packet can hold.
     """
     counted = 0 if packet.function == STREAMER else 2
     length = len(packet.data) + counted
     if length > PACKET_MAX_BYTES:
-        raise ValueError(f"a packet of {length} bytes; {PACKET_MAX_BYTES} at most")
+        raise ValueError(
+            f"packet of {length} bytes: at most {PACKET_MAX_BYTES} fit. Split the data"
+        )
     route = packet.destination | packet.source << 3 | packet.last << 6
     return ROUTE.pack(length, route, packet.function) + packet.data

@@ -1,4 +1,4 @@
-"""The robot's state as the nanocockpit firmware packs it beside each image."""
+"""Robot state as the nanocockpit firmware packs it beside each image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a robot last told its camera about itself.
+    """Last state that a robot sent to its camera.
 
     Parameters
     ----------
     robot_ms
         Time of the state on the robot's clock, unwrapped.
     received_us
-        Time on the camera's clock when it came, unwrapped.
+        Time of arrival on the camera's clock, unwrapped.
     position_m, velocity_mps, acceleration_mps2
         World frame of the robot's estimator.
     quaternion_xyzw
         Attitude, world from body.
     turning_radps
-        About the body's x, y, z.
+        Angular rates about the body's x, y, z.
     """
 
     robot_ms: int
@@ -42,12 +42,12 @@ class State:
 
 
 def unpack_state(values: Sequence[int], robot_ms: int, received_us: int) -> State:
-    """The state whose packed values these are (``STATE_FORMAT``; more may follow).
+    """Decode a state from its packed values (``STATE_FORMAT``; more may follow).
 
     Parameters
     ----------
     values
-        As ``struct`` gave them.
+        Output of ``struct``.
     robot_ms, received_us
         Its two times, unwrapped.
     """
@@ -65,7 +65,7 @@ def unpack_state(values: Sequence[int], robot_ms: int, received_us: int) -> Stat
 
 
 def pack_state(state: State) -> tuple[int, ...]:
-    """The values of ``STATE_FORMAT``."""
+    """Encode a state as the values of ``STATE_FORMAT``."""
     vectors = (*state.position_m, *state.velocity_mps, *state.acceleration_mps2)
     return (
         state.robot_ms % (1 << 32),
@@ -80,9 +80,10 @@ def _milli(value: float) -> int:
 
 
 def quaternion(packed: int) -> Quaternion:
-    """x, y, z, w of 32 bits: which part is largest, then sign and 9 bits of the others.
+    """Return x, y, z, w of a 32-bit quaternion: index of the largest part, then the others.
 
-    The Crazyflie's ``quatcompress.h``: the largest part is positive and follows from the rest.
+    Each of the others has a sign and 9 bits. Follows the Crazyflie's ``quatcompress.h``. The
+    largest part is positive and is computed from the others.
     """
     packed &= 0xFFFFFFFF
     largest = packed >> 30
@@ -97,7 +98,7 @@ def quaternion(packed: int) -> Quaternion:
 
 
 def compressed(xyzw: Quaternion) -> int:
-    """A unit quaternion in 32 bits, signed, as `quaternion` reads it."""
+    """Compress a unit quaternion to 32 bits, signed, as `decompress_quaternion` reads it."""
     largest = int(np.argmax(np.abs(xyzw)))
     packed = largest
     for k, part in enumerate(xyzw):

@@ -1,8 +1,8 @@
 """Dumps of the HyperFlash that the published firmware fills.
 
-Records of 71,704 bytes: 224 x 320 pixels as the sensor gave them (rows 10 to 233 and columns
-2 to 321 of 244 x 324), then six little-endian float32, see ``aideck``. Erased flash is 0xFF: a
-record of nothing else ends the dump. There are no times: they are nominal.
+A record has 71,704 bytes: 224 x 320 raw pixels of the sensor (rows 10 to 233 and columns 2 to
+321 of 244 x 324), then six little-endian float32, see ``published_firmware``. Erased flash is
+0xFF, so an all-0xFF record ends the dump. The dump has no times: nominal ones are assigned.
 """
 
 from collections.abc import Iterator
@@ -27,10 +27,9 @@ ERASED = b"\xff" * RECORD.itemsize
 
 
 def recognises(source: Path) -> bool:
-    """Whether a file is whole records, or those and erased flash, the first of them plausible.
+    """Return whether a file consists of records, the first plausible, and erased flash.
 
-    Six floats of anything may be plausible; of a dump that was cut short one has to say what
-    it is.
+    The first record must have non-zero values, since the six floats of any file may be plausible.
     """
     if not source.is_file() or source.stat().st_size < RECORD.itemsize:
         return False
@@ -43,14 +42,14 @@ def recognises(source: Path) -> bool:
 
 
 def records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
-    """Whole records up to the end marker or the end; says what is left out.
+    """Yield whole records up to the end marker or the end; report the bytes left out.
 
     Parameters
     ----------
     stream
         The dump.
     what
-        Its name, for the line on stderr; None: there is no such line.
+        Its name, for the line on stderr; None: print no line.
     """
     while len(data := stream.read(RECORD.itemsize)) == RECORD.itemsize:
         if data == ERASED:
@@ -61,35 +60,35 @@ def records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of a dump: pictures in RGB, attitude, and the peer as the firmware had it.
+    """Load the samples of a dump: images in RGB, attitude, and the firmware's estimate of the peer.
 
     Parameters
     ----------
     source
         The file.
     options
-        ``robot``, ``rate_hz``, ``camera`` (without one: the AI-deck's) and ``names``, in which
-        0 names the peer; cf2 else.
+        ``robot``, ``rate_hz``, ``camera`` (default: the AI-deck's) and ``names``, where "0" names
+        the peer (default: cf2).
 
     Raises
     ------
     SourceError
-        If there is no whole record before the end marker, or most of them are no records.
+        If no whole record precedes the end marker, or most records are implausible.
     MissingExtra
         If OpenCV is not installed.
     """
     if not source.is_file():
-        raise SourceError(f"{source} is no file. Name the dump of a flash")
+        raise SourceError(f"{source} is not a file. Pass the dump of a flash")
     with source.open("rb") as stream:
         plausible = [published_firmware.is_plausible(r["values"].tolist()) for r in records(stream)]
     if not plausible:
-        raise SourceError(f"{source} holds no record of {RECORD.itemsize} bytes. Name another dump")
+        raise SourceError(f"{source} has no record of {RECORD.itemsize} bytes. Pass another dump")
     if 2 * sum(plausible) <= len(plausible):
         raise SourceError(
-            f"{source}: {len(plausible) - sum(plausible)} of {len(plausible)} records have numbers "
-            "that no drone has, so it is no such dump, or its bytes are shifted. Name another"
+            f"{source}: {len(plausible) - sum(plausible)} of {len(plausible)} records have "
+            "impossible numbers: it is not a dump, or its bytes are shifted. Pass another"
         )
-    rgb_of(np.zeros((4, 4), np.uint8))  # a missing extra is said before anything is written
+    rgb_of(np.zeros((4, 4), np.uint8))  # raises MissingExtra before anything is written
     return Content(_samples(source, options), source.stat().st_size // RECORD.itemsize)
 
 
@@ -106,7 +105,7 @@ def _samples(source: Path, options: Options) -> Iterator[Sample]:
             odd += not published_firmware.is_plausible(values)
             yield from published_firmware.samples(time_ns, options.robot, peer, values, camera)
     if odd:
-        say(f"{source}: {odd} pictures have impossible numbers; their labels are left out")
+        say(f"{source}: {odd} images have impossible numbers; their labels are left out")
 
 
 FORMAT = Format("hyperflash", "a dump of the AI-deck's flash", recognises, content)

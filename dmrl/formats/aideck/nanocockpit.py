@@ -1,9 +1,9 @@
 """Folders that the nanocockpit client saves: ``metadata.csv``, ``camera_raw/``, ``camera_rgb/``.
 
-A row per picture: its file, its number (uint8) and time on the camera's clock (uint32
-microseconds, wraps in 71.6 minutes), and the robot's last state: millimetres, millimetres a
-second, a compressed quaternion, milliradians a second. The raw pictures are used, made RGB;
-where they are missing, the colour ones.
+A row per image contains its file, its number (uint8) and time on the camera's clock (uint32
+microseconds, wraps in 71.6 minutes), and the robot's last state: millimetres, millimetres per
+second, a compressed quaternion, milliradians per second. Raw images are converted to RGB; where
+they are missing, the colour ones are used.
 """
 
 import csv
@@ -33,7 +33,7 @@ NEEDED = (FILE, NUMBER, TIME, STATE_TIME, *(f"state_{name}" for name in (*STATE,
 
 
 def recognises(source: Path) -> bool:
-    """Whether a folder has such a ``metadata.csv`` and pictures beside it."""
+    """Return whether a folder has the client's ``metadata.csv`` and an image folder."""
     path = source / METADATA
     if not path.is_file() or not any((source / folder).is_dir() for folder in FOLDERS):
         return False
@@ -42,40 +42,40 @@ def recognises(source: Path) -> bool:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of a folder: pictures, and the robot's state as it came to the camera.
+    """Load the samples of a folder: images, and the robot's state as the camera received it.
 
     Parameters
     ----------
     source
         The folder.
     options
-        ``robot`` and ``camera``, which must be of the size of the pictures.
+        ``robot`` and ``camera``, which must have the size of the images.
 
     Raises
     ------
     SourceError
-        If the table lacks a column, or a picture is missing or cannot be decoded.
+        If the table lacks a column, or an image is missing or cannot be decoded.
     MissingExtra
-        If pictures are raw and OpenCV is not installed.
+        If images are raw and OpenCV is not installed.
     """
     names, table = _read(source / METADATA)
     paths = [_picture(source, name) for name in names]
     time_ns = unwrap(table[TIME], 32) * 1000
     lost = int((np.diff(unwrap(table[NUMBER], 8)) - 1).clip(0).sum())
     if lost:
-        say(f"{source}: {lost} pictures were lost on the way, by their numbers")
+        say(f"{source}: {lost} images were lost in transmission, by their numbers")
     state_ns = time_ns + _nearest(table[STATE_TIME] - table[TIME]) * 1000
     streams = [_pictures(paths, np.maximum.accumulate(time_ns), options)]
     return Content(in_order(streams + _state(table, state_ns, options, source)))
 
 
 def _nearest(ticks: Times) -> Times:
-    """Differences of two 32-bit counts, without the wrap that may lie between them."""
+    """Wrap differences of two 32-bit counters to the range of int32."""
     return np.asarray((ticks + (1 << 31)) % (1 << 32) - (1 << 31))
 
 
 def _read(path: Path) -> tuple[list[str], dict[str, Times]]:
-    """Names of the pictures, and the other columns as integers."""
+    """Load the names of the images, and the other columns as integers."""
     head, rows = _lines(path)
     if missing := [name for name in NEEDED if name not in head]:
         raise SourceError(f"{path}:1: no column {', '.join(missing)}. Restore the file")
@@ -83,7 +83,7 @@ def _read(path: Path) -> tuple[list[str], dict[str, Times]]:
         say(f"{path}: its last line is cut short; left out")
         rows.pop()
     if not rows:
-        raise SourceError(f"{path} has no rows. Name another folder")
+        raise SourceError(f"{path} has no rows. Pass another folder")
     places = [head.index(name) for name in NEEDED[1:]]
     values = [_integers(row, places, f"{path}:{line}") for line, row in enumerate(rows, 2)]
     try:
@@ -94,7 +94,7 @@ def _read(path: Path) -> tuple[list[str], dict[str, Times]]:
 
 
 def _lines(path: Path) -> tuple[list[str], list[list[str]]]:
-    """The names of the columns, and the rows below them."""
+    """Parse a CSV file into the names of its columns and its rows."""
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             head, *rows = list(csv.reader(stream)) or [[]]
@@ -107,7 +107,7 @@ def _integers(row: list[str], places: list[int], where: str) -> list[int]:
     try:
         return [int(row[place]) for place in places]
     except (ValueError, IndexError):
-        raise SourceError(f"{where}: not a file and whole numbers. Mend it") from None
+        raise SourceError(f"{where}: not a file and whole numbers. Fix the line") from None
 
 
 def _picture(source: Path, name: str) -> Path:
@@ -115,7 +115,7 @@ def _picture(source: Path, name: str) -> Path:
     for folder, suffix in zip(FOLDERS, (".png", ".jpg"), strict=True):
         if (path := source / folder / f"{stem}{suffix}").is_file():
             return path
-    raise SourceError(f"no picture {stem} in {source / FOLDERS[0]}. Restore it")
+    raise SourceError(f"no image {stem} in {source / FOLDERS[0]}. Restore it")
 
 
 def _pictures(paths: Sequence[Path], time_ns: Times, options: Options) -> Iterator[Sample]:
@@ -135,7 +135,7 @@ def _pictures(paths: Sequence[Path], time_ns: Times, options: Options) -> Iterat
 def _state(
     table: dict[str, Times], state_ns: Times, options: Options, source: Path
 ) -> list[log_variables.Stream]:
-    """The robot's log, each state once; none before the first has come."""
+    """Build the streams of the robot's log, with each received state once."""
     stamps = table[STATE_TIME]
     fresh = (stamps != 0) & np.concatenate([[True], np.diff(stamps) != 0])
     if not fresh.any():

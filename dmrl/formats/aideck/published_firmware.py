@@ -1,8 +1,8 @@
-"""What the published firmware says of a picture: its attitude and where the peer is.
+"""Numbers that the published firmware stores with an image: attitude and position of the peer.
 
-Six numbers: roll and pitch in degrees with the Crazyflie's signs (pitch positive nose up), x,
-y, z of the peer in the horizontal frame and its UWB distance d, metres. They stand in a dump
-of the flash and, as ``imgNNNNN.ppm roll pitch x y z d``, in a text beside pictures.
+They are roll and pitch in degrees with the Crazyflie's signs (pitch positive nose up), x, y, z
+of the peer in the horizontal frame and its UWB distance d, metres. A dump of the flash contains
+them, and so does a text file beside images, as ``imgNNNNN.ppm roll pitch x y z d``.
 """
 
 import math
@@ -23,7 +23,7 @@ FARTHEST_M = 60.0
 
 
 def is_plausible(values: Sequence[float]) -> bool:
-    """Whether six numbers can be what they should be: finite, and of a drone that flies."""
+    """Return whether six numbers are finite and possible for a flying drone."""
     roll, pitch, *rest = values
     return all(map(math.isfinite, values)) and (
         max(abs(roll), abs(pitch)) <= 180.0 and max(map(abs, rest)) <= FARTHEST_M
@@ -33,20 +33,20 @@ def is_plausible(values: Sequence[float]) -> bool:
 def samples(
     time_ns: int, robot: str, peer: str, values: Sequence[float], camera: Camera | None
 ) -> Iterator[Sample]:
-    """The six numbers as logged, and as messages; with a camera, a label as well.
+    """Yield the six numbers as logged, and as messages; with a camera, a label as well.
 
     Parameters
     ----------
     time_ns
-        Of the picture.
+        Time of the image.
     robot
-        That carries the camera.
+        Robot that carries the camera.
     peer
-        That is seen.
+        Robot in view.
     values
-        Roll, pitch, x, y, z, d. Only logged if they are not plausible.
+        Roll, pitch, x, y, z, d. Implausible ones are only logged.
     camera
-        Of the stored picture; None: not known.
+        Camera of the stored image; None: unknown.
     """
     fields = dict(zip(VARIABLES, values, strict=True))
     yield Sample(time_ns, topics.log(robot, LOG.name), LOG, fields)
@@ -68,7 +68,7 @@ def samples(
 def _seen(
     peer: str, xyz: Sequence[float], roll: float, pitch: float, camera: Camera
 ) -> list[dict[str, object]]:
-    """The label, from the firmware's own estimate; none where the peer is out of view."""
+    """Build the label from the firmware's estimate; empty if the peer is out of view."""
     uv, depth_m, _ = pixels_from_horizontal(
         np.array([xyz]), np.array([roll]), np.array([pitch]), camera
     )

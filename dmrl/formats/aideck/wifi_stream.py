@@ -1,7 +1,7 @@
-"""A recorded CPX stream of an AI-deck: the bytes as they came over TCP, nothing added.
+"""Recorded CPX stream of an AI-deck: the bytes that came over TCP, unchanged.
 
-``nc 192.168.4.1 5000 > flight.cpx`` makes one. See ``cpx`` for what is in it. Where the
-camera sends its time with the pictures, that is their time; bare streams get nominal ones.
+Record one with ``nc 192.168.4.1 5000 > flight.cpx``. Its content is described in ``cpx``. Images
+get the camera's times if the stream contains them, otherwise nominal ones.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ LOOK_BYTES = 1 << 18
 
 
 def recognises(source: Path) -> bool:
-    """Whether images, whole and unbroken, begin in the first 256 KiB of a file."""
+    """Return whether a whole image begins in the first 256 KiB of a file."""
     if not source.is_file() or source.suffix not in (".cpx", ".bin", ".raw", ""):
         return False
     reader = ImageReader()
@@ -37,34 +37,34 @@ def recognises(source: Path) -> bool:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of a stream: pictures in RGB, and the robot's state where it is in the stream.
+    """Load the samples of a stream: images in RGB, and the robot's state if the stream has it.
 
     Parameters
     ----------
     source
         The file.
     options
-        ``robot``, ``rate_hz`` and ``camera``, which must be of the size that is streamed.
+        ``robot``, ``rate_hz`` and ``camera``, which must have the size of the images.
 
     Raises
     ------
     SourceError
-        If there is no whole picture in it.
+        If the stream has no whole image.
     MissingExtra
-        If pictures are raw and OpenCV is not installed.
+        If images are raw and OpenCV is not installed.
     """
     if not source.is_file():
-        raise SourceError(f"{source} is no file. Name the bytes of a stream")
+        raise SourceError(f"{source} is not a file. Pass a recorded stream")
     times, states, reader = [], [], ImageReader()
     for found in _images(source, reader):
         times.append(found.time_us)
         states.append(found.state)
     if not times:
-        raise SourceError(f"{source} holds no whole picture of a CPX stream. Name another file")
+        raise SourceError(f"{source} has no whole image of a CPX stream. Pass another file")
     if reader.broken or reader.skipped_bytes:
         say(
-            f"{source}: {reader.broken} pictures are broken or cut short and "
-            f"{reader.skipped_bytes} bytes belong to nothing; left out"
+            f"{source}: {reader.broken} images are broken or cut short and "
+            f"{reader.skipped_bytes} bytes belong to no packet; left out"
         )
     time_ns = _times_ns(times, options.rate_hz)
     pictures = _pictures(source, time_ns, options)
@@ -80,7 +80,7 @@ def _images(source: Path, reader: ImageReader) -> Iterator[Image]:
 
 
 def _times_ns(times_us: Sequence[int | None], rate_hz: float) -> list[int]:
-    """The camera's times, or nominal ones where it does not tell every picture's."""
+    """Return the camera's times, or nominal ones unless every image has one."""
     if any(time is None for time in times_us):
         return [round(k * 1e9 / rate_hz) for k in range(len(times_us))]
     return list(accumulate((1000 * (time or 0) for time in times_us), max))
@@ -98,7 +98,7 @@ def _pictures(source: Path, time_ns: Sequence[int], options: Options) -> Iterato
 
 
 def _states(states: Sequence[State], options: Options, source: Path) -> list[log_variables.Stream]:
-    """What the robot told its camera, each state once."""
+    """Build the streams of the robot's states, each state once."""
     fresh = list({state.received_us: state for state in states}.values())
     if not fresh:
         return []

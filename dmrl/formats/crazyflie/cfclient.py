@@ -1,8 +1,9 @@
-"""Log blocks as the Crazyflie client writes them: CSV, ``Timestamp`` in milliseconds first.
+"""Log blocks written by the Crazyflie client: CSV with ``Timestamp`` in milliseconds first.
 
-One file per log block, ``<block>-<date>T<time>.csv``. A column whose cells are all without a
-point is of integers, which tells millimetres from metres. A single file is a robot's log; so is a
-folder of such files. In a folder of folders, each of them is a robot, named after it.
+Each log block has its own file, ``<block>-<date>T<time>.csv``. A column without any decimal point
+contains integers, which distinguishes millimetres from metres. A single file, or a folder of
+such files, is the log of one robot. In a folder of folders, each folder is a robot, named after
+it.
 """
 
 import csv
@@ -31,12 +32,12 @@ STAMP = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
 
 
 def recognises(source: Path) -> bool:
-    """Whether it is a CSV file that begins with ``Timestamp``, or holds one."""
+    """Return whether a source is a CSV file that begins with ``Timestamp``, or contains one."""
     return bool(_robots(source, "cf1"))
 
 
 def _robots(source: Path, robot: str) -> dict[str, list[Path]]:
-    """Files of each robot."""
+    """List the log files of each robot."""
     if source.is_file():
         return {robot: [source]} if _is_log(source) else {}
     if own := sorted(path for path in source.glob("*.csv") if _is_log(path)):
@@ -54,7 +55,7 @@ def _is_log(path: Path) -> bool:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of the log blocks.
+    """Load the samples of the log blocks.
 
     Parameters
     ----------
@@ -66,11 +67,11 @@ def content(source: Path, options: Options) -> Content:
     Raises
     ------
     SourceError
-        If there is no such file, or a line of one is not as its header: names the line.
+        If there is no log file, or a line differs from its header: names the line.
     """
     robots = _robots(source, options.robot)
     if not robots:
-        raise SourceError(f"no CSV file that begins with {TIME} in {source}. Name another source")
+        raise SourceError(f"no CSV file that begins with {TIME} in {source}. Pass another source")
     streams: list[log_variables.Stream] = []
     for name, paths in robots.items():
         robot = options.names.get(name, name)
@@ -80,32 +81,32 @@ def content(source: Path, options: Options) -> Content:
 
 
 def read_block(path: Path) -> Block:
-    """One file. A last line that was cut short is left out, with a line that says so.
+    """Read one file. A last line that is cut short is left out and reported.
 
     Raises
     ------
     SourceError
-        If the file is no such CSV file, or has no row.
+        If the file is not a log of the client, or has no row.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as e:
-        raise SourceError(f"{path} cannot be read as text: {e}. Name another file") from None
+        raise SourceError(f"{path} cannot be read as text: {e}. Pass another file") from None
     lines = text.splitlines()
     try:
         names = next(csv.reader(lines[:1]), [])
     except csv.Error as e:
-        raise SourceError(f"{path}:1: {e}. Name another file") from None
+        raise SourceError(f"{path}:1: {e}. Pass another file") from None
     if names[:1] != [TIME] or len(set(names)) < len(names) or not all(names):
-        raise SourceError(f"{path}:1: not {TIME} and names of variables. Name another file")
+        raise SourceError(f"{path}:1: not {TIME} and names of variables. Pass another file")
     rows = [_row(line, len(names)) for line in lines[1:]]
     if rows and rows[-1] is None and not text.endswith("\n"):
         say(f"{path}: its last line is cut short; left out")
         rows.pop()
     if None in rows:
-        raise SourceError(f"{path}:{rows.index(None) + 2}: not {len(names)} numbers. Mend the line")
+        raise SourceError(f"{path}:{rows.index(None) + 2}: not {len(names)} numbers. Fix the line")
     if not rows:
-        raise SourceError(f"{path} has no rows. Name another file")
+        raise SourceError(f"{path} has no rows. Pass another file")
     values = np.array(rows, float).T
     time_ns = unwrap(values[0], TIME_BITS) * NS_PER_MS
     cells = zip(*(line.split(",")[1:] for line in lines[1 : len(rows) + 1]), strict=True)
@@ -117,7 +118,7 @@ def read_block(path: Path) -> Block:
 
 
 def _in_its_type(cells: tuple[str, ...], values: Array) -> NDArray[Any]:
-    """A column as the firmware has it: integers are written without a point."""
+    """Restore the type of a column: the client writes integers without a decimal point."""
     whole = all(WHOLE.fullmatch(cell) for cell in cells)
     if whole and np.abs(values).max() < 2**31:
         return values.astype(np.int32)
@@ -125,10 +126,10 @@ def _in_its_type(cells: tuple[str, ...], values: Array) -> NDArray[Any]:
 
 
 def _of_one_clock(blocks: list[Block]) -> list[Block]:
-    """Blocks with the wraps added that one of them began before and another after."""
+    """Add missing wraps: blocks may start on different sides of a wrap of the clock."""
     period_ns, start_ns = NS_PER_MS << TIME_BITS, blocks[0].time_ns[0]
     wraps = [round((start_ns - block.time_ns[0]) / period_ns) for block in blocks]
-    return [  # the earliest stays: no time is before 0
+    return [  # relative to the earliest, so that no time is before 0
         replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
         for block, count in zip(blocks, wraps, strict=True)
     ]
@@ -136,7 +137,7 @@ def _of_one_clock(blocks: list[Block]) -> list[Block]:
 
 def _row(line: str, width: int) -> list[float] | None:
     if len(line) > limits.LINE_CHARACTERS:
-        return None  # Python's own error would quote all of it
+        return None  # Python's own error would quote the whole line
     try:
         row = [float(cell) for cell in line.split(",")]
     except ValueError:

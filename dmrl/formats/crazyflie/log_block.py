@@ -1,4 +1,4 @@
-"""Variables that were logged together, and rotations as logs have them."""
+"""Log blocks, time series of their variables, and unpacking of compressed quaternions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ class Block:
     Parameters
     ----------
     name
-        Of the event or log block.
+        Name of the event or log block.
     time_ns
         (N,) nanoseconds.
     columns
-        (N,) for each variable, by name, in the type it was logged in.
+        (N,) values of each variable, by name, in the type in which they were logged.
     """
 
     name: str
@@ -38,16 +38,16 @@ class Series:
     values: Array
 
     def part(self, column: int) -> "Series":
-        """One of the values, (N, 1)."""
+        """Return one of the values as a series, (N, 1)."""
         return Series(self.time_ns, self.values[:, [column]])
 
     def at(self, time_ns: Times) -> Array:
-        """(M, C) values at other times, linear between, held before and after."""
+        """Interpolate (M, C) values at other times: linear, constant before and after."""
         return np.stack([np.interp(time_ns, self.time_ns, v) for v in self.values.T], axis=1)
 
 
 def series(blocks: Sequence[Block], names: Sequence[str]) -> Series | None:
-    """The first block's columns that has all these names, rows with finite values only."""
+    """Return the columns of the first block with all these names, finite rows only; or None."""
     for block in blocks:
         if all(name in block.columns for name in names):
             values = np.stack([block.columns[name].astype(float) for name in names], axis=1)
@@ -57,10 +57,10 @@ def series(blocks: Sequence[Block], names: Sequence[str]) -> Series | None:
 
 
 def unpacked_quaternion(packed: NDArray[np.int64]) -> Array:
-    """(N, 4) x, y, z, w of the firmware's 32-bit quaternions.
+    """Return (N, 4) x, y, z, w of the firmware's 32-bit quaternions.
 
-    Two bits name the largest component, left out and positive; the others follow in order,
-    ten bits each: sign, and nine of magnitude in units of sqrt(1/2).
+    Two bits give the index of the largest component, which is omitted and positive. The others
+    follow in order, ten bits each: the sign, and nine bits of magnitude in units of sqrt(1/2).
     """
     packed = packed & 0xFFFFFFFF
     largest = packed >> 30

@@ -1,19 +1,19 @@
-"""Log variables of the Crazyflie, by their names, in dmrl's units and signs.
+"""Conversion of Crazyflie log variables to dmrl's units, signs and topics.
 
-Every block is kept as it was logged, on ``/<robot>/log/<block>``. What is known of it comes
-besides, on dmrl's own topics:
+Every block is kept as it was logged, on ``/<robot>/log/<block>``. In addition, these quantities
+are derived from it, on dmrl's own topics:
 
 * attitude, from ``stateEstimate.q*``, ``stateEstimateZ.quat``, or ``stateEstimate``, else
-  ``stabilizer`` ``.roll .pitch .yaw`` (degrees, pitch positive nose up: turned round here);
-* its turning rate about the vertical, from ``gyro.*`` (degrees a second, body axes);
-* velocity, from ``stateEstimate.v*``: in the frame of take-off, turned by -yaw, for which
+  ``stabilizer`` ``.roll .pitch .yaw`` (degrees, pitch positive nose up: negated here);
+* its yaw rate about the vertical, from ``gyro.*`` (degrees per second, body axes);
+* velocity, from ``stateEstimate.v*``: in the frame of take-off, rotated by -yaw, for which
   roll and pitch need not be logged;
 * height, from ``stateEstimate.z``, else ``range.zrange`` (millimetres along the body's z);
 * ranges, from ``ranging.distanceN`` (metres as a float, millimetres as an integer, or as
-  whole numbers that metres cannot be) and the event ``estDistance``;
+  whole numbers too large for metres) and the event ``estDistance``;
 * pose and true pose, from ``stateEstimate`` and ``locSrv`` (motion capture).
 
-Attitude or velocity that cannot be had of a log is said in one line, with what it lacks.
+If attitude or velocity cannot be derived, one line reports the missing variables.
 """
 
 import re
@@ -43,7 +43,7 @@ from dmrl.samples.sample import Columns, Sample
 from dmrl.terminal.progress import say
 
 RANGE_MAX_M = 60.0
-ZRANGE_MAX_MM = 8000.0  # the sensor says 32766 and the like where it sees no floor
+ZRANGE_MAX_MM = 8000.0  # the sensor reports values such as 32766 where it detects no floor
 TF_PERIOD_NS = 50_000_000
 DISTANCE = re.compile(r"ranging\.distance(\d+)")
 
@@ -53,14 +53,14 @@ Stream = Iterable[Sample]
 def streams(
     robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object = "the log"
 ) -> list[Stream]:
-    """Samples of a robot's log: each stream in time order.
+    """Build the sample streams of a robot's log, each in time order.
 
     Parameters
     ----------
     robot
         Its name.
     blocks
-        What it logged.
+        Its log blocks.
     names
         Names of the robots that it ranges to, by their number; others are ``cf<number>``.
     where
@@ -74,7 +74,7 @@ def streams(
 def derived(
     robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object
 ) -> list[Stream]:
-    """What is known of blocks in order of time, on dmrl's own topics; see ``streams``."""
+    """Derive dmrl's own topics from blocks in time order; see the module."""
     found: list[Stream] = []
     attitude = attitude_of(blocks)
     if attitude is not None:
@@ -95,7 +95,7 @@ def _ordered(block: Block) -> Block:
 
 
 def as_logged(robot: str, block: Block) -> Stream:
-    """Every variable of a block, exactly as it was logged."""
+    """Build the stream of a block's variables, exactly as they were logged."""
     codes = {name: values.dtype.char.replace("l", "i") for name, values in block.columns.items()}
     kind = LogType(block.name, tuple(codes.items()))
     topic = topics.log(robot, re.sub(r"[^A-Za-z0-9_-]", "_", block.name))
@@ -148,11 +148,11 @@ def _say_what_lacks(
     elif "yaw" in lacking:
         reasons.append("no velocity: no yaw to turn vx, vy by")
     if reasons:
-        say(f"{where}: {'; '.join(reasons)}. What was logged is on {topics.log(robot, '*')}")
+        say(f"{where}: {'; '.join(reasons)}. The log is kept on {topics.log(robot, '*')}")
 
 
 def _flown_over(blocks: Sequence[Block], attitude: Series | None) -> Series | None:
-    """Height from the downward range, which leans with the robot."""
+    """Derive height from the downward range, corrected for the robot's tilt."""
     beam = series(blocks, ["range.zrange"])
     if beam is None:
         return None
@@ -166,7 +166,7 @@ def _flown_over(blocks: Sequence[Block], attitude: Series | None) -> Series | No
 def ranges_of(
     robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object
 ) -> Iterator[Stream]:
-    """UWB distances. A logged value that did not change is the same measurement still."""
+    """Yield streams of UWB distances. A repeated value is not a new measurement."""
     for number, time_ns, range_m in _distances(blocks, where):
         peer = names.get(str(number), f"cf{number}")
         usable = np.isfinite(range_m) & (range_m > 0) & (range_m < RANGE_MAX_M)
@@ -179,7 +179,7 @@ def ranges_of(
 
 
 def _distances(blocks: Sequence[Block], where: object) -> Iterator[tuple[int, Times, Array]]:
-    """(number of the peer, times, metres) of each peer."""
+    """Yield the number, times and distances in metres of each peer."""
     for block in blocks:
         for name, values in block.columns.items():
             match = DISTANCE.fullmatch(name)
@@ -195,14 +195,15 @@ def _distances(blocks: Sequence[Block], where: object) -> Iterator[tuple[int, Ti
 
 
 def _metres_per_unit(values: NDArray[Any], what: str) -> float:
-    """By the type of a logged distance; a tool in between may have made floats of integers."""
-    told = values[np.isfinite(values) & (values > 0)].astype(float)
+    """Detect the unit by type; whole floats too large for metres are millimetres as well."""
+    valid = values[np.isfinite(values) & (values > 0)].astype(float)
     if values.dtype.kind != "f":
-        if told.size and told.max() < RANGE_MAX_M:
-            say(f"{what} is taken for mm, but is {told.max():.0f} at most. Are they metres?")
+        if valid.size and valid.max() < RANGE_MAX_M:
+            say(f"{what} is read as mm, but is {valid.max():.0f} at most. Are they metres?")
         return 1e-3
-    if told.size and told.min() > RANGE_MAX_M and (told % 1 == 0).all():
-        say(f"{what} holds whole numbers from {told.min():.0f} on: taken for millimetres")
+    # A tool in between may have converted integers to floats.
+    if valid.size and valid.min() > RANGE_MAX_M and (valid % 1 == 0).all():
+        say(f"{what} has only whole numbers, {valid.min():.0f} or more: read as millimetres")
         return 1e-3
     return 1.0
 
@@ -214,7 +215,7 @@ def _poses(robot: str, blocks: Sequence[Block]) -> Iterator[Stream]:
         yield _pose_samples(topics.pose(robot), *estimated)
     if true is not None:
         if not any(block.name == "estPose" for block in blocks):
-            # Polled faster than it comes, a pose stands several times: once is enough.
+            # A pose that is polled faster than it arrives is logged several times: keep one.
             time_ns, rows = true
             fresh = np.concatenate([[True], (np.diff(rows, axis=0) != 0).any(axis=1)])
             true = time_ns[fresh], rows[fresh]
@@ -224,14 +225,14 @@ def _poses(robot: str, blocks: Sequence[Block]) -> Iterator[Stream]:
 
 
 def _pose(place: Series | None, turn: Series | None) -> tuple[Times, Array] | None:
-    """(N,) times and (N, 7) x, y, z, qx, qy, qz, qw; no turn: level, looking along x."""
+    """Return (N,) times and (N, 7) x, y, z, qx, qy, qz, qw; default attitude: level, along x."""
     if place is None:
         return None
     if turn is None:
         level = np.tile([0.0, 0.0, 0.0, 1.0], (len(place.time_ns), 1))
         return place.time_ns, np.column_stack([place.values, level])
     same = np.isin(place.time_ns, turn.time_ns)
-    if same.any():  # one block: no need to interpolate
+    if same.any():  # one block: matching times need no interpolation
         time_ns, first = np.unique(place.time_ns[same], return_index=True)
         at = np.searchsorted(turn.time_ns, time_ns)
         return time_ns, np.column_stack([place.values[same][first], turn.values[at]])
@@ -251,7 +252,7 @@ def _pose_samples(topic: str, time_ns: Times, rows: Array) -> Stream:
 
 
 def _transforms(robot: str, time_ns: Times, rows: Array) -> Stream:
-    """Frames of the robot, every 50 ms."""
+    """Yield the frames of the robot, every 50 ms."""
     first = np.unique(time_ns // TF_PERIOD_NS, return_index=True)[1]
     angles = euler_zyx(rows[first, 3:])
     for moment, row, (roll, pitch, yaw) in zip(

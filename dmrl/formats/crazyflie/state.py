@@ -1,4 +1,4 @@
-"""The state of a Crazyflie, as series over time, from whichever of its log variables have it."""
+"""State of a Crazyflie as time series, from whichever of its log variables contain it."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ ANGLES = ("roll", "pitch", "yaw")
 
 
 def attitude_of(blocks: Sequence[Block]) -> Series | None:
-    """Roll, pitch, yaw of Rz Ry Rx, radians, (N, 3), yaw unwrapped; None: not all logged."""
+    """Return roll, pitch, yaw of Rz Ry Rx, radians, (N, 3), yaw unwrapped; None: not all logged."""
     turned = quaternions_of(blocks)
     if turned is not None:
         angles = euler_zyx(turned.values)
@@ -20,13 +20,13 @@ def attitude_of(blocks: Sequence[Block]) -> Series | None:
     roll, pitch, yaw = (angle_of(blocks, name) for name in ANGLES)
     if roll is None or pitch is None or yaw is None:
         return None
-    # Angles of other blocks are taken to the times of the first.
+    # Angles of other blocks are interpolated at the times of the first.
     columns = [roll.values, -pitch.at(roll.time_ns), yaw.at(roll.time_ns)]
     return Series(roll.time_ns, np.hstack(columns))
 
 
 def angle_of(blocks: Sequence[Block], name: str) -> Series | None:
-    """(N, 1) radians, in the sign of the log, without jumps; None: not logged."""
+    """Return (N, 1) radians, with the sign of the log, unwrapped; None: not logged."""
     for group in ("stateEstimate", "stabilizer"):
         logged = series(blocks, [f"{group}.{name}"])
         if logged is not None:
@@ -35,7 +35,7 @@ def angle_of(blocks: Sequence[Block], name: str) -> Series | None:
 
 
 def quaternions_of(blocks: Sequence[Block], group: str = "stateEstimate") -> Series | None:
-    """(N, 4) unit quaternions x, y, z, w; rows before the estimator has started are left out."""
+    """Return (N, 4) unit quaternions x, y, z, w, without rows before the estimator has started."""
     logged = series(blocks, [f"{group}.{name}" for name in ("qx", "qy", "qz", "qw")])
     packed = series(blocks, ["stateEstimateZ.quat"]) if group == "stateEstimate" else None
     if logged is None and packed is not None:
@@ -50,10 +50,10 @@ def quaternions_of(blocks: Sequence[Block], group: str = "stateEstimate") -> Ser
 
 
 def yaw_rate_of(blocks: Sequence[Block], attitude: Series) -> Array:
-    """(N,) turning rate about the vertical at the times of the attitude, radians a second.
+    """Compute the (N,) yaw rate about the vertical at the times of the attitude, rad/s.
 
     From the gyroscope: (q sin(roll) + r cos(roll)) / cos(pitch), or r alone where q was not
-    logged; without a gyroscope, the slope of the yaw.
+    logged. Without a gyroscope: the slope of the yaw.
     """
     roll, pitch, yaw = attitude.values.T
     both = series(blocks, ["gyro.y", "gyro.z"])
@@ -70,7 +70,7 @@ def yaw_rate_of(blocks: Sequence[Block], attitude: Series) -> Array:
 
 
 def scaled(blocks: Sequence[Block], names: str) -> Series | None:
-    """State in metres: from stateEstimate, else from stateEstimateZ, in millimetres."""
+    """Return state in metres: from stateEstimate, else from stateEstimateZ, in millimetres."""
     plain = series(blocks, [f"stateEstimate.{name}" for name in names.split()])
     if plain is not None:
         return plain
@@ -79,9 +79,9 @@ def scaled(blocks: Sequence[Block], names: str) -> Series | None:
 
 
 def turn_of(blocks: Sequence[Block]) -> Series | None:
-    """(N, 4) unit quaternions x, y, z, w, of the angles where there is none; those not logged: 0.
+    """Return (N, 4) unit quaternions x, y, z, w, else from the angles; missing angles are 0.
 
-    None: nothing that tells a turn was logged.
+    None: no orientation was logged.
     """
     turned = quaternions_of(blocks)
     angles = {name: angle for name in ANGLES if (angle := angle_of(blocks, name)) is not None}

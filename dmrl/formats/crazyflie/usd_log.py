@@ -3,8 +3,8 @@
 Little endian: ``0xBC``, u16 version, u16 number of event types; per type u16 id, name, 0,
 u16 number of variables, each ``group.name(T)`` and 0, T a letter of ``struct``. Then records:
 u16 id, time since boot (version 1: u32 milliseconds, version 2: u64 microseconds), the
-values. The last four bytes are the CRC-32 of all before. A log that was cut short, by a flat
-battery as a rule, has no CRC: all its whole records are read, with a warning.
+values. The last four bytes are the CRC-32 of all before. A log that was cut short, usually by an
+empty battery, has no CRC. All its whole records are read, with a warning.
 """
 
 import struct
@@ -19,32 +19,32 @@ from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options, content_of
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import Block
-from dmrl.formats.crazyflie.usd_records import Event, Rows, records_of
+from dmrl.formats.crazyflie.usd_records import Event, Rows, gather_records
 from dmrl.formats.timestamps import unwrap
 from dmrl.terminal.progress import say
 
 MAGIC = 0xBC
 VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}
-"""Type and nanoseconds of a time, by version."""
+"""NumPy type of a time, and nanoseconds of its unit, by version."""
 CODES = "bBhHiIef"
 TYPES_MAX = 250
 CRC_BYTES = 4
 SAID = 3
-"""Files of a folder that are named one by one when they are left out."""
+"""Largest number of skipped files that are listed by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """What a file holds.
+    """Content of a file.
 
     Parameters
     ----------
     version
-        Of the format.
+        Version of the format.
     blocks
         One for each event type that has records.
     warnings
-        What is wrong with the file, a line each.
+        Problems of the file, a line each.
     """
 
     version: int
@@ -53,7 +53,7 @@ class Log:
 
 
 def recognises(source: Path) -> bool:
-    """Whether a file begins like such a log, or a folder holds one that does."""
+    """Return whether a file begins like a micro-SD log, or a folder contains one that does."""
     if source.is_dir():
         return any(recognises(path) for path in source.iterdir() if path.is_file())
     with source.open("rb") as stream:
@@ -65,28 +65,28 @@ def recognises(source: Path) -> bool:
 
 
 def decode(data: bytes, what: object = "the log") -> Log:
-    """Records of a log, as one array per variable.
+    """Decode the records of a log to one array per variable.
 
     Parameters
     ----------
     data
-        The file.
+        Content of the file.
     what
         Its name, for errors.
 
     Raises
     ------
     SourceError
-        If it is no such log, or ends inside its header.
+        If it is no micro-SD log, or ends inside its header.
     """
     if not data:
-        raise SourceError(f"{what} is empty: the card was full, or removed. Name another log")
+        raise SourceError(f"{what} is empty: the card was full, or removed. Pass another log")
     version, events, body = _header(data, what)
     sealed = len(data) - body >= CRC_BYTES and zlib.crc32(
         memoryview(data)[:-CRC_BYTES]
     ) == int.from_bytes(data[-CRC_BYTES:], "little")
     stop = len(data) - CRC_BYTES * sealed
-    rows, end = records_of(data, body, stop, events)
+    rows, end = gather_records(data, body, stop, events)
     warnings = [] if sealed else [f"{what}: no valid CRC at its end; cut short, or damaged"]
     if left := stop - end:
         warnings.append(f"{what}: {left} bytes from byte {end} on are no whole record; left out")
@@ -96,11 +96,11 @@ def decode(data: bytes, what: object = "the log") -> Log:
 
 
 def _header(data: bytes, what: object) -> tuple[int, list[Event], int]:
-    """Version, event types, and where the records begin."""
+    """Parse the version, the event types, and the offset at which the records begin."""
     try:
         magic, version, types = struct.unpack_from("<BHH", data)
         if magic != MAGIC or version not in VERSIONS or not 0 < types <= TYPES_MAX:
-            raise SourceError(f"{what} is no micro-SD log of version 1 or 2. Name another file")
+            raise SourceError(f"{what} is no micro-SD log of version 1 or 2. Pass another file")
         at, events = 5, []
         for _ in range(types):
             (number,) = struct.unpack_from("<H", data, at)
@@ -114,7 +114,7 @@ def _header(data: bytes, what: object) -> tuple[int, list[Event], int]:
             events.append(Event(number, name, tuple(variables), VERSIONS[version][0]))
     except (struct.error, ValueError) as e:
         raise SourceError(
-            f"{what} is damaged in its header, or ends there: {e}. Name another log"
+            f"{what} is damaged in its header, or ends there: {e}. Pass another log"
         ) from None
     _check(events, what)
     return version, events, at
@@ -133,11 +133,11 @@ def _check(events: list[Event], what: object) -> None:
         ) or not (event.name.isprintable() and event.name and len(set(names)) == len(names)):
             raise SourceError(
                 f"{what}: event {event.name!r} has variables without name or known type in its "
-                "header. Name another log"
+                "header. Pass another log"
             )
     for kind, values in (("id", [e.number for e in events]), ("name", [e.name for e in events])):
         if len(set(values)) < len(values):
-            raise SourceError(f"{what}: two events have the same {kind}. Name another log")
+            raise SourceError(f"{what}: two events have the same {kind}. Pass another log")
 
 
 def _block(event: Event, rows: Rows, scale_ns: int) -> Block:
@@ -148,20 +148,20 @@ def _block(event: Event, rows: Rows, scale_ns: int) -> Block:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of a log, or of a folder with one log per robot, named after it.
+    """Load the samples of a log, or of a folder with one log per robot, named after it.
 
     Parameters
     ----------
     source
         The file or folder.
     options
-        ``robot`` names the robot of a single file; ``names`` the robots ranged to, and those of a
-        folder.
+        ``robot`` is the robot of a single file. ``names`` names the robots ranged to, and those of
+        a folder.
 
     Raises
     ------
     SourceError
-        If a log cannot be used. A folder's empty files are left out, with a line that says so.
+        If a log cannot be used. Empty files of a folder are left out and reported.
     """
     streams = [s for robot, path in _files(source, options) for s in _streams(robot, path, options)]
     return content_of(streams)
@@ -174,7 +174,7 @@ def _files(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
     paths = sorted(p for p in source.iterdir() if p.is_file() and p.name[0] != ".")
     logs = [path for path in paths if path.stat().st_size and recognises(path)]
     if not logs:
-        raise SourceError(f"no micro-SD log in {source}. Name a folder with one file per robot")
+        raise SourceError(f"no micro-SD log in {source}. Pass a folder with one file per robot")
     for path in paths:
         if path.stat().st_size == 0:
             say(f"{path} is empty; left out")
@@ -182,7 +182,7 @@ def _files(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
             yield options.names.get(path.stem, path.stem), path
     if others := [path.name for path in paths if path.stat().st_size and path not in logs]:
         more = f" and {len(others) - SAID} more" if len(others) > SAID else ""
-        say(f"{source}: left out: {', '.join(others[:SAID])}{more} is no micro-SD log")
+        say(f"{source}: left out, as no micro-SD log: {', '.join(others[:SAID])}{more}")
 
 
 def _streams(robot: str, path: Path, options: Options) -> list[log_variables.Stream]:
@@ -190,7 +190,7 @@ def _streams(robot: str, path: Path, options: Options) -> list[log_variables.Str
     for warning in log.warnings:
         say(warning)
     if not log.blocks:
-        raise SourceError(f"{path} has a header, but no whole record. Name another log")
+        raise SourceError(f"{path} has a header, but no whole record. Pass another log")
     return log_variables.streams(robot, log.blocks, options.names, path)
 
 

@@ -1,4 +1,4 @@
-"""What the columns of somebody else's CSV file are: a TOML file, one table per quantity.
+"""Meaning of the columns of a foreign CSV file: a TOML file with one table per quantity.
 
 ::
 
@@ -17,7 +17,7 @@
     name = "uwb_2"
     unit = "mm"
 
-``QUANTITIES`` lists what there is.
+``QUANTITIES`` lists the supported quantities.
 """
 
 from collections.abc import Iterator, Mapping
@@ -47,7 +47,7 @@ QUANTITIES: dict[str, Mapping[str, float]] = {
     **dict.fromkeys(("true_x", "true_y", "true_z"), LENGTH),
     **dict.fromkeys(("true_qx", "true_qy", "true_qz", "true_qw"), PLAIN),
 }
-"""Quantities and their units, each with its size in dmrl's (of time: in nanoseconds)."""
+"""Quantities and their units, each with its size in dmrl's unit (time: in nanoseconds)."""
 
 TOGETHER = (
     ("roll", "pitch"),
@@ -57,22 +57,22 @@ TOGETHER = (
     ("true_x", "true_y", "true_z"),
     ("true_qx", "true_qy", "true_qz", "true_qw"),
 )
-"""Quantities that mean something together only."""
+"""Groups of quantities that are only meaningful together."""
 KEYS = ("name", "unit", "sign", "frame")
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """What one column holds.
+    """One column of the file.
 
     Parameters
     ----------
     name
-        In the file's first line.
+        Its name in the file's first line.
     scale
-        From its unit and sign to dmrl's.
+        Factor from its unit and sign to dmrl's.
     frame
-        Of a velocity.
+        Frame of a velocity.
     """
 
     name: str
@@ -82,29 +82,29 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """Columns by quantity, and of ranges by peer."""
+    """Columns by quantity, and columns of ranges by peer."""
 
     columns: Mapping[str, Column]
     ranges: Mapping[str, Column]
 
     @property
     def names(self) -> set[str]:
-        """All columns of the file that it takes."""
+        """Names of all columns of the file that the map uses."""
         return {column.name for column in (*self.columns.values(), *self.ranges.values())}
 
 
 def read_map(path: Path) -> ColumnMap:
-    """The map that a TOML file describes.
+    """Read the column map from a TOML file.
 
     Raises
     ------
     SourceError
-        If the file is not TOML, or describes no map: names every fault, in one line.
+        If the file is not TOML, or no valid map: names every error, in one line.
     """
     try:
         values = parse_toml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as e:
-        raise SourceError(f"{path} is no table of columns in TOML: {e}. Mend it") from None
+        raise SourceError(f"{path} is no table of columns in TOML: {e}. Fix it") from None
     ranges = values.pop("range", {})
     ranges = ranges if isinstance(ranges, dict) else {"": ranges}
     faults = [fault for key, table in values.items() for fault in _faults(key, table)]
@@ -123,16 +123,16 @@ def _missing(values: Mapping[str, Any]) -> Iterator[str]:
         given = [name for name in group if name in values]
         if given and len(given) < len(group):
             lacking = ", ".join(f"[{name}]" for name in group if name not in values)
-            yield f"[{given[0]}] wants {lacking} too"
+            yield f"[{given[0]}] also needs {lacking}"
     frames = {v.get("frame", "") for k, v in values.items() if k[0] == "v" and isinstance(v, dict)}
     if len(frames) > 1:
-        yield "velocities of several frames"
+        yield "velocities in several frames"
     if "height" in values and "z" in values:
-        yield "[height] and [z] are one thing; leave one out"
+        yield "[height] and [z] are the same quantity; remove one"
 
 
 def _faults(key: str, table: Any) -> Iterator[str]:
-    """What is wrong with the table of a quantity."""
+    """Yield the errors of a quantity's table."""
     units = LENGTH if key.startswith("range.") else QUANTITIES.get(key)
     if units is None:
         near = get_close_matches(key, QUANTITIES, n=1)
@@ -146,7 +146,7 @@ def _faults(key: str, table: Any) -> Iterator[str]:
 
 
 def _wrong_values(units: Mapping[str, float], table: Mapping[str, Any]) -> dict[str, str]:
-    """What is wrong with the values of a quantity's table, by their keys."""
+    """Return the errors of the values of a quantity's table, by key."""
     wrong = {}
     name, unit, sign, frame = (table.get(key) for key in KEYS)
     if not (isinstance(name, str) and name):
@@ -159,7 +159,7 @@ def _wrong_values(units: Mapping[str, float], table: Mapping[str, Any]) -> dict[
     if units is SPEED and frame not in FRAMES:
         wrong["frame"] = f"not one of {', '.join(FRAMES)}"
     if units is not SPEED and "frame" in table:
-        wrong["frame"] = "of velocities only"
+        wrong["frame"] = "for velocities only"
     return wrong
 
 

@@ -1,4 +1,4 @@
-"""Pictures of any size brought to one size, with their labels and calibration."""
+"""Cropping and scaling of images to one size, with their labels and calibration."""
 
 from dataclasses import dataclass, replace
 
@@ -9,16 +9,16 @@ from dmrl.images import codec
 
 @dataclass(frozen=True, slots=True)
 class Crop:
-    """The largest centred part of a picture with another aspect ratio, scaled.
+    """The largest centred part of an image with another aspect ratio, scaled.
 
     Parameters
     ----------
     from_width_px, from_height_px
-        Size of the picture.
+        Size of the image.
     width_px, height_px
-        Size wanted.
+        Size of the result.
     margin_px
-        Left and top of what counts as the picture, which lies in its middle.
+        Left and top margin around the centred area that is used.
     """
 
     from_width_px: int
@@ -29,12 +29,12 @@ class Crop:
 
     @property
     def changes(self) -> bool:
-        """Whether the picture is not of the wanted size already."""
+        """Whether the image needs to be cropped or scaled."""
         return (self.from_width_px, self.from_height_px) != (self.width_px, self.height_px)
 
     @property
     def scale(self) -> float:
-        """Wanted pixels per pixel of the picture, the same both ways."""
+        """Pixels of the result per pixel of the image, the same in both directions."""
         width_px = self.from_width_px - 2 * self.margin_px[0]
         height_px = self.from_height_px - 2 * self.margin_px[1]
         return max(self.width_px / width_px, self.height_px / height_px)
@@ -47,14 +47,14 @@ class Crop:
         return max(left, 0.0), max(top, 0.0)
 
     def pixels(self, rgb: codec.Rgb) -> codec.Rgb:
-        """Part of a picture that is kept, (height_px, width_px, 3)."""
+        """Return the kept part of an image, (height_px, width_px, 3)."""
         left, top = self.corner_px
         right = min(left + self.width_px / self.scale, self.from_width_px)
         bottom = min(top + self.height_px / self.scale, self.from_height_px)
         return codec.crop_and_scale(rgb, (left, top, right, bottom), self.width_px, self.height_px)
 
     def label(self, row: LabelRow) -> LabelRow:
-        """A label in the pixels of the result; its box is clipped, or empty if outside."""
+        """Return a label in the pixels of the result; its box is clipped, or empty if outside."""
         left, top = self.corner_px
         sigma_u, sigma_v, sigma_depth = row.sigmas
         return replace(
@@ -74,7 +74,7 @@ class Crop:
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else ()
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera that would have taken the result."""
+        """Return the calibration of the result."""
         left, top = self.corner_px
         return replace(
             camera,

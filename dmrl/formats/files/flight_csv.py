@@ -2,15 +2,15 @@
 
 Columns, SI units, angles in radians:
 
-* ``time_s, roll_rad, pitch_rad, yaw_rate_radps, vx_mps, vy_mps, height_m`` must be there:
+* ``time_s, roll_rad, pitch_rad, yaw_rate_radps, vx_mps, vy_mps, height_m`` are required:
   velocity in the robot's own horizontal frame (x forward, y left, turning with its yaw),
   attitude Rz(yaw) Ry(pitch) Rx(roll), z up, so pitch is positive nose down;
-* ``range_<peer>_m`` may be: UWB distance, empty where there was none;
-* ``<peer>_x_m, <peer>_y_m, <peer>_z_m`` may be: true position of the peer in the robot's
-  horizontal frame, empty where it is not known;
-* columns of other sensors may be, as ``csv`` in dmrl/topics.py names them.
+* ``range_<peer>_m`` is optional: UWB distance, empty where there is none;
+* ``<peer>_x_m, <peer>_y_m, <peer>_z_m`` are optional: true position of the peer in the robot's
+  horizontal frame, empty where it is unknown;
+* columns of other sensors are optional, named like ``csv`` in dmrl/topics.py.
 
-Pictures of a robot lie in a folder ``<robot>/``, named by their time in nanoseconds, at least
+Images of a robot are in a folder ``<robot>/``, named by their time in nanoseconds, at least
 12 digits (zeros in front); ``calibration.toml`` there is its camera.
 """
 
@@ -37,20 +37,20 @@ from dmrl.topics import Topic
 TIME = "time_s"
 REQUIRED = (TIME, *LOG_COLUMNS)
 GAP_S = 1.0
-TIME_MAX_S = 9e9  # nanoseconds of it fill 64 bits; the year 2255 of those who count from 1970
-RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios that found nothing say 65535 mm
+TIME_MAX_S = 9e9  # its nanoseconds fit 64 bits; the year 2255 if counted from 1970
+RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
 OWN = {field for row in topics.OWN_SENSORS for field in row.csv}
 OTHERS = tuple(
     row
     for row in topics.SENSORS
     if row.csv and row.pattern != topics.RANGE and not set(row.csv) <= set(LOG_COLUMNS)
 )
-"""Sensors whose columns need no rule of their own."""
+"""Sensors whose columns need no special rule."""
 
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """One CSV file: its path, columns, (N,) each, NaN where a cell is empty, and line of a row."""
+    """One CSV file: path, (N,) columns with NaN for empty cells, and the line of each row."""
 
     path: Path
     columns: dict[str, Array]
@@ -58,7 +58,7 @@ class Log:
 
     @property
     def robot(self) -> str:
-        """The robot it is of."""
+        """Robot of the file."""
         return self.path.stem
 
     @property
@@ -68,7 +68,7 @@ class Log:
 
     @property
     def ranged(self) -> list[str]:
-        """Peers that it has ranges to."""
+        """Peers to which it has ranges."""
         return [
             name[6:-2]
             for name in self.columns
@@ -77,7 +77,7 @@ class Log:
 
     @property
     def seen(self) -> list[str]:
-        """Peers whose true position it has."""
+        """Peers of which it has true positions."""
         return [
             name[:-4]
             for name in self.columns
@@ -87,7 +87,7 @@ class Log:
 
 
 def recognises(source: Path) -> bool:
-    """Whether a folder holds a CSV file whose first column is ``time_s``."""
+    """Return whether a folder has a CSV file whose first column is ``time_s``."""
     return source.is_dir() and any(_header(path)[:1] == [TIME] for path in source.glob("*.csv"))
 
 
@@ -100,14 +100,14 @@ def _header(path: Path) -> list[str]:
 
 
 def content(source: Path, options: Options | None = None) -> Content:
-    """Samples of a flight, in time order. Says on stderr what is odd but can be used.
+    """Load the samples of a flight, in time order. Reports suspicious values on stderr.
 
     Parameters
     ----------
     source
         The folder.
     options
-        ``names`` of robots; ``camera`` and ``size_px`` of the pictures.
+        ``names`` of robots; ``camera`` and ``size_px`` of the images.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def content(source: Path, options: Options | None = None) -> Content:
     """
     paths = sorted(source.glob("*.csv")) if source.is_dir() else []
     if not paths:
-        raise SourceError(f"no <robot>.csv in {source}. Name a folder with a file per robot")
+        raise SourceError(f"no <robot>.csv in {source}. Pass a folder with a file per robot")
     logs = [read_log(path) for path in paths]
     _check_together(logs)
     options = options or Options()
@@ -127,7 +127,7 @@ def content(source: Path, options: Options | None = None) -> Content:
 
 
 def read_log(path: Path) -> Log:
-    """One robot's file, checked.
+    """Read and check the file of one robot.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def read_log(path: Path) -> Log:
     lines = [line for line, _ in rows]
     values = [_numbers(path, line, row, len(names)) for line, row in rows]
     if len(rows) < 2:
-        raise SourceError(f"{path} has fewer than two rows. Give it a flight, or remove it")
+        raise SourceError(f"{path} has fewer than two rows. Add rows, or remove it")
     log = Log(path, dict(zip(names, np.array(values).T, strict=True)), lines)
     _check(log)
     return log
@@ -155,18 +155,18 @@ def read_log(path: Path) -> Log:
 
 def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
     if len(row) != width:
-        raise SourceError(f"{path}:{line} has {len(row)} cells, not {width}. Mend the line")
+        raise SourceError(f"{path}:{line} has {len(row)} cells, not {width}. Fix the line")
     try:
         return [float(cell) if cell.strip() else np.nan for cell in row]
     except ValueError as e:
-        raise SourceError(f"{path}:{line}: {e}. Mend the line, or leave the cell empty") from None
+        raise SourceError(f"{path}:{line}: {e}. Fix the line, or leave the cell empty") from None
 
 
 def _check(log: Log) -> None:
     for name in REQUIRED:
         if (bad := np.flatnonzero(~np.isfinite(log.columns[name]))).size:
             raise SourceError(
-                f"{log.path}:{log.lines[bad[0]]}: {name} is no number. Fill it, or drop the line"
+                f"{log.path}:{log.lines[bad[0]]}: {name} is no number. Fill it, or remove the line"
             )
     steps = np.diff(log.time_s)
     if (back := np.flatnonzero(steps <= 0)).size:
@@ -188,7 +188,7 @@ def _check(log: Log) -> None:
 
 
 def _warn_of_units(log: Log) -> None:
-    """Doubt columns a tenth of whose values is too large for any small robot."""
+    """Warn about columns of which a tenth is too large for any small robot."""
     for doubt in (doubt for row in topics.OWN_SENSORS for doubt in row.doubts):
         if doubt.field not in log.columns:
             continue
@@ -240,7 +240,7 @@ def _streams(log: Log, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
 
 
 def _columns_of(row: Topic, log: Log) -> Iterator[tuple[str, dict[str, Array]]]:
-    """Columns of a sensor by the fields of its message, for each peer that it has them of."""
+    """Yield the columns of a sensor by the fields of its message, for each peer that has them."""
     if not row.of_pairs:
         peers = [""]
     else:

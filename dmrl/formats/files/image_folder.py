@@ -1,23 +1,24 @@
-"""A folder of pictures, with labels in a CSV file where there are any.
+"""A folder of images, with labels in a CSV file if there is one.
 
-Pictures: ``.png .jpg .jpeg .ppm .pgm .bmp``, in the order of their names. When every name is a
-number of 12 digits or more, the numbers are times in nanoseconds; otherwise the pictures
+Images: ``.png .jpg .jpeg .ppm .pgm .bmp``, in the order of their names. If every name is a
+number of 12 digits or more, the numbers are times in nanoseconds; otherwise the images
 get nominal times, evenly spaced from 0.
 
-Labels: ``labels.csv`` in the folder, or another file. One row per peer and picture; a row
-with an empty peer says that no peer is in view. A picture without a row is not labelled.
+Labels: ``labels.csv`` in the folder, or another file. It has one row per peer and image; a row
+with an empty peer means that no peer is in view. An image without a row is not labelled.
 
-* ``file, peer, u_px, v_px, depth_m`` must be there;
+* ``file, peer, u_px, v_px, depth_m`` are required;
 * ``left_px, top_px, right_px, bottom_px, visible_share, source, split, sigma_u_px,
-  sigma_v_px, sigma_depth_m`` may be. ``source`` is "hand" where it is empty.
+  sigma_v_px, sigma_depth_m`` are optional. An empty ``source`` is "hand".
 
 Or ``label.txt`` as the published firmware's tools write it, ``imgNNNNN.ppm roll pitch x y z d``
-a line: see ``aideck``. Labels of it need a camera. Maps of a chip: see ``chip_maps``.
+per line: see ``published_firmware``. Its labels need a camera. Maps of a chip: see
+``chip_outputs``.
 
-Pixels are those of the stored picture, pixel-edge coordinates. ``calibration.toml`` in the
-folder is the camera that took the pictures as they are stored (keys: see ``Camera``). Pictures of
-the AI-deck's whole sensor, 324x244, with a camera of 320x224 are cut to what that is of, unless
-324x244 is asked for.
+Pixels are those of the stored image, in pixel-edge coordinates. ``calibration.toml`` in the
+folder is the camera of the images as they are stored (keys: see ``Camera``). Images of the
+AI-deck's whole sensor, 324x244, with a camera of 320x224 are cropped to the area of that camera,
+unless 324x244 is requested.
 """
 
 from collections.abc import Collection, Iterator
@@ -50,7 +51,7 @@ TIME_MAX_NS = 2**63 - 1
 
 
 def recognises(source: Path) -> bool:
-    """Whether a folder holds a picture."""
+    """Return whether a folder has an image."""
     return source.is_dir() and any(_is_picture(path) for path in source.iterdir())
 
 
@@ -59,22 +60,22 @@ def _is_picture(path: Path) -> bool:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of a folder: pictures in time order, with the labels they have.
+    """Load the samples of a folder: images in time order, with their labels.
 
     Parameters
     ----------
     source
         The folder.
     options
-        All but ``names`` count.
+        All but ``columns``; of ``names`` only "0", the peer of ``label.txt``.
 
     Raises
     ------
     SourceError
-        If there is no picture, one cannot be decoded, or the labels do not fit them: names
+        If there is no image, one cannot be decoded, or the labels do not match them: names
         the file, and the line.
     SettingError
-        If the camera is not of the pictures' size.
+        If the camera does not have the images' size.
     """
     own = source / CALIBRATION
     if options.camera is None and own.is_file():
@@ -86,7 +87,7 @@ def content(source: Path, options: Options) -> Content:
     splits = {name: found[0].split for name, found in rows.items()}
     states = _aideck_labels(source / AIDECK_LABELS, known)
     if states.keys() - rows.keys() and options.camera is None:
-        say(f"{source / AIDECK_LABELS} gives no labels without a camera. Try: --camera aideck")
+        say(f"{source / AIDECK_LABELS} gives no labels without a camera. Pass: --camera aideck")
     return Content(
         samples=_samples(pictures, rows, states, options),
         total=len(pictures) + len(rows) + (options.camera is not None),
@@ -95,7 +96,7 @@ def content(source: Path, options: Options) -> Content:
 
 
 def list_pictures(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
-    """(time_ns, path) of every picture in a folder, in time order.
+    """List (time_ns, path) of every image in a folder, in time order.
 
     Raises
     ------
@@ -103,11 +104,11 @@ def list_pictures(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
         If there is none, only some are named by times, or two have the same time.
     """
     if not source.is_dir():
-        raise SourceError(f"no folder {source}. Name a folder of pictures")
+        raise SourceError(f"no folder {source}. Pass a folder of images")
     refuse_pipes(source)
     paths = sorted(path for path in source.iterdir() if _is_picture(path))
     if not paths:
-        raise SourceError(f"no picture ({', '.join(SUFFIXES)}) in {source}. Name another folder")
+        raise SourceError(f"no image ({', '.join(SUFFIXES)}) in {source}. Pass another folder")
     timed = [path for path in paths if _time_ns(path) is not None]
     if not timed:
         return [(round(k * NS_PER_S / rate_hz), path) for k, path in enumerate(paths)]
@@ -132,7 +133,7 @@ def _time_ns(path: Path) -> int | None:
 
 
 def _aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[float]]:
-    """Six numbers by picture, from ``label.txt`` where there is one."""
+    """Load six numbers per image from ``label.txt``, if it exists."""
     found: dict[str, list[float]] = {}
     try:
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
@@ -148,9 +149,9 @@ def _aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[float]]
             values = []
         if len(values) != len(published_firmware.VARIABLES):
             wanted = " ".join(published_firmware.VARIABLES)
-            raise SourceError(f"{path}:{number}: not a picture and {wanted}. Mend the line")
+            raise SourceError(f"{path}:{number}: not an image and {wanted}. Fix the line")
         if (name := name.rsplit("/", 1)[-1]) not in files:
-            raise SourceError(f"{path}:{number}: no picture {name}. Add it, or delete the line")
+            raise SourceError(f"{path}:{number}: no image {name}. Add it, or delete the line")
         found[name] = values
     return found
 
@@ -161,7 +162,7 @@ def _samples(
     states: dict[str, list[float]],
     options: Options,
 ) -> Iterator[Sample]:
-    """The calibration, then of each picture: itself, its labels, and what the firmware said."""
+    """Yield the calibration, then each image, its labels, and the firmware's numbers."""
     for k, (time_ns, path) in enumerate(pictures):
         crop, data, kind = _stored(path, options)
         if options.camera is not None and k == 0:
@@ -183,7 +184,7 @@ def _samples(
 
 
 def _stored(path: Path, options: Options) -> tuple[Crop, bytes, str]:
-    """How a picture is cropped, and its bytes and format: as they are, where nothing changes."""
+    """Return the crop, bytes and format of an image; the bytes are unchanged if possible."""
     data = path.read_bytes()
     rgb = _colours(data, path) if options.raw else codec.decode(data, path, limits.PIXELS)
     crop = _crop(rgb.shape[1], rgb.shape[0], path, options)
@@ -198,7 +199,7 @@ def _stored(path: Path, options: Options) -> tuple[Crop, bytes, str]:
 def _colours(data: bytes, path: Path) -> codec.Rgb:
     rgb = codec.decode(data, path, limits.PIXELS)
     if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
-        raise SourceError(f"{path} has colours already, so it is not raw. Leave out --raw")
+        raise SourceError(f"{path} has colours already, so it is not raw. Remove --raw")
     return rgb_of(rgb[..., 0].copy())
 
 
@@ -211,7 +212,7 @@ def _crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
         return Crop(*size, *wanted, (0, 0) if wanted == size else AIDECK_CORNER_PX)
     raise SettingError(
         f"{path} is {width_px}x{height_px} px, its camera {camera.width_px}x"
-        f"{camera.height_px}. Give the calibration of the pictures as they are stored"
+        f"{camera.height_px}. Pass the calibration of the images as they are stored"
     )
 
 
@@ -220,9 +221,9 @@ def _size(camera: Camera) -> tuple[int, int]:
 
 
 def _camera_after(crop: Crop, camera: Camera) -> Camera:
-    """The camera of the pictures as they are written, from one of them as they are stored.
+    """Return the camera of the cropped images, from that of the stored ones.
 
-    A camera that is of less than is stored is of what lies in the middle.
+    A camera smaller than the stored images is centred in them.
     """
     left = (crop.from_width_px - camera.width_px) / 2
     top = (crop.from_height_px - camera.height_px) / 2

@@ -1,4 +1,4 @@
-"""Labels of pictures in a CSV file: rows in, rows out."""
+"""Labels of images in a CSV file: reading and writing of rows."""
 
 import csv
 import math
@@ -21,28 +21,28 @@ COLUMNS = (*NEEDED, *BOX, "visible_share", "source", "split", *SIGMAS)
 
 @dataclass(frozen=True, slots=True)
 class LabelRow:
-    """One peer in one picture.
+    """One peer in one image.
 
     Parameters
     ----------
     file
-        Name of the picture.
+        Name of the image.
     peer
-        The robot that is seen; empty: no peer is in view.
+        The robot in view; empty: no peer is in view.
     u_px, v_px
         Projection of its centre, pixel-edge coordinates.
     depth_m
         Distance along the optical axis, metres.
     box_px
-        Left, top, right, bottom of the visible part; empty where not known.
+        Left, top, right, bottom of the visible part; empty if unknown.
     visible_share
-        Share of the peer's pixels that nothing hides, 0 to 1; 0: not known.
+        Share of the peer's pixels that are not hidden, 0 to 1; 0: unknown.
     source
         truth, estimate, published or hand.
     split
-        train, test or another; None: in none.
+        train, test or another; None: no split.
     sigmas
-        One standard deviation of u, v (px) and depth (m); 0: exact or not known.
+        One standard deviation of u, v (px) and depth (m); 0: exact or unknown.
     """
 
     file: str
@@ -57,12 +57,12 @@ class LabelRow:
     sigmas: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def fields(self) -> dict[str, Any]:
-        """Fields of a PeerLabel."""
+        """Return the fields of a PeerLabel."""
         point = {name: getattr(self, name) for name in ("peer", *POINT, "visible_share", "source")}
         return point | dict(zip(SIGMAS, self.sigmas, strict=True)) | {"box_px": list(self.box_px)}
 
     def cells(self) -> list[str]:
-        """Cells of the row in the order of ``COLUMNS``; what is not known is empty."""
+        """Return the cells of the row in the order of ``COLUMNS``; unknown values are empty."""
         if not self.peer:
             return [self.file, *[""] * 9, self.source, self.split or "", "", "", ""]
         point = [f"{self.u_px:.4f}", f"{self.v_px:.4f}", f"{self.depth_m:.5f}"]
@@ -81,19 +81,19 @@ def write_labels(stream: TextIO, rows: Sequence[LabelRow]) -> None:
 
 
 def read_labels(path: Path, files: Collection[str]) -> dict[str, list[LabelRow]]:
-    """Rows by picture, in the order of the file.
+    """Read rows by image, in the order of the file.
 
     Parameters
     ----------
     path
         CSV file with a header; see ``COLUMNS``.
     files
-        Names of the pictures there are.
+        Names of the existing images.
 
     Raises
     ------
     SourceError
-        If a column is unknown or missing, a cell is not a number, a picture does not exist,
+        If a column is unknown or missing, a cell is not a number, an image does not exist,
         or rows contradict each other: names file and line.
     """
     found: dict[str, list[LabelRow]] = {}
@@ -112,7 +112,7 @@ def read_labels(path: Path, files: Collection[str]) -> dict[str, list[LabelRow]]
                         "Delete some"
                     )
     except FileNotFoundError:
-        raise SourceError(f"no label file {path}. Name another with --labels") from None
+        raise SourceError(f"no label file {path}. Pass another with --labels") from None
     except (OSError, UnicodeDecodeError, csv.Error) as e:
         raise SourceError(f"{path} is not a CSV file: {e}. Save it as CSV in UTF-8") from None
     return found
@@ -136,14 +136,14 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
 def _texts(
     where: str, cells: Mapping[str | None, Any], files: Collection[str]
 ) -> Mapping[str, str]:
-    """The cells of a line by the names of their columns; one for each, and of a known picture."""
+    """Return the cells of a line by column name. Each cell and the image must exist."""
     if None in cells or None in cells.values():
-        raise SourceError(f"{where}: not as many cells as the header. Mend the line")
+        raise SourceError(f"{where}: not as many cells as the header. Fix the line")
     row = {str(name): str(cell).strip() for name, cell in cells.items()}
     if row["file"] not in files:
         near = get_close_matches(row["file"], files, n=1)
-        hint = f"Did you mean {near[0]}?" if near else "Add the picture, or delete the line"
-        raise SourceError(f"{where}: no picture {row['file']!r} in the folder. {hint}")
+        hint = f"Did you mean {near[0]}?" if near else "Add the image, or delete the line"
+        raise SourceError(f"{where}: no image {row['file']!r} in the folder. {hint}")
     return row
 
 
@@ -190,7 +190,7 @@ def _number(where: str, row: Mapping[str, str], name: str, default: float | None
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise SourceError(f"{where}: {name} is {cell!r}, not a number. Mend the cell")
+        raise SourceError(f"{where}: {name} is {cell!r}, not a number. Fix the cell")
     return value
 
 
@@ -198,7 +198,7 @@ def _check_values(
     where: str, depth_m: float, box: tuple[float, ...], share: float, sigmas: tuple[float, ...]
 ) -> None:
     if depth_m <= 0:
-        raise SourceError(f"{where}: depth_m is {depth_m:g}; it must be over 0. Mend the cell")
+        raise SourceError(f"{where}: depth_m is {depth_m:g}; it must be over 0. Fix the cell")
     if box and not (len(box) == 4 and box[0] < box[2] and box[1] < box[3]):
         raise SourceError(
             f"{where}: not a box. {', '.join(BOX)}: all or none, left < right, top < bottom"
@@ -206,13 +206,13 @@ def _check_values(
     if not 0 <= share <= 1:
         raise SourceError(f"{where}: visible_share is {share:g}. It must be from 0 to 1")
     if min(sigmas) < 0:
-        raise SourceError(f"{where}: a sigma is negative. Mend the cell")
+        raise SourceError(f"{where}: a sigma is negative. Fix the cell")
 
 
 def _check_agrees(where: str, row: LabelRow, others: Sequence[LabelRow]) -> None:
     if others and (not row.peer or not others[0].peer):
         raise SourceError(
-            f"{where}: {row.file} has a row with an empty peer, so no other. Delete one"
+            f"{where}: {row.file} has a row with an empty peer, so it may have no other. Delete one"
         )
     if any((row.peer, row.source) == (other.peer, other.source) for other in others):
         raise SourceError(

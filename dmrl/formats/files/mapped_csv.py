@@ -1,7 +1,7 @@
-"""CSV files of others, by a table that says what their columns are (`column_map`).
+"""Foreign CSV files, read by a table that defines their columns (`column_map`).
 
-A file is the log of one robot, a folder one per robot, named after its file. Every column is kept
-as it stands, on ``/<robot>/log/columns``. Flights of NanoBench are known by their columns.
+A file is the log of one robot; a folder has one per robot, named after its file. Every column is
+kept unchanged, on ``/<robot>/log/columns``. Flights of NanoBench are recognised by their columns.
 """
 
 import csv
@@ -26,9 +26,9 @@ from dmrl.terminal.progress import say
 NANOBENCH = Path(__file__).parent / "nanobench.toml"
 SEPARATORS = ",;\t"
 SHIPPED = {"nanobench": NANOBENCH}
-"""Tables of columns that have a name."""
+"""Column tables of this package, by name."""
 
-# A table's quantities as the Crazyflie's variables, and what one of its units is in theirs.
+# The Crazyflie's variable of each quantity, and the factor from dmrl's unit to its unit.
 AS_LOGGED = {
     "roll": ("stateEstimate.roll", 1 / ANGLE["deg"]),
     "pitch": ("stateEstimate.pitch", -1 / ANGLE["deg"]),
@@ -42,18 +42,18 @@ AS_LOGGED = {
 }
 TILT_MAX_RAD = np.pi
 TURN_RATIO = 10.0
-"""A gyroscope and the slope of the yaw that differ by more than this have other units."""
+"""Largest ratio between a gyroscope and the slope of the yaw before their units are doubted."""
 
 
 def recognises(source: Path) -> bool:
-    """Whether it is a CSV file with all columns of a table that ships."""
+    """Return whether a source is a CSV file with all columns of a table of this package."""
     if not source.is_file() or source.suffix.lower() != ".csv":
         return False
     return read_map(NANOBENCH).names <= set(_header(source)[0])
 
 
 def _header(path: Path) -> tuple[list[str], str]:
-    """Names of the columns, and what stands between them."""
+    """Parse the names of the columns, and their separator."""
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
         first = stream.readline(1 << 16)
     separator = max(SEPARATORS, key=first.count)
@@ -62,15 +62,15 @@ def _header(path: Path) -> tuple[list[str], str]:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of the log of a robot, or of one per file of a folder.
+    """Load the samples of the log of a robot, or of one per file of a folder.
 
     Parameters
     ----------
     source
         The file or folder.
     options
-        ``columns``, the table, without which it is NanoBench's; ``robot`` of a single file;
-        ``names`` of those of a folder.
+        ``columns``, the table (default: NanoBench's); ``robot`` of a single file; ``names`` of
+        those of a folder.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def content(source: Path, options: Options) -> Content:
         paths = sorted(p for p in source.iterdir() if p.suffix.lower() == ".csv")
         files = {options.names.get(p.stem, p.stem): p for p in paths}
     if not files:
-        raise SourceError(f"no CSV file in {source}. Name a folder with one per robot")
+        raise SourceError(f"no CSV file in {source}. Pass a folder with one per robot")
     return content_of(s for n, p in files.items() for s in _streams(n, p, table))
 
 
@@ -109,10 +109,10 @@ def _streams(robot: str, path: Path, table: ColumnMap) -> Iterator[Stream]:
 
 
 def _read(path: Path, table: ColumnMap) -> tuple[Times, dict[str, Array]]:
-    """Times, and every column that holds numbers, NaN where a cell is empty."""
+    """Load the times, and every numeric column, NaN where a cell is empty."""
     names, separator = _header(path)
     if missing := sorted(table.names - set(names)):
-        raise SourceError(f"{path}:1: no column {', '.join(missing)}. Mend the table of columns")
+        raise SourceError(f"{path}:1: no column {', '.join(missing)}. Fix the table of columns")
     if len(set(names)) < len(names):
         raise SourceError(f"{path}:1: a column appears twice. Rename one")
     rows = _rows(path, separator, len(names))
@@ -121,7 +121,7 @@ def _read(path: Path, table: ColumnMap) -> tuple[Times, dict[str, Array]]:
     moments = np.array([_time_ns(path, line, row[at], time.scale) for line, row in rows], np.int64)
     order = np.argsort(moments, kind="stable")
     if (np.diff(moments) < 0).any():
-        say(f"{path}: its lines are not in order of time; sorted")
+        say(f"{path}: its lines are not in time order; sorted")
     return moments[order], {
         name: values[order]
         for k, name in enumerate(names)
@@ -130,40 +130,40 @@ def _read(path: Path, table: ColumnMap) -> tuple[Times, dict[str, Array]]:
 
 
 def _rows(path: Path, separator: str, cells: int) -> list[tuple[int, list[str]]]:
-    """Line number and cells of every row below the header, as many cells in each."""
+    """Parse the line number and cells of every row below the header, with equally many cells."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream, delimiter=separator)
             next(reader)
             rows = [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as e:
-        raise SourceError(f"{path} cannot be read as CSV: {e}. Name another file") from None
+        raise SourceError(f"{path} cannot be read as CSV: {e}. Pass another file") from None
     if rows and len(rows[-1][1]) < cells:
         say(f"{path}: its last line is cut short; left out")
         rows.pop()
     if not rows:
-        raise SourceError(f"{path} has no rows. Name another file")
+        raise SourceError(f"{path} has no rows. Pass another file")
     for line, row in rows:
         if len(row) != cells:
-            raise SourceError(f"{path}:{line}: {len(row)} cells, not {cells}. Mend the line")
+            raise SourceError(f"{path}:{line}: {len(row)} cells, not {cells}. Fix the line")
     return rows
 
 
 def _time_ns(path: Path, line: int, cell: str, scale: float) -> int:
-    """Whole nanoseconds: a float has too few digits for those since 1970."""
+    """Parse whole nanoseconds exactly: a float has too few digits for those since 1970."""
     try:
         time_ns = int((Decimal(cell.strip()) * Decimal(scale)).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError):
-        raise SourceError(f"{path}:{line}: {cell!r} is no time. Mend the line") from None
+        raise SourceError(f"{path}:{line}: {cell!r} is no time. Fix the line") from None
     if not 0 <= time_ns < 1 << 63:
-        raise SourceError(f"{path}:{line}: time {cell} is before 1970 or after 2262. Is its unit?")
+        raise SourceError(f"{path}:{line}: time {cell} is before 1970 or after 2262. Fix its unit")
     return time_ns
 
 
 def _numbers(
     path: Path, cells: Sequence[tuple[int, str]], name: str, table: ColumnMap
 ) -> Array | None:
-    """A column; None for one of text that the table does not ask for."""
+    """Parse a column; None for a text column that the table does not use."""
     values = np.full(len(cells), np.nan)
     for k, (line, cell) in enumerate(cells):
         try:
@@ -171,19 +171,19 @@ def _numbers(
         except ValueError:
             if name not in table.names:
                 return None
-            raise SourceError(f"{path}:{line}: {name} is {cell!r}, no number. Mend it") from None
+            raise SourceError(f"{path}:{line}: {name} is {cell!r}, no number. Fix it") from None
     return values
 
 
 def _world_velocity(
     path: Path, time_ns: Times, values: Mapping[str, Array], frame: str, attitude: Series | None
 ) -> dict[str, Array]:
-    """Velocity as the Crazyflie logs it: in the frame in which yaw is measured."""
+    """Rotate velocity to the frame in which yaw is measured, as the Crazyflie logs it."""
     v = [values[name] for name in ("vx", "vy", "vz") if name in values]
     if frame != "world":
         if attitude is None or (frame == "body" and len(v) < 3):
             wanted = "[vz], [roll], [pitch] and [yaw]" if frame == "body" else "an attitude"
-            raise SourceError(f"{path}: velocity of frame {frame} wants {wanted} in the table")
+            raise SourceError(f"{path}: velocity in frame {frame} needs {wanted} in the table")
         roll, pitch, yaw = attitude.at(time_ns).T
         if frame == "body":
             v = _levelled(v, roll, pitch)
@@ -193,7 +193,7 @@ def _world_velocity(
 
 
 def _levelled(v: Sequence[Array], roll: Array, pitch: Array) -> list[Array]:
-    """A velocity in the body's frame, in the horizontal one: Ry(pitch) Rx(roll)."""
+    """Rotate a velocity from the body frame to the horizontal one: Ry(pitch) Rx(roll)."""
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     left, up = cr * v[1] - sr * v[2], sr * v[1] + cr * v[2]
     return [cp * v[0] + sp * up, left, -sp * v[0] + cp * up]
@@ -202,7 +202,7 @@ def _levelled(v: Sequence[Array], roll: Array, pitch: Array) -> list[Array]:
 def _doubt(
     path: Path, time_ns: Times, values: Mapping[str, Array], attitude: Series | None
 ) -> None:
-    """Say which units cannot be right."""
+    """Warn about units that cannot be right."""
     for name in ("roll", "pitch"):
         most = float(np.nanmax(np.abs(values.get(name, np.zeros(1)))))
         if most > TILT_MAX_RAD:

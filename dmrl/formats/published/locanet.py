@@ -1,6 +1,6 @@
 """The synthetic set published with the network ``locanet``: text files and JPEGs.
 
-A folder holds ``synImgs/`` (one robot per picture) or ``synImgsMulti/``, with
+A folder contains ``synImgs/`` (one robot per image) or ``synImgsMulti/``, with
 
 * ``posLabel.txt``: ``path roll,pitch`` of the camera, then ``x,y,z,roll,pitch,yaw`` per
   robot; x, y, z in the camera frame, metres and radians.
@@ -8,12 +8,12 @@ A folder holds ``synImgs/`` (one robot per picture) or ``synImgsMulti/``, with
   the robot covers when drawn alone; x counts from 0, y from 1.
 * ``train.txt``, ``test.txt``: ``path roll,pitch`` and per robot ``u,v,depth_mm,class``.
 
-Only the file name of ``path`` counts. Attitudes: the camera stands in the horizontal frame
-as Rx(roll) Ry(pitch), and a robot as Rx(roll) Rz(yaw) Ry(pitch), x forward, y left, z up,
-not negated. The signs follow from the boxes: of all combinations only these fit the
-outlines (0.6 px median, the next best 1.1 px), and a test holds it. The order of the
-camera's two turns is that of the authors' rendering script; the boxes agree, weakly. The
-robots' attitudes are against the horizontal frame, unlike their positions.
+Only the file name of ``path`` is used. Attitudes in the horizontal frame, x forward, y left, z
+up, not negated: Rx(roll) Ry(pitch) for the camera, Rx(roll) Rz(yaw) Ry(pitch) for a robot. The
+signs follow from the boxes: of all combinations only these match the outlines (0.6 px median,
+the next best 1.1 px), and a test checks it. The order of the camera's two rotations is that of
+the authors' rendering script; the boxes agree, weakly. The robots' attitudes are relative to the
+horizontal frame, unlike their positions.
 """
 
 from collections.abc import Iterator, Mapping
@@ -32,12 +32,12 @@ from dmrl.samples.sample import Sample, calibration, image, intervals, labels
 
 FOLDERS = ("synImgs", "synImgsMulti")
 STEP_NS = 1_000_000_000
-"""The pictures are unrelated; number n gets the nominal time n seconds."""
+"""Period of the nominal times: image n is at n seconds. The images are unrelated."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocanetImage:
-    """One picture of the set and what is published about it.
+    """One image of the set and its published labels.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ class LocanetImage:
     attitude_rad
         (N, 3) roll, pitch, yaw of the robots: Rx(roll) Rz(yaw) Ry(pitch), horizontal frame.
     box_px
-        (N, 4) left, top, right, bottom, pixel-edge coordinates, clipped to the image, as if
-        nothing hid the robot. (0, 4) without boxLabel.txt.
+        (N, 4) left, top, right, bottom, pixel-edge coordinates, clipped to the image, without
+        occlusion. (0, 4) without boxLabel.txt.
     published
         (N, 3) u_px, v_px, depth_m as printed in train.txt or test.txt; (0, 3) where absent.
     split
@@ -72,7 +72,7 @@ class LocanetImage:
 
 
 def recognises(source: Path) -> bool:
-    """Whether a folder holds the published set, by the names of its files."""
+    """Return whether a folder has the file names of the published set."""
     folders = (source, *(source / name for name in FOLDERS))
     return any((folder / "posLabel.txt").is_file() for folder in folders) or any(
         (source / name).is_dir() for name in FOLDERS
@@ -90,7 +90,7 @@ Lines = Mapping[str, _Line]
 
 
 def read(source: Path) -> list[LocanetImage]:
-    """Pictures of the set in the order of their numbers.
+    """Load the images of the set in the order of their numbers.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def read(source: Path) -> list[LocanetImage]:
     Raises
     ------
     SourceError
-        If posLabel.txt or a picture is missing, or a line is malformed: names file and line.
+        If posLabel.txt or an image is missing, or a line is malformed: names file and line.
     """
     folder = _folder(source)
     positions = _lines(folder / "posLabel.txt", head=2, width=6)
@@ -120,17 +120,17 @@ def read(source: Path) -> list[LocanetImage]:
 def _folder(source: Path) -> Path:
     inner = [source / name for name in FOLDERS if (source / name).is_dir()]
     if len(inner) > 1:
-        raise SourceError(f"{source} holds two sets. Name one: {inner[0]} or {inner[1]}")
+        raise SourceError(f"{source} has two sets. Pass one: {inner[0]} or {inner[1]}")
     folder = inner[0] if inner else source
     if not (folder / "posLabel.txt").is_file():
         raise SourceError(
-            f"no posLabel.txt in {folder}. Name the folder that holds synImgs/ or synImgsMulti/"
+            f"no posLabel.txt in {folder}. Pass the folder that has synImgs/ or synImgsMulti/"
         )
     return folder
 
 
 def _lines(path: Path, *, head: int, width: int, optional: bool = False) -> Lines:
-    """Lines of a label file by the file name of the picture."""
+    """Parse the lines of a label file by the file name of the image."""
     if optional and not path.is_file():
         return {}
     found: dict[str, _Line] = {}
@@ -155,7 +155,7 @@ def _numbers(
     try:
         groups = [[float(number) for number in word.split(",")] for word in words]
     except ValueError as e:
-        raise SourceError(f"{where}: {e}; wanted {wanted}. Restore the line") from None
+        raise SourceError(f"{where}: {e}; expected {wanted}. Restore the line") from None
     first = tuple(groups.pop(0)) if head and groups else ()
     robots = np.array(groups) if {len(g) for g in groups} == {width} else np.empty(0)
     if len(first) != head or robots.ndim != 2 or not np.isfinite([*first, *robots.flat]).all():
@@ -168,7 +168,7 @@ def _image(
 ) -> LocanetImage:
     path = folder / name
     if not path.is_file():
-        raise SourceError(f"{line.where}: no picture {path}. Restore it, or delete the line")
+        raise SourceError(f"{line.where}: no image {path}. Restore it, or delete the line")
     if not path.stem.isdecimal():
         raise SourceError(f"{line.where}: {name} is not named by its number. Rename it: 0007.jpg")
     if (line.robots[:, 0] <= 0).any():
@@ -188,7 +188,7 @@ def _image(
 
 
 def _of_robots(name: str, line: _Line, other: Lines) -> Array:
-    """Rows of another file about the same robots, one each."""
+    """Return the rows of another file about the same robots, one each."""
     if name not in other:
         beside = next(iter(other.values())).where.rsplit(":", 1)[0]
         raise SourceError(f"{line.where}: no line for {name} in {beside}. Restore it")
@@ -201,7 +201,7 @@ def _of_robots(name: str, line: _Line, other: Lines) -> Array:
 
 
 def _box_px(robots: Array) -> Array:
-    """Edges from first and last pixel; v is printed one too high."""
+    """Convert first and last pixels to edges; v is printed one too high."""
     limit = (PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px) * 2
     return np.clip(robots[:, :4] + (0.0, -1.0, 1.0, 0.0), 0.0, limit)
 
@@ -211,24 +211,24 @@ def _published(robots: Array) -> Array:
 
 
 def attitude_zyx(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
-    """Roll and pitch of Rz(yaw) Ry(pitch) Rx(roll) from those of the set, Rx(roll) Ry(pitch).
+    """Convert roll and pitch of Rx(roll) Ry(pitch) to those of Rz(yaw) Ry(pitch) Rx(roll).
 
-    The yaw between the two, up to 7 degrees, is left out: the horizontal frame of dmrl has
-    its x axis under the camera's.
+    The set uses the former, dmrl the latter. The yaw between the two, up to 7 degrees, is
+    omitted: the x axis of dmrl's horizontal frame lies below that of the camera.
     """
     cr, sr, cp, sp = np.cos(roll_rad), np.sin(roll_rad), np.cos(pitch_rad), np.sin(pitch_rad)
     return float(np.arctan2(sr, cr * cp)), float(np.arcsin(cr * sp))
 
 
 def content(source: Path, options: Options | None = None) -> Content:
-    """Samples of the set: every picture with its true and its published labels.
+    """Load the samples of the set: every image with its true and its published labels.
 
     Parameters
     ----------
     source
         A folder with ``synImgs/`` or ``synImgsMulti/``, or that folder itself.
     options
-        ``robot`` carries the camera. It sees cf2, cf3, ..., without itself.
+        ``robot`` carries the camera. Its peers are cf2, cf3, ..., without itself.
 
     Raises
     ------
@@ -261,7 +261,7 @@ def _samples(items: list[LocanetImage], robot: str) -> Iterator[Sample]:
 
 
 def _jpeg(path: Path) -> bytes:
-    """Bytes of a picture that decodes to the size of the published renders."""
+    """Load the bytes of an image, which must decode to the size of the published renders."""
     data = path.read_bytes()
     height_px, width_px, _ = codec.decode(data, path).shape
     wanted = (PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px)
@@ -286,7 +286,7 @@ def _truth(time_ns: int, robot: str, peer: str, xyz: list[float]) -> Sample:
 
 
 def _peers(item: LocanetImage, names: list[str]) -> list[dict[str, Any]]:
-    """True label of every robot, each followed by the published one where there is one."""
+    """Build the true label of every robot, each followed by the published one if there is one."""
     uv, depth_m = project(item.xyz_camera, PUBLISHED_RENDER.image_from_optical)
     true = np.column_stack([uv, depth_m])
     found: list[dict[str, Any]] = []

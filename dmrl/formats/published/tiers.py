@@ -1,10 +1,10 @@
 """Ranges between ground robots with motion capture: the TIERS group's ``.npz`` files.
 
-Arrays of equal length: ``uwb_range_<a>_<b>_np`` (metres, 0 where there was none),
+Arrays of equal length: ``uwb_range_<a>_<b>_np`` (metres, 0 if not measured),
 ``optitrack_turtle0<n>_pose_np`` (N, 2) metres and ``..._orientation_np`` radians. The file has
-no times: 10 Hz fits the robots, whose steps then end at the top speeds of their makes,
-0.22 and 0.26 m/s. It has no odometry either, so velocity and yaw rate are derived from motion
-capture and are far better than a drone's. Ranges stand as measured, some 0.35 m too long.
+no times. A rate of 10 Hz is assumed: with it, the robots' top speeds match those of their
+makers, 0.22 and 0.26 m/s. The file has no odometry either, so velocity and yaw rate are derived
+from motion capture and are far better than a drone's. Ranges are unchanged, about 0.35 m too long.
 """
 
 import re
@@ -26,7 +26,7 @@ from dmrl.samples.flight import from_poses, in_order, nanoseconds
 from dmrl.samples.sample import Sample
 
 RATE_HZ = 10.0
-# What zipfile, zlib and NumPy raise on damaged archives.
+# Errors of zipfile, zlib and NumPy on damaged archives.
 BROKEN = (
     OSError,
     ValueError,
@@ -44,11 +44,11 @@ BROKEN = (
 POSE = re.compile(r"optitrack_turtle(\d{1,3})_pose_np")
 RANGE = re.compile(r"uwb_range_(\d{1,3})_(\d{1,3})_np")
 ROBOTS = 64
-"""More would be told of too many pairs."""
+"""Largest number of robots, since every pair gets a topic."""
 
 
 def recognises(source: Path) -> bool:
-    """Whether a file is an ``.npz`` with ranges and poses of these names."""
+    """Return whether a file is an ``.npz`` with ranges and poses of these names."""
     if source.suffix != ".npz" or not zipfile.is_zipfile(source):
         return False
     try:
@@ -60,7 +60,7 @@ def recognises(source: Path) -> bool:
 
 
 def content(source: Path, _options: Options | None = None) -> Content:
-    """Samples of the file, robots named turtle1, turtle3, ...
+    """Load the samples of the file, robots named turtle1, turtle3, ...
 
     Parameters
     ----------
@@ -70,10 +70,10 @@ def content(source: Path, _options: Options | None = None) -> Content:
     Raises
     ------
     SourceError
-        If it is not such a file, or its arrays do not fit each other.
+        If it has no such arrays, or their shapes do not match.
     """
     if not recognises(source):
-        raise SourceError(f"{source} has no uwb_range_*_np and optitrack_*_pose_np. Name another")
+        raise SourceError(f"{source} has no uwb_range_*_np and optitrack_*_pose_np. Pass another")
     arrays = _arrays(source)
     poses = {int(m[1]): _pose(arrays, m[1]) for m in map(POSE.fullmatch, arrays) if m}
     streams: list[Iterator[Sample]] = []
@@ -100,12 +100,12 @@ def _arrays(source: Path) -> dict[str, Array]:
         found = {n: np.asarray(v, float) for n, v in load_npz(source).items() if v.itemsize >= 4}
     except BROKEN as e:
         why = " ".join(str(e).split())
-        raise SourceError(f"{source} cannot be read: {why}. Fetch it again") from e
+        raise SourceError(f"{source} cannot be read: {why}. Download it again") from e
     ranges = [values for name, values in found.items() if RANGE.fullmatch(name)]
     if not all(v.ndim for v in found.values()) or any(v.ndim != 1 for v in ranges):
-        raise SourceError(f"{source} has arrays of other shapes than it should. Fetch it again")
+        raise SourceError(f"{source} has arrays of wrong shapes. Download it again")
     if sum(bool(POSE.fullmatch(name)) for name in found) > ROBOTS:
-        raise SourceError(f"{source} has more than {ROBOTS} robots. Fetch it again")
+        raise SourceError(f"{source} has more than {ROBOTS} robots. Download it again")
     return found
 
 
@@ -113,12 +113,12 @@ def _pose(arrays: dict[str, Array], number: str) -> tuple[Array, Array, Array]:
     xy_m = arrays[f"optitrack_turtle{number}_pose_np"]
     yaw = arrays.get(f"optitrack_turtle{number}_orientation_np", np.zeros(0))
     if xy_m.shape != (len(yaw), 2) or {len(a) for a in arrays.values()} != {len(yaw)}:
-        raise SourceError(f"the arrays of turtle{number} differ in length. Fetch the file again")
+        raise SourceError(f"the arrays of turtle{number} differ in length. Download the file again")
     return np.arange(len(yaw)) / RATE_HZ, xy_m, yaw
 
 
 def _seen_from(here: Array, yaw: Array, peer: Array) -> Array:
-    """(N, 3) peer in the horizontal frame of a robot on the same floor."""
+    """Return the (N, 3) peer in the horizontal frame of a robot on the same floor."""
     x, y = (peer - here).T
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack([c * x + s * y, c * y - s * x, np.zeros(len(yaw))], axis=1)

@@ -1,16 +1,16 @@
-"""ROS bags: rosbag2 (folders, ``.db3``, ``.mcap``) and ROS 1 (``.bag``). The home of rosbags.
+"""ROS bags: rosbag2 (folders, ``.db3``, ``.mcap``) and ROS 1 (``.bag``). The only user of rosbags.
 
-What is taken, by the message's type; all else is left out, with a line that names it:
+These message types are converted. All others are left out, with a line that names them:
 
 * ``sensor_msgs/Image`` (8 bits), ``CompressedImage`` (PNG, JPEG) and ``CameraInfo``;
 * ``nav_msgs/Odometry``: attitude, velocity (in the body's frame), height, pose;
 * ``sensor_msgs/Imu`` and ``geometry_msgs/TwistStamped``, for a robot without odometry;
-* ``geometry_msgs/PoseStamped``: a true pose where the topic names motion capture, else a pose;
+* ``geometry_msgs/PoseStamped``: a true pose if the topic names motion capture, else a pose;
 * ``sensor_msgs/Range`` on a topic that names two robots, ``/<robot>/uwb/<peer>``: UWB;
 * ``dmrl_msgs/*``, as ``dmrl convert --to ros2`` writes them, on the topics of dmrl.
 
-Times are those of the headers. Where they are empty, the time at which the bag received a message
-stands for it, with a line that says so; that time is the publish time of every message.
+Times are those of the headers. If they are empty, the time at which the bag received a message
+replaces it, and a line reports this. That time is the publish time of every message.
 """
 
 import errno
@@ -35,10 +35,10 @@ from dmrl.terminal.progress import say
 SUFFIXES = (".db3", ".bag", ".mcap")
 BEGINNING = b"#ROSBAG V2.0\n"
 NO_PICTURES = (topics.MASKS, topics.DEPTHS)
-"""Images that are no pictures of a camera: of a render that was exported."""
+"""Image topics of an exported render that are not images of a camera."""
 CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
 ODD_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
-# Parts of a topic that say what it is, not whose.
+# Parts of a topic that describe its content rather than name its robot.
 GENERIC = re.compile(
     r"odom\w*|odometry|pose\w*|imu\w*|data|raw|twist|velocity|image\w*|color|colour|camera\w*|rgb|"
     r"compressed|info|camera_info|filtered|local|vrpn_client_node|mavros|state|truth|calibration|"
@@ -48,7 +48,7 @@ GENERIC = re.compile(
 
 
 def recognises(source: Path) -> bool:
-    """Whether it is a ROS 1 bag, a rosbag2 folder, or the storage of one."""
+    """Return whether a source is a ROS 1 bag, a rosbag2 folder, or the storage of one."""
     if source.is_dir():
         return (source / "metadata.yaml").is_file()
     if source.suffix not in SUFFIXES:
@@ -62,7 +62,7 @@ def recognises(source: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """What becomes of one topic of a bag."""
+    """Conversion of one topic of a bag: its type, message count, robot and peer."""
 
     topic: str
     kind: str
@@ -72,27 +72,27 @@ class Line:
 
 
 def content(source: Path, options: Options) -> Content:
-    """Samples of a bag, in the bag's order.
+    """Load the samples of a bag, in the bag's order.
 
     Parameters
     ----------
     source
         The bag.
     options
-        ``names`` gives robots their names: those in topics are else kept. ``robot`` is the
-        one of topics that name none.
+        ``names`` renames robots; others keep the names in their topics. ``robot`` is the robot of
+        topics that name none.
 
     Raises
     ------
     SourceError
-        If the bag cannot be read, or holds nothing that is known.
+        If the bag cannot be read, or has no supported topic.
     MissingExtra
         If rosbags is not installed.
     """
     lines, unknown = plan(_topics(source), options)
     if not lines:
         known = ", ".join(sorted({*HANDLERS}))
-        raise SourceError(f"{source} has no topic that is known: {known}. Name another bag")
+        raise SourceError(f"{source} has no topic of a known type: {known}. Pass another bag")
     if unknown:
         say(f"{source}: left out: {', '.join(sorted(unknown))}")
     return Content(_samples(source, lines), sum(line.count for line in lines.values()))
@@ -101,14 +101,14 @@ def content(source: Path, options: Options) -> Content:
 def plan(
     held: list[tuple[str, str, int]], options: Options
 ) -> tuple[dict[tuple[str, str], Line], list[str]]:
-    """What becomes of each topic, and the topics that are left out.
+    """Return the conversion of each topic, and the topics that are left out.
 
     Parameters
     ----------
     held
         Topic, type and number of messages.
     options
-        See ``content``.
+        See ``load_content``.
     """
     lines: dict[tuple[str, str], Line] = {}
     unknown = []
@@ -118,7 +118,7 @@ def plan(
             unknown += [topic] if count else []
         else:
             lines[topic, kind] = line
-    # One source of a kind per robot: two, interleaved, would contradict each other.
+    # One topic per type and robot: two interleaved ones would contradict each other.
     best: dict[tuple[str, str, str, bool], Line] = {}
     for line in lines.values():
         key = (line.kind, line.robot, line.peer, bool(CAPTURE.search(line.topic)))
@@ -159,7 +159,7 @@ def _reader(source: Path) -> Any:
 
 
 def _topics(source: Path) -> list[tuple[str, str, int]]:
-    """Topic, type and number of messages of all connections of a bag."""
+    """List topic, type and number of messages of all connections of a bag."""
     found: Counter[tuple[str, str]] = Counter()
     for connection in _guarded(source, lambda reader: iter(reader.connections)):
         found[connection.topic, connection.msgtype] += connection.msgcount
@@ -167,34 +167,29 @@ def _topics(source: Path) -> list[tuple[str, str, int]]:
 
 
 def _refuse_odd(source: Path) -> None:
-    """Nothing, if the SQLite files of a bag hold tables alone: a view computes what it likes.
+    """Raise SourceError unless a bag's SQLite files have tables alone; a view can run any query.
 
-    A ROS 1 bag has to begin as one: rosbags reads its first line, however long it is.
-
-    Raises
-    ------
-    SourceError
-        If it is not so.
+    A ROS 1 bag must begin with its magic: rosbags reads its first line, however long it is.
     """
     for path in sorted(source.glob("*.db3")) if source.is_dir() else [source]:
         with path.open("rb") as stream:
             head = stream.read(16)
         if path.suffix == ".bag" and not head.startswith(BEGINNING):
-            raise SourceError(f"{path} does not begin as a ROS 1 bag 2.0. Name another file")
+            raise SourceError(f"{path} does not begin as a ROS 1 bag 2.0. Pass another file")
         if not head.startswith(b"SQLite format 3"):
             continue
         where = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
         with closing(sqlite3.connect(where, uri=True)) as database:
             for kind, text in database.execute("SELECT type, sql FROM sqlite_master"):
                 if kind not in ("table", "index") or ODD_TABLE.search(text or ""):
-                    raise SourceError(f"{path} holds more than tables. Record the bag again")
+                    raise SourceError(f"{path} has more than tables. Record the bag again")
 
 
 def _guarded(source: Path, of: Any) -> Iterator[Any]:
-    """What ``of(reader)`` gives, with any error of rosbags as one line.
+    """Yield the items of ``of(reader)``, with any error of rosbags as one line.
 
-    rosbags lets through what sqlite, YAML, struct and its decompressors raise on damaged
-    bags, so there is no list of errors to name here.
+    rosbags passes on the errors of sqlite, YAML, struct and its decompressors on damaged bags, so
+    all exceptions are caught.
     """
     try:
         bound = Bounded(size_of(source))
@@ -236,12 +231,12 @@ def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sa
     for line, bag_ns, decoded in _guarded(source, messages):
         captured, odometry = bool(CAPTURE.search(line.topic)), line.robot in moving
         where = Placed(source, line.robot, line.peer, captured, odometry, fixed)
-        # Where a header has no time, and where there is none, the bag's own is the best there is.
+        # Without a time in the header, the bag's own time is the best estimate.
         time_ns = _stamp_ns(decoded)
         unstamped[line.topic] += time_ns == 0 < bag_ns
         for sample in _of(line, decoded, time_ns or max(bag_ns, 0), where):
             is_calibration = sample.message == "CameraCalibration"
-            # It comes with every image and is always the same: the first is enough.
+            # A calibration is sent with every image and never changes: keep the first.
             if not (is_calibration and sample.topic in calibrated):
                 yield replace(sample, publish_ns=max(bag_ns, 0))
             if is_calibration:
@@ -250,18 +245,18 @@ def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sa
 
 
 def _say_what_is_odd(source: Path, fixed: set[str], unstamped: Mapping[str, int]) -> None:
-    """Lines on velocities that were left out, and on topics whose stamps are 0."""
+    """Report velocities that were left out, and topics whose stamps are 0."""
     if fixed:
         say(
             f"{source}: left out: velocities of {', '.join(sorted(fixed))}, which are in a frame "
             "that does not turn with the robot. Record its odometry"
         )
-    if told := [f"{count} on {topic}" for topic, count in unstamped.items() if count]:
-        say(f"{source}: a stamp of 0 have {', '.join(told)}; they are at the times of the bag")
+    if zeros := [f"{count} on {topic}" for topic, count in unstamped.items() if count]:
+        say(f"{source}: messages with a stamp of 0 get the bag's times: {', '.join(zeros)}")
 
 
 def _stamp_ns(message: Any) -> int | None:
-    """Time in the header; 0: it is empty, None: there is no header."""
+    """Return the time in the header; 0: it is empty, None: there is no header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is None:
         return None

@@ -1,4 +1,4 @@
-"""Messages of ROS as samples: one function per type, by its name."""
+"""Conversion of ROS messages to samples: one function per message type."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -17,32 +17,32 @@ from dmrl.images.bayer import rgb_of
 from dmrl.messages import LogType, descriptor
 from dmrl.samples.sample import Sample, image
 
-HALF_PX = 0.5  # ROS has the first pixel's centre at 0, dmrl its edge
+HALF_PX = 0.5  # the origin is the first pixel's centre in ROS, its edge in dmrl
 RANGE_MAX_M = 60.0
 OWN = "dmrl_msgs/msg/"
 SIDE_MAX_PX = 10_000
 FIXED = ("odom", "map", "world", "earth")
-"""Last part of the names of frames that do not turn with a robot (REP 105)."""
+"""Last parts of the names of frames that do not turn with a robot (REP 105)."""
 LETTERS = {"uint32": "I", "int32": "i", "float32": "f", "float64": "d"}
 
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Where a message belongs.
+    """Context of a message: its bag and robots.
 
     Parameters
     ----------
     source
         The bag, for errors.
     robot, peer
-        Whose it is, and to whom it ranges.
+        Robot of the message, and the peer that it ranges to.
     captured
-        It comes from motion capture.
+        The message comes from motion capture.
     odometry
-        The robot has odometry, which says all that other messages say.
+        The robot has odometry, which replaces other messages.
     fixed
-        Robots whose velocities are in a fixed frame and cannot be turned into their own: filled
-        here.
+        Robots whose velocities are in a fixed frame and cannot be rotated into their own. The
+        converters add to it.
     """
 
     source: Path
@@ -65,9 +65,9 @@ def _rgb(message: Any, source: Path) -> codec.Rgb:
     count = channels.get(message.encoding)
     if count is None:
         known = ", ".join(channels)
-        raise SourceError(f"{source}: pictures of encoding {message.encoding!r}. Known: {known}")
+        raise SourceError(f"{source}: images of encoding {message.encoding!r}. Use {known}")
     if not (4 <= height <= SIDE_MAX_PX and width * count <= step <= len(message.data) // height):
-        raise SourceError(f"{source}: a picture is not {width} x {height} pixels. Restore the bag")
+        raise SourceError(f"{source}: an image is not {width} x {height} pixels. Restore the bag")
     rows = message.data[: height * step].reshape(height, step)[:, : width * count]
     pixels = rows.reshape(height, width, count)
     if message.encoding == "bayer_rggb8":
@@ -79,9 +79,9 @@ def _rgb(message: Any, source: Path) -> codec.Rgb:
 
 def _compressed(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
     data = message.data.tobytes()
-    kind = codec.size(data, f"a picture in {where.source}")[2]
+    kind = codec.size(data, f"an image in {where.source}")[2]
     if kind not in ("png", "jpeg"):
-        raise SourceError(f"{where.source}: pictures are {kind}. Save them as PNG or JPEG")
+        raise SourceError(f"{where.source}: images are {kind}. Save them as PNG or JPEG")
     yield image(time_ns, where.robot, data, kind)
 
 
@@ -111,7 +111,7 @@ def _xyz(vector: Any) -> Array:
 
 
 def _angles(q: Any) -> Array | None:
-    """Roll, pitch, yaw; None where the quaternion is not one."""
+    """Return roll, pitch, yaw; None if the quaternion is not a unit one."""
     values = np.array([q.x, q.y, q.z, q.w])
     norm = float(np.linalg.norm(values))
     return euler_zyx(values[None] / norm)[0] if abs(norm - 1) < 0.1 else None
@@ -128,7 +128,7 @@ def _attitude(robot: str, time_ns: int, angles: Array, yaw_rate: float) -> Sampl
 
 
 def _yaw_rate(turning: Array, angles: Array) -> float:
-    """Rate of the yaw, from turning rates about the body's axes."""
+    """Compute the yaw rate from angular rates about the body's axes."""
     roll, pitch, _ = angles.tolist()
     return float((turning[1] * math.sin(roll) + turning[2] * math.cos(roll)) / math.cos(pitch))
 
@@ -139,20 +139,20 @@ def _velocity(robot: str, time_ns: int, level: Array) -> Sample:
 
 
 def _levelled(body: Array, angles: Array) -> Array:
-    """A vector in the body's frame, in the robot's horizontal one."""
+    """Rotate a vector from the body's frame to the robot's horizontal one."""
     roll, pitch, _ = angles.tolist()
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     return np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]]) @ body
 
 
 def _turned_back(fixed: Array, angles: Array) -> Array:
-    """A vector in the frame that the yaw is told in, in the robot's horizontal one."""
+    """Rotate a vector from the frame of the yaw to the robot's horizontal one."""
     c, s = math.cos(angles[2]), math.sin(angles[2])
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ fixed
 
 
 def pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sample:
-    """A geometry_msgs pose in the world frame."""
+    """Build a pose in the world frame from a geometry_msgs pose."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
     turn = {name: float(getattr(orientation, name)) for name in "xyzw"}
     place = {name: float(getattr(position, name)) for name in "xyz"}
@@ -172,7 +172,7 @@ def _odometry(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
     angles = _angles(held.orientation)
     if angles is None:
         return
-    # The twist is in the child's frame, says the message; some drivers name a fixed one there.
+    # The twist is in the child's frame by definition; some drivers name a fixed one there.
     fixed = _is_fixed(message.child_frame_id, message.header.frame_id)
     turning, linear = _xyz(twist.angular), _xyz(twist.linear)
     yaw_rate = float(turning[2]) if fixed else _yaw_rate(turning, angles)
@@ -227,10 +227,10 @@ def _transforms(message: Any, time_ns: int, _where: Placed) -> Iterator[Sample]:
 
 
 def own(message: Any, topic: str, time_ns: int) -> Sample | None:
-    """A message of dmrl as it was exported; None for one of another version."""
+    """Convert a message of dmrl as it was exported; None for one of another version."""
     name = message.__msgtype__.removeprefix(OWN)
     if topics.names(topics.LOG, topic):
-        # rosbags keeps the types of fields in their annotations only, so values tell them.
+        # rosbags keeps the types of fields in their annotations only, so the values define them.
         fields = {k: v for k, v in vars(message).items() if isinstance(v, (int, float))}
         kind = LogType(
             name.removeprefix("Log"),

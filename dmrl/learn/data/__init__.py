@@ -1,1 +1,1 @@
-"""Training data: batches, augmentation, crops and grid targets."""
+"""Training data: batches, targets, augmentation and a torch dataset."""

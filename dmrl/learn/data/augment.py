@@ -1,11 +1,11 @@
-"""Augmentation: new images out of old ones, with labels that stay right.
+"""Augmentation: new training images from existing ones, with transformed labels.
 
-An image is made of layers. A layer shows a window of one source image, turned, mirrored and
-zoomed, in a rectangle of the canvas: the whole canvas, the parts of a mosaic, or a patch cut
-out around one robot. One sampling a layer does all of the geometry.
+An image consists of layers. A layer shows a window of one source image (rotated, mirrored, zoomed)
+in a rectangle of the canvas: the whole canvas, a tile of a mosaic, or a patch around one robot.
+Each layer is sampled once.
 
-A camera of fixed intrinsics sees a robot z times as large when it is z times as near, so a
-zoom by z divides the depth by z. A turn about the optical axis keeps it.
+With fixed intrinsics, a robot appears z times as large at 1/z of its distance, so a zoom by z
+divides the depth by z. A rotation about the optical axis keeps the depth.
 """
 
 import math
@@ -44,47 +44,48 @@ from dmrl.learn.data.crops import (
 )
 
 MAX_ROBOTS = 12
-"""Robots of one canvas that are labelled, at most."""
+"""Maximum number of labelled robots in one image."""
 PATCH_MARGIN = 1.25
-"""Side of a pasted patch over that of the robot's box."""
+"""Side of a pasted patch over the side of the robot's box."""
 DISTRACTOR_SHARE = 0.4
-"""Share of patches that show any place of any image."""
+"""Fraction of patches that show a random position of a random image."""
 FOCUS_SHARE = 0.8
-"""Share of mosaic windows that hold a robot of their image; the rest fall where they may."""
+"""Fraction of windows that contain a robot of their image; the others are placed at random."""
 LEAST_AHEAD = 0.25
-"""Least over greatest depth, along the source's axis, of what a turned camera's corners see."""
+"""Minimum ratio of smallest to largest depth, along the source's axis, over a rotated view's
+corners."""
 DEPTH_SLACK = 1.1
-"""How far beyond the nearest and the farthest label zooming may bring a robot."""
+"""Factor by which zooming may move a robot beyond the nearest and the farthest label."""
 
 
 @dataclass(frozen=True, slots=True)
 class Augmentation:
-    """How images are varied. All zero: not at all.
+    """Settings of the augmentation. All zero: none.
 
     Parameters
     ----------
     flip_share
-        Share of windows mirrored left to right.
+        Probability of a left-right mirrored window.
     zoom
-        Least and greatest magnification of a window; it is also kept to where the robot's
-        depth stays among those of the labels.
+        Smallest and largest magnification of a window. It is also limited so that the robot's depth
+        stays in the range of the labels.
     rotation_deg
-        Greatest turn about the optical axis, either way.
+        Largest rotation about the optical axis, either way.
     mosaic_share
-        Share of images put together from windows of two or four.
+        Probability that an image is a mosaic of two or four windows.
     paste
         Mean number of patches of other images pasted into one, most of them around a robot.
     colour
         Spread (one sigma) of contrast, brightness and each channel's gain, 0 to 1.
     noise
-        Greatest sigma of sensor noise, 0 to 1 of full scale.
+        Largest sigma of sensor noise, 0 to 1 of full scale.
     blur_share
-        Share of images that are slightly out of focus.
+        Probability of a slight defocus.
     intrinsics
-        Of the camera, undistorted. With them a window is what the camera would have seen had it
-        been turned; without, it is cut out.
+        Intrinsics of the camera, undistorted. With them, a window is the view of a rotated camera;
+        without, it is a crop.
     grey_share
-        Share of images whose three channels become their luma, as of a grey camera.
+        Probability that the three channels become their luma, as of a grey camera.
     """
 
     flip_share: float = 0.0
@@ -100,26 +101,26 @@ class Augmentation:
 
     @property
     def plain(self) -> "Augmentation":
-        """The same without what moves or cuts anything but whole images."""
+        """The same without zoom, rotation, mosaic and pasted patches."""
         return replace(self, zoom=(1.0, 1.0), rotation_deg=0.0, mosaic_share=0.0, paste=0.0)
 
     @property
     def is_nothing(self) -> bool:
-        """Whether images stay as they are."""
+        """Whether images stay unchanged."""
         return self == Augmentation()
 
 
 class Augmenter:
-    """Makes augmented batches of one set of examples.
+    """Generator of augmented batches from one set of examples.
 
     Parameters
     ----------
     examples
-        The images to vary.
+        Source images.
     settings
-        How.
+        Settings of the augmentation.
     seed
-        Batches depend on the seed, the epoch and their place in it alone.
+        Seed. A batch depends only on the seed, the epoch and its index in the epoch.
     """
 
     def __init__(self, examples: Examples, settings: Augmentation, *, seed: int) -> None:
@@ -138,14 +139,14 @@ class Augmenter:
         self._grain = np.random.default_rng([seed, 1]).standard_normal(numbers, np.float32)
 
     def batch(self, chosen: Sequence[int] | NDArray[np.int64], *, epoch: int, index: int) -> Batch:
-        """An augmented batch: one canvas for each of the chosen images.
+        """Return an augmented batch: one canvas for each of the chosen images.
 
         Parameters
         ----------
         chosen
-            Numbers of images.
+            Indices of images.
         epoch, index
-            The epoch, and the batch's place in it.
+            Epoch, and index of the batch in it.
         """
         rng = np.random.default_rng([self._seed, epoch, index])
         canvas = np.empty((len(chosen), self._height, self._width, 3), np.uint8)
@@ -156,7 +157,7 @@ class Augmenter:
         return Batch(torch.from_numpy(canvas).permute(0, 3, 1, 2), torch.from_numpy(robots))
 
     def _draw(self, canvas: Pixels, number: int, rng: Rng) -> list[Robot]:
-        """Fill a canvas (H, W, 3); returns the robots in it."""
+        """Draw a canvas (H, W, 3) and return its robots."""
         robots: list[Robot] = []
         whole = (0, 0, self._width, self._height)
         mosaic = rng.random() < self._settings.mosaic_share
@@ -172,12 +173,12 @@ class Augmenter:
     def _layer(
         self, canvas: Pixels, rect: Rect, source: int, robots: list[Robot], rng: Rng
     ) -> list[Robot]:
-        """Show a window of a source in a rectangle; the robots of the canvas after it."""
+        """Draw a window of a source in a rectangle; return the robots of the canvas after it."""
         width, height = rect[2] - rect[0], rect[3] - rect[1]
         mine = present(self._examples.robots[source])
         focus = mine[int(rng.integers(len(mine)))] if mine else None
         zoom = self._zoom(focus, rng)
-        zoom = max(zoom, width / self._width, height / self._height)  # no look past the source
+        zoom = max(zoom, width / self._width, height / self._height)  # stay inside the source
         held = focus if focus and rng.random() < FOCUS_SHARE else None
         seen = (
             _looked_at(self._width, width / (2 * zoom), held[U] if held else None, rng),
@@ -185,7 +186,7 @@ class Augmenter:
         )
         shown = (width / 2, height / 2)
         turn = self._turn(zoom, rng)
-        if focus:  # a camera is turned about where the robot comes to be
+        if focus:  # the camera rotation is exact at the robot's new position
             at = _back(turn, focus[U] - seen[0], focus[V] - seen[1])
             at = (at[0] + shown[0], at[1] + shown[1])
             if 0 <= at[0] < width and 0 <= at[1] < height:
@@ -194,10 +195,10 @@ class Augmenter:
         return self._show(canvas, rect, source, window, mine, robots, rng)
 
     def _patch(self, canvas: Pixels, robots: list[Robot], rng: Rng) -> list[Robot]:
-        """Paste a robot of another image, or as much without one.
+        """Paste a robot of another image, or sometimes a patch without one.
 
-        Along its mask where that is known, else with what is close around it. Without patches
-        that hold no robot, the edge of a patch would tell that one is in it.
+        The patch follows the robot's mask if there is one, else a box with a feathered border.
+        Patches without a robot are needed: otherwise the edge of a patch would reveal a robot.
         """
         if not len(self._pasteable):
             return robots
@@ -229,7 +230,7 @@ class Augmenter:
         return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
 
     def _zoom(self, robot: Robot | None, rng: Rng) -> float:
-        """A magnification, log-uniform; the robot's depth stays in the range of the labels."""
+        """Sample a log-uniform magnification; the depth stays in the range of the labels."""
         low, high = self._settings.zoom
         if robot is not None:
             depth_m = robot[DEPTH]
@@ -238,7 +239,7 @@ class Augmenter:
         return math.exp(rng.uniform(math.log(low), math.log(high)))
 
     def _turn(self, zoom: float, rng: Rng) -> Turn:
-        """From steps on the canvas to steps in the source."""
+        """Sample the (2, 2) matrix from steps on the canvas to steps in the source."""
         most = math.radians(self._settings.rotation_deg)
         angle = rng.uniform(-most, most)
         mirror = -1.0 if rng.random() < self._settings.flip_share else 1.0
@@ -246,7 +247,7 @@ class Augmenter:
         return (mirror * along, -across), (mirror * across, along)
 
     def _window(self, turn: Turn, zoom: float, seen: Point, shown: Point, rect: Rect) -> Window:
-        """The window of a rectangle that shows a source's point at one of its own."""
+        """Build the window of a rectangle that maps a source point to one of its points."""
         camera = self._settings.intrinsics
         if camera:
             matrix = turned(camera, turn, seen, shown, (rect[0], rect[1]))
@@ -268,6 +269,7 @@ class Augmenter:
         rng: Rng,
         opacity: Opacity | None = None,
     ) -> list[Robot]:
+        """Render a window into the canvas; return the robots that are then visible."""
         left, top, right, bottom = rect
         pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
         pixels = self._tinted(pixels, rng)
@@ -279,7 +281,7 @@ class Augmenter:
         return kept + [robot for robot in new if under(robot, rect, opacity)]
 
     def _tinted(self, pixels: Pixels, rng: Rng) -> Pixels:
-        """With other contrast, brightness and white balance."""
+        """Return the pixels with random contrast, brightness and white balance."""
         spread = self._settings.colour
         if not spread:
             return pixels
@@ -288,7 +290,7 @@ class Augmenter:
         return levelled(pixels, gain, [128 * (1 - times + light) for times in gain])
 
     def _spoil(self, canvas: Pixels, rng: Rng) -> None:
-        """Defocus, sensor noise and the loss of colours, in place."""
+        """Apply defocus, sensor noise and loss of colours, in place."""
         if rng.random() < self._settings.blur_share:
             canvas[:] = defocused(canvas, rng.uniform(0.1, 1 / 3))
         if self._settings.noise:
@@ -300,9 +302,9 @@ class Augmenter:
 
 
 def _looked_at(whole: float, half: float, held: float | None, rng: Rng) -> float:
-    """Where along an axis the middle of a window lies, that reaches so far to either side.
+    """Sample the centre of a window along an axis, given its half size.
 
-    Within the whole; about what is to be held, where there is such.
+    The window stays inside the image and, where ``held`` is a position, contains it.
     """
     low, high = half, max(whole - half, half)
     if held is not None:
@@ -311,7 +313,7 @@ def _looked_at(whole: float, half: float, held: float | None, rng: Rng) -> float
 
 
 def _back(turn: Turn, right: float, down: float) -> Point:
-    """Steps on the canvas from those in the source."""
+    """Return a step in the source as a step on the canvas."""
     (a, b), (c, d) = turn
     area = a * d - b * c
     return (d * right - b * down) / area, (a * down - c * right) / area

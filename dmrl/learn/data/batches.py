@@ -1,8 +1,7 @@
-"""Batches of training images: shuffled, in stated shares, each made while the one before is used.
+"""Batches of training images: sampling by weights, shuffling, collation and prefetching.
 
-The images of a dataset are a list of arrays mapped from its files. A plain batch is gathered
-into a buffer: one copy per image, still uint8. ``ahead`` makes the next batch in a thread
-while the network learns from this one.
+The images of a dataset are a list of arrays, memory-mapped from its files. `collate` copies each
+image once, as uint8. `prefetch` prepares the next batch in a thread during the training step.
 """
 
 from bisect import bisect_right
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Robots = NDArray[np.float32]
-"""(..., 11): ``FIELDS`` of each robot; a row whose u is NaN is no robot."""
+"""(..., 11): ``ROBOT_FIELDS`` of each robot; a row whose u is NaN is no robot."""
 
 FIELDS = (
     *("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m"),
@@ -30,14 +29,14 @@ U, V, DEPTH, SIGMA_U, SIGMA_V, SIGMA_DEPTH = range(6)
 BOX, CLASS_ID = slice(6, 10), 10
 
 BLOCK, WINDOW = 64, 8192
-"""Images of an Arrow batch, which lie together on the disk; and those that are shuffled at a time:
-1.8 GB of 320 x 224 pixels, all that is read again and again within a while."""
+"""Images of a block, contiguous on disk as one Arrow batch; and images shuffled at a time, the
+working set of reads: 1.8 GB at 320 x 224 pixels."""
 
 T = TypeVar("T")
 
 
 class Batch(NamedTuple):
-    """Images and the robots in them.
+    """Images and their robots.
 
     ``images`` (N, 3, H, W) uint8, channels last in memory; ``robots`` (N, K, 11) float32.
     """
@@ -55,11 +54,11 @@ class Examples:
     pixels
         Arrays of (n_i, H, W, 3) uint8, RGB, such as zero-copy views of a mapped file.
     robots
-        (N, K, 11) float32, ``FIELDS`` of up to K robots in each of the N images, N the sum of
-        the n_i. Sigmas are 0 where the label is exact, a box or class NaN where there is none.
+        (N, K, 11) float32, ``ROBOT_FIELDS`` of up to K robots in each of the N images, N the sum of
+        the n_i. Sigmas are 0 where the label is exact; a box or class is NaN where there is none.
     masks
-        Arrays of (n_i, H, W) uint8, what every pixel shows: 0 or the place of a robot in
-        ``robots``, from 1. Empty: it is not known.
+        Arrays of (n_i, H, W) uint8, segmentation masks: 0, or the index of a robot in ``robots``,
+        from 1. Empty: no masks.
     """
 
     pixels: Sequence[NDArray[np.uint8]]
@@ -89,7 +88,7 @@ class Examples:
         return height, width, channels
 
     def select(self, chosen: NDArray[np.bool_]) -> "Examples":
-        """The chosen images, one chunk each, not copied."""
+        """Return the chosen images, one chunk each, not copied."""
         numbers = np.flatnonzero(chosen)
         places = [self._at(index) for index in numbers.tolist()]
         chunks = [self.pixels[chunk][place][None] for chunk, place in places]
@@ -97,13 +96,13 @@ class Examples:
         return Examples(chunks, self.robots[numbers], masks)
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) image of a number."""
+        """Return the (H, W, 3) image at an index."""
         chunk, place = self._at(index)
         found: NDArray[np.uint8] = self.pixels[chunk][place]
         return found
 
     def mask(self, index: int, robot: int) -> NDArray[np.uint8] | None:
-        """(H, W) 1 where an image shows one of its robots; None if its centre is not shown."""
+        """Return (H, W) 1 where an image shows this robot; None if its centre is not visible."""
         if not self.masks:
             return None
         chunk, place = self._at(index)
@@ -125,31 +124,32 @@ def order(
     shares: NDArray[np.float64] | None = None,
     images: int = 0,
 ) -> NDArray[np.int64]:
-    """The images in this epoch's order, keyed by seed and epoch alone.
+    """Return the image indices of an epoch, determined by seed and epoch only.
 
-    Of more than ``WINDOW`` images, blocks are shuffled, and then the images of each window of them:
-    what is read of a file within a while lies together, however large the dataset is.
+    With more than ``SHUFFLE_WINDOW_IMAGES`` images, blocks are shuffled, and then the images of
+    each window of blocks. Reads that are close in time are then close in the file, whatever its
+    size.
 
     Parameters
     ----------
     count
-        Images that there are.
+        Number of images.
     seed, epoch
-        What the order is drawn from.
+        Seed of the order.
     shares
-        (count,) how often each image shall come in an epoch, in proportion. Whole parts come
-        surely, the rest by chance. None: all as often.
+        (count,) how often each image shall appear in an epoch, in proportion. The integer part is
+        exact, the rest is random. None: equally often.
     images
-        Images of an epoch. 0: as many as there are.
+        Images per epoch. 0: ``count``.
     """
     rng = np.random.default_rng([seed, epoch])
     images = images or count
     if shares is None and images == count:
         return _by_windows(count, rng) if count > WINDOW else rng.permutation(count)
     shares = np.ones(count) if shares is None else shares
-    # Systematic sampling: every image comes floor or ceil of its share, and the sum is exact.
+    # Systematic sampling: every image appears floor or ceil of its share, and the sum is exact.
     ticks = np.floor(np.cumsum(shares[rng.permutation(count)]) * images / shares.sum() + 1e-9)
-    ticks[-1] = images  # not one less, as a sum of floats may have it
+    ticks[-1] = images  # rounding of the sum may make it one less
     times = np.diff(ticks, prepend=0).astype(np.int64)
     rng = np.random.default_rng([seed, epoch])
     return rng.permutation(np.repeat(rng.permutation(count), times))
@@ -164,25 +164,25 @@ def _by_windows(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
 
 
 def batch_count(count: int, batch_size: int) -> int:
-    """Batches in an epoch; the last may be short."""
+    """Return the number of batches in an epoch; the last may be short."""
     return -(-count // batch_size)
 
 
 def gathered(examples: Examples, chosen: Sequence[int] | NDArray[np.int64]) -> Batch:
-    """The chosen examples as they are."""
+    """Collate the chosen examples into a batch, without augmentation."""
     images = np.stack([examples.image(int(index)) for index in chosen])
     robots = torch.from_numpy(examples.robots[np.asarray(chosen)])
     return Batch(torch.from_numpy(images).permute(0, 3, 1, 2), robots)
 
 
 def in_order(examples: Examples, batch_size: int) -> Iterator[Batch]:
-    """Every example once, from first to last."""
+    """Yield batches of all examples in order."""
     for start in range(0, len(examples), batch_size):
         yield gathered(examples, np.arange(start, min(start + batch_size, len(examples))))
 
 
 def ahead(items: Iterator[T]) -> Iterator[T]:
-    """The same items, the next one made in a thread while one is used."""
+    """Yield the items, computing the next one in a thread meanwhile."""
     with ThreadPoolExecutor(1) as pool:
         ends = object()
         coming = pool.submit(next, items, ends)

@@ -1,6 +1,7 @@
-"""Windows of images and the rectangles that show them: the geometry of ``augment``.
+"""Crop geometry and pixel operations of `augment`: homographies, sampling, blending, noise.
 
-There are many windows and few robots in each: plain numbers are quicker here than small arrays.
+An image needs many windows with few robots each, so plain numbers are faster here than small
+arrays.
 """
 
 import math
@@ -17,20 +18,20 @@ from dmrl.learn.data.batches import BOX, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, R
 FEATHER_PX = 3.0
 """Width of a pasted patch's soft border."""
 SHARPENED = 0.1
-"""What each of the two pixels beside loses to a pixel, down and across, before it is sampled.
+"""Weight subtracted from a pixel for each of its two neighbours, in both axes, before sampling.
 
-A bilinear window alone is half as sharp as the whole images that a network will see. With it the
-squares of steps between pixels are 0.95 of what Lanczos' sampling leaves (20 published images in
-random windows), those of a bicubic window, three times as dear, 0.92, of a bilinear one 0.64.
+A bilinear window alone has half the sharpness of the whole images in inference. With sharpening,
+squared differences of neighbouring pixels are 0.95 of those after Lanczos resampling (20 published
+images, random windows). Bicubic sampling, three times as slow, has 0.92, and bilinear 0.64.
 """
 _HOW = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 _BEYOND = cv2.BORDER_REPLICATE
 _SHARP = np.array([-SHARPENED, 1 + 2 * SHARPENED, -SHARPENED], np.float32)
-_MARGIN_PX = 2  # what sampling and sharpening see beside a pixel
-_EXACT_PX = 1e-3  # what lies no further from whole pixels lies on them
+_MARGIN_PX = 2  # neighbourhood of a pixel in sampling and sharpening
+_EXACT_PX = 1e-3  # tolerance for windows that coincide with whole pixels
 _NO_BOX = [math.nan] * 4
 _MIDDLE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-cv2.setNumThreads(1)  # a window is small, and the cores are torch's
+cv2.setNumThreads(1)  # windows are small, and torch uses the cores
 
 Rng = np.random.Generator
 Pixels = NDArray[np.uint8]
@@ -39,9 +40,9 @@ Opacity = NDArray[np.float32]
 Point = tuple[float, float]
 """u and v, pixels."""
 Turn = tuple[tuple[float, float], tuple[float, float]]
-"""(2, 2) from steps on the canvas to steps in the source."""
+"""(2, 2) matrix from steps on the canvas to steps in the source."""
 Robot = list[float]
-"""``FIELDS`` of one robot."""
+"""``ROBOT_FIELDS`` of one robot."""
 Rect = tuple[int, int, int, int]
 """Left, top, right, bottom on the canvas, whole pixels."""
 Intrinsics = tuple[float, float, float, float]
@@ -49,10 +50,11 @@ Intrinsics = tuple[float, float, float, float]
 
 
 class Window(NamedTuple):
-    """Where a canvas rectangle looks.
+    """Mapping from a rectangle of the canvas to a source image.
 
-    ``matrix`` (3, 3) is the homography from pixels of the rectangle, from its corner, to those of
-    the source. ``camera``: of both, where it is known and the window is that of a turned camera.
+    ``matrix`` (3, 3) is the homography from pixels of the rectangle, counted from its corner, to
+    pixels of the source. ``camera`` has the intrinsics of both if the window is the view of a
+    rotated camera.
     """
 
     matrix: NDArray[np.float64]
@@ -61,14 +63,14 @@ class Window(NamedTuple):
 
 
 def flat(turn: Turn, seen: Point, shown: Point) -> NDArray[np.float64]:
-    """(3, 3) window that shows a source's point somewhere in its rectangle, as scissors would.
+    """Build the (3, 3) homography of a crop: scale, rotation and mirroring only.
 
     Parameters
     ----------
     turn
-        From steps on the canvas to steps in the source.
+        Matrix from steps on the canvas to steps in the source.
     seen, shown
-        Point of the source, and where in the rectangle it comes, pixels.
+        Point of the source, and its position in the rectangle, pixels.
     """
     (a, b), (c, d) = turn
     x, y = shown
@@ -78,19 +80,19 @@ def flat(turn: Turn, seen: Point, shown: Point) -> NDArray[np.float64]:
 def turned(
     camera: Intrinsics, turn: Turn, seen: Point, shown: Point, corner: Point
 ) -> NDArray[np.float64]:
-    """(3, 3) window of a camera that was turned until a point of the source is elsewhere.
+    """Build the (3, 3) homography of a camera rotated until a source point is at another pixel.
 
-    What a pinhole camera sees is stretched away from its centre. Scissors carry that along; a
-    turn of the camera about its own centre, which is a homography, does not.
+    A pinhole camera stretches objects away from the image centre. A crop keeps this stretch at the
+    wrong position. A rotation of the camera about its own centre, which is a homography, does not.
 
     Parameters
     ----------
     camera
-        Of source and canvas.
+        Intrinsics of source and canvas.
     turn, seen, shown
-        See `flat`.
+        See `build_crop_homography`.
     corner
-        Of the rectangle, on the canvas.
+        Corner of the rectangle, on the canvas.
     """
     fx, fy, cx, cy = camera
     (a, b), (c, d) = turn
@@ -103,7 +105,7 @@ def turned(
 
 
 def facing(camera: Intrinsics, uv: Point) -> NDArray[np.float64]:
-    """(3, 3) rotation of the optical axis onto a pixel's ray: tilted, then panned."""
+    """Return the (3, 3) rotation of the optical axis onto a pixel's ray: tilt, then pan."""
     fx, fy, cx, cy = camera
     x, y = (uv[0] - cx) / fx, (uv[1] - cy) / fy
     across, whole = math.hypot(1, x), math.sqrt(1 + x * x + y * y)
@@ -118,13 +120,13 @@ def facing(camera: Intrinsics, uv: Point) -> NDArray[np.float64]:
 
 
 def slant(camera: Intrinsics, u: float, v: float) -> float:
-    """Distance over depth of what is seen at a pixel."""
+    """Return distance over depth of a point that projects to this pixel."""
     fx, fy, cx, cy = camera
     return math.sqrt(1 + ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2)
 
 
 def through(matrix: Sequence[Sequence[float]], u: float, v: float) -> Point:
-    """Where a homography (3, 3) takes a point; NaN behind the camera."""
+    """Map a point by a homography (3, 3); NaN behind the camera."""
     (a, b, c), (d, e, f), (g, h, i) = matrix
     ahead = g * u + h * v + i
     if ahead <= 0:
@@ -133,27 +135,26 @@ def through(matrix: Sequence[Sequence[float]], u: float, v: float) -> Point:
 
 
 def sample(raw: Pixels, window: Window, shape: tuple[int, int], *, sharp: bool = True) -> Pixels:
-    """(h, w, C) pixels that a rectangle of this shape shows of an image (H, W[, C]).
+    """Sample the (h, w, C) pixels of a window from an image (H, W[, C]).
 
-    What lies beyond the image is as its border. Where the pixels of both lie on each other they
-    are copied.
+    Beyond the image, its border is repeated. If the pixels of both coincide, they are copied.
 
     Parameters
     ----------
     raw
-        The image.
+        Source image.
     window
-        Where the rectangle looks, all of it ahead of the camera.
+        Window, all of it in front of the camera.
     shape
-        Its height and width, pixels.
+        Height and width of the rectangle, pixels.
     sharp
-        Sharpen what is sampled, as a picture's bilinear samples are blurred.
+        Sharpen before sampling, since bilinear interpolation blurs.
     """
     rows = window.matrix.tolist()
     left, top, right, bottom = _reach(rows, shape, raw.shape)
     if (copied := _copied(raw, rows, shape)) is not None:
         return copied.reshape(*shape, -1)
-    # OpenCV counts pixels from their middles. It is quickest with four channels.
+    # OpenCV counts pixels from their centres. It is fastest with four channels.
     to_part = np.array([[1, 0, -left - 0.5], [0, 1, -top - 0.5], [0, 0, 1]])
     matrix = to_part @ window.matrix @ _MIDDLE
     part: Any = raw[top:bottom, left:right]
@@ -167,7 +168,7 @@ def sample(raw: Pixels, window: Window, shape: tuple[int, int], *, sharp: bool =
 
 
 def _reach(matrix: list[list[float]], shape: tuple[int, int], source: tuple[int, ...]) -> Rect:
-    """What a rectangle sees of a source, and a margin; one pixel at least."""
+    """Return the bounds of a rectangle in the source, plus a margin; at least one pixel."""
     at = [through(matrix, u, v) for u in (0, shape[1]) for v in (0, shape[0])]
     (left, top), (right, bottom) = map(min, *at), map(max, *at)
     height, width = source[:2]
@@ -182,7 +183,7 @@ def _reach(matrix: list[list[float]], shape: tuple[int, int], source: tuple[int,
 def _copied(
     raw: Pixels, matrix: list[list[float]], shape: tuple[int, int]
 ) -> NDArray[np.uint8] | None:
-    """A part of an image as it is, or mirrored; None where a window shows no such part."""
+    """Return a part of an image, unchanged or mirrored; None if the window is not such a part."""
     (a, b, c), (d, e, f), (g, h, i) = matrix
     bent = max(abs(abs(a) - 1), abs(b), abs(d), abs(e - 1), abs(g), abs(h), abs(i - 1))
     left, top = round(c if a > 0 else c - shape[1]), round(f)
@@ -196,27 +197,27 @@ def _copied(
 
 
 def levelled(pixels: Pixels, gain: Sequence[float], lift: Sequence[float]) -> Pixels:
-    """(h, w, 3) every channel times ``gain`` (3,) plus ``lift`` (3,), rounded, within 0 and 255."""
-    # OpenCV works by the pixel; NumPy and torch are slow at arrays that end in a side of 3.
+    """Return (h, w, 3) channels times ``gain`` (3,) plus ``lift`` (3,), rounded, 0 to 255."""
+    # OpenCV, since NumPy and torch are slow on arrays whose last axis is 3.
     (a, b, c), (d, e, f) = gain, lift
     matrix = np.array([[a, 0, 0, d], [0, b, 0, e], [0, 0, c, f]])
     return np.asarray(cv2.transform(pixels, matrix), np.uint8)
 
 
 def blended(below: Pixels, above: Pixels, opacity: Opacity) -> Pixels:
-    """(h, w, 3) one over the other, rounded."""
+    """Blend one (h, w, 3) image over another, rounded."""
     under = below.astype(np.float32)
     return np.asarray(under + opacity * (above - under) + np.float32(0.5)).astype(np.uint8)
 
 
 def defocused(pixels: Pixels, share: float) -> Pixels:
-    """(h, w, 3) as much of each of the two pixels beside in place of a pixel, down and across."""
+    """Blur (h, w, 3): each pixel takes ``share`` of each of its two neighbours, in both axes."""
     line = np.array([share, 1 - 2 * share, share])
     return np.asarray(cv2.sepFilter2D(pixels, -1, line, line, borderType=_BEYOND), np.uint8)
 
 
 def grained(pixels: Pixels, grain: NDArray[np.float32], sigma: float) -> Pixels:
-    """(h, w, 3) with noise: ``sigma`` times so many numbers of ``grain``."""
+    """Add noise to (h, w, 3): ``sigma`` times as many numbers of ``grain``."""
     levels = grain * np.float32(sigma)
     levels += pixels.ravel()
     levels += np.float32(0.5)
@@ -224,12 +225,12 @@ def grained(pixels: Pixels, grain: NDArray[np.float32], sigma: float) -> Pixels:
 
 
 def greyed(pixels: Pixels) -> Pixels:
-    """(h, w, 1) luma."""
+    """Return the (h, w, 1) luma."""
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)[..., None]
 
 
 def parts(whole: Rect, rng: Rng) -> list[Rect]:
-    """A rectangle cut in two or four, cut between a third and two thirds of its sides."""
+    """Split a rectangle in two or four, at a third to two thirds of its sides."""
     left, top, right, bottom = whole
     x = round(left + (right - left) * rng.uniform(1 / 3, 2 / 3))
     y = round(top + (bottom - top) * rng.uniform(1 / 3, 2 / 3))
@@ -242,48 +243,48 @@ def parts(whole: Rect, rng: Rng) -> list[Rect]:
 
 
 def present(robots: Robots) -> list[Robot]:
-    """The rows (K, 11) that are robots."""
+    """Return the rows of (K, 11) that are robots."""
     return [robot for robot in robots.tolist() if not math.isnan(robot[U])]
 
 
 def inside(robot: Robot, rect: Rect) -> bool:
-    """Whether a robot has its centre in a rectangle."""
+    """Return whether a robot's centre is inside a rectangle."""
     return rect[0] <= robot[U] < rect[2] and rect[1] <= robot[V] < rect[3]
 
 
 def under(robot: Robot, rect: Rect, opacity: Opacity | None) -> bool:
-    """Whether a robot has its centre under a layer (h, w, 1), None: opaque."""
+    """Return whether a robot's centre is covered by a layer (h, w, 1); None: opaque."""
     if not inside(robot, rect) or opacity is None:
         return inside(robot, rect)
     return bool(opacity[int(robot[V] - rect[1]), int(robot[U] - rect[0]), 0] > 0.5)
 
 
 def moved(robots: Sequence[Robot], window: Window, rect: Rect) -> list[Robot]:
-    """Robots of a source where a window puts them on the canvas."""
+    """Transform the labels of a source's robots to their positions on the canvas."""
     back = np.linalg.inv(window.matrix).tolist() if robots else []
     out = []
     for robot in robots:
         u, v = through(back, robot[U], robot[V])
         u, v, nearer = u + rect[0], v + rect[1], window.zoom
-        if window.camera:  # a turn keeps the distance, not the depth
+        if window.camera:  # a rotation keeps the distance, not the depth
             nearer *= slant(window.camera, u, v) / slant(window.camera, robot[U], robot[V])
         there = [*robot]
         there[U], there[V] = u, v
         there[DEPTH], there[SIGMA_DEPTH] = robot[DEPTH] / nearer, robot[SIGMA_DEPTH] / nearer
         there[SIGMA_U], there[SIGMA_V] = robot[SIGMA_U] * nearer, robot[SIGMA_V] * nearer
-        there[BOX] = _NO_BOX  # not carried along: nothing asks for it
+        there[BOX] = _NO_BOX  # not transformed: nothing uses it
         out.append(there)
     return out
 
 
 def feather(height: int, width: int) -> Opacity:
-    """(h, w, 1) opacity: 1 within, falling to 0 over the border."""
+    """Return (h, w, 1) opacity: 1 inside, falling to 0 over the border."""
     return (_risen(height)[:, None] * _risen(width))[..., None]
 
 
 @lru_cache(maxsize=1024)
 def _risen(size: int) -> NDArray[np.float32]:
-    """(n,) opacity along a line: from either end it rises to 1."""
+    """Return (n,) opacity along a line: from either end it rises to 1."""
     at = np.arange(size, dtype=np.float32)
     rises = (np.minimum(at, size - 1 - at) + 1) / np.float32(FEATHER_PX + 1)
     return np.asarray(np.minimum(rises, 1), np.float32)

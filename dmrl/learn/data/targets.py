@@ -1,9 +1,9 @@
-"""Training targets: what the network should say in every cell, from the robots of an image.
+"""Training targets of every grid cell, built from the labelled robots of an image.
 
-One rule gives both the paper's labels and softer ones. A robot is present in a cell by
-g = exp(-d^2 / 2 s^2), d the distance from the middle of the cell to the robot's centre in
-cells; at s = 0 g is 1 in the cell of the centre and 0 elsewhere (paper eq. 4). The cell's
-depth and offset are those of the robot that is most present there, the nearer one of equals.
+One rule gives both the paper's labels and softer ones. The presence of a robot in a cell is g =
+exp(-d^2 / 2 s^2), d the distance from the cell centre to the robot centre in cells. At s = 0, g is
+1 in the cell of the centre and 0 elsewhere (paper eq. 4). Depth and offset of a cell are those of
+the robot with the highest presence there; of equal ones, the nearer robot.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from dmrl.learn.data.batches import CLASS_ID, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA
 from dmrl.learn.networks.architectures import by_name
 
 PRESENT = 0.1
-"""Cells where g is below this learn neither depth nor offset."""
+"""Lower bound of g for cells that train depth and offset."""
 TOLERANCE_PX, TOLERANCE_DEPTH = 8.0, 0.1
-"""A label with such a sigma (pixels; share of the depth) counts half."""
+"""Sigma (pixels; fraction of the depth) at which a label has half weight."""
 
 LabelNoise = Literal["ignore", "weight", "soften"]
 
 
 class Targets(NamedTuple):
-    """Targets of N images, all float32.
+    """Targets of N images, float32 except ``class_id``.
 
     Parameters
     ----------
@@ -33,14 +33,14 @@ class Targets(NamedTuple):
     confidence_weight
         (N, rows, cols) weight of a cell in the confidence loss; 1 where labels are exact.
     weight, offset_weight
-        (N, rows, cols) weight of a cell in the loss of the depth and of the offset; 0 away
-        from robots.
+        (N, rows, cols) weight of a cell in the loss of the depth and of the offset; 0 away from
+        robots.
     depth_m
         (N, rows, cols) metres; 1 where the weight is 0.
     offset
-        (N, 2, rows, cols) centre minus middle of the cell, (u, v), cells.
+        (N, 2, rows, cols) robot centre minus cell centre, (u, v), cells.
     class_id
-        (N, rows, cols) class of the robot, -1 where it is not known or there is none.
+        (N, rows, cols) int64 class of the robot; -1 where it is unknown or there is no robot.
     """
 
     confidence: Tensor
@@ -60,23 +60,23 @@ def targets(
     stride_px: int = 8,
     label_noise: LabelNoise = "ignore",
 ) -> Targets:
-    """Targets of a batch.
+    """Build the targets of a batch.
 
     Parameters
     ----------
     robots
-        (N, K, 11), see ``batches.FIELDS``. A robot whose centre is outside the image is in no
-        cell, but may reach into it.
+        (N, K, 11), see ``ROBOT_FIELDS`` of `batches`. A robot whose centre is outside the image has
+        no cell of its own, but may be present in cells nearby.
     shape
         Rows and columns of the grid.
     sigma_cells
-        s of this module's rule.
+        Width s of the presence, cells.
     stride_px
         Pixels per cell, both ways.
     label_noise
-        What the labels' sigmas do. "weight": a robot's cells count by
-        1 / (1 + (sigma / tolerance)^2). "soften": s^2 grows by the square of the sigma, the
-        height of g sinks with it, as the mean of g over where the robot may be.
+        Use of the labels' sigmas. "weight": the weight of a robot's cells is
+        1 / (1 + (sigma / tolerance)^2). "soften": the square of the sigma is added to s^2 and the
+        height of g is reduced, which gives the mean of g over the robot's possible positions.
     """
     robots = robots.to(torch.float32)
     ahead = torch.isfinite(robots[..., :3]).all(dim=-1) & (robots[..., DEPTH] > 0)
@@ -86,7 +86,7 @@ def targets(
     du, dv = _from_middles(clean[..., (U, V)] / stride_px, shape)
     present = _presence(du, dv, sigma_cells, sigma_px / stride_px, soften=label_noise == "soften")
     present = present * ahead[..., None, None]
-    # A hair more presence for the nearer of equals.
+    # Slightly raise the presence of nearer robots, to break ties.
     rank = present * (1 + 1e-3 / (1 + clean[..., DEPTH, None, None]))
     best = rank.argmax(dim=1, keepdim=True)
     confidence = present.amax(dim=1)
@@ -100,11 +100,11 @@ def targets(
     class_id = torch.nan_to_num(robots[..., CLASS_ID, None, None], nan=-1.0)
     return Targets(
         confidence,
-        # Background cells count in full: that nobody is there does not depend on a label's sigma.
+        # Background cells have full weight: their emptiness does not depend on a label's sigma.
         torch.where(confidence > 0.01, trust_px, 1.0),
         near * trust_depth,
         near * trust_px,
-        # 1 m where there is no robot, so that its logarithm exists; the weight there is 0.
+        # 1 m where there is no robot, so that the logarithm is finite; the weight there is 0.
         torch.where(found, _of(best, clean[..., DEPTH, None, None]), 1.0),
         torch.stack((_of(best, du), _of(best, dv)), dim=1) * found[:, None],
         torch.where(found, _of(best, class_id), -1.0).to(torch.int64),
@@ -112,35 +112,35 @@ def targets(
 
 
 def _from_middles(centre: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """(N, K, 1, cols) and (N, K, rows, 1) from the middle of each cell to each centre, cells."""
+    """Return the offsets (N, K, 1, cols) and (N, K, rows, 1) from cell to robot centres, cells."""
     rows, cols = (torch.arange(n, device=centre.device) + 0.5 for n in shape)
     return centre[..., 0, None, None] - cols, centre[..., 1, None, None] - rows[:, None]
 
 
 def _of(best: Tensor, values: Tensor) -> Tensor:
-    """(N, rows, cols) value in each cell of the robot that is most present there.
+    """Return (N, rows, cols) the value of the robot with the highest presence in each cell.
 
-    ``best`` is (N, 1, rows, cols), the robot's place in the image's list; ``values`` are
-    (N, K, ...), stretched over the cells.
+    ``best`` is (N, 1, rows, cols), the index of that robot. ``values`` are (N, K, ...), broadcast
+    over the cells.
     """
     every = values.expand(*values.shape[:2], *best.shape[2:])
     return every.gather(1, best)[:, 0]
 
 
 def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Targets:
-    """What a teacher says of N images, for others to learn (Hinton et al. 2015).
+    """Build targets for N images from a teacher's output, for distillation (Hinton et al. 2015).
 
-    Its confidence is present everywhere, also where it doubts; depth and offset count where it
-    sees a robot, by its confidence. Classes are those of the labels.
+    The teacher's confidence is the target in all cells. Depth and offset are weighted by that
+    confidence and only count where it reaches `MIN_PRESENCE`. Classes are those of the labels.
 
     Parameters
     ----------
     channels
-        Of the output.
+        Channels of the output.
     output
         (N, C, rows, cols).
     labelled
-        Targets of the same images by their labels.
+        Targets of the same images from their labels.
     """
     out = by_name(channels, output)
     confidence = out["confidence"].sigmoid()
@@ -161,7 +161,7 @@ def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Ta
 def _presence(
     du: Tensor, dv: Tensor, sigma_cells: float, sigma_label: Tensor, *, soften: bool
 ) -> Tensor:
-    """(N, K, rows, cols) g of every robot in every cell."""
+    """Return (N, K, rows, cols) the presence g of every robot in every cell."""
     if sigma_cells == 0:
         # Half open, so that a centre on a border is in one cell.
         inside: Tensor = (du >= -0.5) & (du < 0.5) & (dv >= -0.5) & (dv < 0.5)
@@ -172,9 +172,10 @@ def _presence(
         height = variance / (variance + sigma_label.square())
         variance = variance + sigma_label.square()
     scale = (-0.5 / variance)[..., None, None]
-    # exp of a sum is the product of two small ones: rows and columns, not cells.
+    # exp of a sum is a product: compute it per row and per column, not per cell.
     return (scale * du.square()).exp() * (scale * dv.square()).exp() * height[..., None, None]
 
 
 def _trust(ratio: Tensor) -> Tensor:
+    """Return the weight of labels by the ratio of sigma and tolerance."""
     return (1 / (1 + ratio.square()))[..., None, None]

@@ -1,4 +1,4 @@
-"""Rows of a dataset for a training of one's own: a torch dataset, and a loader by the batch."""
+"""Rows of a dataset as a torch Dataset, and a DataLoader that reads whole batches."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -17,22 +17,22 @@ Item = dict[str, Tensor]
 
 
 class Source(Protocol):
-    """Rows that can be taken out many at a time."""
+    """Protocol of a data source that reads many rows at a time."""
 
     def __len__(self) -> int: ...
 
     def gathered(self, rows: Sequence[int], /) -> dict[str, NDArray[Any]]:
-        """Arrays with a first axis for the rows; ``image`` (N, H, W, 3) among them."""
+        """Return arrays whose first axis is the rows; ``image`` is (N, H, W, 3)."""
         ...
 
 
 class TorchRows(Dataset[Item]):
-    """Rows as tensors: ``image`` (3, H, W) uint8, the rest as it is.
+    """Torch dataset of rows: ``image`` (3, H, W) uint8, the other columns unchanged.
 
     Parameters
     ----------
     source
-        Where they come from.
+        Source of the rows.
     """
 
     def __init__(self, source: Source) -> None:
@@ -45,11 +45,11 @@ class TorchRows(Dataset[Item]):
         return {name: value[0] for name, value in self.batch([index]).items()}
 
     def __getitems__(self, indices: Sequence[int]) -> Item:
-        """What a DataLoader calls for a batch: gathered at once, it needs no collation."""
+        """Return a batch for a DataLoader: read at once, it needs no collation."""
         return self.batch(indices)
 
     def batch(self, indices: Sequence[int]) -> Item:
-        """Some rows, stacked."""
+        """Return rows as stacked tensors."""
         arrays = self.source.gathered(indices)
         tensors = {
             name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()
@@ -58,24 +58,25 @@ class TorchRows(Dataset[Item]):
 
 
 class Part(Sampler[int]):
-    """The rows that one of several processes reads in an epoch; another order each time.
+    """Sampler of the rows that one of several processes reads in an epoch.
 
     Parameters
     ----------
     count
-        Rows of all.
+        Number of rows in total.
     part
-        Which process this is, from 0, and of how many. What they read in an epoch is disjoint.
+        Rank of this process, from 0, and number of processes. Their rows in an epoch are disjoint.
     shuffle
-        All read equally many then, as trainings want that wait for each other: of a remainder
-        other rows are left out each time. Else each row is read once, in order.
+        Use another order in each epoch. All processes then read equally many rows, as synchronised
+        training requires; each epoch leaves out other rows of the remainder. Otherwise each row is
+        read once, in order.
     seed
-        Of the orders. It must be the same everywhere.
+        Seed of the orders. It must be the same in all processes.
 
     Raises
     ------
     SettingError
-        If there is no such part.
+        If the rank is not below the number of processes.
     """
 
     def __init__(self, count: int, part: tuple[int, int], *, shuffle: bool, seed: int) -> None:
@@ -105,7 +106,7 @@ class Part(Sampler[int]):
 
 
 def part_of_torchrun() -> tuple[int, int]:
-    """Which process of how many this is, as torchrun tells it; the only one, without."""
+    """Return rank and number of processes from torchrun; (0, 1) without it."""
     try:
         return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
     except ValueError:
@@ -121,7 +122,10 @@ def loader_of(
     workers: int,
     part: tuple[int, int] | None,
 ) -> DataLoader[Item]:
-    """A DataLoader that gathers each batch at once; ``part`` as `Part` has it, None: torchrun's."""
+    """Build a DataLoader that reads each batch at once.
+
+    ``part`` is as in `ProcessSampler`; None: that of torchrun.
+    """
     return DataLoader(
         TorchRows(source),
         batch_size=batch_size,

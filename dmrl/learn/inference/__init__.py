@@ -1,1 +1,1 @@
-"""Inference: load a model, decode its grids, match detections, set the threshold."""
+"""Trained models: loading, decoding, test-time augmentation, matching and metrics."""

@@ -1,9 +1,9 @@
-"""Confidence that is a probability: of detections of 0.7, seven in ten are right.
+"""Confidence calibration by Platt scaling: of detections with confidence 0.7, 70 % are correct.
 
-What a network is trained on is a hill about every robot, not a chance, so its confidence only
-ranks. Platt's logistic regression (Platt 1999, Guo et al. 2017) of right or wrong on the logit is
-a slope and an offset, and these are carried by the weights of the last layer: exports, int8 and C
-say the same without knowing of it.
+A network is trained on a peak around every robot, not on probabilities, so its confidence only
+ranks detections. Platt's logistic regression of correctness on the logit (Platt 1999, Guo et al.
+2017) gives a slope and an offset. The weights of the last layer absorb both, so ONNX, int8 and C
+exports need no change.
 """
 
 from typing import NamedTuple
@@ -17,31 +17,36 @@ from dmrl.learn.inference.matching import Array
 from dmrl.learn.networks.architectures import Network
 
 LEAST = 30
-"""Right and wrong detections, of each, below which nothing is fitted."""
+"""Minimum number of correct detections, and of wrong ones, for a fit."""
 FAINTEST = 0.02
-"""Confidence below which detections say nothing of those that anybody would believe."""
+"""Lower bound of the confidence of detections in the fit; fainter ones are irrelevant in use."""
 STEPS, CLOSE, RIDGE = 50, 1e-9, 1e-6
+"""Newton's method: most steps, tolerance of loss and step, and diagonal added to the Hessian."""
 SLOPES = (0.2, 10.0)
-"""Beyond these a fit is of too little, or of a network that knows nothing."""
+"""Accepted slopes. Others come from too few detections or an uninformative confidence."""
 
 
 class Calibration(NamedTuple):
-    """What a logit is multiplied by, and what is added then."""
+    """Slope and offset of the confidence logit: slope * logit + offset."""
 
     slope: float
     offset: float
 
 
 def calibration(scored: Scored) -> Calibration | None:
-    """Slope and offset that make confidences of detections the share of them that is right.
+    """Fit the slope and offset that make each confidence the fraction of correct detections.
 
-    Right within 16 px. None where there are too few detections to tell, or a higher confidence
-    is no better.
+    A detection is correct within 16 px of a label.
 
     Parameters
     ----------
     scored
-        Of images that the network did not learn from.
+        Matched detections of images that the network was not trained on.
+
+    Returns
+    -------
+    PlattScaling or None
+        None if there are too few detections, or the slope is outside `SLOPE_RANGE`.
     """
     confidence = scored.detections.confidence
     seen = confidence >= FAINTEST
@@ -55,7 +60,10 @@ def calibration(scored: Scored) -> Calibration | None:
 
 
 def _fitted(rows: Array, right: Array) -> Array:
-    """(K,) weights of (N, K) rows that make (N,) right likeliest: Newton's steps, never uphill."""
+    """Fit a logistic regression of (N,) labels on (N, K) rows; return (K,) weights.
+
+    Newton's method with step halving, so that the loss never increases.
+    """
 
     def loss(weights: Array) -> float:
         odds = rows @ weights
@@ -75,14 +83,14 @@ def _fitted(rows: Array, right: Array) -> Array:
 
 
 def calibrate(network: Network, found: Calibration) -> bool:
-    """Write a calibration into the last layer, ``head``; False for a network without one.
+    """Write a calibration into the last layer, ``head``; return False if the network has none.
 
     Parameters
     ----------
     network
-        Changed in place.
+        Network, changed in place.
     found
-        Of this network.
+        Calibration of this network.
     """
     head = getattr(network, "head", None)
     if not isinstance(head, nn.Conv2d) or head.bias is None:

@@ -1,9 +1,9 @@
-"""Grids of a network's output to detections. NumPy only.
+"""Decoding of output grids to detections. NumPy only.
 
-A detection is a cell that is the most confident of its 3x3 neighbourhood, in order of
-confidence. (The published code walks the cells in raster order.) It lies in the middle of the
-cell or, where the network says so, at an offset from it; then two cells may name one robot,
-and of detections closer than ``SAME_PX`` only the most confident stays.
+A detection is a cell with the highest confidence in its 3x3 neighbourhood. Detections are sorted by
+confidence; the published code uses raster order. A detection lies at the centre of its cell or,
+if the network has offset channels, at the offset from it. With offsets, two cells may locate the
+same robot: of detections closer than ``DUPLICATE_RADIUS_PX``, only the most confident is kept.
 """
 
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 PER_DETECTION = ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m", "class_id")
-"""Columns of `Found`, named as the fields of a Detection."""
+"""Columns of `Detections`, named as the fields of a Detection message."""
 SAME_PX = 8.0
-"""Detections closer than this are of one robot."""
+"""Detections closer than this, in pixels, belong to one robot."""
 
 
 class Grids(NamedTuple):
-    """What a network says of N images.
+    """Output of a network for N images.
 
     Parameters
     ----------
@@ -30,12 +30,12 @@ class Grids(NamedTuple):
     depth_m
         (N, rows, cols), metres.
     offset
-        (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells; None
-        for a network that has no such channels.
+        (N, 2, rows, cols) robot centre minus cell centre, (u, v), cells; None without these
+        channels.
     spread
-        (N, rows, cols) scale b of the error of log depth, exp(-|error| / b); None likewise.
+        (N, rows, cols) scale b of the error of log depth, exp(-|error| / b); None without it.
     class_id
-        (N, rows, cols) the likeliest class; None likewise.
+        (N, rows, cols) the most likely class; None without class channels.
     """
 
     confidence: NDArray[np.floating]
@@ -47,16 +47,16 @@ class Grids(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Detections of N images, best first, K columns wide.
+    """Detections of N images, most confident first, K columns wide.
 
     Parameters
     ----------
     u_px, v_px, depth_m, confidence
         (N, K). Only the first ``count[i]`` columns of row i are detections.
     sigma_depth_m
-        (N, K) standard deviation of the depth; 0 where the network does not say.
+        (N, K) standard deviation of the depth; 0 without a spread channel.
     class_id
-        (N, K) the likeliest class; 0 where the network does not say.
+        (N, K) the most likely class; 0 without class channels.
     count
         (N,) detections in each image, at least 1.
     """
@@ -71,9 +71,9 @@ class Found:
 
 
 def peaks(confidence: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Cells of (N, rows, cols) grids that no neighbour exceeds.
+    """Return the local maxima of (N, rows, cols) grids.
 
-    Of equal neighbours the first in raster order is the peak, so every grid has one.
+    Of equal neighbours, the first in raster order is the maximum, so every grid has one.
     """
     rows, cols = confidence.shape[1:]
     padded = np.pad(confidence, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
@@ -99,23 +99,23 @@ def decode(
     most: int = 20,
     min_confidence: float = 0.01,
 ) -> Found:
-    """Detections in grids of the network's output.
+    """Decode the output grids of a network to detections.
 
     Parameters
     ----------
     confidence, depth_m
         (N, rows, cols): 0 to 1, and metres.
     offset
-        (N, 2, rows, cols) centre of the robot minus middle of the cell, (u, v), cells. None:
-        the middle is as good as it gets.
+        (N, 2, rows, cols) robot centre minus cell centre, (u, v), cells. None: positions are cell
+        centres.
     spread, class_id
         (N, rows, cols), as in `Grids`.
     stride_px
         Pixels per cell, both ways.
     most
-        Keep at most this many per image.
+        Maximum number of detections per image.
     min_confidence
-        Drop peaks below this, but never the best of an image.
+        Drop peaks below this confidence, but always keep the best of an image.
     """
     images, rows, cols = confidence.shape
     score = np.where(peaks(confidence), confidence, -1.0).reshape(images, rows * cols)
@@ -130,13 +130,13 @@ def decode(
     uv *= stride_px
 
     def there(grid: NDArray[Any] | None) -> NDArray[Any]:
-        """A grid's values where the detections are, 0 where there is no grid."""
+        """Return a grid's values at the detections, 0 if there is no grid."""
         if grid is None:
             return np.zeros(best.shape, np.int64)
         return np.take_along_axis(grid.reshape(images, -1), best, axis=1)
 
     depth = there(depth_m).astype(np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):  # a network may say anything
+    with np.errstate(invalid="ignore", over="ignore"):  # outputs can be arbitrarily large
         sigma = np.sqrt(2) * depth * there(spread)  # Laplace
     count = np.maximum((kept >= max(min_confidence, 0.0)).sum(axis=1), 1)
     found = Found(uv[0], uv[1], depth, kept.astype(np.float64), sigma, there(class_id), count)
@@ -144,7 +144,7 @@ def decode(
 
 
 def _without_doubles(found: Found) -> Found:
-    """The same without detections that lie by a more confident one."""
+    """Drop detections that are close to a more confident one."""
     wide = found.u_px.shape[1]
     stays = np.arange(wide) < found.count[:, None]
     for k in range(1, int(found.count.max())):
@@ -153,7 +153,7 @@ def _without_doubles(found: Found) -> Found:
             found.v_px[:, :k] - found.v_px[:, k : k + 1],
         )
         stays[:, k] &= ~((away_px < SAME_PX) & stays[:, :k]).any(axis=1)
-    # Those that stay first, in their order.
+    # Kept detections first, in their order.
     first = np.argsort(~stays, axis=1, kind="stable")
     sorted_columns = {
         name: np.take_along_axis(getattr(found, name), first, axis=1) for name in PER_DETECTION

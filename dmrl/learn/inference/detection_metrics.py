@@ -1,8 +1,8 @@
-"""Figures of detections against labels, by distance, with bootstrap intervals. NumPy only.
+"""Metrics of detections against labels, by distance, with bootstrap intervals. NumPy only.
 
-Every figure is a function of a weight per image, so that one piece of code gives the value
-(all weights 1) and its bootstrap (weights are how often an image was drawn). Intervals are
-95 % percentile intervals over images. Definitions of the figures: ``DEFINITIONS``.
+Every metric is a function of one weight per image. The same code thus gives the value (all weights
+1) and its bootstrap (weights are how often an image was drawn). Intervals are 95 % percentile
+intervals over images. ``METRIC_DEFINITIONS`` defines the metrics.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from dmrl.learn.inference.matching import Array, Errors, Index, Points, errors, hits
 
 BANDS_M = ((0.0, np.inf), (0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 2.0), (2.0, np.inf))
-"""Ranges of the label's depth, metres, lower end included; the first is all of them."""
+"""Bands of the label's depth, metres, lower end included; the first contains all labels."""
 
 Band = tuple[float, float]
 Across = Callable[[Callable[[Band], "BandFigures"], Sequence[Band]], Iterable["BandFigures"]]
 
 SCORE_RADIUS_PX = 16.0
+"""Radius within which a detection is correct, pixels."""
 
 DEFINITIONS = {
     "error": "label minus detection; an image with N labels inside the image has its N most "
@@ -48,7 +49,7 @@ DEFINITIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure with its 95 % interval; NaN where there is nothing to measure."""
+    """One metric with its 95 % interval; NaN if there is nothing to measure."""
 
     value: float
     low: float
@@ -57,16 +58,16 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class BandFigures:
-    """Figures of the labels in one range of depth.
+    """Metrics of the labels in one depth band.
 
     Parameters
     ----------
     from_m, to_m
-        The range, lower end included.
+        Limits of the band, lower end included.
     labels, images, unmatched
-        Labels in the range, images that hold them, and labels without any detection.
+        Labels in the band, images that contain them, and labels without any detection.
     figures
-        By the names of ``DEFINITIONS``.
+        Metrics by the names of ``METRIC_DEFINITIONS``.
     """
 
     from_m: float
@@ -84,11 +85,11 @@ class Scored:
     Parameters
     ----------
     images
-        Number of images, also those without labels.
+        Number of images, including those without labels.
     label_error
         Error of each label.
     right_8_px, right_16_px
-        Label of each detection within 8 and 16 px, -1 for none.
+        Label that each detection matches within 8 and 16 px, -1 for none.
     """
 
     images: int
@@ -100,7 +101,7 @@ class Scored:
 
 
 def score(images: int, labels: Points, detections: Points) -> Scored:
-    """Labels and detections with their matches."""
+    """Match labels and detections."""
     return Scored(
         images,
         labels,
@@ -114,7 +115,7 @@ def score(images: int, labels: Points, detections: Points) -> Scored:
 def by_band(
     scored: Scored, *, threshold: float, draws: int = 1000, seed: int = 0, across: Across = map
 ) -> list[BandFigures]:
-    """Figures over all distances, then for each band of ``BANDS_M``.
+    """Compute the metrics over all distances, then for each band of ``DEPTH_BANDS_M``.
 
     Parameters
     ----------
@@ -123,11 +124,11 @@ def by_band(
     threshold
         Confidence at or above which a detection counts in precision, recall and F1.
     draws
-        Bootstrap samples.
+        Number of bootstrap samples.
     seed
-        Of the bootstrap.
+        Seed of the bootstrap.
     across
-        What does a thing for every band, in their order: processes, perhaps.
+        Function that maps over the bands in their order, such as `map` or a parallel map.
     """
     one = partial(_band, scored=scored, threshold=threshold, draws=draws, seed=seed)
     return list(across(one, BANDS_M))
@@ -143,7 +144,7 @@ def _band(band: Band, scored: Scored, threshold: float, draws: int, seed: int) -
     for name, (point,) in value.items():
         sample = np.concatenate([block[name] for block in blocks])
         sample = sample[np.isfinite(sample)]
-        # Nearest ranks, so that an infinite neighbour cannot turn a limit into NaN.
+        # Nearest ranks, so that an infinite neighbour does not turn a limit into NaN.
         low, high = (
             np.quantile(sample, (0.025, 0.975), method="inverted_cdf")
             if len(sample) and np.isfinite(point)
@@ -161,15 +162,15 @@ def _band(band: Band, scored: Scored, threshold: float, draws: int, seed: int) -
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """What a threshold would cost, and whether confidence is a probability.
+    """Precision-recall curve and reliability diagram.
 
     Parameters
     ----------
     confidence, precision, recall
-        (K,) of all detections at or above that confidence, surest first.
+        (K,) of all detections at or above that confidence, most confident first.
     bin_confidence, bin_right, bin_count
-        (10,) mean confidence, share of detections that are right, and how many there are, in
-        tenths of the confidence; NaN where there is none.
+        (10,) mean confidence, fraction of correct detections, and number of detections per tenth of
+        the confidence; NaN for an empty bin.
     """
 
     confidence: Array
@@ -181,20 +182,20 @@ class Curves:
 
 
 def curves(scored: Scored, most: int = 200) -> Curves:
-    """Precision over recall, and reliability, of detections that are right within 16 px.
+    """Compute precision over recall, and reliability; detections are correct within 16 px.
 
     Parameters
     ----------
     scored
         Matched labels and detections.
     most
-        Points of the curve at most, evenly over the detections.
+        Maximum number of points of the curve, evenly spaced over the detections.
     """
     confidence = scored.detections.confidence
     order = np.argsort(-confidence, kind="stable")
     right = (scored.right_16_px >= 0)[order]
     found = np.cumsum(right)
-    # Detections of equal confidence are taken or left together.
+    # Detections of equal confidence are included together.
     last = np.flatnonzero(np.diff(confidence[order], append=-1.0))
     last = last[np.unique(np.linspace(0, len(last) - 1, min(most, len(last))).round().astype(int))]
     place = np.clip((confidence[order] * 10).astype(int), 0, 9)
@@ -211,7 +212,10 @@ def curves(scored: Scored, most: int = 200) -> Curves:
 
 
 def resamples(scored: Scored, draws: int, seed: int) -> Iterator[Array]:
-    """Blocks of (b, images) weights: how often each image was drawn, ``draws`` rows in all."""
+    """Yield bootstrap weights in blocks (b, images), ``draws`` rows in all.
+
+    A weight is the number of times an image was drawn.
+    """
     rng = np.random.default_rng(seed)
     widest = max(scored.images, len(scored.labels), len(scored.detections), 1)
     block = max(1, 2_000_000 // widest)
@@ -224,7 +228,7 @@ def resamples(scored: Scored, draws: int, seed: int) -> Iterator[Array]:
 
 
 def figures(scored: Scored, band: Band, threshold: float, weights: Array) -> dict[str, Array]:
-    """Every figure for (b, images) weights: name to (b,) values."""
+    """Compute every metric for (b, images) weights: name to (b,) values."""
     inside = _in_band(scored.labels.depth_m, band)
     out = _error_figures(scored, inside, weights[:, scored.labels.image[inside]])
     total = weights[:, scored.labels.image[inside]].sum(axis=1)
@@ -268,10 +272,10 @@ def _error_figures(scored: Scored, inside: NDArray[np.bool_], weights: Array) ->
 
 
 def weighted_quantile(values: Array, weights: Array, share: float) -> Array:
-    """(b,) quantiles of (n,) values under (b, n) weights, as if repeated that often.
+    """Return (b,) quantiles of (n,) values under (b, n) weights, as if repeated that often.
 
-    Where the share falls between two values it is their mean, so the median of an even
-    number of values is the usual one. NaN where the weights are all zero.
+    If the quantile falls between two values, it is their mean, so the median of an even number of
+    values is the usual one. NaN if all weights are zero.
     """
     if not len(values):
         return np.full(len(weights), np.nan)
@@ -292,9 +296,9 @@ def average_precision(
     weights: Array,
     total: Array,
 ) -> Array:
-    """(b,) areas under the precision envelope over recall.
+    """Return (b,) areas under the precision envelope over recall.
 
-    No threshold lies between equal confidences: they count together, whatever their order.
+    No threshold separates equal confidences: they count together, whatever their order.
 
     Parameters
     ----------
@@ -308,7 +312,7 @@ def average_precision(
     judged = np.flatnonzero(right | wrong)
     order = judged[np.argsort(-confidence[judged], kind="stable")]
     mass = weights[:, order]
-    # Precision peaks at right detections, so the envelope needs no other.
+    # Precision peaks at correct detections, so the envelope needs no others.
     at = np.flatnonzero(right[order])
     true = mass[:, at]
     falling = -confidence[order]
@@ -324,7 +328,7 @@ def average_precision(
 def _judged(
     scored: Scored, taken: Index, band: Band, inside: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(D,) right and (D,) wrong detections of a band; the others are another band's."""
+    """Return (D,) correct and (D,) wrong detections of a band; others belong to other bands."""
     free = taken < 0
     right = np.zeros(len(taken), bool)
     right[~free] = inside[taken[~free]]

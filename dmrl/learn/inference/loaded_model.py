@@ -1,6 +1,6 @@
-"""A trained network with what is needed to use it: run folders, safetensors, published .h5.
+"""Trained models: run folders, safetensors files and published Keras .h5 files.
 
-A run folder holds ``model.safetensors`` and ``model.json``. Nothing is ever unpickled.
+A run folder contains ``model.safetensors`` and ``model.json``. Nothing is ever unpickled.
 """
 
 import json
@@ -38,13 +38,13 @@ from dmrl.learn.networks.keras_weights import read_h5
 WEIGHTS_NAME = "model.safetensors"
 DESCRIPTION_NAME = "model.json"
 PUBLISHED_THRESHOLD = 0.33
-"""Confidence threshold of the published evaluation."""
+"""Confidence threshold of the published evaluation, 0 to 1."""
 
 Grid = NDArray[np.float32]
 
 
 def grids_of(network: Network, images: Tensor) -> Grids:
-    """Grids of (N, 3, H, W) uint8 images; the network as it stands, on its device."""
+    """Run a network, in its present mode and on its device, on (N, 3, H, W) uint8 images."""
     device = next(network.parameters()).device
     with torch.inference_mode():
         out = network(to_input(images.to(device))).cpu()
@@ -66,17 +66,17 @@ class Model:
     Parameters
     ----------
     network
-        In evaluation mode.
+        Network in evaluation mode.
     architecture
-        Its name, one of ``network.architecture_names()``.
+        Name of the architecture, one of `list_architectures`.
     name
-        Of the file or folder it came from.
+        Name of the file or folder it was loaded from.
     width_px, height_px
         Size of the images it was trained on.
     threshold
-        Confidence above which a detection is to be believed, 0 to 1.
+        Confidence from which a detection is reported, 0 to 1.
     label_source
-        Source of the labels it was trained on ("truth", "published", ...); empty: not known.
+        Source of the labels it was trained on ("truth", "published", ...); empty: unknown.
     training
         Summary of the training: settings, losses, images.
     """
@@ -91,7 +91,7 @@ class Model:
     training: dict[str, Any] = field(default_factory=dict)
 
     def require_size(self, width_px: int, height_px: int, what: object) -> None:
-        """Nothing, if the network can take images of this size.
+        """Raise SettingError unless the network accepts images of this size.
 
         Raises
         ------
@@ -106,23 +106,23 @@ class Model:
             )
 
     def grids(self, images: NDArray[np.uint8]) -> Grids:
-        """What the network says of (N, H, W, 3) RGB images.
+        """Run the network on (N, H, W, 3) RGB images.
 
         Raises
         ------
         SettingError
-            If the network cannot take images of this size.
+            If the network does not accept images of this size.
         """
         self.require_size(images.shape[2], images.shape[1], self.name or self.architecture)
-        # torch takes writable arrays only; a view of a mapped file is copied here.
+        # torch accepts writable arrays only; a view of a mapped file is copied here.
         writable = np.require(images, requirements="W")
         return grids_of(self.network, torch.from_numpy(writable).permute(0, 3, 1, 2))
 
 
 def weights_of(network: Network) -> dict[str, Tensor]:
-    """Every tensor of a network, contiguous, on the CPU.
+    """Return every tensor of a network, contiguous, on the CPU.
 
-    Batch counters are left out: no fixed-momentum normalisation reads them.
+    Batch counters are left out: normalisations with fixed momentum do not use them.
     """
     return {
         name: value.detach().cpu().contiguous()
@@ -132,16 +132,16 @@ def weights_of(network: Network) -> dict[str, Tensor]:
 
 
 def mixed(network: Network, first: dict[str, Tensor], share: float) -> None:
-    """Bring a network's weights towards others by a share of the way, in place.
+    """Interpolate a network's weights linearly towards others, in place.
 
     Parameters
     ----------
     network
-        Changed in place.
+        Network, changed in place.
     first
-        By the names of ``weights_of``, of the same shapes.
+        Other weights, with the names and shapes of `get_weights`.
     share
-        0: nothing changes; 1: the others.
+        Weight of ``first``. 0: no change; 1: all weights are replaced.
     """
     with torch.no_grad():
         for name, value in network.state_dict().items():
@@ -150,9 +150,9 @@ def mixed(network: Network, first: dict[str, Tensor], share: float) -> None:
 
 
 def with_channels(known: Network, network: Network) -> dict[str, Tensor]:
-    """Weights of a known network for one that may have other channels on top of the same body.
+    """Return weights of one network for another with the same body and perhaps other channels.
 
-    Channels that only the latter has keep the weights it has now.
+    Channels that only the second network has keep its present weights.
     """
     weights, fresh = weights_of(known), weights_of(network)
     for name in ("head.weight", "head.bias"):
@@ -177,14 +177,14 @@ def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> 
     wanted = weights_of(network)
     if odd := sorted(wanted.keys() ^ weights.keys()):
         verb = "lacks" if odd[0] in wanted else "has an unknown"
-        raise ModelError(f"{where} {verb} tensor {odd[0]}. Give weights of this architecture")
+        raise ModelError(f"{where} {verb} tensor {odd[0]}. Use weights of this architecture")
     for name, value in weights.items():
         if value.dtype not in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
             raise ModelError(f"{where}: {name} holds {value.dtype}. Give weights in float32")
         if value.shape != wanted[name].shape:
             raise ModelError(
                 f"{where}: {name} has shape {tuple(value.shape)}, the network needs "
-                f"{tuple(wanted[name].shape)}. Give weights of this architecture"
+                f"{tuple(wanted[name].shape)}. Use weights of this architecture"
             )
         if not torch.isfinite(value).all():
             raise ModelError(f"{where}: {name} holds values that are not finite. Train again")
@@ -192,12 +192,15 @@ def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> 
 
 
 def write_tensors(tensors: dict[str, Tensor], path: Path) -> None:
-    """Write a .safetensors file. A full disk is an OSError, unlike in the library's own way."""
+    """Write a .safetensors file.
+
+    A full disk raises OSError, unlike with the library's own writer.
+    """
     path.write_bytes(save(tensors))
 
 
 def describe(model: Model) -> dict[str, Any]:
-    """What ``model.json`` says about a model."""
+    """Return the content of ``model.json``."""
     return {
         "architecture": model.architecture,
         "parameters": parameter_count(model.network),
@@ -220,15 +223,15 @@ def save_model(model: Model, folder: Path) -> None:
 
 
 def load_model(path: Path) -> Model:
-    """Model of a run folder, of a .safetensors with its .json beside it, or of a Keras .h5.
+    """Load a model from a run folder, a .safetensors with its .json, or a Keras .h5.
 
-    The kind is told by the content, not the name.
+    The format is detected by content, not by name.
 
     Raises
     ------
     ModelError
-        If the file is none of these (a pickle is refused unread), is damaged, or its tensors
-        do not fit the architecture.
+        If the file has none of these formats, is damaged, or its tensors do not fit the
+        architecture. A pickle is rejected without reading it.
     """
     refuse_no_text(path)
     refuse_pipes(path)
@@ -271,7 +274,7 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
 
 
 def _extra(said: dict[str, Any], path: Path) -> list[str]:
-    """Channels on top of the architecture's own, as a description lists them all."""
+    """Return the channels of a description in addition to the architecture's own."""
     own = list(architecture(said["architecture"]).own)
     outputs = said.get("outputs", own)
     extra = outputs[len(own) :] if isinstance(outputs, list) else None
@@ -305,7 +308,7 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path} has no valid threshold. Give the model.json of dmrl train")
     if said["architecture"] not in architecture_names():
         raise ModelError(
-            f"{path} asks for architecture {said['architecture']}, this dmrl knows "
-            f"{', '.join(architecture_names())}. Update dmrl, or install the package that brings it"
+            f"{path} requires architecture {said['architecture']}, this dmrl has "
+            f"{', '.join(architecture_names())}. Update dmrl, or install the package with it"
         )
     return dict(said)

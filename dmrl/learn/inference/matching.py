@@ -1,9 +1,9 @@
-"""Which detection belongs to which label.
+"""Matching of detections with labels, by two rules for two purposes.
 
-Two questions, two rules. *How far off is the network* (``errors``): an image with N labels
-has its N most confident detections matched one-to-one with the least total distance; for one
-label that is the most confident cell. *Which detections are right* (``hits``): in order of
-confidence each detection takes the nearest label that is still free, within a radius.
+*Localization error* (`compute_errors`): the N most confident detections of an image with N labels
+are assigned one-to-one with the least total distance. With one label, this is the most confident
+cell. *Correct detections* (`match_within_radius`): in order of confidence, each detection takes
+the nearest label within a radius that is still unmatched.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class Points:
     Parameters
     ----------
     image
-        (M,) index of the image, ascending. Detections of one image: best first.
+        (M,) index of the image, ascending. Detections of one image: most confident first.
     u_px, v_px, depth_m
         (M,) pixel and depth.
     confidence
@@ -41,12 +41,12 @@ class Points:
         return len(self.image)
 
     def ranks(self) -> Index:
-        """(M,) place of each row within its image, from 0."""
+        """Return (M,) the position of each row within its image, from 0."""
         return np.arange(len(self), dtype=np.int64) - np.searchsorted(self.image, self.image)
 
     @staticmethod
     def concatenate(parts: Sequence["Points"], first: Index) -> "Points":
-        """All parts, the images of part k counted from ``first[k]``."""
+        """Concatenate parts; image indices of part k are offset by ``first[k]``."""
         return Points(
             np.concatenate([part.image + first[k] for k, part in enumerate(parts)]),
             np.concatenate([part.u_px for part in parts]),
@@ -56,7 +56,7 @@ class Points:
         )
 
     def select(self, keep: NDArray[np.bool_] | Index) -> "Points":
-        """The chosen rows."""
+        """Return the chosen rows."""
         return Points(
             self.image[keep],
             self.u_px[keep],
@@ -68,7 +68,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Label minus detection, one row per label; NaN where an image has too few detections.
+    """Label minus detection, one row per label; NaN if an image has too few detections.
 
     Parameters
     ----------
@@ -82,13 +82,13 @@ class Errors:
 
     @property
     def norm_px(self) -> Array:
-        """(M,) length of the pixel error; infinite where there was no detection."""
+        """(M,) length of the pixel error; infinite without a detection."""
         length = np.hypot(self.u_px, self.v_px)
         return np.where(np.isnan(length), np.inf, length)
 
 
 def errors(labels: Points, detections: Points) -> Errors:
-    """Error of every label, by the first rule of this module."""
+    """Compute the localization error of every label, by the first rule of this module."""
     rows = partners(labels, detections)
     missing = rows < 0
 
@@ -105,7 +105,7 @@ def errors(labels: Points, detections: Points) -> Errors:
 
 
 def partners(labels: Points, detections: Points) -> Index:
-    """(M,) row of the detection matched to each label, -1 for none."""
+    """Return (M,) the row of the detection assigned to each label, -1 for none."""
     first = np.searchsorted(detections.image, labels.image)
     available = np.searchsorted(detections.image, labels.image, side="right") - first
     wanted = np.searchsorted(labels.image, labels.image, side="right") - np.searchsorted(
@@ -127,7 +127,7 @@ def partners(labels: Points, detections: Points) -> Index:
 
 
 def hits(labels: Points, detections: Points, radius_px: float) -> Index:
-    """(D,) label that each detection is right about, -1 for none; the second rule."""
+    """Match each detection with a label within a radius; return (D,) label rows, -1 for none."""
     out = np.full(len(detections), -1, np.int64)
     if not len(labels):
         return out

@@ -1,4 +1,4 @@
-"""From which confidence a detection is to be believed, and what that costs where nobody is."""
+"""Selection of the confidence threshold, and the false alarms that it causes."""
 
 from dataclasses import dataclass
 
@@ -8,23 +8,23 @@ from numpy.typing import NDArray
 from dmrl.learn.inference.detection_metrics import Scored
 
 LEAST_LABELS = 10
-"""Labels below which a threshold would hang on chance."""
+"""Minimum number of labels; with fewer, the threshold would be random."""
 LEAST_EMPTY = 20
-"""Images without a robot below which a rate of false alarms would."""
+"""Minimum number of images without a robot; with fewer, the false alarm rate would be random."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alarms:
-    """What a detector says of images without a robot.
+    """False alarms of a detector in images without a robot.
 
     Parameters
     ----------
     empty_images
-        Images whose labels say that no robot is in view.
+        Number of images labelled as containing no robot.
     alarmed_images
-        Those of them with a detection at or above the threshold.
+        Number of those with a detection at or above the threshold.
     false_alarms
-        Detections at or above the threshold in an empty image, on average; NaN without one.
+        Mean number of detections at or above the threshold in an empty image; NaN without any.
     """
 
     empty_images: int
@@ -33,7 +33,7 @@ class Alarms:
 
 
 def alarms(scored: Scored, threshold: float) -> Alarms:
-    """Detections at or above a threshold where no robot is."""
+    """Count detections at or above a threshold in images without a robot."""
     empty = without_label(scored)
     sure = scored.detections.image[scored.detections.confidence >= threshold]
     mine = sure[empty[sure]]
@@ -42,25 +42,25 @@ def alarms(scored: Scored, threshold: float) -> Alarms:
 
 
 def without_label(scored: Scored) -> NDArray[np.bool_]:
-    """(images,) which have no label."""
+    """Return (images,) whether each image has no label."""
     empty = np.ones(scored.images, bool)
     empty[scored.labels.image] = False
     return empty
 
 
 def best_threshold(scored: Scored, false_alarms: float = np.inf) -> float | None:
-    """Confidence that gives the best F1, detections right within 16 px; None with few labels.
+    """Return the threshold with the best F1, detections correct within 16 px; None with few labels.
 
-    Of the confidences at or above which an image without a label has at most so many detections,
-    where `LEAST_EMPTY` images are without. Halfway between the last detection that pays and the
-    next below it, so that the choice does not hang on one detection's last digits.
+    If at least `MIN_EMPTY_IMAGES` images have no label, only thresholds with an acceptable rate of
+    false alarms are candidates. The result lies halfway between the last useful detection and the
+    next less confident one, so that it does not depend on the last digits of one detection.
 
     Parameters
     ----------
     scored
         Matched labels and detections.
     false_alarms
-        Detections of an image without a label, on average, at most.
+        Largest mean number of detections in an image without a label.
     """
     right: NDArray[np.bool_] = scored.right_16_px >= 0
     if len(scored.labels) < LEAST_LABELS or not right.any():
@@ -71,14 +71,14 @@ def best_threshold(scored: Scored, false_alarms: float = np.inf) -> float | None
     f1 = 2 * true / (np.arange(1, len(true) + 1) + len(scored.labels))
     f1[~_quiet(scored, descending, false_alarms)] = -1.0
     best = int(np.argmax(f1))
-    if f1[best] < 0:  # the surest of all is a false alarm, and one is too many
+    if f1[best] < 0:  # the most confident detection is a false alarm, and the limit allows none
         return float((confidence[0] + 1) / 2)
     below = confidence[best + 1] if best + 1 < len(confidence) else 0.0
     return float((confidence[best] + below) / 2)
 
 
 def _quiet(scored: Scored, order: NDArray[np.int64], false_alarms: float) -> NDArray[np.bool_]:
-    """(D,) whether a threshold at a detection, surest first, keeps to the rate of alarms."""
+    """Return (D,) whether a threshold at each detection in ``order`` meets the false alarm rate."""
     empty = without_label(scored)
     if empty.sum() < LEAST_EMPTY:
         return np.ones(len(order), bool)

@@ -1,7 +1,8 @@
-"""Test-time augmentation: one image, shifted by parts of a cell and mirrored. NumPy only.
+"""Test-time augmentation: views of one image, shifted by parts of a cell and mirrored. NumPy only.
 
-What a network errs by depends on where in its cell a robot lies, and on left and right: the median
-over views errs less. A camera in flight has no time for it; labels have.
+The error of a network depends on the position of the robot within its cell, and differs between
+left and right. The median over views has a smaller error. It is too slow in flight but suits
+labelling.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,11 +17,11 @@ from dmrl.learn.inference.decode_grids import PER_DETECTION, Found
 Rows = NDArray[np.float64]
 
 ONE_ROBOT_PX = 16.0
-"""Detections of different views closer than this are of one robot."""
+"""Detections of different views closer than this, in pixels, belong to one robot."""
 
 
 class View(NamedTuple):
-    """A mirrored image or not, shifted right and down by these parts of a cell."""
+    """A view of an image: mirrored or not, then shifted right and down by these parts of a cell."""
 
     mirrored: bool
     right: float
@@ -29,11 +30,11 @@ class View(NamedTuple):
 
 SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (-0.25, 0.25), (0.25, -0.25))
 VIEWS = tuple(View(mirrored, *shift) for shift in SHIFTS for mirrored in (False, True))
-"""The first is the image as it is."""
+"""All views; the first is the unchanged image."""
 
 
 def shown(images: Rgb, view: View, stride_px: int) -> Rgb:
-    """(N, H, W, 3) images in a view; what it shifts in repeats the rim."""
+    """Apply a view to (N, H, W, 3) images; the border is repeated where it shifts in."""
     right_px, down_px = _shift_px(view, stride_px)
     reach = stride_px
     padded = np.pad(images, ((0, 0), (reach, reach), (reach, reach), (0, 0)), mode="edge")
@@ -44,7 +45,7 @@ def shown(images: Rgb, view: View, stride_px: int) -> Rgb:
 
 
 def returned(found: Found, view: View, stride_px: int, size_px: tuple[int, int]) -> Found:
-    """Detections in a view of N images, where they are in the images of this height and width."""
+    """Map detections in a view back to the N images, which have this height and width."""
     height_px, width_px = size_px
     right_px, down_px = _shift_px(view, stride_px)
     u_px, v_px = found.u_px - right_px, found.v_px - down_px
@@ -55,18 +56,18 @@ def returned(found: Found, view: View, stride_px: int, size_px: tuple[int, int])
 
 
 def agreed(views: Sequence[Found], *, most: int = 20, min_confidence: float = 0.01) -> Found:
-    """What several views of N images say together.
+    """Merge the detections of several views of N images.
 
-    From the most confident detection on, the nearest of each other view within `ONE_ROBOT_PX` are
-    of the same robot. Its position, depth and sigma are their medians, its class the first's, its
-    confidence the mean over all views, 0 where one saw nothing.
+    Starting from the most confident detection, the nearest one of each other view within
+    `MERGE_RADIUS_PX` belongs to the same robot. Position, depth and sigma are medians; the class is
+    that of the first. The confidence is the mean over all views, 0 for a view without a detection.
 
     Parameters
     ----------
     views
-        Detections of each, placed in the images.
+        Detections of each view, mapped back to the images.
     most, min_confidence
-        As in ``decode``.
+        As in `decode`.
     """
     images = [
         _best(list(_robots(_pooled(views, image), len(views))), most, min_confidence)
@@ -86,7 +87,7 @@ def _shift_px(view: View, stride_px: int) -> tuple[int, int]:
 
 
 def _pooled(views: Sequence[Found], image: int) -> Rows:
-    """(D, 1 + columns) the view's number and its detections, the most confident first."""
+    """Return (D, 1 + columns) view number and detections of one image, most confident first."""
     parts = [
         np.column_stack(
             [np.full(found.count[image], number)]
@@ -100,7 +101,7 @@ def _pooled(views: Sequence[Found], image: int) -> Rows:
 
 
 def _robots(rows: Rows, views: int) -> Iterator[Rows]:
-    """Each robot's row, (columns,)."""
+    """Yield the merged row of each robot, (columns,)."""
     confidence, class_id = map(PER_DETECTION.index, ("confidence", "class_id"))
     while len(rows):
         away_px = np.hypot(*(rows[:, 1:3] - rows[0, 1:3]).T)
@@ -115,7 +116,7 @@ def _robots(rows: Rows, views: int) -> Iterator[Rows]:
 
 
 def _best(robots: list[Rows], most: int, min_confidence: float) -> Rows:
-    """(K, columns) the most confident first, at least one."""
+    """Return (K, columns) rows, the most confident first; at least one."""
     table = np.stack(robots)
     confidence = table[:, PER_DETECTION.index("confidence")]
     order = np.argsort(-confidence, kind="stable")[:most]

@@ -1,1 +1,1 @@
-"""Network architectures, their graph and foreign weights."""
+"""Network architectures, the traced operation graph, and import of Keras weights."""

@@ -1,8 +1,10 @@
-"""The networks, by name. A new one is a class here and a row of ``ARCHITECTURES``, or a plug-in.
+"""Network architectures, selected by name.
 
-Every network takes images as ``to_input`` gives them and returns (N, C, rows, cols), one cell
-per ``stride_px`` pixels both ways. Its ``channels`` name what each of the C is; the first two
-are the same for all, see ``CHANNEL_MEANINGS``.
+To add one, write a subclass of `Network` and a row of ``ARCHITECTURES``, or a plug-in.
+
+A network takes images as `normalize_images` returns them and returns (N, C, rows, cols). One
+cell covers ``stride_px`` pixels both ways. ``channels`` names each of the C outputs; see
+``CHANNEL_MEANINGS``. The first two are the same for all architectures.
 """
 
 from abc import ABC, abstractmethod
@@ -27,22 +29,22 @@ CHANNEL_MEANINGS = {
     "class_0": "logit that the robot is of class 0; class_1 and so on for the others",
 }
 DETECTION = ("log_depth", "confidence")
-"""Channels of a network that knows a robot to the cell."""
+"""Channels of a network that locates a robot to the cell."""
 SUB_CELL = (*DETECTION, "offset_u", "offset_v")
-"""Channels of a network that knows where in its cell a robot is."""
+"""Channels of a network that also regresses the position within the cell."""
 SPREAD, CLASS = "log_spread", "class_"
-"""Channels that a recipe may add to those of an architecture; classes are numbered."""
-# One cell in 1120 holds a robot. With a zero-mean head the loss starts near 190 and the first
-# epochs go into learning that most cells are empty.
+"""Channels that a recipe may add to an architecture's own; class channels are numbered."""
 CONFIDENCE_BIAS = -4.0
+"""Initial bias of the confidence logit. One cell in 1120 contains a robot. From a bias of 0, the
+loss starts near 190 and the first epochs only learn that most cells are empty."""
 
 
 class Network(nn.Module, ABC):
-    """What training, prediction and export ask of a network.
+    """Base class of all architectures, as training, prediction and export use it.
 
-    ``stride_px`` is the side of a grid cell; images are a whole number of cells. ``channels``
-    are names in ``CHANNEL_MEANINGS``, in the order of the output: the architecture's ``own``
-    first, then those that were asked for on top.
+    ``stride_px`` is the side of a grid cell; images measure a whole number of cells. ``channels``
+    are names in ``CHANNEL_MEANINGS``, in output order: first the architecture's ``own`` channels,
+    then the extra ones that the caller requested.
     """
 
     stride_px: ClassVar[int] = 8
@@ -54,15 +56,15 @@ class Network(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, images: Tensor) -> Tensor:
-        """(N, C, rows, cols) of ``channels``, of (N, 3, H, W) images."""
+        """Return (N, C, rows, cols) outputs, ordered as ``channels``, for (N, 3, H, W) images."""
 
 
 class LocaNet(Network):
-    """The network of the paper: 24,778 parameters, receptive field 38 px.
+    """Network of the paper: 24,778 parameters, receptive field 38 px.
 
-    Four blocks of 3x3 convolution, batch normalisation and ReLU, a 2x2 max-pool before all
-    but the first, then a 1x1 convolution. Layers, paddings and constants are those of the
-    published Keras weights, so these load into it.
+    It has four blocks of 3x3 convolution, batch normalisation and ReLU, and a final 1x1
+    convolution. A 2x2 max-pool precedes each block but the first. Layers, padding and constants
+    equal those of the published Keras weights, so these weights load into it.
     """
 
     widths: ClassVar[tuple[int, ...]] = (8, 16, 32, 64)
@@ -74,7 +76,7 @@ class LocaNet(Network):
             nn.Conv2d(a, b, 3, padding=1, bias=False)
             for a, b in zip(ins, self.widths, strict=False)
         )
-        # torch's momentum is the share of the new batch: 0.01 is Keras' 0.99.
+        # torch's momentum is the weight of the new batch: 0.01 equals Keras' 0.99.
         self.norms = nn.ModuleList(nn.BatchNorm2d(w, eps=1e-3, momentum=0.01) for w in self.widths)
         self.head = nn.Conv2d(self.widths[-1], len(self.channels), 1)
         self._initialise()
@@ -82,11 +84,11 @@ class LocaNet(Network):
     def _initialise(self) -> None:
         for conv in (*self.convs, self.head):
             assert isinstance(conv, nn.Conv2d)
-            nn.init.normal_(conv.weight, std=0.01)  # as published
+            nn.init.normal_(conv.weight, std=0.01)  # as in the published code
         _start_empty(self.head, self.channels)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(N, C, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
+        """Return (N, C, H/8, W/8) outputs, ordered as ``channels``, for (N, 3, H, W) images."""
         x = images
         for index, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
             if index:
@@ -97,7 +99,7 @@ class LocaNet(Network):
 
 
 def _start_empty(head: nn.Conv2d, channels: Sequence[str]) -> None:
-    """Biases of a head that takes nearly every cell for empty."""
+    """Set the biases of a head so that it initially predicts nearly every cell to be empty."""
     assert head.bias is not None
     with torch.no_grad():
         head.bias.zero_()
@@ -105,9 +107,9 @@ def _start_empty(head: nn.Conv2d, channels: Sequence[str]) -> None:
 
 
 class ConvNorm(nn.Sequential):
-    """Convolution without bias, batch normalisation, and a ReLU unless told otherwise.
+    """Convolution without bias, batch normalisation, and an optional ReLU.
 
-    The three fold into one convolution: what an int8 path carries.
+    The three fold into one convolution, which int8 inference requires.
     """
 
     def __init__(
@@ -132,7 +134,10 @@ class ConvNorm(nn.Sequential):
 
 
 class Residual(nn.Module):
-    """A dilated depthwise 3x3 and a 1x1 convolution beside a shortcut; ReLU after the sum."""
+    """Residual block: a dilated depthwise 3x3 and a 1x1 convolution beside a shortcut.
+
+    The ReLU follows the sum.
+    """
 
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
@@ -140,16 +145,17 @@ class Residual(nn.Module):
         self.pointwise = ConvNorm(width, width, 1, relu=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, width, rows, cols) of the same."""
+        """Return (N, width, rows, cols) for an input of the same shape."""
         return torch.relu(x + self.pointwise(self.depthwise(x)))
 
 
 class DmrlNano(Network):
-    """dmrl's own small network: 24,836 parameters, 57.7 million products, receptive field 287 px.
+    """Default small network of dmrl: 24,836 parameters, 57.7 million MACs, receptive field 287 px.
 
-    Two dense strided 3x3 convolutions, two residual blocks at stride 4, where a robot 2 m away
-    is still a few cells wide, a separable step to stride 8, five residual blocks there whose
-    dilation grows to see a near robot whole, and a 1x1 convolution for the four channels.
+    Two dense strided 3x3 convolutions lead to stride 4, where a robot 2 m away still covers a few
+    cells. Two residual blocks and a separable step to stride 8 follow. There, five residual blocks
+    increase the dilation until the receptive field covers a near robot. A 1x1 convolution gives
+    the four channels.
     """
 
     own: ClassVar[tuple[str, ...]] = SUB_CELL
@@ -172,7 +178,7 @@ class DmrlNano(Network):
         _start_empty(self.head, self.channels)
 
     def forward(self, images: Tensor) -> Tensor:
-        """(N, C, H/8, W/8) of ``channels``, of (N, 3, H, W) images."""
+        """Return (N, C, H/8, W/8) outputs, ordered as ``channels``, for (N, 3, H, W) images."""
         features = self.body(images)
         with torch.autocast(features.device.type, enabled=False):
             out: Tensor = self.head(features.float())
@@ -180,16 +186,17 @@ class DmrlNano(Network):
 
 
 class DmrlNanoFine(DmrlNano):
-    """dmrl-nano with more at stride 4, for robots far away; receptive field 311 px.
+    """Variant of dmrl-nano with more layers at stride 4, for distant robots.
 
-    24,740 parameters and 75.1 million products: all of a budget of 25,000 and 80 million.
+    It has 24,740 parameters, 75.1 million MACs and a receptive field of 311 px. The budget is
+    25,000 parameters and 80 million MACs.
     """
 
     dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 2, 1, 2, 1, 2), (2, 4, 8))
 
 
 class DmrlLarge(DmrlNano):
-    """The same, wider: a teacher, too large for a microcontroller."""
+    """Wider variant of dmrl-nano: a teacher, too large for a microcontroller."""
 
     widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)
 
@@ -203,19 +210,19 @@ ARCHITECTURES: dict[str, type[Network]] = {
 
 
 def architecture_names() -> list[str]:
-    """Names of all architectures, dmrl's and those of plug-ins, sorted."""
+    """Return the names of all architectures, built in and from plug-ins, sorted."""
     return sorted({*ARCHITECTURES, *plugins.found(plugins.NETWORKS)})
 
 
 def architecture(name: str) -> type[Network]:
-    """The class of an architecture.
+    """Return the class of an architecture.
 
     Raises
     ------
     SettingError
         If there is no architecture of this name.
     PluginError
-        If it is a plug-in's, and cannot be loaded.
+        If it belongs to a plug-in that cannot be loaded.
     """
     if name in ARCHITECTURES:
         return ARCHITECTURES[name]
@@ -231,16 +238,23 @@ def architecture(name: str) -> type[Network]:
 
 
 def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
-    """A new network, its weights drawn with ``seed``, channels last in memory.
+    """Build a network with random weights, in channels-last memory format.
 
-    ``extra`` are channels on top of the architecture's own.
+    Parameters
+    ----------
+    name
+        Architecture, one of `list_architectures`.
+    seed
+        Seed of the initial weights.
+    extra
+        Channels in addition to the architecture's own.
 
     Raises
     ------
     SettingError
         If there is no architecture of this name.
     PluginError
-        If it is a plug-in's, and cannot be loaded.
+        If it belongs to a plug-in that cannot be loaded.
     """
     form, plugin = architecture(name), plugins.found(plugins.NETWORKS).get(name)
     with torch.random.fork_rng(devices=[]):
@@ -251,12 +265,12 @@ def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
 
 
 def by_name(channels: Sequence[str], output: Tensor) -> dict[str, Tensor]:
-    """(N, rows, cols) of each channel of an output (N, C, rows, cols)."""
+    """Split an output (N, C, rows, cols) into one (N, rows, cols) tensor per channel name."""
     return dict(zip(channels, output.unbind(1), strict=True))
 
 
 def to_input(images: Tensor) -> Tensor:
-    """Network input, x / 128 - 1, of uint8 images; float32, memory order unchanged.
+    """Normalize uint8 images to network input, x / 128 - 1, float32; the memory format is kept.
 
     Parameters
     ----------
@@ -267,7 +281,7 @@ def to_input(images: Tensor) -> Tensor:
 
 
 def product_count(network: Network, height_px: int = 224, width_px: int = 320) -> int:
-    """Multiplications of one image's convolutions."""
+    """Count the multiply-accumulates of all convolutions for one image."""
     total = 0
 
     def count(layer: nn.Module, _: object, out: Tensor) -> None:
@@ -287,5 +301,5 @@ def product_count(network: Network, height_px: int = 224, width_px: int = 320) -
 
 
 def parameter_count(network: Network) -> int:
-    """Number of trained parameters."""
+    """Count the trainable parameters."""
     return sum(p.numel() for p in network.parameters())

@@ -1,13 +1,13 @@
-"""Depthwise 3x3 convolution with a quick backward pass on the CPU.
+"""Depthwise 3x3 convolution with a fast backward pass on the CPU.
 
-oneDNN has quick kernels for every forward pass, but not for all backward ones: at dilation 4
-the gradients of a 48-channel layer take 20 times as long as the layer itself, in bfloat16 70
-times. Both gradients can be had from quick kernels:
+oneDNN has fast kernels for every forward pass but not for every backward pass. At dilation 4, the
+gradients of a 48-channel layer take 20 times as long as the layer itself, in bfloat16 70 times.
+Fast kernels can compute both gradients:
 
-* of the input: the forward pass again, kernel turned by half, over the output's gradient
-  (spread out with zeros, where the stride is over 1);
-* of the kernel: pixels that a dilated kernel sees together are d apart, so the d x d grids of
-  such pixels are images of their own, on which the kernel is not dilated.
+* input gradient: the forward pass over the output gradient with the kernel rotated by 180 degrees
+  (for a stride over 1, the output gradient is first spaced out with zeros);
+* kernel gradient: a kernel of dilation d combines pixels that are d apart. Each of the d x d
+  grids of such pixels is treated as an image, on which the kernel is not dilated.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ from torch.nn.functional import conv2d, pad
 
 
 class Depthwise(nn.Conv2d):
-    """Depthwise 3x3 convolution without bias that keeps the size, or divides it by the stride."""
+    """Depthwise 3x3 convolution without bias that keeps the size or divides it by the stride."""
 
     def __init__(self, channels: int, *, stride: int = 1, dilation: int = 1) -> None:
         super().__init__(
@@ -26,7 +26,7 @@ class Depthwise(nn.Conv2d):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, H / stride, W / stride) of (N, C, H, W)."""
+        """Return (N, C, H / stride, W / stride) for an input (N, C, H, W)."""
         stride, dilation = self.stride[0], self.dilation[0]
         odd = x.shape[2] % stride or x.shape[3] % stride
         if not self.training or x.device.type != "cpu" or odd:
@@ -65,7 +65,10 @@ class _Depthwise(torch.autograd.Function):
 
 
 def _grids(x: Tensor, apart: int) -> Tensor:
-    """(N * apart^2, C, rows, cols): grids of pixels ``apart`` from each other, zeros at the end."""
+    """Split images into (N * apart^2, C, rows, cols) grids of pixels ``apart`` from each other.
+
+    Zeros pad the end of each grid.
+    """
     images, channels, height, width = x.shape
     rows, cols = -(-height // apart), -(-width // apart)
     x = pad(x, (0, cols * apart - width, 0, rows * apart - height)).permute(0, 2, 3, 1)

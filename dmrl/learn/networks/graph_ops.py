@@ -1,6 +1,6 @@
-"""The operations that a network consists of, as data without torch.
+"""Operations of a network as plain data, without torch.
 
-``trace`` makes such lists; whatever takes a network elsewhere, such as ``deploy``, reads them.
+`trace` makes lists of them. Exporters such as ``deploy`` read these lists.
 """
 
 from dataclasses import dataclass, field
@@ -16,22 +16,22 @@ IMAGE = "image"
 
 @dataclass(frozen=True, slots=True)
 class Op:
-    """One operation.
+    """One operation of a network.
 
     Parameters
     ----------
     kind
-        "image", "conv", "norm", "relu", "max_pool", "add", "concatenate", "output"; or what
-        torch calls it, where it is none of these.
+        "image", "conv", "norm", "relu", "max_pool", "add", "concatenate" or "output"; for any other
+        operation, its torch name.
     name
-        Of the module, or of the operation in ``forward``.
+        Name of the module, or of the operation in ``forward``.
     sources
-        Names of the operations whose results it takes.
+        Names of the operations whose results it reads.
     values
-        Its arrays: weight (out, in / groups, k, k) and bias (out,) of a conv; of a norm, the
-        factor and the summand (channels,) that it comes to in use.
+        Arrays. Of a conv: weight (out, in / groups, k, k) and bias (out,). Of a norm in evaluation
+        mode: factor and summand (channels,).
     settings
-        Its numbers: kernel, stride, dilation, padding, groups. A pair where the two ways differ.
+        Numbers: kernel, stride, dilation, padding, groups. A pair where height and width differ.
     """
 
     kind: str

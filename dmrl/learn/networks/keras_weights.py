@@ -1,7 +1,7 @@
-"""Published Keras weights (.h5) as torch weights of ``locanet``.
+"""Import of published Keras weights (.h5) for ``locanet``.
 
-Keras keeps a kernel as (height, width, in, out), torch as (out, in, height, width). 'same'
-padding at stride 1 is symmetric, so a 3x3 kernel moves over with padding 1.
+Keras stores a kernel as (height, width, in, out), torch as (out, in, height, width). At stride 1,
+'same' padding is symmetric, so a 3x3 kernel needs padding 1 in torch.
 """
 
 from pathlib import Path
@@ -28,18 +28,18 @@ NORM = {
 
 
 def read_h5(path: Path) -> dict[str, Tensor]:
-    """Weights of ``locanet`` from a Keras file, by torch name.
+    """Read the weights of ``locanet`` from a Keras file, keyed by torch name.
 
     Parameters
     ----------
     path
-        A whole saved model, or weights alone, with layers conv2d, conv2d_1 .. conv2d_4 and
+        A saved model, or weights only, with layers conv2d, conv2d_1 .. conv2d_4 and
         batch_normalization .. batch_normalization_3.
 
     Raises
     ------
     ModelError
-        If a layer is missing or of another shape; it is named with both shapes.
+        If a layer is missing or has another shape; the message contains its name and both shapes.
     MissingExtra
         If h5py is not installed.
     """
@@ -56,7 +56,7 @@ def read_h5(path: Path) -> dict[str, Tensor]:
 
 
 def _places() -> dict[str, tuple[str, str]]:
-    """Layer and variable in the Keras file of every torch tensor."""
+    """Map the name of every torch tensor to its layer and variable in the Keras file."""
     blocks = len(LocaNet.widths)
     numbered = [f"_{i}" if i else "" for i in range(blocks + 1)]
     places = {f"convs.{i}.weight": (f"conv2d{numbered[i]}", "kernel") for i in range(blocks)}
@@ -71,7 +71,7 @@ def _places() -> dict[str, tuple[str, str]]:
 def _read(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
     found: h5py.Group | h5py.Dataset | None = group
     for part in (layer, layer, f"{variable}:0"):
-        # A soft or external link may lead anywhere, also into files that are not the stranger's.
+        # A soft or external link could lead to any other file of this machine.
         own = isinstance(found, h5py.Group) and isinstance(
             found.get(part, getlink=True), h5py.HardLink
         )

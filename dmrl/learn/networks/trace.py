@@ -1,7 +1,7 @@
-"""A network as a list of plain operations (``operations``), traced by torch.
+"""Tracing of a network into a list of plain operations.
 
-The list is what the network's own ``forward`` does with an image, so it cannot fall behind it. A
-``forward`` that decides by the values it sees shows the operation that it decides by.
+The list records the calls of the network's own ``forward`` for one image, so the two cannot differ.
+If ``forward`` branches on values, the list contains the operation on which it branches.
 """
 
 from collections.abc import Iterable
@@ -23,16 +23,17 @@ KINDS = {
     "max_pool2d": "max_pool",
     "cat": "concatenate",
 }
-"""Kind of an operation, by what torch calls the function."""
+"""Kind of an operation by the name of its torch function."""
 PASSED_ON = ("float", "to", "contiguous", "detach", "clone")
-"""Functions that change no value."""
+"""Functions that do not change values."""
 SAME = (nn.Identity, nn.Dropout, nn.Dropout2d)
-"""Modules that do nothing once a network is trained."""
+"""Modules that do nothing in evaluation mode."""
 CELLS = 16
+"""Side of the traced image, in grid cells."""
 
 
 def operations(network: Network) -> list[Op]:
-    """The operations of a network in use, in order; the first is the image, the last the output."""
+    """Trace the operations of a network in evaluation mode, from the image to the output."""
     side_px = CELLS * network.stride_px
     image = next(network.parameters()).new_zeros(1, CHANNELS, side_px, side_px)
     training = network.training
@@ -57,34 +58,34 @@ def operations(network: Network) -> list[Op]:
 
 
 def _is_one(module: nn.Module) -> bool:
-    """Whether a module is one operation."""
+    """Return whether a module counts as one operation."""
     plain = type(module).__module__.startswith("torch.nn") and not list(module.children())
     return plain or isinstance(module, nn.Conv2d | nn.BatchNorm2d)
 
 
 class _Recorder(TorchFunctionMode):
-    """Notes what is done with an image, modules as a whole and functions outside of them."""
+    """Records the operations on an image: leaf modules, and torch functions outside of them."""
 
     def __init__(self, image: Tensor) -> None:
         super().__init__()
         self.ops = [Op("image", IMAGE)]
         self._name_of = {id(image): IMAGE}
-        self._kept = [image]  # an id is a tensor's own only as long as it lives
+        self._kept = [image]  # an id is unique only while its tensor is alive
         self._inside = 0
 
     def names(self, values: Iterable[Any]) -> tuple[str, ...]:
-        """Names of the operations that gave these values, as far as they are known."""
+        """Return the names of the operations that produced these values, without unknown ones."""
         flat = (
             v for value in values for v in (value if isinstance(value, list | tuple) else [value])
         )
         return tuple(self._name_of[id(v)] for v in flat if id(v) in self._name_of)
 
     def enter(self, _module: nn.Module, _args: Any) -> None:
-        """Before a module that is one operation."""
+        """Register that a leaf module starts (forward pre-hook)."""
         self._inside += 1
 
     def leave(self, name: str, module: nn.Module, args: Any, out: Tensor) -> None:
-        """After it."""
+        """Append the operation of a leaf module (forward hook)."""
         self._inside -= 1
         if isinstance(module, SAME):
             self._call(out, self.names(args)[0])
@@ -102,7 +103,7 @@ class _Recorder(TorchFunctionMode):
     def __torch_function__(
         self, func: Any, _types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
-        """Do what is asked for, and note it."""
+        """Call the function and append its operation."""
         out = func(*args, **(kwargs or {}))
         sources = self.names(args)
         if self._inside or not isinstance(out, Tensor) or not sources:
@@ -133,7 +134,7 @@ def _of_function(
 
 
 def _pooling(given: dict[str, Any]) -> dict[str, Any]:
-    """Kernel and stride of a max-pool, and what is unusual about it."""
+    """Return kernel and stride of a max-pool, and each further setting that is not the default."""
     usual: dict[str, Any] = {"padding": 0, "dilation": 1, "ceil": False}
     odd = {k: _one(v) for k, v in given.items() if k in usual and _one(v) != usual[k]}
     kernel = _one(given["kernel"])
@@ -169,7 +170,7 @@ def _of_conv(module: nn.Conv2d, name: str, sources: tuple[str, ...]) -> Op:
 
 
 def _of_norm(module: nn.BatchNorm2d) -> dict[str, Array]:
-    """What the normalisation comes to in use: a factor and a summand per channel."""
+    """Return the factor and the summand per channel of a batch normalisation in evaluation mode."""
     assert module.running_mean is not None
     assert module.running_var is not None
     mean, variance = _array(module.running_mean), _array(module.running_var)

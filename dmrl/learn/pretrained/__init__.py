@@ -1,4 +1,4 @@
-"""Networks that ship with dmrl: each a run folder of ``dmrl train`` with a card, by its name."""
+"""Pretrained networks, each a run folder of ``dmrl train`` with a model card."""
 
 from pathlib import Path
 
@@ -6,17 +6,17 @@ SHIPPED = Path(__file__).parent
 
 
 def names() -> list[str]:
-    """Names of the networks that ship with dmrl."""
+    """Return the names of the pretrained networks."""
     return sorted(card.parent.name for card in SHIPPED.glob("*/README.md"))
 
 
 def resolved(model: Path) -> Path:
-    """The model itself where there is one, else the network that ships under this name.
+    """Return the path of a model: itself if it exists, else the pretrained network of this name.
 
     Parameters
     ----------
     model
-        A path, or a name in ``names()``. A path that is neither is given back: what opens it
-        says what is wrong.
+        A path, or a name in `list_pretrained`. Anything else is returned unchanged, so that the
+        function that opens it reports the error.
     """
     return SHIPPED / model if not model.exists() and str(model) in names() else model

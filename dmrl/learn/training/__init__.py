@@ -1,1 +1,1 @@
-"""Training: losses, optimizer, train step, validation and checkpoints."""
+"""Training: losses, optimizer, training step, validation, checkpoints and several processes."""

@@ -1,7 +1,7 @@
-"""Training that can go on after a kill: weights and optimizer state at the end of an epoch.
+"""Checkpoints: weights and optimizer state at the end of an epoch, for resuming a training.
 
-Tensors are a safetensors file named by the epoch; ``checkpoint.json`` names it. The JSON is
-replaced in one step once the tensors are whole, so it never names half a file.
+Tensors are in a safetensors file named after the epoch; ``checkpoint.json`` names that file. The
+JSON is replaced atomically after the tensors are written, so it never names an incomplete file.
 """
 
 import json
@@ -27,15 +27,14 @@ STATE_NAME = "checkpoint.json"
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Where a training stands.
+    """Progress of a training.
 
     Parameters
     ----------
     run
-        What makes it this training and no other: settings, identity of the data. A training
-        resumes only where these are equal.
+        Settings and identity of the data. A training resumes only if these are equal.
     epochs_done
-        Whole epochs behind it.
+        Number of completed epochs.
     history
         Mean losses of each epoch.
     """
@@ -46,14 +45,14 @@ class State:
 
 
 def has_checkpoint(folder: Path) -> bool:
-    """Whether a training in this folder can be resumed."""
+    """Return whether the folder contains a checkpoint."""
     return (folder / STATE_NAME).is_file()
 
 
 def save_checkpoint(
     folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, state: State
 ) -> None:
-    """Write the state of a training; the previous one is there until this one is whole."""
+    """Write a checkpoint; the previous one remains until this one is complete."""
     tensors = {
         f"{role}.{name}": value
         for role, network in networks.items()
@@ -76,14 +75,14 @@ def save_checkpoint(
 def load_checkpoint(
     folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, run: dict[str, Any]
 ) -> State:
-    """State of an interrupted training; networks (by role) and optimizer are set to it.
+    """Load a checkpoint into the networks (by role) and the optimizer, and return its progress.
 
     Raises
     ------
     ModelError
-        If there is no whole checkpoint in the folder.
+        If the folder has no complete checkpoint.
     SettingError
-        If it belongs to a training with other settings or data.
+        If the checkpoint belongs to a training with other settings or data.
     """
     if not has_checkpoint(folder):
         raise ModelError(f"no checkpoint in {folder} to resume from. Train without --resume")
@@ -92,7 +91,7 @@ def load_checkpoint(
         tensors = load_file(inside(folder, said.pop("tensors"), f"{folder}: the tensors"))
         state = State(**said)
         if not isinstance(state.run, dict) or not isinstance(state.epochs_done, int):
-            raise ValueError("it tells no run")
+            raise ValueError("run or epochs_done is missing")
     except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:
         raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
     _require_same(state.run, run, folder)
@@ -108,17 +107,19 @@ def load_checkpoint(
 
 
 def _require_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
+    """Raise SettingError unless two trainings have the same settings and data."""
     now = json.loads(json.dumps(now))
     different = sorted(k for k in before.keys() | now.keys() if before.get(k) != now.get(k))
     if different:
         key = different[0]
         raise SettingError(
             f"{folder} was trained with {key} {before.get(key)}, not {now.get(key)}. "
-            "Resume with the settings and data it was started with, or train anew"
+            "Resume with the settings and data it was started with, or train without --resume"
         )
 
 
 def _set_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
+    """Load the optimizer's state from the tensors of a checkpoint."""
     fresh = optimizer.state_dict()
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {i: {} for i in range(len(parameters))}
@@ -126,7 +127,7 @@ def _set_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
         if key.startswith("optimizer."):
             _, index, name = key.split(".")
             like = parameters[int(index)]
-            # The memory order of the parameter: another order may round differently.
+            # Keep the memory format of the parameter: another one may round differently.
             state[int(index)][name] = (
                 torch.empty_like(like).copy_(value) if value.shape == like.shape else value
             )
@@ -134,6 +135,6 @@ def _set_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """Take the checkpoint out of a folder whose training is done."""
+    """Remove the checkpoint from a folder whose training has finished."""
     for path in (folder / STATE_NAME, *folder.glob("checkpoint-*.safetensors")):
         path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Every setting of a training, with dmrl's own defaults."""
+"""Training configuration: every setting of ``dmrl train`` and its default."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -15,98 +15,100 @@ DEFAULT, AUTO = "dmrl-nano", "auto"
 
 @dataclass(frozen=True, slots=True)
 class FitSettings(LossSettings):
-    """How a network is trained; what is learnt stands in `LossSettings`.
+    """Settings of a training run; those of the loss are in `LossSettings`.
 
     Parameters
     ----------
     architecture
-        Name of the network. auto: that of the model to start from or, without one, dmrl-nano.
+        Name of the network. auto: that of the model to start from, or dmrl-nano if there is none.
     epochs
-        Times that ``epoch_images`` are seen.
+        Number of epochs of ``epoch_images`` images.
     epoch_images
-        Images of an epoch: a few come often, of many some. 0: as many as there are.
+        Images per epoch, drawn with repetition from a small dataset and as a sample from a large
+        one. 0: the size of the dataset.
     batch_size
         Images per step.
     optimizer
-        "muon": Muon for the kernels that mix channels, AdamW for the rest.
+        "muon": Muon for kernels that mix channels, AdamW for the rest.
         "adam": Adam as published or, with a weight decay, AdamW.
     learning_rate
-        Of the optimizer, at the end of the warm-up.
+        Learning rate at the end of the warm-up.
     final_learning_rate
-        At the last step, after a half cosine.
+        Learning rate at the last step, after a half cosine.
     warmup_epochs
         Epochs over which the learning rate rises linearly from zero.
     weight_decay
-        Decoupled, on convolution weights. 0 with "adam": plain Adam.
+        Decoupled weight decay of the convolution weights. 0 with "adam": plain Adam.
     ema_steps
-        Steps over which the weights that are kept are averaged. 0: the last weights are kept.
+        Time constant of the exponential moving average (EMA) of the weights, steps. The saved model
+        has the averaged weights. 0: no EMA, the last weights are saved.
     target_sigma_cells
-        Width (one sigma) of a robot in the confidence targets, cells. 0: one cell, as
-        published.
+        Width (one sigma) of a robot in the confidence targets, cells. 0: one cell, as published.
     distill_share
-        With a teacher: how much of the losses is against what it says, the rest against the
-        labels, 0 to 1.
+        Weight of the distillation loss if there is a teacher, 0 to 1; the labels have the rest.
     label_noise
-        What the labels' sigmas do: "ignore" them, "weight" the cells, or "soften" the targets.
+        Use of the labels' sigmas: "ignore" them, "weight" the cells, or "soften" the targets.
     shares
-        How much of an epoch comes from which recordings: patterns of their names, as in
+        Fraction of an epoch by recording: patterns of recording names, as in
         { "flight-*" = 0.7, "renders*" = 0.3 }. Empty: every image once.
     validation_share
-        Share of the training images held out, where the dataset has no split named val, to
-        choose the threshold on. The last of each recording, so that neighbours in time stay
-        together.
+        Fraction of the training images held out to select the threshold, if the dataset has no
+        split named val. These are the last images of each recording, so that neighbours in time
+        stay together.
     threshold
-        Confidence from which the model's detections are to be believed, 0 to 1. Without it,
-        that of the best F1 on the images held out among those that keep to ``false_alarms``, or
-        0.33 where these hold fewer than 10 robots.
+        Confidence from which the model reports a detection, 0 to 1. None: the threshold with the
+        best F1 on held-out images that satisfies ``false_alarms``, or 0.33 if these contain fewer
+        than 10 robots.
     false_alarms
-        Detections at or above the threshold in an image without a robot, on average, at most:
-        of the images held out, where at least 20 of them have none.
+        Largest mean number of detections at or above the threshold in a held-out image without a
+        robot. Applied if there are at least 20 such images.
     init_share
-        Share of the weights that a training starts from in those that are kept, 0 to 1: what was
-        known before is forgotten less (Wortsman et al. 2022). 0: the trained ones alone.
+        Weight of the initial model in the saved weights, 0 to 1, against forgetting (Wortsman et
+        al. 2022). 0: the trained weights only.
     hard_share
-        Share of an epoch that is images without a robot, those first that the network believes
-        to hold one: each as often as the square of its greatest confidence. They are looked at
-        anew before every epoch. 0: as often as the other images.
+        Fraction of an epoch that consists of images without a robot. Each is drawn in proportion to
+        the square of the network's highest confidence in it, which is measured before every epoch.
+        0: these images are drawn as often as others.
     flip_share
-        Share of windows mirrored left to right, 0 to 1.
+        Probability of a left-right mirrored window.
     zoom
-        Least and greatest magnification. Depth follows it, and stays among those of the labels.
+        Smallest and largest magnification. Depth labels are scaled with it and stay within the
+        range of the labels.
     rotation_deg
-        Greatest turn about the optical axis, either way.
+        Largest rotation about the optical axis, either way.
     mosaic_share
-        Share of images put together from windows of two or four, 0 to 1.
+        Probability that an image is a mosaic of two or four windows.
     paste
-        Mean number of patches of other images pasted into one. Needs labels with boxes.
+        Mean number of patches of other images pasted into one. Requires labels with boxes.
     plain_epochs
-        The last epochs, in which images stay whole: mirrored and tinted, but not zoomed, turned
-        or put together (Ge et al. 2021).
+        Number of last epochs with weak augmentation: mirroring and colours, but no zoom, rotation,
+        mosaic or pasted patches (Ge et al. 2021).
     frozen_norm_epochs
-        The last epochs, in which batch normalisation takes its running statistics, as the
-        network will when it is used, in place of each batch's.
+        Number of last epochs in which batch normalisation uses its running statistics, as in
+        inference, instead of those of the batch.
     colour
         Spread (one sigma) of contrast, brightness and white balance, 0 to 1.
     noise
-        Greatest sigma of sensor noise, 0 to 1 of full scale.
+        Largest sigma of sensor noise, 0 to 1 of full scale.
     blur_share
-        Share of images slightly out of focus, 0 to 1.
+        Probability of a slight defocus.
     intrinsics
-        fx, fy, cx and cy of the camera, pixels, of images without distortion. With them windows
-        of images are what the camera would have seen had it been turned; without, they are cut
-        out, and carry along the stretch of where they were.
+        fx, fy, cx and cy, pixels, of a camera whose images have no distortion. With them, a window
+        is the view of a rotated camera. Without them, it is a crop and keeps the perspective
+        stretch of its source position.
     grey_share
-        Share of images whose colours are taken away, 0 to 1, for grey cameras as well.
+        Probability that colours are removed, for models that shall also work with grey cameras.
     precision
-        What the network is trained in. "bfloat16": the body in bfloat16, weights, head and
-        losses in float32; half as long again as fast on CPUs that have it.
+        "bfloat16": body in bfloat16, weights, head and losses in float32; 1.5 times as fast on CPUs
+        that support it.
     seed
-        Of the first weights, the order of the images and their augmentation.
+        Seed of the initial weights, the image order and the augmentation.
     device
-        Where to compute; auto takes CUDA where there is one.
+        Compute device; auto selects CUDA if available.
     processes
-        That share every batch, on a CPU: one for each core is faster than one with as many
-        threads. As many give the same weights, byte for byte. torchrun says how many itself.
+        Processes that share every batch, on a CPU. One process per core is faster than one process
+        with as many threads. With the same number of processes, weights are byte-identical. Under
+        torchrun, its number of processes applies.
     """
 
     architecture: str = DEFAULT
@@ -172,12 +174,12 @@ class FitSettings(LossSettings):
 
     @property
     def extra(self) -> tuple[str, ...]:
-        """Channels of the network on top of its architecture's own."""
+        """Channels of the network in addition to the architecture's own."""
         classes = tuple(f"{CLASS}{k}" for k in range(len(self.classes)))
         return (*([SPREAD] if self.spread_weight else []), *classes)
 
     def augmentation(self, epoch: int) -> Augmentation:
-        """How images are varied in an epoch, from 0."""
+        """Return the augmentation of an epoch, counted from 0."""
         whole = Augmentation(
             self.flip_share,
             self.zoom,
@@ -207,13 +209,14 @@ NOT_NEGATIVE = (
     *("plain_epochs", "frozen_norm_epochs", "false_alarms"),
 )
 LARGE = 10_000_000
+"""Upper bound of settings without a tighter one."""
 MOST = dict.fromkeys(("learning_rate", *AT_LEAST_ONE, *NOT_NEGATIVE), LARGE) | {
     "processes": 256,
     "paste": 100,
     "seed": 2**63 - 1,
 }
-"""What no training reaches: a recipe may come from a stranger, and asks for no more processes,
-pictures or peers in one, and for no number that float32 cannot hold."""
+"""Upper bounds, which no real training reaches. A recipe may come from a stranger, so it must not
+start arbitrarily many processes, paste arbitrarily many patches, or overflow float32."""
 
 
 def _refuse(wrong: bool, why: str) -> None:

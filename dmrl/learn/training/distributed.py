@@ -1,7 +1,7 @@
-"""Several processes that train one network: those of ``torchrun``, or started here.
+"""Data-parallel training in several processes, started by ``torchrun`` or by dmrl.
 
-Every process computes its part of each batch; gradients, losses and the running statistics of
-the normalisations are then averaged, so that all hold the same network after every step.
+Every process computes its part of each batch. Gradients, losses and running statistics of the batch
+normalisations are then averaged, so that all processes have the same network after every step.
 """
 
 import multiprocessing
@@ -27,42 +27,48 @@ from dmrl.learn.networks.architectures import Network
 
 Made = TypeVar("Made")
 Work = Callable[["Group"], Made]
-"""What each process of a group does."""
+"""Function that each process of a group calls."""
 SPAWN = multiprocessing.get_context("spawn")
 MEETING_S = 60.0
-"""How long the processes of a group may take to find each other. All have loaded by then."""
+"""Timeout for the processes of a group to connect, seconds. All have loaded by then."""
 WORK_S = 1800.0
-"""How long one may wait for the others afterwards: the first also validates and saves."""
+"""Timeout of collective operations afterwards, seconds: rank 0 also validates and saves."""
 LAST_WORDS_S = 5.0
-"""How long a process that is done, or killed, may take to be gone."""
+"""Timeout for a finished or killed process to exit, seconds."""
 
 
 class Group:
-    """The processes of a training, and which of them this is. Alone: rank 0 of 1."""
+    """Processes of a training, and the rank of this one. Single process: rank 0 of 1."""
 
     def __init__(self, rank: int = 0, size: int = 1) -> None:
         self.rank, self.size = rank, size
 
     @property
     def leads(self) -> bool:
-        """Whether this is the process that writes."""
+        """Whether this is rank 0, the process that writes."""
         return self.rank == 0
 
     def part(self, items: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The items of this process; none where there are more processes than items."""
+        """Return the items of this process; none if there are more processes than items."""
         return items[self.rank :: self.size]
 
     def average(self, network: Network, losses: Tensor, share: float) -> Tensor:
-        """Losses of the whole batch; the network's gradients and statistics become its own.
+        """Average losses, gradients and running statistics over all processes (all-reduce).
 
         Parameters
         ----------
         network
-            With the gradients of this process' part.
+            Network with the gradients of this process's part; gradients and statistics change in
+            place.
         losses
-            (n,) losses of this process' part.
+            (n,) losses of this process's part, changed in place.
         share
-            Share of the batch that this process had. The shares of all add up to 1.
+            Weight of this process's part in the batch. The weights of all processes sum to 1.
+
+        Returns
+        -------
+        Tensor
+            (n,) losses of the whole batch.
         """
         if self.size == 1:
             return losses
@@ -77,28 +83,29 @@ class Group:
 
 
 def _gradient(parameter: torch.nn.Parameter) -> Tensor:
+    """Return the gradient of a parameter; zeros if it has none yet."""
     if parameter.grad is None:
         parameter.grad = torch.zeros_like(parameter)
     return parameter.grad
 
 
 def in_group(processes: int, work: Work[Made]) -> Made:
-    """What ``work(group)`` returns in the process that leads a group.
+    """Call ``work(group)`` in every process of a group and return the result of rank 0.
 
-    Under ``torchrun`` the group is the one that this process was put in. Else this process leads,
-    and starts the others on this machine's CPU; they end with it.
+    Under ``torchrun``, the group is the one of this process. Otherwise this process is rank 0 and
+    starts the others on this machine's CPU; they end with it.
 
     Parameters
     ----------
     processes
-        How many, where ``torchrun`` does not say.
+        Number of processes. Under ``torchrun``, its number applies instead.
     work
-        A function of a module, or a part of one: fit to be pickled.
+        Function of a module, or a partial of one, so that it can be pickled.
 
     Raises
     ------
     SettingError
-        If one of the others is killed, or the processes do not find each other.
+        If another process is killed, or the processes do not connect.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         return _by_torchrun(work)
@@ -114,6 +121,7 @@ def in_group(processes: int, work: Work[Made]) -> Made:
 
 
 def _by_torchrun(work: Work[Made]) -> Made:
+    """Run in the group that ``torchrun`` started."""
     cuda = torch.cuda.is_available()
     if cuda:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
@@ -122,6 +130,7 @@ def _by_torchrun(work: Work[Made]) -> Made:
 
 
 def _member(meeting: str, rank: int, size: int, work: Work[Made]) -> Made:
+    """Join a group and run as one of its processes."""
     wait = timedelta(seconds=MEETING_S)
     try:
         distributed.init_process_group("gloo", meeting, timeout=wait, rank=rank, world_size=size)
@@ -129,27 +138,28 @@ def _member(meeting: str, rank: int, size: int, work: Work[Made]) -> Made:
         _forget_failed_start()
         raise SettingError(
             f"the {size} processes did not find each other within {MEETING_S:g} s. "
-            "Begin again, on a less busy machine or with fewer --processes"
+            "Try again on a less busy machine or with fewer --processes"
         ) from e
     distributed.distributed_c10d._set_pg_timeout(timedelta(seconds=WORK_S))
     return _until_all_are_done(work)
 
 
 def _forget_failed_start() -> None:
-    """Make torch count its groups from 0 again.
+    """Reset torch's count of process groups after a failed start.
 
-    It names a group by that count, and a failed start leaves it raised: the next group of this
-    process would look for its peers under a name that they do not have. Only the end of a group
-    sets it back, so one of this process alone is begun and ended.
+    torch names a group by that count, and a failed start leaves it raised. The next group of this
+    process would then wait for its peers under a name that they do not use. Only the end of a group
+    resets the count, so a group of this process alone is started and ended.
     """
     distributed.init_process_group("gloo", store=HashStore(), rank=0, world_size=1)
     distributed.destroy_process_group()
 
 
 def _until_all_are_done(work: Work[Made]) -> Made:
+    """Run the work and wait for the other processes."""
     try:
         made = work(Group(distributed.get_rank(), distributed.get_world_size()))
-        # Not after an error: whoever fails alone would wait for those who wait for it.
+        # Not after an error: a process that fails alone would wait for those that wait for it.
         distributed.barrier()
         return made
     finally:
@@ -158,10 +168,10 @@ def _until_all_are_done(work: Work[Made]) -> Made:
 
 @contextmanager
 def _others(size: int, work: Work[Any]) -> Iterator[str]:
-    """Where the group meets; all but the first of its processes run meanwhile.
+    """Start all processes of a group but the first; yield the address where they connect.
 
-    torch's launchers would start the first as well; here, its progress, its errors and Ctrl-C are
-    those of a training alone.
+    torch's launchers would start the first process as well. Here, progress, errors and Ctrl-C of
+    the first process are the same as in a training without a group.
     """
     with tempfile.TemporaryDirectory() as folder:
         meeting = (Path(folder) / "meeting").as_uri()
@@ -173,13 +183,13 @@ def _others(size: int, work: Work[Any]) -> Iterator[str]:
             yield meeting
             _wait_for(processes, LAST_WORDS_S)
         except (EOFError, RuntimeError, SettingError) as e:
-            # What was seen here may come of one that is gone: then that is what is said. One that
-            # raised has said so itself, or fails because this one did.
+            # The error here may be the consequence of a killed process, which is then reported. A
+            # process that raised has printed its error, or failed because this one did.
             if not _any_killed(processes):
                 raise
             raise SettingError(
-                f"one of the {size} processes was killed, for want of memory perhaps. "
-                "Go on with --resume, or begin again with fewer --processes"
+                f"one of the {size} processes was killed, possibly for lack of memory. "
+                "Continue with --resume, or train again with fewer --processes"
             ) from e
         finally:
             for process in processes:
@@ -188,29 +198,30 @@ def _others(size: int, work: Work[Any]) -> Iterator[str]:
 
 
 def _wait_for(processes: Sequence[SpawnProcess], seconds: float) -> None:
-    """Until all have ended, each for so long."""
+    """Wait until all processes have ended, for so many seconds each."""
     for process in processes:
         process.join(seconds)
 
 
 def _any_killed(processes: Sequence[SpawnProcess]) -> bool:
-    """Whether a signal ended one: only then is its exit code negative."""
+    """Return whether a signal ended a process; its exit code is then negative."""
     _wait_for(processes, LAST_WORDS_S / (len(processes) + 1))
     return any((process.exitcode or 0) < 0 for process in processes)
 
 
 def _start(meeting: str, rank: int, size: int, work: Work[Any]) -> tuple[Connection, SpawnProcess]:
+    """Start one process and return the connection on which it reports that it has loaded."""
     here, there = SPAWN.Pipe(duplex=False)
     process = SPAWN.Process(target=_follow, args=(there, meeting, rank, size, work), daemon=True)
     process.start()
-    there.close()  # so that the other end knows if the process is gone
+    there.close()  # so that the other end detects the end of the process
     return here, process
 
 
 def _follow(ready: Connection, meeting: str, rank: int, size: int, work: Work[Any]) -> None:
-    """What a process does that does not lead."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the one that leads ends it
+    """Run as a process other than rank 0."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 ends it
     torch.set_num_threads(max(torch.get_num_threads() // size, 1))
     ready.send(True)
-    with suppress(DmrlError):  # the one that leads says so
+    with suppress(DmrlError):  # rank 0 reports it
         _member(meeting, rank, size, work)

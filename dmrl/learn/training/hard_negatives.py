@@ -1,7 +1,7 @@
-"""Hard negatives: images without a robot, in the order in which a network believes in one.
+"""Hard negative mining: images without a robot, sampled by the network's highest confidence.
 
-Of places that look like nothing, one image teaches as much as a thousand; what is worth seeing
-again is what was taken for a robot (Sung and Poggio 1998, Shrivastava et al. 2016).
+Easy backgrounds teach little: one image is as good as a thousand. Backgrounds that the network
+classifies as robots are worth repeating (Sung and Poggio 1998, Shrivastava et al. 2016).
 """
 
 import numpy as np
@@ -12,33 +12,39 @@ from dmrl.learn.inference.loaded_model import grids_of
 from dmrl.learn.networks.architectures import Network
 
 LEAST = 0.05
-"""Confidence that every image is taken to have at least, so that none is forgotten."""
+"""Lower bound of an image's confidence when it is weighted, so that every image still appears."""
 BATCH = 32
+"""Images per forward pass."""
 
 
 def mined(
     network: Network, examples: Examples, shares: NDArray[np.float64] | None, hard_share: float
 ) -> NDArray[np.float64] | None:
-    """How often each image shall come in the next epoch, 1 on average.
+    """Return how often each image shall appear in the next epoch, 1 on average.
 
-    Images without a robot make up ``hard_share`` of it, each in proportion to the square of the
-    greatest confidence that the network has in it; the others keep their proportions. An image
-    that has no share gets none.
+    Images without a robot make up ``hard_share`` of the epoch. Each appears in proportion to the
+    square of the network's highest confidence in it. The other images keep their proportions. An
+    image of weight 0 keeps weight 0.
 
     Parameters
     ----------
     network
-        As it stands; left in the mode that it is in.
+        Network in its present state; its mode (train or eval) is restored.
     examples
         Training images.
     shares
-        (N,) of the images so far. None: 1 for each.
+        (N,) previous weights of the images. None: 1 for each.
     hard_share
-        Share of the epoch, 0 to 1.
+        Fraction of the epoch without a robot, 0 to 1.
+
+    Returns
+    -------
+    NDArray or None
+        (N,) weights; ``shares`` itself if there are no images of one of the two kinds.
     """
     before = np.ones(len(examples)) if shares is None else shares
     empty = empties(examples)
-    wanted = empty & (before > 0)  # what has no share is not to be learned from
+    wanted = empty & (before > 0)  # weight 0: excluded from training
     if not wanted.any() or not before[~empty].sum():
         return shares
     weight = np.maximum(beliefs(network, examples, np.flatnonzero(wanted)), LEAST) ** 2
@@ -49,12 +55,12 @@ def mined(
 
 
 def empties(examples: Examples) -> NDArray[np.bool_]:
-    """(N,) which images are labelled to hold no robot."""
+    """Return (N,) whether each image is labelled as containing no robot."""
     return np.asarray(np.isnan(examples.robots[..., U]).all(axis=1))
 
 
 def beliefs(network: Network, examples: Examples, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(len(chosen),) the greatest confidence in each of the chosen images, 0 to 1."""
+    """Return (len(chosen),) the highest confidence in each of the chosen images, 0 to 1."""
     training = network.training
     network.eval()
     try:

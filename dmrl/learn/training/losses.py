@@ -1,6 +1,6 @@
-"""Losses on a grid of cells: summed over cells, mean over images.
+"""Losses on a grid of cells, summed over cells and averaged over images.
 
-A loss is a function, a key of `LossSettings` that weighs it, and a row of `TERMS`.
+To add a loss, write a function, a weight in `LossSettings`, and a row of `TERMS`.
 """
 
 import math
@@ -17,34 +17,34 @@ from dmrl.learn.networks.architectures import CLASS, SPREAD
 
 DepthLoss = Literal["squared", "log"]
 Outputs = Mapping[str, Tensor]
-"""(N, rows, cols) of each channel of a network's output, by the channel's name."""
+"""Output of a network: (N, rows, cols) by channel name."""
 LEAST_LOG_SPREAD = math.log(0.01)
-"""A spread below this is taken for it: a hundredth of the depth."""
+"""Lower bound of the predicted log spread: a hundredth of the depth."""
 
 
 @dataclass(frozen=True, slots=True)
 class LossSettings:
-    """What is learnt, and how much each part of it counts: the base of `FitSettings`.
+    """Weights and kinds of the losses; base class of `TrainConfig`.
 
     Parameters
     ----------
     confidence_weight
-        Factor of the confidence loss.
+        Weight of the confidence loss.
     focus
         Exponent of the focal confidence loss. 0: plain cross entropy.
     depth_weight
-        Factor of the depth loss.
+        Weight of the depth loss.
     depth_loss
         "log": absolute error of the log depth. "squared": squared error in m^2, as published.
     offset_weight
-        Factor of the sub-cell offset's loss, for networks that have the channels.
+        Weight of the sub-cell offset loss, for networks with these channels.
     spread_weight
-        Factor of the loss of a channel that says how sure the depth is. 0: no such channel.
+        Weight of the loss of the depth uncertainty channel. 0: no such channel.
     class_weight
-        Factor of the class loss.
+        Weight of the class loss.
     classes
-        What tells robots apart, one pattern of peer names each: ["cf2", "cf[3-9]"] is two
-        classes. Empty: the network does not tell.
+        Classes of robots, each a pattern of peer names: ["cf2", "cf[3-9]"] defines two. Empty: the
+        network does not classify.
     """
 
     confidence_weight: float = 1.0
@@ -60,18 +60,19 @@ class LossSettings:
 def confidence_loss(
     logit: Tensor, confidence: Tensor, weight: Tensor | None = None, *, focus: float = 2.0
 ) -> Tensor:
-    """Focal cross entropy |c - p|^focus * BCE(p, c); the paper's with a focus of 2.
+    """Compute the focal cross entropy |c - p|^focus * BCE(p, c); with focus 2, that of the paper.
 
     Parameters
     ----------
     logit
         (N, rows, cols) confidence logits; p is their sigmoid.
     confidence
-        (N, rows, cols) labels c, 0 to 1.
+        (N, rows, cols) targets c, 0 to 1.
     weight
-        (N, rows, cols) factor of each cell. None: 1.
+        (N, rows, cols) weight of each cell. None: 1.
     focus
-        How much cells that are nearly right are left alone. 0: plain cross entropy.
+        Focal exponent: how strongly cells with a small error are down-weighted. 0: plain cross
+        entropy.
     """
     entropy = binary_cross_entropy_with_logits(logit, confidence, weight, reduction="none")
     if focus:
@@ -82,21 +83,21 @@ def confidence_loss(
 def depth_loss(
     log_depth: Tensor, depth_m: Tensor, weight: Tensor, kind: DepthLoss = "squared"
 ) -> Tensor:
-    """Depth error in cells with a robot.
+    """Compute the depth error in cells with a robot.
 
     Parameters
     ----------
     log_depth
         (N, rows, cols) predicted natural log of the depth in metres.
     depth_m
-        (N, rows, cols) labels, metres; any value where ``weight`` is 0.
+        (N, rows, cols) targets, metres; any value where ``weight`` is 0.
     weight
-        (N, rows, cols) factor of each cell.
+        (N, rows, cols) weight of each cell.
     kind
-        "squared": squared error, m^2, as in the paper. "log": absolute error of the
-        logarithm, that is, of the share.
+        "squared": squared error, m^2, as in the paper. "log": absolute error of the log depth, that
+        is, the relative error.
     """
-    # Masked first: a far-off log depth in an empty cell must not give inf * 0.
+    # Mask first: an extreme log depth in an empty cell must not give inf * 0.
     there = weight > 0
     if kind == "log":
         wanted = torch.where(there, depth_m, 1.0).log()
@@ -107,51 +108,51 @@ def depth_loss(
 
 
 def offset_loss(predicted: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
-    """Absolute error of the offset in cells with a robot, cells.
+    """Compute the absolute error of the sub-cell offset in cells with a robot, in cells.
 
     Parameters
     ----------
     predicted, offset
         (N, 2, rows, cols), cells.
     weight
-        (N, rows, cols) factor of each cell.
+        (N, rows, cols) weight of each cell.
     """
     return (weight[:, None] * (predicted - offset).abs()).sum(dim=(1, 2, 3)).mean()
 
 
 def spread_loss(log_spread: Tensor, log_depth: Tensor, depth_m: Tensor, weight: Tensor) -> Tensor:
-    """How badly the spread fits the error of log depth: -log of a Laplace density (less log 2).
+    """Compute the negative log likelihood of the log depth error under a Laplace density.
 
-    The depth does not learn from it: a network that also says how sure it is sees as well as one
-    that does not.
+    The constant log 2 is left out. The depth gets no gradient from it: detection is then as good as
+    without an uncertainty channel.
 
     Parameters
     ----------
     log_spread, log_depth
-        (N, rows, cols) predicted: log of the scale b of the error, and log of the depth, metres.
+        (N, rows, cols) predictions: log of the scale b of the error, and log of the depth, metres.
     depth_m
-        (N, rows, cols) labels, metres; any value where ``weight`` is 0.
+        (N, rows, cols) targets, metres; any value where ``weight`` is 0.
     weight
-        (N, rows, cols) factor of each cell.
+        (N, rows, cols) weight of each cell.
     """
     there = weight > 0
     error = (log_depth.detach() - torch.where(there, depth_m, 1.0).log()).abs() * there
-    # Without a floor, a depth that is met exactly is worth infinitely much.
+    # Without a lower bound, an exact depth would have an infinitely good loss.
     log_b = log_spread.clamp(min=LEAST_LOG_SPREAD)
     return (weight * (error * (-log_b).exp() + log_b)).sum(dim=(1, 2)).mean()
 
 
 def class_loss(logits: Tensor, class_id: Tensor, weight: Tensor) -> Tensor:
-    """Cross entropy of every class in cells with a robot (paper eq. 8).
+    """Compute the cross entropy of every class in cells with a robot (paper eq. 8).
 
     Parameters
     ----------
     logits
         (N, classes, rows, cols).
     class_id
-        (N, rows, cols) labels; -1 where it is not known.
+        (N, rows, cols) targets; -1 where the class is unknown.
     weight
-        (N, rows, cols) factor of each cell.
+        (N, rows, cols) weight of each cell.
     """
     known = class_id >= 0
     wanted = one_hot(class_id.clamp(min=0), logits.shape[1]).movedim(3, 1).to(logits.dtype)
@@ -161,18 +162,18 @@ def class_loss(logits: Tensor, class_id: Tensor, weight: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One part of the loss.
+    """One term of the loss.
 
     Parameters
     ----------
     name
-        As histories and curves call it.
+        Name in histories and curves.
     weight
-        Key of `LossSettings` with its factor.
+        Field of `LossSettings` with its weight.
     channels
-        What a network must give for it; the term is 0 for one that lacks any of them.
+        Channels that it requires; the term is 0 for a network that lacks any of them.
     of
-        The loss before its factor: a scalar, of outputs, targets and settings.
+        Function of outputs, targets and settings that returns the unweighted loss, a scalar.
     """
 
     name: str
@@ -211,11 +212,11 @@ TERMS = (
     Term("spread_loss", "spread_weight", (SPREAD, "log_depth"), _spread),
     Term("class_loss", "class_weight", (f"{CLASS}0",), _class),
 )
-"""Every part of the loss; what is minimised is their sum."""
+"""All terms of the loss; training minimises their weighted sum."""
 
 
 def weighted(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
-    """Every term times its factor, in the order of ``TERMS``; 0 without its channels."""
+    """Return every weighted term, in the order of ``TERMS``; 0 if its channels are missing."""
     none = out["confidence"].new_zeros(())
     parts = [
         term.of(out, wanted, settings) if out.keys() >= set(term.channels) else none

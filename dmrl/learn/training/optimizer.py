@@ -10,28 +10,31 @@ from dmrl.learn.networks.architectures import CHANNELS, Network
 
 OptimizerName = Literal["muon", "adam"]
 
-ADAM_EPSILON = 1e-7  # Keras' default, with which the paper trained
+ADAM_EPSILON = 1e-7
+"""Denominator term of Adam: the default of Keras, which the paper used."""
 MOMENTUM = 0.95
+"""Momentum of Muon, with Nesterov's look-ahead."""
 UPDATE_RMS = 0.2
-"""Root mean square of an update over the learning rate: about that of Adam's, so that one
+"""Root mean square of a Muon update over the learning rate. About that of Adam, so that one
 learning rate suits both (Liu et al. 2025)."""
 NEWTON_SCHULZ = (3.4445, -4.7750, 2.0315)
+"""Coefficients of the quintic iteration."""
 NEWTON_SCHULZ_STEPS = 5
 
 
 def new_optimizer(
     network: Network, name: OptimizerName, weight_decay: float
 ) -> torch.optim.Optimizer:
-    """The optimizer of a training.
+    """Build the optimizer of a training.
 
     Parameters
     ----------
     network
-        What it steps.
+        Network whose parameters it updates.
     name
-        "adam", or "muon" for the kernels that mix channels beside Adam for all the rest.
+        "adam", or "muon" for the kernels that mix channels and Adam for the rest.
     weight_decay
-        Decoupled, on kernels alone. 0 with "adam": the paper's plain Adam.
+        Decoupled weight decay, of kernels only. 0 with "adam": the paper's plain Adam.
     """
     kernels = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim == 1]
@@ -55,7 +58,7 @@ def new_optimizer(
 
 
 def _mixing(network: Network) -> list[Tensor]:
-    """Kernels between hidden layers: neither of the image, nor depthwise, nor the head's."""
+    """Return the kernels between hidden layers: no first layer, no depthwise layer, no head."""
     convs = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
     return [
         conv.weight
@@ -65,13 +68,13 @@ def _mixing(network: Network) -> list[Tensor]:
 
 
 class Muon(torch.optim.AdamW):
-    """Muon (Jordan et al. 2024) for groups that are ``mixing``, AdamW for the others.
+    """Muon (Jordan et al. 2024) for parameter groups that are ``mixing``, AdamW for the others.
 
-    Adam scales every number of a kernel by itself. A kernel that mixes channels is one matrix:
-    Muon takes its smoothed gradient for the direction and makes all of its singular values
-    about 1, so that rare directions are learnt as fast as common ones.
+    Adam scales every number of a kernel by itself. A kernel that mixes channels is one matrix: Muon
+    orthogonalises its momentum, so that all singular values are about 1. Rare directions are then
+    learned as fast as common ones.
 
-    ``torch.optim.Muon`` takes matrices alone, these kernels are (out, in, rows, cols).
+    ``torch.optim.Muon`` accepts matrices only; these kernels are (out, in, rows, cols).
 
     Parameters
     ----------
@@ -84,32 +87,33 @@ class Muon(torch.optim.AdamW):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """One step of all parameters; the mixing kernels' gradients are used up."""
+        """Update all parameters once; gradients of the mixing kernels are set to None."""
         for group in self.param_groups:
             if group["mixing"]:
                 for kernel in group["params"]:
                     self._turn(kernel, group["lr"], group["weight_decay"])
-                    kernel.grad = None  # so AdamW passes it by
+                    kernel.grad = None  # so that AdamW skips it
         return super().step(closure)
 
     def _turn(self, kernel: Tensor, learning_rate: float, weight_decay: float) -> None:
+        """Apply the Muon update to one kernel."""
         state = self.state[kernel]
         if not state:
-            # AdamW's own name: it looks for it in every state that it loads.
+            # The key that AdamW requires in every state that it loads.
             state["step"] = torch.tensor(0.0)
             state["momentum"] = torch.zeros_like(kernel)
         assert kernel.grad is not None
         momentum = state["momentum"].lerp_(kernel.grad, 1 - MOMENTUM)
-        ahead = torch.lerp(kernel.grad, momentum, MOMENTUM).flatten(1)  # Nesterov's
+        ahead = torch.lerp(kernel.grad, momentum, MOMENTUM).flatten(1)  # Nesterov
         update = orthogonal(ahead).reshape(kernel.shape)
         kernel.mul_(1 - learning_rate * weight_decay)
         kernel.add_(update, alpha=-learning_rate * UPDATE_RMS * max(ahead.shape) ** 0.5)
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """A matrix with its singular values all brought to about 1 (0.7 to 1.2).
+    """Orthogonalise a matrix: scale all singular values to about 1 (0.7 to 1.2).
 
-    By five rounds of a quintic Newton-Schulz iteration: products alone, no decomposition.
+    Five steps of a quintic Newton-Schulz iteration need only products, no decomposition.
     """
     tall = matrix.shape[0] > matrix.shape[1]
     x: Tensor = matrix.T if tall else matrix

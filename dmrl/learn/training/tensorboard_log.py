@@ -1,4 +1,4 @@
-"""TensorBoard's log of a training."""
+"""TensorBoard log of a training."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -8,22 +8,22 @@ from pathlib import Path
 from torch.utils.tensorboard import SummaryWriter
 
 Board = Callable[[str, float, int], None]
-"""Takes a curve's name, its value and the step."""
+"""Function that logs the name of a curve, its value and the step."""
 
 
 @contextmanager
 def opened(folder: Path, first_step: int) -> Iterator[Board]:
-    """A log in ``folder``; what an earlier training wrote from ``first_step`` on is void.
+    """Open a TensorBoard log in ``folder``; earlier values from ``first_step`` on are dropped.
 
     Raises
     ------
     OSError
-        If it cannot be written: said by one of the next values, or at the end.
+        If the log cannot be written: raised by one of the next writes, or at the end.
     """
     before = threading.excepthook
 
     def hook(args: threading.ExceptHookArgs) -> None:
-        # TensorBoard writes in a thread of its own, and raises what that met here once more.
+        # TensorBoard's writer thread fails first; the same error is then raised in this thread.
         if not type(args.thread).__module__.startswith("tensorboard."):
             before(args)
 

@@ -1,4 +1,4 @@
-"""One step of a training: losses of a batch, and the average of the weights."""
+"""Training step: losses of a batch, backward pass, optimizer update, and the EMA of the weights."""
 
 from copy import deepcopy
 
@@ -19,9 +19,9 @@ LOSSES = tuple(term.name for term in TERMS)
 def losses(
     network: Network, batch: Batch, settings: FitSettings, teacher: Network | None = None
 ) -> Tensor:
-    """The weighted losses of a batch, in the order of ``LOSSES``.
+    """Compute the weighted losses of a batch, in the order of ``LOSSES``.
 
-    With a teacher, a share of them is against what it says in place of the labels.
+    With a teacher, a fraction ``distill_share`` of each loss is against the teacher's output.
     """
     device = next(network.parameters()).device
     images, robots = (t.to(device, non_blocking=True) for t in batch)
@@ -45,7 +45,7 @@ def losses(
 
 
 def _output(network: Network, pixels: Tensor, settings: FitSettings) -> Tensor:
-    """(N, C, rows, cols) float32."""
+    """Run a network in the configured precision; return (N, C, rows, cols) float32."""
     half = settings.precision == "bfloat16"
     with torch.autocast(pixels.device.type, torch.bfloat16, enabled=half):
         out: Tensor = network(pixels)
@@ -62,24 +62,29 @@ def train_step(
     share: float = 1.0,
     teacher: Network | None = None,
 ) -> Tensor:
-    """Losses of a batch in the order of ``LOSSES``, after one step of the optimizer on their sum.
+    """Take one optimizer step on a batch.
 
     Parameters
     ----------
     network, optimizer
         Changed in place.
     batch
-        Images and robots; this process' part of the batch.
+        Images and labels; this process's part of the batch.
     settings
-        The recipe.
+        Training configuration.
     learning_rate
-        Of this step.
+        Learning rate of this step.
     group
-        The processes that train together.
+        Processes that train together.
     share
-        Share of the whole batch that ``batch`` is. 0: of ``batch`` nothing is learnt.
+        Weight of ``batch`` in the whole batch. 0: ``batch`` does not contribute.
     teacher
-        A network whose output is learnt beside the labels.
+        Network whose output is learned in addition to the labels.
+
+    Returns
+    -------
+    Tensor
+        Losses of the whole batch before the update, in the order of ``LOSSES``.
     """
     for parameters in optimizer.param_groups:
         parameters["lr"] = learning_rate
@@ -92,9 +97,9 @@ def train_step(
 
 
 class Average:
-    """The mean of the weights over the last steps: steadier than the weights of any one.
+    """Exponential moving average (EMA) of the weights; it varies less than the weights do.
 
-    Young averages forget faster, so that the first weights do not linger.
+    The time constant is shorter in the first steps, so that the initial weights do not persist.
     """
 
     def __init__(self, network: Network, steps: int) -> None:
@@ -109,7 +114,7 @@ class Average:
         ]
 
     def update(self, step: int) -> None:
-        """Take in the network's weights after a step (from 1)."""
+        """Update the average with the network's weights after a step (from 1)."""
         share = max(1 / self._steps, 10 / (9 + step))
         mine, theirs = zip(*self._pairs, strict=True)
         torch._foreach_lerp_(list(mine), list(theirs), min(share, 1.0))

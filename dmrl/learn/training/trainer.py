@@ -1,4 +1,4 @@
-"""Training: seeded, resumable, watched in TensorBoard."""
+"""Trainer: the training loop, seeded, resumable and logged to TensorBoard."""
 
 import math
 from collections.abc import Generator, Iterator
@@ -26,24 +26,25 @@ from dmrl.learn.training.train_step import ALONE, LOSSES, Average, train_step
 from dmrl.learn.training.validation import validation_figures
 
 Shares = NDArray[np.float64] | None
-"""(N,) how often each image comes in an epoch, 1 on average; None: once."""
-WATCH_STEPS = 10  # reading a loss makes an accelerator wait, so not at every step
+"""(N,) how often each image appears in an epoch, 1 on average; None: once."""
+WATCH_STEPS = 10
+"""Steps between two readings of the loss, since each reading synchronises an accelerator."""
 
 
 class Step(NamedTuple):
-    """One step of a training: epoch from 1, and the mean loss of the last few steps."""
+    """Progress after a training step: epoch from 1, and the mean loss of the last few steps."""
 
     epoch: int
     loss: float
 
 
 def device_of(name: str) -> torch.device:
-    """The device to compute on.
+    """Select the compute device.
 
     Raises
     ------
     SettingError
-        If CUDA is asked for and there is none.
+        If CUDA is requested but not available.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -53,7 +54,7 @@ def device_of(name: str) -> torch.device:
 
 
 def learning_rate_at(step: int, steps_per_epoch: int, settings: FitSettings) -> float:
-    """Learning rate of a step (from 1): linear warm-up, then a half cosine."""
+    """Return the learning rate of a step (from 1): linear warm-up, then a half cosine."""
     warmup = settings.warmup_epochs * steps_per_epoch
     if step < warmup:
         return settings.learning_rate * step / warmup
@@ -64,16 +65,16 @@ def learning_rate_at(step: int, steps_per_epoch: int, settings: FitSettings) -> 
 
 
 def new_network(settings: FitSettings, examples: Examples) -> Network:
-    """The network to train, its first weights drawn with the seed.
+    """Build the network to train, with initial weights from the seed.
 
     Raises
     ------
     SettingError
-        If there is no such architecture, no image, or the network cannot take their size.
+        If the architecture does not exist, there are no images, or it does not support their size.
     """
     network = build(settings.architecture, seed=settings.seed, extra=settings.extra)
     if not len(examples):
-        raise SettingError("no images to train on. Give a dataset with a train split")
+        raise SettingError("no images to train on. Use a dataset with a train split")
     height_px, width_px, _ = examples.image_shape
     cell = network.stride_px
     if height_px % cell or width_px % cell:
@@ -85,35 +86,35 @@ def new_network(settings: FitSettings, examples: Examples) -> Network:
 
 
 class Training:
-    """One training: iterate ``steps()`` to the end, then look at ``history`` and ``network``.
+    """Training loop: iterate ``steps()`` to the end, then use ``history`` and ``network``.
 
     Parameters
     ----------
     network
-        Trained in place, on the device of the settings.
+        Network, trained in place on the configured device.
     examples
         Training images and labels.
     settings
-        The recipe.
+        Training configuration.
     folder
-        Gets a checkpoint after every epoch, and TensorBoard's log.
+        Folder of the checkpoint, written after every epoch, and of the TensorBoard log.
     validation
-        Images that are looked at after every epoch, and never learnt from.
+        Images evaluated after every epoch and never trained on.
     shares
-        (N,) how often each image shall come in an epoch. None: once.
+        (N,) how often each image shall appear in an epoch. None: once.
     identity
-        Names the data, so that a training is resumed on the same.
+        Identity of the data; a training is resumed only on the same data.
     teacher
-        A network whose output is learnt beside the labels. None: the labels alone.
+        Network whose output is learned in addition to the labels. None: labels only.
     group
-        The processes that train this network together; only the first writes to ``folder``.
+        Processes that train this network together; only the first writes to ``folder``.
     resume
-        Go on from the checkpoint in ``folder``.
+        Resume from the checkpoint in ``folder``.
 
     Raises
     ------
     SettingError
-        If the checkpoint is of another training, or the device is not there.
+        If the checkpoint belongs to another training, or the device is not available.
     ModelError
         If there is no checkpoint to resume from.
     """
@@ -148,17 +149,17 @@ class Training:
 
     @property
     def network(self) -> Network:
-        """The network to keep: the averaged one, where there is one."""
+        """Network to save: the EMA if there is one, else the trained network."""
         return self._average.network if self._average else self._learning
 
     @property
     def history(self) -> list[dict[str, float]]:
-        """Mean losses of every epoch so far, and figures of the validation images."""
+        """Mean losses of every epoch so far, and metrics of the validation images."""
         return self._state.history
 
     @property
     def steps_left(self) -> int:
-        """Steps that ``steps()`` will take."""
+        """Number of steps that ``steps()`` will take."""
         return (self._settings.epochs - self._state.epochs_done) * self._steps_per_epoch
 
     def steps(self) -> Iterator[Step]:
@@ -167,12 +168,12 @@ class Training:
         Yields
         ------
         Step
-            After every step.
+            Progress after every step.
 
         Raises
         ------
         SettingError
-            If the loss is no longer a number.
+            If the loss is not finite.
         """
         first = self._state.epochs_done
         with self._board(first * self._steps_per_epoch + 1) as board:
@@ -193,7 +194,7 @@ class Training:
 
     @contextmanager
     def _board(self, first_step: int) -> Iterator[boards.Board]:
-        """TensorBoard's log; nothing in processes that do not lead."""
+        """Open the TensorBoard log; only the first process writes one."""
         if not self._group.leads:
             yield lambda name, value, step: None
             return
@@ -215,7 +216,7 @@ class Training:
         )
         for index, start in enumerate(range(0, len(indices), size)):
             whole = indices[start : start + size]
-            # Where there are more processes than images some compute one that does not count.
+            # With more processes than images, the others compute an image of weight 0.
             chosen = self._group.part(whole) if len(whole) >= self._group.size else whole[:1]
             if augmenter is None:
                 yield gathered(self._examples, chosen)
@@ -225,12 +226,12 @@ class Training:
                 )
 
     def _epoch_shares(self) -> Shares:
-        """How often each image comes in the next epoch: hard ones without a robot more often."""
+        """Return how often each image appears in the next epoch, with hard negatives if enabled."""
         share = self._settings.hard_share
         return mined(self.network, self._examples, self._shares, share) if share else self._shares
 
     def _epoch(self, epoch: int, board: boards.Board) -> Generator[Step, None, dict[str, float]]:
-        """Train one epoch; returns its mean losses."""
+        """Train one epoch and return its mean losses."""
         size = self._settings.batch_size
         seen: list[Tensor] = []
         total, loss = torch.zeros(len(LOSSES)), math.nan
@@ -256,7 +257,7 @@ class Training:
         return {"loss": sum(means), **dict(zip(LOSSES, means, strict=True))}
 
     def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:
-        """``LOSSES`` of a batch of ``whole`` images, of which this process has a part."""
+        """Take one step on this process's part of a batch of ``whole`` images; return losses."""
         group = self._group
         share = len(group.part(np.arange(whole))) / whole
         return train_step(
@@ -272,7 +273,7 @@ class Training:
 
 
 def _for_training(network: Network, *, frozen_norms: bool) -> None:
-    """Have a network learn, its normalisations by the batch or by their running statistics."""
+    """Set train mode; with frozen norms, batch normalisation keeps its running statistics."""
     network.train()
     if frozen_norms:
         for module in network.modules():
@@ -281,8 +282,9 @@ def _for_training(network: Network, *, frozen_norms: bool) -> None:
 
 
 def _require_finite(loss: float, epoch: int, step: int) -> None:
+    """Raise SettingError unless the loss is finite."""
     if not math.isfinite(loss):
         raise SettingError(
             f"the loss is {loss} in epoch {epoch}, step {step}. "
-            "Lower --learning-rate, or look for labels that are not finite"
+            "Lower --learning-rate, or fix labels that are not finite"
         )

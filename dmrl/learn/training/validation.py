@@ -1,4 +1,4 @@
-"""How good a network is on images held out."""
+"""Validation: loss and detection metrics of a network on held-out images."""
 
 import numpy as np
 import torch
@@ -13,23 +13,24 @@ from dmrl.learn.training.config import FitSettings
 from dmrl.learn.training.train_step import losses
 
 WATCHED = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
-"""Figures of ``metrics`` that are watched during a training."""
+"""Metrics of `detection_metrics` that are logged during a training."""
 EVERYWHERE = (0.0, np.inf)
+"""Depth band of all labels, metres."""
 
 
 def validation_figures(
     network: Network, examples: Examples, settings: FitSettings
 ) -> dict[str, float]:
-    """Loss and figures on images held out, each name beginning with validation.
+    """Compute loss and metrics on held-out images; each name begins with validation.
 
     Parameters
     ----------
     network
-        In evaluation mode.
+        Network in evaluation mode.
     examples
-        Images held out, as they are.
+        Held-out images, without augmentation.
     settings
-        The recipe, for its losses and batch size.
+        Training configuration, for losses and batch size.
     """
     total = 0.0
     with torch.inference_mode():
@@ -42,7 +43,7 @@ def validation_figures(
 
 
 def scores(network: Network, examples: Examples, batch_size: int = 16) -> Scored:
-    """A network's detections in images, matched with their labels."""
+    """Detect robots in images and match the detections with the labels."""
     parts = []
     for batch in in_order(examples, batch_size):
         found = decode(*grids_of(network, batch.images), stride_px=network.stride_px)
@@ -54,7 +55,7 @@ def scores(network: Network, examples: Examples, batch_size: int = 16) -> Scored
 
 
 def labels(examples: Examples) -> Points:
-    """Robots whose centres are inside the images."""
+    """Return the labels of robots whose centres are inside the images."""
     height_px, width_px, _ = examples.image_shape
     robots = examples.robots.astype(np.float64)
     u, v = robots[..., U], robots[..., V]

@@ -1,4 +1,4 @@
-"""A simulated AI-deck: a flight's pictures over CPX, in any of the layouts."""
+"""Simulated AI-deck that sends a flight's images over CPX, in any of the layouts."""
 
 import socket
 import threading
@@ -20,36 +20,36 @@ Sends = Literal["plain", "stamped", "streamer", "jpeg"]
 
 POLL_S = 0.05
 CAMERA_BOOT_US = 3_210_000
-"""What the camera's clock shows more than the robot's: its chip starts at another time."""
+"""Offset of the camera's clock from the robot's, since its chip starts at another time."""
 UART_US = 1_500
-"""How long a state takes to the camera."""
+"""Latency of a state on its way to the camera."""
 JPEG_QUALITY = 90
 
 
 class FakeCamera(threading.Thread):
-    """One camera, from now until stopped. Serves one client at a time, as the deck does.
+    """Thread of one simulated camera. Like the deck, it serves one client at a time.
 
     Parameters
     ----------
     robot
-        That carries it.
+        Robot that carries the camera.
     address
         Host and port to listen at.
     pictures
-        Of its flight; those whose time passes while nobody listens are gone.
+        Images of its flight. Those whose time passes without a client are skipped.
     clock
-        Common time of the flight.
+        Common clock of the flight.
     faults
-        What goes wrong with the robot.
+        Simulated faults of the robot.
     sends
-        In which form.
+        Layout of the images.
     seed
-        Which images are dropped.
+        Seed of the dropped images.
 
     Raises
     ------
     SettingError
-        If the port cannot be had.
+        If the port cannot be opened.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class FakeCamera(threading.Thread):
             listener = socket.create_server(self._address)
         except OSError as e:
             raise SettingError(
-                f"camera port {self._address[1]}: {e.strerror or e}. Name another --camera"
+                f"camera port {self._address[1]}: {e.strerror or e}. Pass another --camera"
             ) from None
         listener.settimeout(POLL_S)
         self._address = (self._address[0], int(listener.getsockname()[1]))
@@ -84,20 +84,20 @@ class FakeCamera(threading.Thread):
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port at which it listens."""
         return self._address[1]
 
     def stop(self) -> None:
-        """Ask it to end; `join` waits for that."""
+        """Request the thread to end; `join` waits for it."""
         self._stop_wanted.set()
 
     def close(self) -> None:
-        """Give the port back, if it was never started."""
+        """Release the port, if the thread was never started."""
         if self.ident is None:
             self._listener.close()
 
     def run(self) -> None:
-        """Wait for a client and send it images, and again."""
+        """Serve one client after the other with images, until stopped."""
         while not self._stop_wanted.is_set():
             if self._faults.dead(self._clock.now_s()):
                 self._listener.close()
@@ -117,7 +117,7 @@ class FakeCamera(threading.Thread):
             behind_s = self._clock.now_s() - time_s
             self._number += 1
             if self._clock.flying and behind_s > 1.0:
-                continue  # its time passed while nobody listened
+                continue  # its time passed without a client
             if not self._wait_until(time_s):
                 return
             if self._chance.random() < self._faults.drop:
@@ -130,7 +130,7 @@ class FakeCamera(threading.Thread):
             pass  # landed; the connection stays
 
     def _wait_until(self, time_s: float) -> bool:
-        """Whether the flight reached a time; False if the robot died or all is to end."""
+        """Wait for a time of the flight; return False if the robot died or the thread is to end."""
         while not self._stop_wanted.is_set():
             now_s = self._clock.now_s()
             if self._faults.dead(now_s):
@@ -155,13 +155,13 @@ class FakeCamera(threading.Thread):
 
     @staticmethod
     def _state(robot_us: int) -> State:
-        """The last state that came before an image was taken: of a whole millisecond."""
+        """Build the last state that arrived before the exposure, at a whole millisecond."""
         sent_ms = (robot_us - UART_US) // 1000
         return State(sent_ms, 1000 * sent_ms + UART_US + CAMERA_BOOT_US)
 
 
 def whole_sensor(rgb: codec.Rgb) -> codec.Rgb:
-    """What the whole sensor saw of (H, W, 3), with the cut-off border made up; or as it was."""
+    """Pad (H, W, 3) of the calibrated area to the whole sensor; other sizes are unchanged."""
     if rgb.shape[:2] != (AIDECK.height_px, AIDECK.width_px):
         return rgb
     width_px, height_px = AIDECK_SENSOR_PX

@@ -1,8 +1,8 @@
-"""A simulated Crazyflie: the CRTP log protocol over UDP.
+"""Simulated Crazyflie: the CRTP log protocol over UDP.
 
 One CRTP packet per datagram, as cflib's ``udp://`` driver sends them: a header byte
-``port:4 link:2 channel:2``, then at most 30 bytes. Answered is what cflib asks for until it
-is connected (link, platform, log, memories, parameters), and then log blocks are sent.
+``port:4 link:2 channel:2``, then at most 30 bytes. The server answers cflib's requests until it
+is connected (link, platform, log, memories, parameters), and then sends log blocks.
 """
 
 import errno
@@ -42,7 +42,7 @@ Address = tuple[str, int]
 
 @dataclass(slots=True)
 class _Block:
-    """A log block: (index of the variable, format it is sent in) each, and when it is due."""
+    """A log block: (index of the variable, format in which it is sent) each, and its due time."""
 
     variables: list[tuple[int, str]] = field(default_factory=list)
     period_ms: int = 0
@@ -55,7 +55,7 @@ class _Block:
 
 
 class FakeCrazyflie(threading.Thread):
-    """One drone, from now until stopped.
+    """Thread of one simulated drone.
 
     Parameters
     ----------
@@ -64,18 +64,18 @@ class FakeCrazyflie(threading.Thread):
     address
         Host and port to listen at.
     flight
-        What it measures.
+        Its measurements.
     clock
-        Common time of the flight.
+        Common clock of the flight.
     faults
-        What goes wrong.
+        Simulated faults.
     seed
-        Which packets are dropped.
+        Seed of the dropped packets.
 
     Raises
     ------
     SettingError
-        If the port cannot be had.
+        If the port cannot be opened.
     """
 
     def __init__(
@@ -102,11 +102,11 @@ class FakeCrazyflie(threading.Thread):
             self._socket.close()
             host, port = address
             why = e.strerror or e
-            raise SettingError(f"udp://{host}:{port}: {why}. Name another --uri") from None
+            raise SettingError(f"udp://{host}:{port}: {why}. Pass another --uri") from None
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port at which it listens."""
         return int(self._socket.getsockname()[1])
 
     @property
@@ -115,16 +115,16 @@ class FakeCrazyflie(threading.Thread):
         return any(block.period_ms for block in list(self._blocks.values()))
 
     def stop(self) -> None:
-        """Ask it to end; `join` waits for that."""
+        """Request the thread to end; `join` waits for it."""
         self._stop_wanted.set()
 
     def close(self) -> None:
-        """Give the port back, if it was never started."""
+        """Release the port, if the thread was never started."""
         if self.ident is None:
             self._socket.close()
 
     def run(self) -> None:
-        """Answer and log."""
+        """Serve requests and send log blocks, until stopped."""
         with self._socket:
             while not self._stop_wanted.is_set():
                 now_s = self._clock.now_s()
@@ -167,11 +167,11 @@ class FakeCrazyflie(threading.Thread):
         self.sent += 1
 
     def _send(self, port: int, channel: int, data: bytes, to: Address) -> None:
-        with suppress(ConnectionError):  # whoever listened may be gone
+        with suppress(ConnectionError):  # the client may be gone
             self._socket.sendto(bytes([port << 4 | 3 << 2 | channel]) + data, to)
 
     def _answer(self, packet: bytes, sender: Address) -> None:
-        """Send what the firmware would; it has no answer to some packets."""
+        """Send the firmware's answer, if it has one."""
         port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
         reply = self._reply(port, channel, data, sender)
         if reply is not None:
@@ -198,7 +198,7 @@ class FakeCrazyflie(threading.Thread):
         return self._control(data, sender) if channel == 1 and data else None
 
     def _control(self, data: bytes, sender: Address) -> bytes:
-        """Do what a log command says; the answer is command, block, error number."""
+        """Execute a log command; return command, block, error number."""
         command, number = data[0], data[1] if len(data) > 1 else 0
         if command == 5:  # reset
             self._blocks.clear()
@@ -244,7 +244,7 @@ def _row(name: str, kind: int) -> bytes:
 
 
 def _contents(data: bytes, rows: list[bytes], crc: int) -> bytes | None:
-    """The answer to a question about a table of contents, version 2."""
+    """Return the answer to a request for a table of contents, version 2."""
     if data[:1] == b"\3":
         return struct.pack("<BHIBB", 3, len(rows), crc, BLOCKS_MAX, 128)
     if data[:1] == b"\2" and len(data) >= 3:

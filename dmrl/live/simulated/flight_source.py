@@ -1,4 +1,4 @@
-"""A recorded or simulated flight, as the log variables of a Crazyflie."""
+"""A recorded or simulated flight as the log variables of a Crazyflie."""
 
 import math
 import threading
@@ -19,20 +19,20 @@ BATTERY_FULL_V, BATTERY_EMPTY_V, BATTERY_S = 4.15, 3.3, 420.0
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """One log variable: its type as cflib names it, and what it was over the flight."""
+    """One log variable: its type in cflib's names, and its values over the flight."""
 
     kind: str
     signal: Signal
 
     def at(self, time_s: float) -> float:
-        """The last value before a time."""
+        """Return the last value before a time."""
         times, values = self.signal
         return float(values[max(int(np.searchsorted(times, time_s, side="right")) - 1, 0)])
 
 
 @dataclass(frozen=True, slots=True)
 class FakeFlight:
-    """What one robot measured.
+    """Measurements of one robot.
 
     Parameters
     ----------
@@ -53,11 +53,11 @@ class FakeFlight:
 
     @property
     def end_s(self) -> float:
-        """When it lands."""
+        """Time of landing."""
         return float(self.attitude[0][-1])
 
     def variables(self) -> dict[str, Variable]:
-        """Log variables, with the units and signs of the Crazyflie's firmware."""
+        """Return the log variables, with the units and signs of the Crazyflie's firmware."""
         time_s, (roll, pitch, yaw, yaw_rate) = self.attitude[0], self.attitude[1].T
         vx, vy = (np.interp(time_s, self.velocity[0], part) for part in self.velocity[1].T)
         roll_rate, pitch_rate = np.gradient(roll, time_s), np.gradient(pitch, time_s)
@@ -88,14 +88,14 @@ class FakeFlight:
 
 
 class FlightClock:
-    """Time of a flight that begins when somebody listens.
+    """Clock of a flight that starts with the first client.
 
     Parameters
     ----------
     speed
         Seconds of the flight per second.
     end_s
-        When it ends, seconds since take-off.
+        Time of landing, seconds since take-off.
     """
 
     def __init__(self, speed: float, end_s: float) -> None:
@@ -104,23 +104,23 @@ class FlightClock:
         self._lock = threading.Lock()
 
     def take_off(self) -> None:
-        """Begin, if it has not begun."""
+        """Start the flight, unless it has started."""
         with self._lock:
             if self._start_s is None:
                 self._start_s = time.monotonic()
 
     @property
     def flying(self) -> bool:
-        """Whether it has begun."""
+        """Whether the flight has started."""
         return self._start_s is not None
 
     @property
     def landed(self) -> bool:
-        """Whether it is over."""
+        """Whether the flight is over."""
         return self.flying and self.now_s() >= self.end_s
 
     def now_s(self) -> float:
-        """Seconds since take-off; 0 before."""
+        """Return the seconds since take-off; 0 before."""
         if self._start_s is None:
             return 0.0
         return (time.monotonic() - self._start_s) * self.speed
@@ -128,18 +128,18 @@ class FlightClock:
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What goes wrong with a fake drone.
+    """Simulated faults of a drone.
 
     Parameters
     ----------
     drop
         Share of log packets and images that are not sent.
     dead_s
-        First and last second of the flight in which it is silent; it starts anew after it.
+        First and last second of the flight without a connection; the drone restarts afterwards.
     boot_ms
-        What its clock shows at take-off.
+        Its clock at take-off.
     drift_ppm
-        How much faster its clock runs than true time.
+        Rate error of its clock; positive: faster than true time.
     """
 
     drop: float = 0.0
@@ -148,18 +148,18 @@ class Faults:
     drift_ppm: float = 0.0
 
     def dead(self, time_s: float) -> bool:
-        """Whether it is silent at a time of the flight."""
+        """Return whether it is dead at a time of the flight."""
         return self.dead_s[0] <= time_s < self.dead_s[1]
 
     def clock_ms(self, time_s: float) -> float:
-        """What its clock shows at a time of the flight."""
+        """Return its clock at a time of the flight."""
         began_s = self.dead_s[1] if time_s >= self.dead_s[1] else 0.0
         return self.boot_ms + 1000 * (time_s - began_s) * (1 + 1e-6 * self.drift_ppm)
 
     def reached_s(self, clock_ms: float, time_s: float) -> float:
-        """The time of the flight, near ``time_s``, at which its clock shows this."""
+        """Return the time of the flight, near ``time_s``, at which its clock has this value."""
         return time_s + (clock_ms - self.clock_ms(time_s)) / 1000 / (1 + 1e-6 * self.drift_ppm)
 
 
 Pictures = Iterator[tuple[float, bytes]]
-"""Times, seconds since take-off, and encoded pictures, in order."""
+"""Times, seconds since take-off, and encoded images, in order."""

@@ -1,1 +1,1 @@
-"""Check recordings: clocks, labels, motion and units."""
+"""Check recordings: clocks, labels, odometry and units."""

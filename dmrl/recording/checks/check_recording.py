@@ -1,7 +1,7 @@
-"""Is a recording what it should be? Findings in words, worst first.
+"""Check a recording and report findings, errors first.
 
-Errors make a recording wrong to use; warnings are what a person should know before using it.
-All that is needed is gathered in one pass (`check_seen`), then judged.
+Errors make a recording unusable. Warnings describe problems to consider before it is used.
+`scan` collects all data in one pass over the file; the rules here evaluate them.
 """
 
 from collections import Counter
@@ -22,21 +22,23 @@ from dmrl.recording.mcap.message_batch import Ints
 from dmrl.terminal.progress import say
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, calibration, names, row_of
 
-GAP_PERIODS = 10  # a hole this many times the usual period is a gap
+GAP_PERIODS = 10
+"""Length of a gap, in median periods of the topic."""
 GAP_MIN_S = 0.5
+"""Shortest gap that is reported, seconds."""
 SAID = 2
-"""Findings that a stage says of what it wrote; dmrl check says them all."""
+"""Findings that a stage prints about its output. ``dmrl check`` prints all."""
 
 
 def check(path: Path, *, quick: bool = False) -> list[Finding]:
-    """Everything wrong with a recording, errors first; empty if nothing is.
+    """Return the findings about a recording, errors first.
 
     Parameters
     ----------
     path
         A recording.
     quick
-        Its times and labels only, for which images need not be looked at.
+        Check times and labels only, without decoding images.
 
     Raises
     ------
@@ -54,12 +56,12 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
 
 
 def label_findings(contents: Contents) -> list[str]:
-    """What is wrong with the labels of a recording, a line each, such as a bias.
+    """Return the findings about the labels of a recording, such as a bias, one line each.
 
     Parameters
     ----------
     contents
-        Holds labels and calibrations.
+        A recording with its labels and calibrations in memory.
 
     Raises
     ------
@@ -70,9 +72,9 @@ def label_findings(contents: Contents) -> list[str]:
 
 
 def say_findings(path: Path) -> None:
-    """Say on stderr, in a line or two, what is odd in a recording that was just written.
+    """Print the first findings about a recording that was just written, on stderr.
 
-    It stands, and is whole: what cannot be judged in it is no error of the work.
+    A failed check is printed as a warning: the recording itself is complete.
     """
     try:
         findings = check(path, quick=True)
@@ -86,7 +88,7 @@ def say_findings(path: Path) -> None:
 
 
 def _types(seen: Seen) -> Iterator[Finding]:
-    """Topics with another type than theirs, or messages that are not of it."""
+    """Report topics of a wrong message type, and messages that are not of their type."""
     for topic, info in seen.contents.topics.items():
         row = row_of(topic)
         if row is not None and not carries(topic, info.schema):
@@ -98,7 +100,7 @@ def _types(seen: Seen) -> Iterator[Finding]:
 
 
 def _times(seen: Seen) -> Iterator[Finding]:
-    """Times that go back or repeat in the file, and gaps in topics that have a rhythm."""
+    """Report times that go back or repeat in the file, and gaps in periodic topics."""
     for topic, time_ns in seen.times.items():
         step_ns = np.diff(time_ns)
         if (back := step_ns[step_ns < 0]).size:
@@ -113,12 +115,12 @@ def _times(seen: Seen) -> Iterator[Finding]:
 
 
 def _clocks(seen: Seen) -> Iterator[Finding]:
-    """Times that do not belong together."""
+    """Report clocks that do not fit together."""
     return (Finding("warning", topic, text) for topic, text in clocks(seen))
 
 
 def _units(seen: Seen) -> Iterator[Finding]:
-    """Values and times that cannot be in the units, frames and signs of their topics."""
+    """Report values and times that contradict the unit, frame or sign of their topic."""
     for topic, text in (*seen.values.doubted(), *periods(seen.times), *seen.moved.doubted()):
         yield Finding("warning", topic, text)
 
@@ -137,7 +139,7 @@ def _gaps(topic: str, step_ns: Ints) -> Iterator[Finding]:
 
 
 def _images(seen: Seen) -> Iterator[Finding]:
-    """Images without calibration, of another size than calibrated, or that are no images."""
+    """Report images that are unreadable, uncalibrated, or not of the calibrated size."""
     for topic in seen.times:
         parts = names(CAMERA_IMAGE, topic)
         if parts is None:
@@ -151,7 +153,7 @@ def _images(seen: Seen) -> Iterator[Finding]:
 
 def _sizes(seen: Seen, topic: str, calibrated: str, sizes: Counter[Size]) -> Iterator[Finding]:
     if unreadable := sizes.pop(None, 0):
-        yield Finding("error", topic, f"{unreadable} messages hold no image that can be read")
+        yield Finding("error", topic, f"{unreadable} messages contain no readable image")
     listed = ", ".join(f"{w}x{h}" for w, h in sorted(k for k in sizes if k))
     if len(sizes) > 1:
         yield Finding("warning", topic, f"images of {len(sizes)} sizes: {listed}")
@@ -167,7 +169,7 @@ def _sizes(seen: Seen, topic: str, calibrated: str, sizes: Counter[Size]) -> Ite
 
 
 def _calibrations(seen: Seen) -> Iterator[Finding]:
-    """Calibrations that no camera can have, and cameras that are not calibrated."""
+    """Report calibrations that no camera can have, and uncalibrated cameras."""
     for topic, info in seen.contents.topics.items():
         mine = names(CALIBRATION, topic) is not None and carries(topic, info.schema)
         if not mine or topic in seen.broken:

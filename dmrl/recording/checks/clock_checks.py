@@ -1,4 +1,4 @@
-"""Do the times of a recording belong together? Topic and text of what does not."""
+"""Check whether the times of a recording fit together. Findings are topic and text."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations
@@ -15,13 +15,13 @@ Span = tuple[int, int]
 """Log times of a first and a last message, nanoseconds."""
 
 EPOCH_NS = 10**18
-"""Times from here on count from 1970: it is 2001."""
+"""Smallest time that counts from 1970, nanoseconds. It is in 2001."""
 SPARSE = 2
-"""Topics with fewer messages tell nothing of a clock."""
+"""Minimum number of messages from which a topic indicates the span of its clock."""
 
 
 def clocks(seen: Seen) -> Found:
-    """Robots, or topics of a robot, that share no time; times and stamps of 0."""
+    """Yield robots, or topics of a robot, that share no time; and zero times and stamps."""
     times = {topic: np.sort(t) for topic, t in seen.times.items() if len(t)}
     yield from _zeros(times)
     robots = _spans(times)
@@ -42,11 +42,11 @@ def _zeros(times: Times) -> Found:
 
 
 def _spans(times: Times) -> dict[str, dict[str, Span]]:
-    """By robot, the time from the first to the last message of each of its topics."""
+    """Return the first and last time of each topic, by robot."""
     robots: dict[str, dict[str, Span]] = {}
     for topic, moments in times.items():
-        moments = moments[moments > 0]  # those at 0 are said already
-        # A stranger's topic without a robot in front has no clock to compare.
+        moments = moments[moments > 0]  # zeros are reported separately
+        # A topic without a leading robot name has no clock to compare.
         of_a_robot = topic.startswith("/") and topic != TRANSFORMS
         if of_a_robot and len(moments) >= SPARSE and not names(CALIBRATION, topic):
             robot = topic.split("/")[1]
@@ -55,7 +55,7 @@ def _spans(times: Times) -> dict[str, dict[str, Span]]:
 
 
 def _topics_apart(spans: Mapping[str, Span]) -> Found:
-    """Topics of one robot that share no time with any other of its topics."""
+    """Yield topics that share no time with any other topic of their robot."""
     for topic, span in spans.items():
         others = [other for name, other in spans.items() if name != topic]
         if others and (gap_s := _gap_s(span, _around(others))) > 0:
@@ -63,19 +63,19 @@ def _topics_apart(spans: Mapping[str, Span]) -> Found:
 
 
 def _robots_apart(robots: Mapping[str, Span]) -> Found:
-    """Pairs of robots that share no time."""
+    """Yield pairs of robots that share no time."""
     for one, other in combinations(sorted(robots), 2):
         if (gap_s := _gap_s(robots[one], robots[other])) > 0:
             between = f"shares no time with /{other}: {gap_s:.0f} s between"
-            yield f"/{one}", f"{between}. Clocks of their own? Try: dmrl align"
+            yield f"/{one}", f"{between}. Separate clocks? Try: dmrl align"
 
 
 def _around(spans: Iterable[Span]) -> Span:
-    """The shortest span that holds all of these."""
+    """Return the shortest span that contains all of these."""
     firsts, lasts = zip(*spans, strict=True)
     return min(firsts), max(lasts)
 
 
 def _gap_s(one: Span, other: Span) -> float:
-    """Seconds between two spans; 0 or less where they overlap."""
+    """Return the seconds between two spans; 0 or less if they overlap."""
     return (max(one[0], other[0]) - min(one[1], other[1])) * 1e-9

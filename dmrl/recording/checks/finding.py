@@ -1,4 +1,4 @@
-"""One thing wrong with a recording."""
+"""Define a finding of a check."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,16 +6,16 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing wrong with a recording.
+    """A problem of a recording.
 
     Parameters
     ----------
     level
         "error" or "warning".
     topic
-        Where; empty for the recording as a whole.
+        Topic with the problem; empty for the recording as a whole.
     text
-        What, in one line.
+        Description in one line.
     """
 
     level: Literal["error", "warning"]

@@ -1,4 +1,4 @@
-"""Whether the labels of a recording are what they should be."""
+"""Check the labels of a recording."""
 
 from collections.abc import Iterator
 
@@ -13,15 +13,21 @@ from dmrl.recording.checks.scan import Seen, first_size
 from dmrl.topics import LABELS, calibration, camera_image, names
 
 BIAS_MIN_LABELS = 20
-# A true centre is not exactly the middle of its box: the published renders, labelled with
-# their true projection, sit 0.6 px beside it. 1.5 px is twice that and more.
+"""Labels with boxes that are needed to measure a bias."""
 BIAS_MIN_PX = 1.5
+"""Smallest bias that is reported, pixels.
+
+A true centre is not exactly the middle of its box. In the published renders, labelled with the
+true projection, the offset is 0.6 px.
+"""
 BIAS_MIN_SIGMAS = 5.0
-BORDER_PX = 1.0  # a box this near the border is cut by it, so its middle says nothing
+"""Smallest bias that is reported, in standard errors."""
+BORDER_PX = 1.0
+"""Distance from the image border below which a box counts as cropped, pixels."""
 
 
 def labels(seen: Seen) -> Iterator[Finding]:
-    """Labels without image, outside the image, with impossible values, or biased."""
+    """Report labels without image, outside the image, with impossible values, or biased."""
     found = seen.contents.topics
     for topic in found:
         parts = names(LABELS, topic)
@@ -53,7 +59,7 @@ def _without_image(seen: Seen, topic: str, image: str, table: pa.Table) -> Itera
 
 
 def _bounds(seen: Seen, robot: str) -> tuple[int, int] | None:
-    """Width and height of the robot's images, from the calibration or the first image."""
+    """Return width and height of the robot's images, from the calibration or the first image."""
     topic, image = calibration(robot), camera_image(robot)
     if len(seen.times.get(topic, ())):
         known = seen.contents.table(topic, ["width", "height"])
@@ -62,7 +68,7 @@ def _bounds(seen: Seen, robot: str) -> tuple[int, int] | None:
 
 
 def _flat(peers: pa.ChunkedArray) -> pa.Table:
-    """One row per peer and source."""
+    """Return a table with one row per peer and source."""
     flat = pc.list_flatten(peers)
     return pa.table({f.name: pc.struct_field(flat, f.name) for f in flat.type})
 
@@ -77,7 +83,7 @@ def _values(
         yield Finding(
             "error",
             topic,
-            f"{wrong} labels of source {source!r} have no pixel, or a depth not above 0",
+            f"{wrong} labels of source {source!r} have no pixel, or a depth that is not positive",
         )
     if bounds is not None and (outside := int((~inside(uv, *bounds)).sum())):
         yield Finding(
@@ -91,7 +97,7 @@ def _values(
 def _bias(
     topic: str, source: str, peers: pa.Table, bounds: tuple[int, int] | None
 ) -> Iterator[Finding]:
-    """Labels that lie beside the middle of their boxes, all the same way."""
+    """Report labels with a common offset from the middle of their boxes."""
     boxed = peers.filter(pc.equal(pc.list_value_length(peers["box_px"]), 4))
     if bounds is None or boxed.num_rows < BIAS_MIN_LABELS:
         return
@@ -103,7 +109,7 @@ def _bias(
     uv = np.column_stack([boxed["u_px"].to_numpy(), boxed["v_px"].to_numpy()])
     offset = (uv - (low + high) / 2)[whole]
     middle = np.median(offset, axis=0)
-    # Standard error of a median, with the spread taken robustly from the MAD.
+    # Standard error of a median; the spread is estimated robustly from the MAD.
     sigma = 1.4826 * np.median(np.abs(offset - middle), axis=0)
     error = 1.2533 * sigma / np.sqrt(len(offset))
     if ((np.abs(middle) > BIAS_MIN_PX) & (np.abs(middle) > BIAS_MIN_SIGMAS * error)).any():
@@ -111,6 +117,6 @@ def _bias(
             "warning",
             topic,
             f"labels of source {source!r} are biased: {middle[0]:+.1f} px in u and "
-            f"{middle[1]:+.1f} px in v beside the middle of their boxes "
+            f"{middle[1]:+.1f} px in v from the middle of their boxes "
             f"(median of {len(offset)}, standard error {error[0]:.2f} and {error[1]:.2f} px)",
         )

@@ -1,7 +1,7 @@
-"""Does what a robot measures fit how it moved? Signs and frames that contradict its poses.
+"""Check odometry against poses: signs and frames that contradict the robot's motion.
 
-Units are doubted by how large values are (`check_units`). A wrong sign, or a velocity in another
-frame, is as large as the right one: only the slope of a pose, best of motion capture, tells.
+Wrong units are detected by the size of the values (`unit_checks`). A wrong sign or frame does not
+change the size, so measurements are compared with the slope of the poses, at best motion capture.
 """
 
 from collections import defaultdict
@@ -17,34 +17,35 @@ from dmrl.geometry.frames import Array
 from dmrl.geometry.rotations import euler_zyx
 
 STEP_S, SLOPE_S = 0.05, 0.3
-"""Poses are looked at this often; speeds are slopes over this long."""
+"""Interval of the compared samples, and window of the slope of a pose, seconds."""
 MOST = 20_000
-"""Samples of a topic that are kept: the first quarter of an hour says it."""
+"""Samples kept per topic. The first quarter of an hour is enough."""
 LEAST = 100
+"""Samples needed for a comparison."""
 MOVING_MPS, TURNING_RADPS, TILTED_RAD = 0.1, 0.1, 0.02
-"""Less than this, root mean square, says nothing."""
+"""Root mean square of a motion below which it is not compared, m/s, rad/s and rad."""
 UNLIKE, ALIKE = 0.5, 0.8
-"""Two signals whose normalised product is under, or over, this."""
+"""Correlation below which two signals differ, and above which they agree."""
 KINDS = {
     topics.VELOCITY: ("vx_mps", "vy_mps"),
     topics.ATTITUDE: ("roll_rad", "pitch_rad", "yaw_rate_radps"),
     topics.POSE: (),
     topics.TRUE_POSE: (),
 }
-TIED = "or tie its clock to the poses': dmrl align --mocap"
+TIED = "or align its clock with the poses': dmrl align --mocap"
 Signal = tuple[Array, Array]
-"""Times (N,), seconds, increasing, and values (N, K)."""
+"""Increasing times (N,), seconds, and values (N, K)."""
 
 
 @dataclass(slots=True)
 class Moved:
-    """Some samples of what robots measured and where they were, by topic."""
+    """Samples of odometry and of poses, by topic."""
 
     parts: dict[str, list[NDArray[np.float64]]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
 
     def add(self, topic: str, batch: pa.RecordBatch) -> None:
-        """Keep messages of a topic, if it tells of motion and few were kept yet."""
+        """Keep the messages of a topic, up to `SAMPLES_MAX`, if it describes motion."""
         kind = next((kind for kind in KINDS if topics.names(kind, topic)), None)
         room = MOST - self.counts[topic] if kind else 0
         if kind and room > 0:
@@ -53,7 +54,7 @@ class Moved:
             self.counts[topic] += len(rows)
 
     def doubted(self) -> Iterator[tuple[str, str]]:
-        """Topic and text of each signal that contradicts its robot's poses."""
+        """Yield topic and text for each signal that contradicts its robot's poses."""
         of = {topic: _signal(parts) for topic, parts in self.parts.items()}
         for kind in (topics.VELOCITY, topics.ATTITUDE):
             for topic in sorted(topic for topic in of if topics.names(kind, topic)):
@@ -65,7 +66,7 @@ class Moved:
 
 
 def _rows(batch: pa.RecordBatch, fields: tuple[str, ...]) -> NDArray[np.float64]:
-    """(N, 1 + K) seconds and values; of a pose x, y and a quaternion."""
+    """Return (N, 1 + K) seconds and values; for a pose x, y and a quaternion."""
     columns = [batch["log_time"].to_numpy() * 1e-9]
     if fields:
         columns += [batch[name].to_numpy(zero_copy_only=False) for name in fields]
@@ -85,7 +86,7 @@ def _signal(parts: list[NDArray[np.float64]]) -> Signal:
 
 
 def _motion(time_s: Array, pose: Array) -> Mapping[str, Signal]:
-    """World velocity, yaw, yaw rate, roll and pitch of poses (N, 6), where these are close."""
+    """Return world velocity, angles and yaw rate from poses (N, 6), where poses are dense."""
     size = np.linalg.norm(pose[:, 2:], axis=1)
     good = np.abs(size - 1) < 0.1
     time_s, pose, size = time_s[good], pose[good], size[good]
@@ -98,7 +99,7 @@ def _motion(time_s: Array, pose: Array) -> Mapping[str, Signal]:
                      for way in (-SLOPE_S / 2, SLOPE_S / 2))  # fmt: skip
     slope, mean = (after - before) / SLOPE_S, (after + before) / 2
     near = np.searchsorted(time_s, middle + SLOPE_S) - np.searchsorted(time_s, middle - SLOPE_S)
-    known = near >= 4  # lost markers say nothing
+    known = near >= 4  # not where motion capture lost the markers
     return {
         "velocity": (middle[known], slope[known, :2]),
         "angles": (middle[known], mean[known, 2:]),
@@ -111,7 +112,7 @@ def _at(signal: Signal, time_s: Array) -> Array:
 
 
 def _velocity(measured: Signal, motion: Mapping[str, Signal]) -> Iterator[str]:
-    """Velocities in another frame than the robot's own horizontal one."""
+    """Report velocities that are not in the robot's horizontal frame."""
     if not motion:
         return
     time_s, world = motion["velocity"]
@@ -127,19 +128,19 @@ def _velocity(measured: Signal, motion: Mapping[str, Signal]) -> Iterator[str]:
         "They seem to be in a frame that does not turn with it": world,
         "Sideways seems to be positive to the right": np.column_stack([forward, -left]),
         "Forward seems to be negative": np.column_stack([-forward, left]),
-        "Both seem to have the other sign": -np.column_stack([forward, left]),
-        "x and y seem to be exchanged": np.column_stack([left, forward]),
+        "Both seem to have the wrong sign": -np.column_stack([forward, left]),
+        "x and y seem to be swapped": np.column_stack([left, forward]),
     }
     likely = max(others, key=lambda text: _alike(said, others[text]))
     if _alike(said, others[likely]) > ALIKE:
         yield (
-            f"velocities contradict the slope of the robot's poses. {likely}: say x forward, "
+            f"velocities contradict the slope of the robot's poses. {likely}: use x forward, "
             f"y left, {TIED}"
         )
 
 
 def _attitude(measured: Signal, motion: Mapping[str, Signal]) -> Iterator[str]:
-    """Angles and a yaw rate of the other sign."""
+    """Report angles and yaw rates with the wrong sign."""
     if not motion:
         return
     time_s, angles = motion["angles"]
@@ -156,7 +157,7 @@ def _attitude(measured: Signal, motion: Mapping[str, Signal]) -> Iterator[str]:
     for k, (name, way, least) in enumerate(names):
         here, there = said[:, k] - said[:, k].mean(), true[:, k] - true[:, k].mean()
         if min(_rms(here), _rms(there)) > least and _alike(here, there) < -UNLIKE:
-            yield f"{name} has the other sign than the robot's poses: it is {way}, {TIED}"
+            yield f"{name} has the opposite sign to the robot's poses: use {way}, {TIED}"
 
 
 def _within(measured: Signal, time_s: Array, *values: Array) -> tuple[Array, ...]:
@@ -169,5 +170,5 @@ def _rms(values: Array) -> float:
 
 
 def _alike(one: Array, other: Array) -> float:
-    """Normalised product, 1 for two signals of one shape, -1 for one of the other sign."""
+    """Return the normalised product: 1 for equal signals, -1 for opposite ones."""
     return float((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum() + 1e-12))

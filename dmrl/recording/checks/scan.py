@@ -1,4 +1,4 @@
-"""What a check has to see of a recording, gathered in one pass over it."""
+"""Collect the data that the checks evaluate, in one pass over a recording."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -23,33 +23,34 @@ from dmrl.recording.reader import STRETCH_BYTES, columns
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, LABELS, names, row_of
 
 STAMPED = ("CompressedImage", "PoseInFrame")
-"""Messages that say of themselves of what time they are."""
+"""Message types that contain a time stamp."""
 HELD = (LABELS, CALIBRATION)
+"""Topics whose messages are kept in memory."""
 
 Size = tuple[int, int] | None
-"""Width and height of an image; None for data that is no image."""
+"""Width and height of an image; None for data that are not an image."""
 
 
 @dataclass(slots=True)
 class Seen:
-    """What was seen of a recording.
+    """Data collected from a recording.
 
     Parameters
     ----------
     contents
-        Labels and calibrations.
+        The recording, with labels and calibrations in memory.
     times
-        By topic: log times, in the order of the file, or sorted if only the index was read.
+        Log times by topic, in file order, or sorted if only the index was read.
     broken
-        By topic: why its messages are not of their type.
+        Error text by topic, for messages that are not of their type.
     sizes
-        By topic of images: how many are of which size; the first one's comes first.
-    unset
-        By topic: how many messages have a time stamp of 0, and stand at another time.
-    values
-        How large what sensors say is.
-    moved
-        What robots measured of their motion, and their poses.
+        Number of images of each size, by topic; the size of the first image comes first.
+    unset_stamps
+        Messages with time stamp 0 and another log time, by topic.
+    magnitudes
+        Histograms of the sensor values.
+    motion
+        Samples of odometry and poses.
     """
 
     contents: Contents
@@ -62,13 +63,13 @@ class Seen:
 
 
 def carries(topic: str, schema: str) -> bool:
-    """Whether a topic is dmrl's, and carries what it should."""
+    """Return whether a topic is one of dmrl's and has the right message type."""
     row = row_of(topic)
     return row is not None and row.carries(schema)
 
 
 def look(path: Path) -> Seen:
-    """Everything, every message decoded once.
+    """Collect all data, decoding every message once.
 
     Raises
     ------
@@ -93,12 +94,12 @@ def look(path: Path) -> Seen:
 
 
 def glimpse(contents: Contents) -> Seen:
-    """Times as the index has them; no picture is looked at but the first of some.
+    """Collect the log times from the index. No image is decoded.
 
     Parameters
     ----------
     contents
-        Holds what `HELD` names.
+        A recording with the messages of `KEPT_TOPICS` in memory.
 
     Raises
     ------
@@ -109,7 +110,7 @@ def glimpse(contents: Contents) -> Seen:
 
 
 def first_size(seen: Seen, topic: str) -> Size:
-    """Width and height of the first image of a topic; None where there is none, or no image."""
+    """Return the size of the first image of a topic; None without an image."""
     if topic not in seen.sizes and len(seen.times[topic]):
         image = next(columns(seen.contents.path, topic, fields=["data"]))
         seen.sizes[topic][_size(image["data"][0].as_buffer())] += 1
@@ -122,7 +123,7 @@ def _held(contents: Contents, topic: str) -> bool:
 
 
 def _stretches(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
-    """Every message as the file has them; several chunks at once, so that few calls decode them."""
+    """Yield every message in file order, joining chunks so that few calls decode them."""
     held: list[Block] = []
     size = 0
     channels: dict[int, Channel] = {}
@@ -137,7 +138,7 @@ def _stretches(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
 
 
 def _decode(seen: Seen, topic: str, block: Block, channels: dict[int, Channel]) -> None:
-    """Decode messages of a topic of dmrl's, and note what is odd in them."""
+    """Decode messages of a topic of dmrl's, and collect their data."""
     path, schema = seen.contents.path, seen.contents.topics[topic].schema
     stamped = schema.rpartition(".")[2] in STAMPED
     if topic in seen.broken or not (carries(topic, schema) or stamped):
@@ -158,10 +159,10 @@ def _decode(seen: Seen, topic: str, block: Block, channels: dict[int, Channel]) 
 
 
 def _unset(batch: pa.RecordBatch) -> int:
-    """How many messages say that they are of time 0, and stand at another."""
+    """Count the messages with time stamp 0 and another log time."""
     stamp = batch["timestamp"]
     zero = [pc.equal(pc.fill_null(pc.struct_field(stamp, n), 0), 0) for n in ("seconds", "nanos")]
-    # Without any stamp, nothing is said.
+    # A message without a stamp is not counted.
     wrong = pc.and_(pc.and_(*zero), pc.and_(stamp.is_valid(), pc.not_equal(batch["log_time"], 0)))
     return int(pc.sum(wrong).as_py() or 0)
 

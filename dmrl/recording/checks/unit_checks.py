@@ -1,6 +1,7 @@
-"""Are a recording's values in the units of their topics? Topic and text of what cannot be.
+"""Check whether the values of a recording are in the units of their topics.
 
-How large values are is counted while they pass, in powers of two, so that it takes no memory.
+Magnitudes are counted in logarithmic bins as messages pass, so that memory is constant.
+Findings are topic and text.
 """
 
 from collections import defaultdict
@@ -14,25 +15,26 @@ from numpy.typing import NDArray
 from dmrl.topics import SENSORS, Doubt, names
 
 RARELY_S, OFTEN_S = 5.0, 1e-5
-"""Usual periods of a sensor beyond which its times are doubted."""
+"""Longest and shortest plausible median period of a sensor, seconds."""
 FEW = 20
-"""Fewer messages have no usual period, and no usual size."""
+"""Messages needed to measure a period or a magnitude."""
 STEPS = 4
-"""Bins for each power of two."""
+"""Bins per power of two."""
 BINS, ZERO = 2048, 1024
+"""Number of bins, and the bin of magnitude 1."""
 Times = NDArray[np.int64]
 
 
 @dataclass(slots=True)
 class Sizes:
-    """How large the values of sensors are, by topic and field, in bins of their logarithm."""
+    """Histograms of the magnitudes of sensor values, by topic and field, in logarithmic bins."""
 
     counts: dict[tuple[str, str], NDArray[np.int64]] = field(
         default_factory=lambda: defaultdict(lambda: np.zeros(BINS, np.int64))
     )
 
     def add(self, topic: str, batch: pa.RecordBatch) -> None:
-        """Count values of a topic."""
+        """Add the values of a topic."""
         for doubt in _doubts(topic):
             if doubt.field in batch.schema.names:
                 size = np.abs(batch[doubt.field].to_numpy(zero_copy_only=False).astype(float))
@@ -42,7 +44,7 @@ class Sizes:
                 self.counts[topic, doubt.field] += counted
 
     def doubted(self) -> Iterator[tuple[str, str]]:
-        """Fields a tenth of whose values is beyond what their unit explains."""
+        """Yield fields of which over a tenth of the values exceed the limit for their unit."""
         for (topic, name), counts in self.counts.items():
             total = int(counts.sum())
             doubt = next(doubt for doubt in _doubts(topic) if doubt.field == name)
@@ -56,14 +58,14 @@ class Sizes:
 
 
 def unit_doubts(topic: str, table: pa.Table) -> list[str]:
-    """What is doubted of the values of a topic.
+    """Return the findings about the values of a topic.
 
     Parameters
     ----------
     topic
-        Its name.
+        Name of the topic.
     table
-        Messages of it, with the fields whose values may be doubted, or some of them.
+        Messages of the topic, with any of the fields that have a limit.
     """
     sizes = Sizes()
     for batch in table.to_batches():
@@ -72,7 +74,7 @@ def unit_doubts(topic: str, table: pa.Table) -> list[str]:
 
 
 def periods(times: Mapping[str, Times]) -> Iterator[tuple[str, str]]:
-    """Sensors that measure so rarely, or so often, that their times are of another unit."""
+    """Yield sensors whose period is so long or short that their times have the wrong unit."""
     for topic, time_ns in times.items():
         if len(time_ns) < FEW or not any(names(row.pattern, topic) for row in SENSORS):
             continue

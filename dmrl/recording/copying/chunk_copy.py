@@ -1,8 +1,8 @@
-"""Copying from recording to recording, by the chunk: no message is looked at by itself.
+"""Copy messages from recording to recording by the chunk, without a loop over messages.
 
-A chunk goes over as it is where all of it is wanted, it holds pictures or numbers alone, and its
-channels have the same numbers there. Of others the records that are wanted go over as slices.
-Either way a chunk passes its CRC and its index first.
+A chunk is copied compressed if all of it is selected, it holds only images or only numbers, and
+its channels have the same ids in the output. Otherwise its selected records are copied as slices.
+Each chunk's CRC and indexes are verified first.
 """
 
 from collections import Counter
@@ -28,18 +28,18 @@ from dmrl.recording.writer import RecordingWriter
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A chunk of a recording, or what stands outside of chunks.
+    """A chunk of a recording, or the messages outside of chunks.
 
     Parameters
     ----------
-    block
-        Its messages.
+    batch
+        All messages of the unit.
     channels
-        By number, those of the recording at least.
+        By channel id; may contain further channels of the recording.
     chunk
-        What the block is all of; None: it stands outside.
+        The compressed chunk with exactly these messages. None: they must be copied as slices.
     index
-        Message indexes of the chunk, if they are known to be right.
+        Verified message indexes of the chunk, or None.
     """
 
     block: Block
@@ -49,20 +49,20 @@ class Piece:
 
     @property
     def start_ns(self) -> int:
-        """Its first log time."""
+        """First log time, nanoseconds."""
         return int(self.block.time_ns.min(initial=EVER_NS))
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Which messages of a recording are to be copied.
+    """Selection of messages by topic and time.
 
     Parameters
     ----------
     topics
-        Of these topics.
+        Topics to copy.
     low_ns, high_ns
-        Of log times in [low_ns, high_ns).
+        Log times to copy, in [low_ns, high_ns), nanoseconds.
     """
 
     topics: frozenset[str]
@@ -70,7 +70,7 @@ class Wanted:
     high_ns: int = EVER_NS
 
     def rows(self, piece: Piece) -> NDArray[np.bool_]:
-        """(N,) which messages of a piece."""
+        """Return an (N,) mask of the selected messages of a unit."""
         block, present = piece.block, piece.block.numbers()
         topics = {number: piece.channels[number].topic for number in present}
         of_time = np.asarray((block.time_ns >= self.low_ns) & (block.time_ns < self.high_ns))
@@ -81,21 +81,21 @@ class Wanted:
 
 
 def copy(path: Path, wanted: Wanted, sink: RecordingWriter) -> int:
-    """Copy messages into another recording; how many.
+    """Copy messages into another recording, and return how many.
 
     Raises
     ------
     RecordingError
-        If the file is not a complete recording, or a chunk is damaged.
+        If the file is not a complete recording, or a chunk is corrupt.
     OutputError
-        If the other cannot be written.
+        If the output cannot be written.
     """
     adopt(path, wanted.topics, sink)
     return sum(put(piece, wanted, sink) for piece in pieces(path, wanted))
 
 
 def adopt(path: Path, topics: Collection[str], sink: RecordingWriter) -> None:
-    """Number the channels of some topics as a recording does, where that is free."""
+    """Assign the channel ids of a recording to its topics in the output, where they are free."""
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
         if summary is not None:
@@ -105,7 +105,7 @@ def adopt(path: Path, topics: Collection[str], sink: RecordingWriter) -> None:
 
 
 def put(piece: Piece, wanted: Wanted | None, sink: RecordingWriter) -> int:
-    """Copy what is wanted of a piece, None: all; how many messages."""
+    """Copy the selected messages of a unit (None: all), and return how many."""
     block = piece.block
     count = len(block)
     if wanted is not None:
@@ -122,12 +122,12 @@ def put(piece: Piece, wanted: Wanted | None, sink: RecordingWriter) -> int:
 
 
 def pieces(path: Path, wanted: Wanted) -> Iterator[Piece]:
-    """Chunks with messages that are wanted, by time, each unpacked once and verified.
+    """Yield the chunks with selected messages, by time, each decompressed once and verified.
 
     Raises
     ------
     RecordingError
-        If the file is not a complete recording, or a chunk is damaged.
+        If the file is not a complete recording, or a chunk is corrupt.
     """
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
@@ -155,7 +155,7 @@ def _channels(summary: McapSummary) -> dict[int, Channel]:
 def _chunks(
     summary: McapSummary, channels: Mapping[int, Channel], wanted: Wanted
 ) -> list[ChunkIndex]:
-    """Chunks that may hold what is wanted, by time."""
+    """Return the chunks that may contain selected messages, by time."""
     mine = {n for n, channel in channels.items() if channel.topic in wanted.topics}
     found = chunks_between(summary, mine, wanted.low_ns, wanted.high_ns)
     return sorted(found, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))

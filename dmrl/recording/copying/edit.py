@@ -1,4 +1,4 @@
-"""Recordings out of recordings: merged by time, or trimmed."""
+"""Merge recordings by time, or trim a recording."""
 
 import heapq
 from collections.abc import Iterator, Sequence
@@ -20,10 +20,10 @@ from dmrl.topics import CALIBRATION, names, row_of
 
 
 def merge(paths: Sequence[Path], out: Path) -> int:
-    """Write one recording with the messages of several, by log time; how many.
+    """Merge recordings by log time into one, and return the number of messages.
 
     Messages are copied bit for bit, chunk by chunk. Metadata and attachments of all are kept.
-    Two that have the same robot's sensor are mixed with a word.
+    A warning is printed if two recordings contain the same robot's sensor.
 
     Raises
     ------
@@ -46,14 +46,14 @@ def merge(paths: Sequence[Path], out: Path) -> int:
 
 
 def _timed(path: Path, wanted: Wanted) -> Iterator[tuple[int, Piece, Wanted]]:
-    """Pieces of a recording, with their first times."""
+    """Yield the copy units of a recording with their first log times."""
     return ((piece.start_ns, piece, wanted) for piece in pieces(path, wanted))
 
 
 def _warn_of_namesakes(one: Path, other: Path) -> None:
-    """Say so if two recordings have a sensor of one robot: they may be of other flights or robots.
+    """Warn if two recordings contain the same sensor of a robot.
 
-    Parts of one recording, one after the other, go together again without a word.
+    They may be different flights or robots. Consecutive parts of one recording do not warn.
     """
     first, second = summary(one), summary(other)
     for topic in sorted(set(first.topics) & set(second.topics)):
@@ -64,26 +64,26 @@ def _warn_of_namesakes(one: Path, other: Path) -> None:
         if start < to and from_ < end:
             say(
                 f"{one} and {other} both have {topic} at the same time: different flights, or one "
-                "made of the other? Their messages mix now. dataset and evaluate take several "
-                "recordings"
+                "made from the other? Their messages are now mixed. dataset and evaluate take "
+                "several recordings"
             )
             return
         if not _sources(first) & _sources(second):
             say(
                 f"{one} and {other} both have {topic}, one after the other, and are one robot now. "
-                "If they are two robots, or two flights, give the robots names of their own: "
+                "If they are two robots, or two flights, give the robots different names: "
                 "dmrl convert --robot"
             )
             return
 
 
 def _sources(held: Summary) -> set[str]:
-    """SHA-256 of all that a recording was made from."""
+    """Return the SHA-256 of every direct and indirect input of a recording."""
     return {source.sha256 for _, source in held.provenance.ancestry()} if held.provenance else set()
 
 
 def _span(path: Path, topic: str) -> tuple[int, int]:
-    """First and last log time of a topic, nanoseconds."""
+    """Return the first and last log time of a topic, nanoseconds."""
     times = log_times(path, [topic])[topic]
     return (int(times[0]), int(times[-1])) if len(times) else (0, 0)
 
@@ -96,24 +96,24 @@ def trim(
     end_ns: int | None = None,
     topics: Sequence[str] = (),
 ) -> int:
-    """Write the messages of a stretch of time, or of some topics; how many.
+    """Write the messages of a time range, or of some topics, and return how many.
 
-    The calibration that a camera had then goes along, as the first message of the stretch, so that
-    what is left can be used, and its seconds count from where it begins.
+    The camera calibration valid at the start is kept as the first message of the range. The output
+    stays usable, and its time counts from the start of the range.
 
     Parameters
     ----------
     path, out
         Recording to read and recording to write.
     start_ns, end_ns
-        Log times in [start_ns, end_ns) are kept, nanoseconds.
+        Log times to keep, in [start_ns, end_ns), nanoseconds.
     topics
         Topics or patterns to keep. Empty: all.
 
     Raises
     ------
     RecordingError
-        If the recording is not complete, or nothing would be left.
+        If the recording is not complete, or no message is in the range.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -131,8 +131,8 @@ def trim(
         count = sum(put(piece, within, sink) for piece in pieces(path, within))
         if not count:
             raise RecordingError(
-                f"{path} has no message in that stretch; it lasts "
-                f"{(found.end_ns - found.start_ns) / 1e9:.3f} s. Choose times within"
+                f"{path} has no message in that time range; it lasts "
+                f"{(found.end_ns - found.start_ns) / 1e9:.3f} s. Choose times within it"
             )
     return count
 
@@ -140,7 +140,7 @@ def trim(
 def _calibrations(
     path: Path, wanted: frozenset[str], low_ns: int, high_ns: int
 ) -> Iterator[RawMessage]:
-    """The last calibration of each camera before a stretch; if all come after it, the first."""
+    """Yield each camera's last calibration before the range; if all come later, its first."""
     topics = [topic for topic in wanted if names(CALIBRATION, topic) is not None]
     for topic, times in sorted(log_times(path, topics).items()):
         earlier = times[times <= low_ns]
@@ -151,6 +151,6 @@ def _calibrations(
             at_ns = int(later[0])
         else:
             continue
-        if at_ns != low_ns:  # else it is in the stretch
+        if at_ns != low_ns:  # else it is in the range
             *_, raw = read_raw(path, topic, start_ns=at_ns, end_ns=at_ns + 1)
             yield replace(raw, time_ns=low_ns)

@@ -1,4 +1,4 @@
-"""Going on with a recording whose writing was interrupted, to the same bytes."""
+"""Resume the writing of an interrupted recording; the result has the same bytes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,23 +18,23 @@ from dmrl.recording.writer import RecordingWriter
 
 @dataclass(frozen=True, slots=True)
 class Interrupted:
-    """What an interrupted writing of a recording left, mended and set aside.
+    """The recovered part of a recording whose writing was interrupted.
 
     Parameters
     ----------
     path
-        Recording with every message that was kept; None: there is none.
-    pictured
-        Whether pictures belong to every moment.
+        Recording with every recovered message. None: there is none.
+    has_images
+        Whether every moment must have images.
     """
 
     path: Path | None
     pictured: bool = False
 
     def moments(self) -> Iterator[tuple[int, list[RawMessage]]]:
-        """Time and messages of every moment that is whole, numbers before pictures.
+        """Yield time and messages of every complete moment, numbers before images.
 
-        The last one of either may lack some: they stand in other chunks.
+        The last moment of either kind may be incomplete, as they are in different chunks.
         """
         if self.path is None:
             return
@@ -44,27 +44,21 @@ class Interrupted:
             yield time_ns, sorted(group, key=lambda raw: raw.channel.pictured)
 
     def check(self, made: Provenance) -> None:
-        """Nothing, if it was made as ``made`` says.
-
-        Raises
-        ------
-        RecordingError
-            If it was made otherwise.
-        """
+        """Raise RecordingError unless it was made with the same settings, inputs and versions."""
         if self.path is None:
             return
         found = summary(self.path).provenance
         source = found.inputs[0].provenance if found is not None and found.inputs else None
-        # Through text and back, as the file has it: tuples are lists there.
+        # Converted to text and back, as in the file: tuples become lists.
         same = Provenance.from_metadata(made.to_metadata())
         if source is None or source.to_metadata() != same.to_metadata():
             raise RecordingError(
                 f"{self.path} was made with other settings, inputs or versions. "
-                "Use those, or remove it and start anew"
+                "Use those, or remove it and start again"
             )
 
     def copy(self, sink: RecordingWriter) -> int:
-        """Write every whole moment into the recording anew: how many there were."""
+        """Copy every complete moment into the new recording, and return how many."""
         count = 0
         for _, messages in self.moments():
             for raw in messages:
@@ -73,35 +67,35 @@ class Interrupted:
         return count
 
     def forget(self) -> None:
-        """Remove it, once the new recording holds all of it."""
+        """Delete the recovered file, once the new recording contains all of it."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
 
 def interrupted(out: Path, *, resume: bool, pictured: bool = False) -> Interrupted:
-    """What is left of an interrupted writing of ``out``, mended as ``<out>.kept``.
+    """Recover the interrupted recording of ``out`` as ``<out>.kept``.
 
     Parameters
     ----------
     out
         The recording that was being written.
     resume
-        Whether to go on with it.
-    pictured
-        Whether every moment of it has pictures: one without is not whole.
+        Whether to continue it.
+    has_images
+        Whether every moment must have images; one without counts as incomplete.
 
     Raises
     ------
     OutputError
-        If something is left and it is not to be gone on with.
+        If an interrupted recording exists and ``resume`` is false.
     RecordingError
-        If nothing is left that could be gone on with.
+        If ``resume`` is true and there is nothing to continue.
     """
     partial, kept = partial_of(out), out.with_name(out.name + ".kept")
     if not resume:
         if left := [path for path in (partial, kept) if path.exists()]:
             raise OutputError(
-                f"{left[0]} is of an interrupted run. Go on with --resume, or remove it"
+                f"{left[0]} is left from an interrupted run. Go on with --resume, or remove it"
             )
         return Interrupted(None)
     if not partial.exists() and not kept.exists():
@@ -111,7 +105,7 @@ def interrupted(out: Path, *, resume: bool, pictured: bool = False) -> Interrupt
 
 
 def _mend(partial: Path, kept: Path) -> None:
-    """Recover ``partial`` into ``kept``, unless that holds more from an earlier time."""
+    """Recover ``partial`` into ``kept``, unless that already contains more messages."""
     if not partial.exists():
         return
     mended = kept.with_name(kept.name + ".new")
@@ -119,7 +113,7 @@ def _mend(partial: Path, kept: Path) -> None:
     try:
         recover(partial, mended)
     except RecordingError:
-        return  # it was cut before its first chunk: nothing to keep
+        return  # it ends before its first complete chunk
     if not kept.exists() or _count(mended) > _count(kept):
         mended.replace(kept)
     mended.unlink(missing_ok=True)
@@ -130,11 +124,11 @@ def _count(path: Path) -> int:
 
 
 def _whole_until_ns(path: Path, *, pictured: bool) -> int:
-    """Log time before which nothing is missing, of pictures or of numbers."""
+    """Return the log time before which no message, image or number, is missing."""
     last: dict[bool, int] = {}
     held = summary(path).topics
     for topic, times in log_times(path, held).items():
         picture = holds_pictures(held[topic].schema)
         last[picture] = max(last.get(picture, 0), int(times.max(initial=0)))
-    # Where there are pictures, there are numbers that tell of them: those of none were lost.
+    # Images come with numbers that describe them, so a file with images alone has lost numbers.
     return min(last.values()) if False in last and (True in last or not pictured) else 0

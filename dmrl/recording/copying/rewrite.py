@@ -1,4 +1,4 @@
-"""A recording written again, with some topics in place of those it had."""
+"""Rewrite a recording with some topics replaced, or with other times."""
 
 import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from dmrl.recording.writer import RecordingWriter
 
 
 class Timed(NamedTuple):
-    """A message to write at a log time, and when it was received."""
+    """A message to write: log time, topic, message and, if it differs, publish time."""
 
     time_ns: int
     topic: str
@@ -29,7 +29,7 @@ class Timed(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Messages of one topic as columns; see `RecordingWriter.write_columns`. Times increase."""
+    """Messages of one topic as columns, by increasing time; see `RecordingWriter.write_columns`."""
 
     topic: str
     kind: Any
@@ -37,7 +37,7 @@ class Series(NamedTuple):
     fields: Mapping[str, Value]
 
     def between(self, first_ns: int, end_ns: int) -> "Series":
-        """Those of log times in [first_ns, end_ns)."""
+        """Return the messages with log times in [first_ns, end_ns)."""
         rows = slice(*np.searchsorted(self.time_ns, (first_ns, end_ns)).tolist())
         parts = {
             name: value[rows] if isinstance(value, np.ndarray) else value
@@ -56,7 +56,7 @@ def rewrite(
     series: Sequence[Series] = (),
     metadata: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
-    """Copy a recording bit for bit, but for some topics, and add new messages.
+    """Copy a recording bit for bit without some topics, and add new messages.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def rewrite(
     made
         Provenance of ``out``.
     without
-        Topics that are left out.
+        Topics to leave out.
     fresh
         Streams of new messages, each in time order.
     series
@@ -87,7 +87,7 @@ def rewrite(
         for name, values in (metadata or {}).items():
             sink.add_metadata(name, values)
         copy(recording, Wanted(kept), sink)
-        sink.flush()  # what is new begins at the start again: it gets chunks of its own
+        sink.flush()  # new messages start at the first time again, so they get their own chunks
         for part in _by_time(series):
             sink.write_columns(*part)
         for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
@@ -95,19 +95,21 @@ def rewrite(
 
 
 def _by_time(series: Sequence[Series]) -> Iterator[Series]:
-    """One stretch of time after another."""
+    """Yield the columns of all series, one time slice after another."""
     for first_ns, end_ns in time_slices([one.time_ns for one in series]):
         for one in series:
             yield one.between(first_ns, end_ns)
 
 
 def time_slices(times_ns: Sequence[Ints]) -> Iterator[tuple[int, int]]:
-    """Of log time, so many messages each that whoever reads by time holds little of topics.
+    """Yield time ranges with a bounded number of messages each.
+
+    Readers by time then hold few messages of every topic.
 
     Parameters
     ----------
     times_ns
-        (N,) log times of each topic.
+        (N,) log times of each topic, nanoseconds.
     """
     times = np.sort(np.concatenate([np.empty(0, np.int64), *times_ns]))
     yield from pairwise([*times[::ROWS].tolist(), EVER_NS])
@@ -119,23 +121,23 @@ def retime(
     corrected: Callable[[str, Ints], Ints],
     each: Mapping[str, Callable[[RawMessage], RawMessage]],
 ) -> None:
-    """Copy all messages of a recording, with other times.
+    """Copy all messages of a recording with shifted times.
 
     Parameters
     ----------
     recording, sink
         Recording to read and recording to write.
-    corrected
-        Topic and (N,) log times to what is added to them, and to publish times, nanoseconds.
-    each
-        By topic: what becomes of every message, for those that hold their time inside.
+    compute_shift_ns
+        Maps a topic and (N,) log times to the shift of log and publish times, nanoseconds.
+    converters
+        By topic, a function that converts each message. For messages that contain their time.
 
     Raises
     ------
     RecordingError
         If the recording cannot be read.
     OutputError
-        If the other cannot be written.
+        If the output cannot be written.
     """
     every = Wanted(frozenset(summary(recording).topics))
     adopt(recording, every.topics, sink)

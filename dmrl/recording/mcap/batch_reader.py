@@ -1,8 +1,8 @@
-"""The one way messages are read: chunk by chunk, as arrays of offsets into the bytes.
+"""Iterate over the messages of an MCAP file in batches, chunk by chunk.
 
-mcap's reader makes a Python object of every message. Here the chunk and message indexes are
-walked as NumPy arrays instead: one block holds the bytes of a chunk and, for each message
-in it, its times and where its payload starts and ends. Decoders work on whole blocks.
+A `MessageBatch` holds the bytes of a chunk and, as NumPy arrays, the times and the payload offsets
+of its messages. The mcap package would create a Python object for every message instead.
+All readers of messages use this module. Decoders work on whole batches.
 """
 
 from collections import Counter
@@ -30,21 +30,21 @@ def blocks(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> Iterator[tuple[Block, dict[int, Channel]]]:
-    """Messages in log-time order, some thousands at a time, with their channels by number.
+    """Yield messages in log-time order, some thousands at a time, with channels by channel id.
 
-    Of one time, numbers come before pictures, wherever they stand in the file.
+    Messages of equal log time are ordered: numbers before images, then by position in the file.
 
-    Memory is bounded by the chunks that overlap in time; in a recording without an index,
-    by the recording.
+    Memory is bounded by the chunks that overlap in time, or by the whole recording if it has no
+    chunk index.
 
     Parameters
     ----------
     path
         A complete recording.
     topics
-        Only these. None: all.
+        Topics to read. None: all.
     start_ns, end_ns
-        Only log times in [start_ns, end_ns).
+        Read log times in [start_ns, end_ns) only, nanoseconds.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def blocks(
 
 
 def tally(found: Counter[int], block: Block) -> None:
-    """Count the messages of a block by channel number."""
+    """Add the number of messages of a batch to the counts by channel id."""
     for number, count in enumerate(np.bincount(block.channel).tolist()):
         if count:
             found[number] += count
@@ -81,13 +81,7 @@ def tally(found: Counter[int], block: Block) -> None:
 def compare(
     path: Path, summary: McapSummary, channels: dict[int, Channel], found: Counter[int]
 ) -> None:
-    """Nothing, if as many messages were found as the statistics say.
-
-    Raises
-    ------
-    RecordingError
-        If there are more or fewer.
-    """
+    """Raise RecordingError unless the counts of messages equal those of the Statistics record."""
     said = summary.statistics.channel_message_counts if summary.statistics else {}
     for number, channel in channels.items() if said else ():
         if found[number] != said.get(number, 0):
@@ -97,12 +91,12 @@ def compare(
 
 
 def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
-    """Every message as the file has them, chunk by chunk, unsorted.
+    """Yield every message in file order, chunk by chunk, unsorted.
 
     Raises
     ------
     RecordingError
-        As ``blocks``.
+        As ``iter_batches``.
     """
     with opened(path) as stream:
         summary = mcap_summary(path, stream)
@@ -130,6 +124,7 @@ def _in_time_order(
     low: int,
     high: int,
 ) -> Iterator[Block]:
+    """Yield batches in log-time order; hold messages back while a later chunk may precede them."""
     chunks = chunks_between(summary, channels.keys(), low, high)
     last = _pictured(channels)
     held: Block | None = None
@@ -150,7 +145,7 @@ def _in_time_order(
 
 
 def _pictured(channels: dict[int, Channel]) -> list[int]:
-    """Channels of pictures, if there are others beside them."""
+    """Return the ids of channels with images; empty if all channels have images."""
     found = [number for number, channel in channels.items() if channel.pictured]
     return found if len(found) < len(channels) else []
 
@@ -158,7 +153,7 @@ def _pictured(channels: dict[int, Channel]) -> list[int]:
 def chunks_between(
     summary: McapSummary, numbers: Set[int], low: int, high: int
 ) -> list[ChunkIndex]:
-    """Chunks that may hold messages of some channels in [low, high), by time."""
+    """Return the chunks that may contain messages of these channels in [low, high), by time."""
 
     def wanted(chunk: ChunkIndex) -> bool:
         seen = chunk.message_index_offsets
@@ -177,7 +172,7 @@ def chunks_between(
 def _unindexed(
     path: Path, stream: Bounded, topics: frozenset[str] | None, low: int, high: int
 ) -> tuple[Block, dict[int, Channel]]:
-    """One block with every message, for a file without chunk indexes."""
+    """Read every message of a file without chunk indexes into one batch."""
     walk = walked(path, stream)
     channels = {n: c for n, c in walk.channels.items() if topics is None or c.topic in topics}
     kept = []

@@ -1,15 +1,21 @@
-"""What a recording says of a topic, one message of it, and which topics hold pictures."""
+"""Define channels and raw messages, and which message types hold images."""
 
 from dataclasses import dataclass, field
 from functools import cache
 
 PICTURES = ("Image", "Video", "GridMap", "Grid", "PointCloud", "PointCloud2")
-"""How the names of message types end that are large and seldom read with the rest."""
+"""Suffixes of the names of message types that hold images or other large arrays.
+
+Their messages are large and seldom read together with the rest.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """What a recording says of one topic: its name, schema and encodings."""
+    """One channel: topic, schema and encodings.
+
+    Channels compare by content. The channel id belongs to a file, so it is not a field.
+    """
 
     topic: str
     schema_name: str
@@ -18,7 +24,7 @@ class Channel:
     encoding: str = "protobuf"
     metadata: tuple[tuple[str, str], ...] = ()
     pictured: bool = field(init=False, repr=False, compare=False)
-    """Whether its messages stand in chunks of pictures, apart from numbers."""
+    """Whether the messages are images. They are written into chunks of their own."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pictured", holds_pictures(self.schema_name))
@@ -26,20 +32,20 @@ class Channel:
 
 @cache
 def holds_pictures(schema_name: str) -> bool:
-    """Whether messages of this type are pictures: images, masks, depths, network maps."""
+    """Return whether a message type holds images, masks, depths or network maps."""
     return schema_name.endswith(PICTURES)
 
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
-    """One message as it stands in the file.
+    """One message with its undecoded payload.
 
     Parameters
     ----------
     time_ns
-        Log time: the sensor's time, nanoseconds.
+        Log time: time of the measurement, nanoseconds.
     publish_ns
-        Publish time: when it was received, nanoseconds.
+        Publish time: time of reception, nanoseconds.
     channel
         Topic and schema.
     data
@@ -58,5 +64,5 @@ class RawMessage:
 
     @property
     def schema_name(self) -> str:
-        """Full name of the message's type."""
+        """Full name of the message type."""
         return self.channel.schema_name

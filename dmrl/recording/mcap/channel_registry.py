@@ -1,4 +1,4 @@
-"""Numbers of the channels and schemas of a recording that is written, and their records."""
+"""Assign channel and schema ids in a new MCAP file, and serialize their records."""
 
 from collections.abc import Collection, Mapping
 
@@ -13,38 +13,44 @@ from dmrl.recording.mcap.message_batch import Block
 
 
 class Defined:
-    """Channels and schemas by number, as they are met; a copy keeps the numbers it had.
+    """Channels and schemas of a file that is being written, by id.
 
-    ``begun`` are the channels whose definition is in a chunk.
+    Ids are assigned on first use. `adopt_channels` keeps the ids of a recording that is copied.
+
+    Attributes
+    ----------
+    written
+        Ids of the channels whose Channel record is in a chunk already.
     """
 
     def __init__(self) -> None:
         self.begun: set[int] = set()
         self._channels: dict[int, McapChannel] = {}
-        self._records: dict[tuple[int, int], bytes] = {}  # by opcode and number
+        self._records: dict[tuple[int, int], bytes] = {}  # by opcode and id
         self._begun_schemas: set[int] = {0}
         self._numbers: dict[Channel, int] = {}
-        # By identity, as to hash a channel takes longer than to copy its messages. Each is kept.
+        # By identity: to hash a channel takes longer than to copy its messages. The reference to
+        # each channel keeps its id() valid.
         self._seen: dict[int, tuple[Channel, int]] = {}
-        self._alike: dict[int, Channel] = {}  # seen to have the same number elsewhere
+        self._alike: dict[int, Channel] = {}  # channels of copied files that have the same id
         self._schema_numbers: dict[tuple[str, str, bytes], int] = {}
 
     def adopt(self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]) -> None:
-        """Give channels of a recording that is copied the numbers that they have there, if free.
+        """Assign the ids that channels have in a recording that is copied, where they are free.
 
         Parameters
         ----------
         channels
-            By number.
+            By channel id.
         records
-            The same, with the numbers of their schemas.
+            Channel records by channel id, with the schema ids.
         """
         for number, channel in channels.items():
             if channel not in self._numbers and number not in self._channels:
                 self._define(channel, number, records[number].schema_id)
 
     def number(self, channel: Channel) -> int:
-        """Number of a channel."""
+        """Return the id of a channel; assign one if it has none."""
         known = self._seen.get(id(channel))
         if known is None:
             found = self._numbers.get(channel)
@@ -53,11 +59,14 @@ class Defined:
         return known[1]
 
     def topic(self, number: int) -> str:
-        """Topic of a channel."""
+        """Return the topic of a channel id."""
         return str(self._channels[number].topic)
 
     def begin(self, number: int) -> bytes:
-        """What is to stand before the first message of a channel; empty for those after it."""
+        """Return the records to write before the first message of a channel; empty later.
+
+        The channel counts as written from then on.
+        """
         if number in self.begun:
             return b""
         self.begun.add(number)
@@ -68,10 +77,18 @@ class Defined:
         return self._records[Opcode.SCHEMA, schema_id] + record
 
     def begin_in(self, block: Block, channels: Mapping[int, Channel]) -> bool:
-        """Whether the chunk that a block is all of can stand here as it is; it counts as begun.
+        """Return whether a compressed chunk can be copied as it is; if so, mark its channels.
 
-        Every message's channel has the same number here, and is defined before it, in the same
-        words; nothing else is in the chunk.
+        This requires that every channel has the same id here, that the chunk or an earlier one
+        contains an identical definition, and that the chunk contains no other records. The channels
+        then count as written.
+
+        Parameters
+        ----------
+        batch
+            All messages of the chunk.
+        channels
+            By channel id in the chunk.
         """
         numbers, alike = block.numbers(), self._alike
         fresh = [number for number in numbers if alike.get(number) is not channels[number]]
@@ -96,14 +113,14 @@ class Defined:
         return True
 
     def _same(self, number: int, channel: Channel) -> bool:
-        """Whether a channel of another recording has its number here, too."""
+        """Return whether a channel of another recording has the same id here."""
         if self._numbers.get(channel) != number:
             return False
         self._alike[number] = channel
         return True
 
     def all_begun(self) -> tuple[list[bytes], list[bytes]]:
-        """Records of schemas and channels whose definition is in a chunk, by number."""
+        """Return the Schema and Channel records that are in a chunk, by id."""
         schemas = [self._records[Opcode.SCHEMA, n] for n in sorted(self._begun_schemas - {0})]
         return schemas, [self._records[Opcode.CHANNEL, n] for n in sorted(self.begun)]
 
@@ -129,6 +146,6 @@ class Defined:
 
 
 def _free(taken: Collection[int]) -> int:
-    """The number after the greatest, or the least that is free."""
+    """Return the id after the greatest one, or the smallest that is free."""
     after = max(taken, default=0) + 1
     return after if after < 1 << 16 else next(k for k in range(1, 1 << 16) if k not in taken)

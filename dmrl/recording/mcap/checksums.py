@@ -1,9 +1,9 @@
-"""Sums over what MCAP gives no checksum of its own: metadata and message indexes.
+"""Checksums of the parts that MCAP leaves unprotected: metadata and message indexes.
 
-The last metadata record of a recording that dmrl wrote, `dmrl.crc`, holds the CRC-32 of all
-metadata records before it and of all message indexes, and the byte at which it stands. The
-summary, which has a CRC, says that it is there. Another program that writes the recording anew
-may copy this record; then it stands elsewhere, and says nothing of the new file.
+The last Metadata record of a recording that dmrl wrote is `dmrl.crc`. It contains the CRC-32 of
+all earlier Metadata records, the CRC-32 of all Message Index records, and its own byte offset.
+The Summary section, which has a CRC, lists this record. Another program may copy the record into
+a rewritten file. The offset is then different, and the checksums are ignored.
 """
 
 import zlib
@@ -14,29 +14,29 @@ METADATA_NAME = "dmrl.crc"
 
 @dataclass(slots=True)
 class Sums:
-    """CRC-32 of the metadata records and of the message indexes, in the order of the file."""
+    """CRC-32 of the Metadata records and of the Message Index records, in file order."""
 
     metadata: int = 0
     indexes: int = 0
 
     def add_metadata(self, record: bytes) -> None:
-        """A whole metadata record that was written."""
+        """Add a complete Metadata record that was written."""
         self.metadata = zlib.crc32(record, self.metadata)
 
     def add_indexes(self, records: bytes) -> None:
-        """Whole message indexes that were written."""
+        """Add complete Message Index records that were written."""
         self.indexes = zlib.crc32(records, self.indexes)
 
     def to_metadata(self, at: int) -> dict[str, str]:
-        """As they stand in a recording, from this byte on."""
+        """Return the values of the metadata record that starts at this byte."""
         return {"metadata": text(self.metadata), "indexes": text(self.indexes), "at": str(at)}
 
 
 def of_this_file(values: dict[str, str], at: int) -> bool:
-    """Whether sums that start at this byte were written there, and not copied from another file."""
+    """Return whether checksums at this byte belong to this file, not to a copied one."""
     return values.get("at", str(at)) == str(at)
 
 
 def text(crc: int) -> str:
-    """A CRC-32 as it stands in a recording."""
+    """Format a CRC-32 as it is stored in a recording."""
     return f"{crc:08x}"

@@ -1,4 +1,4 @@
-"""A chunk of a recording: unpacked within its budget, and the messages in it."""
+"""Decompress and parse MCAP chunks."""
 
 import zlib
 from collections.abc import Collection, Iterator
@@ -32,17 +32,17 @@ HEAD = np.dtype(
         ("publish", "<u8"),
     ]
 )
-"""Of a message's record."""
+"""Layout of a Message record up to its payload."""
 
 
 def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
-    """The records of a chunk, decompressed and checked against its CRC.
+    """Decompress the records of a chunk and check their size and CRC.
 
     Raises
     ------
     RecordingError
-        If they are more than the budget, are not as many as the chunk says, cannot be
-        decompressed, or the CRC does not match.
+        If the size exceeds the budget or differs from the chunk's uncompressed size, the data
+        cannot be decompressed, or the CRC does not match.
     """
     size = chunk.uncompressed_size
     if size > limits.UNPACKED_BYTES:
@@ -52,17 +52,17 @@ def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as e:
         raise damaged(path, f"chunk at byte {offset}: {e}") from e
     if len(data) != size:
-        raise damaged(path, f"chunk at byte {offset} unpacks to more or less than it says")
+        raise damaged(path, f"chunk at byte {offset} unpacks to another size than it states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise damaged(path, f"chunk at byte {offset} fails its CRC")
     return np.frombuffer(data, np.uint8)
 
 
 def _decompressed(compression: str, data: bytes, size: int) -> bytes:
-    """What ``size`` bytes were compressed to. Neither decoder reserves more than ``size``."""
+    """Decompress to at most ``size`` bytes. Neither decoder reserves more memory than that."""
     if compression == "zstd":
         if zstandard.frame_content_size(data) > size:
-            raise ValueError("unpacks to more than it says")
+            raise ValueError("unpacks to more than the size that it states")
         if not size:
             return b""
         return zstandard.ZstdDecompressor().decompress(data, size)
@@ -74,7 +74,7 @@ def _decompressed(compression: str, data: bytes, size: int) -> bytes:
 
 
 def messages_at(data: Bytes, at_record: Ints) -> Block:
-    """The messages whose records start at these offsets, each at least a header before the end."""
+    """Build a batch from the offsets of Message records, each at least a prefix before the end."""
     heads = taken(data, HEAD, at_record)
     return Block(
         data,
@@ -89,18 +89,18 @@ def messages_at(data: Bytes, at_record: Ints) -> Block:
 def set_heads(
     records: Bytes, at: Ints, number: Ints, time_ns: Ints, publish_ns: Ints, *, fresh: bool = False
 ) -> None:
-    """Write channel number and times into message records.
+    """Write channel ids and times into Message records.
 
     Parameters
     ----------
     records
-        One after another.
+        Message records, contiguous.
     at
-        (N + 1,) where each starts, and the end of the last.
-    number, time_ns, publish_ns
-        (N,) what to write.
+        (N + 1,) offset of each record, and the end of the last.
+    channel_ids, time_ns, publish_ns
+        (N,) channel ids and times to write, nanoseconds.
     fresh
-        Nothing stands there yet: write the rest of the head as well.
+        The prefixes are empty: write opcode and length as well.
     """
     at, size = at[:-1], np.diff(at)
     heads = np.zeros(len(at), HEAD) if fresh else taken(records, HEAD, at)
@@ -112,16 +112,16 @@ def set_heads(
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A chunk, gone through record by record.
+    """A chunk parsed record by record.
 
     Parameters
     ----------
     data
-        Its records.
+        Decompressed records.
     messages
-        Where those of messages start.
+        Offset of each Message record.
     others
-        Opcode, start and end of the others.
+        Opcode, start and end of every other record.
     """
 
     data: Bytes
@@ -130,11 +130,11 @@ class Scan:
 
     @property
     def block(self) -> Block:
-        """Its messages."""
+        """All messages of the chunk."""
         return messages_at(self.data, np.array(self.messages, np.int64))
 
     def definitions(self) -> Iterator[Schema | Channel]:
-        """The schemas and channels that it defines."""
+        """Yield the Schema and Channel records of the chunk."""
         for opcode, at, end in self.others:
             if opcode in DEFINITIONS:
                 body = BytesIO(self.data[at + RECORD_HEADER : end].tobytes())
@@ -142,12 +142,12 @@ class Scan:
 
 
 def scanned(data: Bytes) -> Scan:
-    """A chunk's records, found one after the other, without its message index.
+    """Parse the records of a chunk one after the other, without its message indexes.
 
     Raises
     ------
     McapError
-        If one runs beyond the chunk, or is too short.
+        If a record runs beyond the chunk, or is too short.
     """
     view, at, size, unpack = data.data, 0, len(data), RECORD.unpack_from
     scan = Scan(data, [], [])
@@ -167,9 +167,9 @@ def scanned(data: Bytes) -> Scan:
 
 
 def beside(block: Block) -> Scan | None:
-    """The records of a chunk that are none of a block's messages, all of which it should hold.
+    """Return the records of a chunk other than the messages of a batch, or None.
 
-    None if there are other messages, or they overlap.
+    The batch must hold all messages of the chunk. None: there are other messages, or some overlap.
     """
     first = np.append(block.start - HEAD_BYTES, len(block.data))
     last = np.concatenate([[0], block.end])
@@ -186,13 +186,13 @@ def beside(block: Block) -> Scan | None:
 
 
 def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) -> Block:
-    """The messages of some channels.
+    """Select the messages of some channels.
 
     Raises
     ------
     McapError
-        If a message is of no channel in ``known``, or its time is beyond the year 2262, where 64
-        bits with a sign end.
+        If the channel of a message is not in ``defined``, or a time is beyond the year 2262, the
+        end of signed 64-bit nanoseconds.
     """
     present = set(block.numbers())
     if unknown := present - set(known):
@@ -202,20 +202,14 @@ def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) 
 
 
 def possible(block: Block) -> Block:
-    """The block.
-
-    Raises
-    ------
-    McapError
-        If a time is beyond the year 2262, where 64 bits with a sign end.
-    """
+    """Return the batch; raise McapError if a time is beyond the year 2262."""
     if not block.possible.all():
         raise McapError("a message has a time beyond the year 2262")
     return block
 
 
 def loose(messages: list[Message]) -> Block:
-    """Messages that stand outside of chunks, as a block."""
+    """Build a batch from messages that are outside of chunks."""
     records = [laid_out(message) for message in messages]
     size = np.array([len(record) for record in records], np.int64)
     return messages_at(np.frombuffer(b"".join(records), np.uint8), np.cumsum(size) - size)

@@ -1,4 +1,4 @@
-"""A chunk that messages are put into, one at a time or many, until it is full."""
+"""Collect messages into one chunk until it is full, then compress it."""
 
 import struct
 import zlib
@@ -13,17 +13,26 @@ from dmrl.recording.mcap.message_batch import HEAD_BYTES, Bytes, Ints
 from dmrl.recording.mcap.message_index import index_of
 
 CHUNK_BYTES = 256 * 1024
-"""Costs no size against 1 MiB, and bounds what a crash can lose."""
+"""Target size of a chunk, uncompressed bytes.
+
+Costs no file size against 1 MiB, and bounds the data that a crash can lose.
+"""
 LEVEL = 1
-"""Of zstd: half the time of its usual 3, and numbers of sensors are no larger."""
+"""zstd compression level.
+
+Takes half the time of the default 3, and sensor values do not get larger.
+"""
 HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
-BODY_BYTES = HEAD_BYTES - RECORD_HEADER  # of a head, that the length of its record counts
+BODY_BYTES = HEAD_BYTES - RECORD_HEADER  # part of the prefix that the record length counts
 
 
 class OpenChunk:
-    """Records of one kind that were not written yet.
+    """One chunk that is being filled, with messages of one kind: images or numbers.
 
-    ``age`` counts the chunks of the other kind that were written since it was begun.
+    Attributes
+    ----------
+    age
+        Chunks of the other kind that were written since this one was started.
     """
 
     def __init__(self) -> None:
@@ -31,40 +40,40 @@ class OpenChunk:
 
     @property
     def full(self) -> bool:
-        """Whether it is to be written."""
+        """Whether the chunk has reached its target size."""
         return len(self.data) > CHUNK_BYTES
 
     def define(self, record: bytes) -> None:
-        """Put in what defines a channel or its schema."""
+        """Add a Schema or Channel record."""
         self.data += record
 
     def add(self, number: int, time_ns: int, publish_ns: int, payload: bytes) -> None:
-        """Put in one message."""
+        """Add one message."""
         head = HEAD.pack(MESSAGE, len(payload) + BODY_BYTES, number, 0, time_ns, publish_ns)
         self.starts.append(len(self.data))
         self.data += head
         self.data += payload
 
     def fill(self, records: Bytes, at: Ints) -> int:
-        """Put in the first of some records until it is full: how many.
+        """Add records until the chunk is full, and return how many were added.
 
         Parameters
         ----------
         records
-            Message records, one after another.
+            Message records, contiguous.
         at
-            (N + 1,) where each starts, and the end of the last.
+            (N + 1,) offset of each record, and the end of the last.
         """
         room = CHUNK_BYTES - len(self.data)
         fitting = int(np.searchsorted(at - at[0], room, side="right"))
-        # One at least: a chunk that definitions fill alone is only written with a message.
+        # At least one: a chunk filled by definitions alone is only written with a message.
         count = min(max(fitting, 1), len(at) - 1)
         self.starts.frombytes((at[:count] - at[0] + len(self.data)).tobytes())
         self.data += records[at[0] : at[count]].data
         return count
 
     def packed(self) -> Packed:
-        """The chunk, compressed; it is empty then."""
+        """Compress the chunk, build its message indexes, and start an empty chunk."""
         data = np.frombuffer(bytes(self.data), np.uint8)
         block = messages_at(data, np.array(self.starts, np.int64))
         squeezed = zstandard.ZstdCompressor(level=LEVEL).compress(data.data)

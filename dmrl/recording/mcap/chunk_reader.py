@@ -1,4 +1,4 @@
-"""Chunks that a summary lists: read, and held against it and against their message indexes."""
+"""Read one chunk and verify it against its Chunk Index and Message Index records."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from dmrl.recording.mcap.summary_section import Section
 
 
 def place_of(chunk: ChunkIndex) -> tuple[int, int]:
-    """Where a chunk and its message indexes start, and how long they are together, bytes."""
+    """Return the offset of a chunk, and its size with its message indexes, bytes."""
     return chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length
 
 
@@ -36,23 +36,23 @@ def in_chunk(
     channels: dict[int, Channel],
     summary: Section,
 ) -> Block:
-    """The messages of a chunk that are of some channels, in the order of the chunk.
+    """Read a chunk and return its messages of some channels, in chunk order.
 
     Parameters
     ----------
     path, stream
         The recording.
-    said
-        What its summary says of the chunk.
+    chunk_index
+        Chunk Index record of the chunk.
     channels
-        Those that are wanted.
+        Channels to read, by channel id.
     summary
-        Of the recording.
+        Summary section of the recording.
 
     Raises
     ------
     RecordingError
-        If the chunk is not what its summary and its message indexes say.
+        If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
     raw, _, data = _unpacked(path, stream, said)
     if summary.must_confirm(said):
@@ -67,29 +67,29 @@ def whole_chunk(
     channels: dict[int, Channel],
     summary: Section,
 ) -> tuple[Chunk, Block, MessageIndex | None]:
-    """A chunk, still compressed, with all of its messages and its message indexes, for a copy.
+    """Read a chunk for a copy: still compressed, with all its messages and message indexes.
 
     Parameters
     ----------
     path, stream
         The recording.
-    said
-        What its summary says of the chunk.
+    chunk_index
+        Chunk Index record of the chunk.
     channels
-        All that the recording has.
+        All channels of the recording, by channel id.
     summary
-        Of the recording.
+        Summary section of the recording.
 
     Returns
     -------
     tuple
-        No message indexes where there are none, or where they are laid out otherwise than a
-        copy's.
+        Chunk record, all messages, and message indexes. The indexes are None where there are none
+        or their layout differs from that of a copy.
 
     Raises
     ------
     RecordingError
-        If the chunk is not what its summary and its message indexes say.
+        If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
     raw, chunk, data = _unpacked(path, stream, said)
     block, counts = _indexed(path, raw, data, said, channels, summary)
@@ -104,7 +104,7 @@ def whole_chunk(
 
 
 def _unpacked(path: Path, stream: Bounded, said: ChunkIndex) -> tuple[bytes, Chunk, Bytes]:
-    """A chunk with its message indexes as it stands there, its record, and what it unpacks to."""
+    """Return a chunk's bytes with its message indexes, its record, and its decompressed data."""
     at, size = place_of(said)
     stream.seek(at)
     raw = stream.read(size)
@@ -120,7 +120,7 @@ def _indexed(
     channels: dict[int, Channel],
     summary: Section,
 ) -> tuple[Block, dict[int, int]]:
-    """The messages of some channels in a chunk, and how many each has by its message index."""
+    """Return the messages of some channels, and the number that each message index lists."""
     at = said.chunk_start_offset
     if not said.message_index_offsets:
         block = of_channels(scanned(data).block, channels, summary.channels)
@@ -129,7 +129,7 @@ def _indexed(
     entries = index_entries(path, raw, places)
     if len(entries.at) and not 0 <= entries.at.min() <= entries.at.max() <= len(data) - HEAD_BYTES:
         raise damaged(path, f"index beyond the chunk at byte {at}")
-    # Indexes carry no CRC of their own, so they are held against the records they point at.
+    # Message indexes have no CRC, so they are compared with the records they point at.
     heads = taken(data, HEAD, entries.at)
     block = messages_at(data, np.sort(entries.at.astype(np.uint32)).astype(np.int64))
     right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == entries.channel)
@@ -142,19 +142,19 @@ def _indexed(
 
 
 def _within(path: Path, chunk: ChunkIndex, block: Block) -> Block:
-    """The block, if its messages are of the time that the chunk is said to be of."""
+    """Return the batch; raise RecordingError if its times exceed the range of its Chunk Index."""
     low, high = chunk.message_start_time, chunk.message_end_time
     if len(block) and not low <= block.span[0] <= block.span[1] <= high:
         raise damaged(
             path,
-            f"messages in the chunk at byte {chunk.chunk_start_offset} are of "
-            "other times than it says",
+            f"messages in the chunk at byte {chunk.chunk_start_offset} are "
+            "outside the time range that it states",
         )
     return block
 
 
 def _chunk_record(path: Path, raw: bytes, said: ChunkIndex) -> Chunk:
-    """The chunk at the start of some bytes, if it is the one that the summary says is there."""
+    """Parse the Chunk record at the start of some bytes and compare it with its Chunk Index."""
     at = said.chunk_start_offset
     if len(raw) < CHUNK.size or raw[0] != Opcode.CHUNK:
         raise damaged(path, f"no chunk at byte {at}")
@@ -165,5 +165,5 @@ def _chunk_record(path: Path, raw: bytes, said: ChunkIndex) -> Chunk:
     found = length + RECORD_HEADER, first, last, size, compression
     listed = said.chunk_length, said.message_start_time, said.message_end_time
     if found != (*listed, said.uncompressed_size, said.compression) or end > said.chunk_length:
-        raise damaged(path, f"the chunk at byte {at} is not the one that its summary lists")
+        raise damaged(path, f"the chunk at byte {at} differs from its index in the summary")
     return Chunk(compression, raw[begin:end], last, first, crc, size)

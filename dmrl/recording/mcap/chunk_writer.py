@@ -1,4 +1,4 @@
-"""Messages to chunks: pictures to one, numbers to another, each written when it is full."""
+"""Collect messages into chunks, images and numbers apart, and write each chunk when it is full."""
 
 import zlib
 from collections.abc import Mapping
@@ -19,21 +19,23 @@ from dmrl.recording.mcap.message_batch import Block, Bytes, Ints
 from dmrl.recording.mcap.message_index import MessageIndex, index_of
 
 OLDEST = 16
-"""Chunks of pictures that numbers wait for at most: few and large ones are read faster."""
+"""Chunks of the other kind after which an open chunk is written.
+
+Numbers are rare beside images: few and large chunks of them are read faster.
+"""
 
 
 class Assembly:
-    """The chunks of a recording that is written.
+    """Write the chunks of a recording.
 
     Parameters
     ----------
     path
         The recording, for errors.
     file
-        Takes what is full.
-    oldest
-        A chunk is written, full or not, once so many of the other kind were written after its
-        start.
+        File that receives the full chunks.
+    age_max
+        A chunk is written, full or not, after this many later chunks of the other kind.
     """
 
     def __init__(self, path: Path, file: Container, oldest: int = OLDEST) -> None:
@@ -44,7 +46,7 @@ class Assembly:
     def add(
         self, number: int, chunk: OpenChunk, time_ns: int, publish_ns: int, payload: bytes
     ) -> None:
-        """Append one message of a channel that was begun.
+        """Append one message of a channel that `define_channel` returned.
 
         Raises
         ------
@@ -58,18 +60,18 @@ class Assembly:
             self._close(chunk)
 
     def adopt(self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]) -> None:
-        """Number channels of a recording that is copied as they are there; see `Defined`."""
+        """Assign the channel ids of a recording that is copied; see `ChannelRegistry`."""
         self._defined.adopt(channels, records)
 
     def append(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        """Append many messages, bit for bit.
+        """Append a batch of messages, their payloads bit for bit.
 
         Parameters
         ----------
-        block
-            The messages, with the times that they are to have.
+        batch
+            The messages, with the times to write.
         channels
-            By their numbers in it.
+            By channel id in the batch.
 
         Raises
         ------
@@ -84,7 +86,7 @@ class Assembly:
                 self._append(part, {number: channels[number] for number in own})
 
     def _append(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        """Append messages that are all pictures, or none of them."""
+        """Append messages that are all images, or all numbers."""
         self._refuse_negative(block, channels)
         numbers = np.zeros(max(channels) + 1, np.int64)
         for number, channel in channels.items():
@@ -94,7 +96,7 @@ class Assembly:
         self._fill(chunk, records, at)
 
     def _fill(self, chunk: OpenChunk, records: Bytes, at: Ints) -> None:
-        """Put records into a chunk, and as many after it as they need."""
+        """Add records to a chunk; write it and start another whenever it is full."""
         while len(at) > 1:
             at = at[chunk.fill(records, at) :]
             if chunk.full:
@@ -107,24 +109,24 @@ class Assembly:
         channels: Mapping[int, Channel],
         index: MessageIndex | None = None,
     ) -> bool:
-        """Append a chunk as it is, still compressed, if it can stand in this recording.
+        """Append a chunk as it is, still compressed, if this recording can contain it.
 
         Parameters
         ----------
         chunk
             A chunk that passed its CRC.
-        block
-            All of its messages, in the order of the chunk.
+        batch
+            All messages of the chunk, in chunk order.
         channels
-            By their numbers in it.
+            By channel id in the chunk.
         index
-            Its message indexes, if they are known to be right.
+            Verified message indexes of the chunk. None: they are built.
 
         Returns
         -------
         bool
-            False: it mixes pictures and numbers, is small, or channels have other numbers here.
-            Nothing was written then.
+            False, and nothing is written, if the chunk mixes images and numbers, is small, or its
+            channels have other ids here.
 
         Raises
         ------
@@ -139,7 +141,7 @@ class Assembly:
             return False
         self._refuse_negative(block, channels)
         before = self._pictures if pictured.pop() else self._numbers
-        self._close(before)  # what came before it stands before it
+        self._close(before)  # keeps the order of the messages
         crc = chunk.uncompressed_crc or zlib.crc32(block.data.data)
         size = chunk.uncompressed_size
         self._put(Packed(chunk.compression, chunk.data, size, crc, *block.span, index), before)
@@ -155,18 +157,18 @@ class Assembly:
     def add_records(
         self, channel: Channel, records: Bytes, at: Ints, time_ns: Ints, publish_ns: Ints
     ) -> None:
-        """Append messages of one channel, laid out but for their heads.
+        """Append Message records of one channel whose prefixes are still empty.
 
         Parameters
         ----------
         channel
             The channel.
         records
-            Room for a head, then a message, one after another.
+            Contiguous records: an empty prefix, then a payload.
         at
-            (N + 1,) where each starts, and the end of the last.
+            (N + 1,) offset of each record, and the end of the last.
         time_ns, publish_ns
-            (N,) times.
+            (N,) times to write, nanoseconds.
 
         Raises
         ------
@@ -181,12 +183,12 @@ class Assembly:
         self._fill(chunk, records, at)
 
     def flush(self) -> None:
-        """Close the open chunks, so that a killed process keeps them."""
+        """Write the open chunks, so that they survive a kill of the process."""
         for chunk in (self._numbers, self._pictures):
             self._close(chunk)
 
     def finish(self) -> None:
-        """Close the open chunks, and write the summary.
+        """Write the open chunks and the Summary section.
 
         Raises
         ------
@@ -200,7 +202,7 @@ class Assembly:
             raise as_output_error(self._path, e) from e
 
     def begin(self, channel: Channel) -> tuple[int, OpenChunk]:
-        """Number of a channel, defined before its first message, and the chunk it goes to."""
+        """Return a channel's id and its chunk; define the channel there if it is new."""
         number = self._defined.number(channel)
         chunk = self._pictures if channel.pictured else self._numbers
         chunk.define(self._defined.begin(number))
@@ -212,7 +214,7 @@ class Assembly:
             self._put(chunk.packed(), chunk)
 
     def _put(self, packed: Packed, chunk: OpenChunk) -> None:
-        """Write what was in a chunk, and the other one if it is old."""
+        """Write a compressed chunk, then the open chunk of the other kind if that is old."""
         try:
             self._file.add_chunk(packed)
         except OSError as e:

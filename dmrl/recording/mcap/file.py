@@ -1,4 +1,4 @@
-"""A recording's file, opened: it begins and ends as one, and no read goes beyond its end."""
+"""Open an MCAP file: check its magic bytes, and forbid reads beyond its end."""
 
 import io
 import os
@@ -23,7 +23,6 @@ DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
 }
-# What mcap leaks on damaged lengths and strings.
 DAMAGE = (
     McapError,
     CRCValidationError,
@@ -34,10 +33,19 @@ DAMAGE = (
     LookupError,
     OverflowError,
 )
+"""Errors that the mcap package raises on corrupt lengths and strings."""
 
 
 class Bounded(io.BufferedReader):
-    """A file that refuses to read beyond its end, so that a damaged length reserves no memory."""
+    """A file that raises on reads beyond its end, so that a corrupt length reserves no memory.
+
+    Attributes
+    ----------
+    remote_stream
+        Stream of a file in a bucket; None for a local file.
+    size
+        Size of the file, bytes.
+    """
 
     def __init__(self, path: Path) -> None:
         self.ranged = path.ranged() if isinstance(path, Remote) else None
@@ -50,18 +58,18 @@ class Bounded(io.BufferedReader):
         self.seek(0)
 
     def expect(self, places: Sequence[tuple[int, int]]) -> None:
-        """Say which places will be read, in that order; a remote file fetches many at a time.
+        """Register the next reads, in order. A remote file then fetches many ranges at a time.
 
         Parameters
         ----------
         places
-            Start and size of each, bytes.
+            Start and size of each read, bytes.
         """
         if self.ranged is not None:
             self.ranged.expect(places)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """As a file reads, but all that was asked for.
+        """Read exactly ``size`` bytes.
 
         Raises
         ------
@@ -79,17 +87,17 @@ class Bounded(io.BufferedReader):
 
 @contextmanager
 def opened(path: Path) -> Iterator[Bounded]:
-    """The file, open for reading, known to begin and end as a recording does.
+    """Open a file for reading, and check that it starts and ends as an MCAP file.
 
     Raises
     ------
     RecordingError
-        If it is absent, not MCAP, cut short, or turns out to be damaged inside the block.
+        If it is absent, not MCAP or truncated, or a read in the block meets corrupt data.
     """
     if path.is_dir():
         raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
     if path.exists() and not path.is_file():  # opening a pipe waits for its other end
-        raise RecordingError(f"{path} is no file. Save it to one first")
+        raise RecordingError(f"{path} is not a regular file. Save it to one first")
     try:
         with Bounded(path) as stream:
             _refuse_changed(path, stream)
@@ -98,7 +106,7 @@ def opened(path: Path) -> Iterator[Bounded]:
     except FileNotFoundError:
         raise RecordingError(f"no recording {path}. Check the name") from None
     except PermissionError:
-        raise RecordingError(f"{path} may not be read. Check its permissions") from None
+        raise RecordingError(f"{path} cannot be read. Check its permissions") from None
     except DAMAGE as e:
         raise damaged(path, e) from e
 
@@ -113,9 +121,10 @@ def _stamp(stream: Bounded) -> Stamp:
 
 
 def expect_unchanged(path: Path) -> None:
-    """Refuse to open a recording, whose hash is in a provenance now, once it is another.
+    """Make later opens of a recording fail if the file has changed.
 
-    Until the next output of this process is done: what is read belongs to what was hashed.
+    Called when its hash enters a provenance record, so that the data belong to that hash. Holds
+    until this process has finished its next output.
     """
     with Bounded(path) as stream:
         _HASHED[path] = outputs_done(), _stamp(stream)
@@ -128,7 +137,7 @@ def _refuse_changed(path: Path, stream: Bounded) -> None:
 
 
 def damaged(path: Path, cause: object) -> RecordingError:
-    """The error for a file that begins as a recording but does not go on as one."""
+    """Build the error for a file that starts as a recording but is corrupt."""
     return RecordingError(
         f"{path} is damaged ({cause or type(cause).__name__}). "
         f"Try: dmrl recover {path} recovered.mcap"
@@ -136,9 +145,9 @@ def damaged(path: Path, cause: object) -> RecordingError:
 
 
 def too_large(path: Path, what: str) -> RecordingError:
-    """The error for a file that asks for more than its size explains."""
+    """Build the error for a file that exceeds a limit of `dmrl.guards.limits`."""
     return RecordingError(
-        f"{path}: {what}. Recordings do not; if you trust it, write it again with smaller chunks"
+        f"{path}: {what}, over the limit. If you trust the file, rewrite it with smaller chunks"
     )
 
 

@@ -1,7 +1,7 @@
-"""The bytes of an MCAP file, written front to back: records, chunks, and the summary at the end.
+"""Write the bytes of an MCAP file front to back: records, chunks and the Summary section.
 
-What stands in it is decided above. mcap lays out the records that are few; chunks and message
-indexes are laid out here, from arrays.
+`chunk_writer` decides the content. The mcap package serializes the rare records. Chunks and
+message indexes are serialized here, from arrays.
 """
 
 import io
@@ -37,7 +37,7 @@ FOOTER = struct.Struct("<BQQQ")  # opcode, length, summary start, summary offset
 
 
 def laid_out(*records: McapRecord) -> bytes:
-    """The bytes of some records."""
+    """Serialize records to bytes."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -46,18 +46,18 @@ def laid_out(*records: McapRecord) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """A chunk, compressed, and its message indexes.
+    """A compressed chunk and its message indexes.
 
     Parameters
     ----------
     compression, data
-        How its records are compressed, and to what.
-    size, crc
-        Length of its records, and their CRC-32.
+        Name of the compression, and the compressed records.
+    uncompressed_size, crc
+        Size of the records before compression, bytes, and their CRC-32.
     first_ns, last_ns
-        Of its log times.
+        First and last log time, nanoseconds.
     index
-        Where its messages are.
+        Message indexes.
     """
 
     compression: str
@@ -72,14 +72,14 @@ class Packed:
 class Container:
     """An MCAP file that is being written.
 
-    Every finished piece is handed to the system at once, so that a killed process keeps it.
+    Every finished part is passed to the system at once, so that it survives a kill of the process.
 
     Parameters
     ----------
     path
         File to write.
     library
-        What the header says of the writer.
+        Name of the writer for the Header record.
     """
 
     def __init__(self, path: Path, library: str) -> None:
@@ -98,7 +98,7 @@ class Container:
             raise
 
     def _put(self, data: bytes) -> int:
-        """Write some bytes; where they stand."""
+        """Append bytes to the file and return the offset they start at."""
         at = self._at
         left = memoryview(data)
         while left:
@@ -108,13 +108,13 @@ class Container:
         return at
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
-        """Append named strings."""
+        """Append a Metadata record."""
         record = laid_out(Metadata(name, values))
         self._sums.add_metadata(record)
         self._metadata.append(MetadataIndex(self._put(record), len(record), name))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Append a named file."""
+        """Append an Attachment record."""
         record = laid_out(Attachment(0, 0, name, media_type, data))
         at = self._put(record)
         self._attachments.append(
@@ -122,7 +122,7 @@ class Container:
         )
 
     def add_chunk(self, chunk: Packed) -> None:
-        """Append a chunk with its message indexes."""
+        """Append a chunk and its message indexes."""
         first, last, index = chunk.first_ns, chunk.last_ns, chunk.index
         name = chunk.compression.encode()
         length = CHUNK.size - RECORD.size + len(name) + 8 + len(chunk.data)
@@ -151,7 +151,7 @@ class Container:
         self._counts.update(index.counts)
 
     def finish(self, schemas: Sequence[bytes], channels: Sequence[bytes]) -> None:
-        """Write the sums and the summary, with the records that define every message."""
+        """Write the checksums and the Summary section, which repeats these definitions."""
         self.add_metadata(checksums.METADATA_NAME, self._sums.to_metadata(self._at))
         self._put(laid_out(DataEnd(self._crc)))
         said = self._said
@@ -170,19 +170,22 @@ class Container:
         self._end(start, body, offsets)
 
     def _end(self, start: int, body: bytes, offsets: bytes) -> None:
-        """The summary section and the footer."""
+        """Write the Summary section, the Footer and the magic bytes."""
         places = start, start + len(body)
         footer = FOOTER.pack(Opcode.FOOTER, FOOTER.size - RECORD.size + 4, *places)
         crc = zlib.crc32(body + offsets + footer)
         self._put(body + offsets + laid_out(Footer(*places, crc)) + MAGIC)
 
     def close(self) -> None:
-        """Close the file, whole or not."""
+        """Close the file, complete or not."""
         self._stream.close()
 
 
 def _chunk_index(chunk: ChunkIndex) -> bytes:
-    """Its record. With hundreds of topics mcap takes longer for it than for the chunk."""
+    """Serialize a Chunk Index record.
+
+    With hundreds of topics the mcap package takes longer for it than for the chunk.
+    """
     flat = [value for place in chunk.message_index_offsets.items() for value in place]
     places = struct.pack(f"<{len(flat) // 2 * 'HQ'}", *flat)
     name = chunk.compression.encode()

@@ -1,4 +1,4 @@
-"""Some thousand messages as arrays of offsets into the bytes that hold them."""
+"""Hold many messages as arrays of offsets into the bytes that contain them."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,55 +11,59 @@ Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
 HEAD_BYTES = 31
-"""Of a message's record: opcode, length, channel, sequence, log and publish time."""
-ROWS = 10_000  # that become Python objects at a time
+"""Size of a Message record up to its payload.
+
+Contains opcode, length, channel id, sequence, log time and publish time.
+"""
+ROWS = 10_000
+"""Messages that are converted to Python objects at a time."""
 EVER_NS = int(np.iinfo(np.int64).max)
-"""After every log time: a span up to here holds all."""
+"""End of the range of log times, nanoseconds. Serves as an open upper limit."""
 
 
 def taken(data: Bytes | bytes, dtype: np.dtype[Any] | str, at: Ints) -> NDArray[Any]:
-    """The values that stand at some bytes, aligned or not.
+    """Gather values of a type from byte offsets, aligned or not.
 
     Parameters
     ----------
     data
         Bytes.
     dtype
-        Of a value; several numbers side by side are taken in one go.
+        Type of a value. A structured type gathers adjacent fields at once.
     at
-        (N,) where each starts, each at least its size before the end.
+        (N,) offset of each value, at least its size before the end.
     """
     kind = np.dtype(dtype)
     return _every(data, kind)[at].view(kind)
 
 
 def put_at(data: Bytes, at: Ints, values: NDArray[Any]) -> None:
-    """Write (N,) values where `taken` would find them."""
+    """Write (N,) values to the byte offsets from which `gather` reads them."""
     _every(data, values.dtype)[at] = values.view(_plain(values.dtype))
 
 
 def _every(data: Bytes | bytes, kind: np.dtype[Any]) -> NDArray[Any]:
-    """What stands at every byte of some data: a view with a stride of one byte."""
+    """Return the data as overlapping values, one starting at every byte."""
     return np.ndarray((max(len(data) - kind.itemsize + 1, 0),), _plain(kind), data, 0, (1,))
 
 
 def _plain(kind: np.dtype[Any]) -> np.dtype[Any]:
-    """As many bytes without meaning: NumPy moves fields one by one otherwise."""
+    """Return a void type of the same size. NumPy would copy a structured type field by field."""
     return np.dtype(f"V{kind.itemsize}")
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Messages whose records lie in one run of bytes.
+    """Messages whose records are in one byte array.
 
     Parameters
     ----------
     data
         The bytes.
     channel, time_ns, publish_ns
-        (N,) channel number and times of each message.
+        (N,) channel id, log time and publish time of each message, nanoseconds.
     start, end
-        (N,) where its payload lies in ``data``; the head of its record stands before it.
+        (N,) range of each payload in ``data``. The prefix of its record is directly before it.
     """
 
     data: Bytes
@@ -73,7 +77,7 @@ class Block:
         return len(self.start)
 
     def take(self, rows: Ints | NDArray[np.bool_]) -> "Block":
-        """The same bytes with only these messages."""
+        """Return a batch of these rows over the same bytes."""
         return Block(
             self.data,
             self.channel[rows],
@@ -85,31 +89,31 @@ class Block:
 
     @property
     def span(self) -> tuple[int, int]:
-        """First and last log time of some messages, one at least."""
+        """First and last log time of a batch that is not empty, nanoseconds."""
         return int(self.time_ns.min()), int(self.time_ns.max())
 
     @property
     def possible(self) -> NDArray[np.bool_]:
-        """(N,) whose times 64 bits with a sign can tell, those of the log before `EVER_NS`."""
+        """(N,) whether the times fit signed 64 bits, and log times are below `MAX_TIME_NS`."""
         return np.asarray((self.time_ns >= 0) & (self.publish_ns >= 0) & (self.time_ns < EVER_NS))
 
     def numbers(self) -> list[int]:
-        """Channels that there are messages of."""
+        """Return the ids of the channels that have messages in this batch."""
         found: list[int] = np.flatnonzero(np.bincount(self.channel)).tolist()
         return found
 
     def of(self, channels: Collection[int]) -> "Block":
-        """The same bytes with only the messages of some channels."""
+        """Return a batch of some channels over the same bytes."""
         return self.take(self.among(channels))
 
     def among(self, channels: Collection[int]) -> NDArray[np.bool_]:
-        """(N,) which messages are of some channels."""
+        """Return an (N,) mask of the messages of some channels."""
         chosen = np.zeros(max(max(channels, default=0), int(self.channel.max(initial=0))) + 1, bool)
         chosen[list(channels)] = True
         return np.asarray(chosen[self.channel])
 
     def rows(self) -> Iterator[tuple[int, int, int, bytes]]:
-        """Channel number, log time, publish time and payload of one message after the other."""
+        """Yield channel id, log time, publish time and payload of every message."""
         view = self.data.data
         for first in range(0, len(self), ROWS):
             part = slice(first, first + ROWS)
@@ -120,17 +124,17 @@ class Block:
                 yield number, time_ns, publish_ns, bytes(view[start:end])
 
     def compact(self) -> "Block":
-        """A copy that holds no bytes but its own messages'."""
+        """Copy the batch without bytes between its records."""
         records, at = self.records()
         return Block(
             records, self.channel, self.time_ns, self.publish_ns, at[:-1] + HEAD_BYTES, at[1:]
         )
 
     def records(self) -> tuple[Bytes, Ints]:
-        """A copy of the records, one after another, and (N + 1,) where they start and end."""
+        """Copy the records into one array; return it and the (N + 1,) offsets of their bounds."""
         first = self.start - HEAD_BYTES
         at = np.concatenate([[0], np.cumsum(self.end - first)])
-        # Records that follow each other are copied together.
+        # Adjacent records are copied together.
         breaks = np.flatnonzero(first[1:] != self.end[:-1]) + 1
         starts = np.concatenate([[0], breaks])[: len(self)]
         ends = np.concatenate([breaks, [len(self)]])[: len(self)] - 1
@@ -139,7 +143,10 @@ class Block:
         return np.frombuffer(bytearray().join(view[a:b] for a, b in runs), np.uint8), at
 
     def sorted(self, last: Collection[int] = ()) -> "Block":
-        """By log time; messages of one time keep their order, but for some channels after them."""
+        """Return the batch sorted by log time.
+
+        The sort is stable, but at equal times messages of the channels ``last`` come last.
+        """
         step_ns = np.diff(self.time_ns)
         if len(self) < 2 or step_ns.min() > 0 or (not last and step_ns.min() >= 0):
             return self
@@ -149,7 +156,7 @@ class Block:
 
 
 def concatenate(first: Block | None, second: Block) -> Block:
-    """Both blocks' messages over one run of bytes."""
+    """Join two batches over one byte array, keeping all bytes."""
     if first is None or not len(first):
         return second
     shift = len(first.data)
@@ -164,7 +171,7 @@ def concatenate(first: Block | None, second: Block) -> Block:
 
 
 def joined(blocks: Sequence[Block]) -> Block:
-    """All blocks' messages over one run of bytes, none but their own."""
+    """Join batches over one byte array; leave out unused bytes where they are the larger part."""
     parts = [b.compact() if 2 * int((b.end - b.start).sum()) < len(b.data) else b for b in blocks]
     shift = np.cumsum([0, *(len(part.data) for part in parts)])
     return Block(

@@ -1,4 +1,4 @@
-"""Message indexes: where in a chunk the messages of each channel stand, and their times."""
+"""Build and parse Message Index records: offsets and times of a chunk's messages by channel."""
 
 import struct
 from collections.abc import Mapping
@@ -20,16 +20,18 @@ _ENTRY = np.dtype([("time", "<i8"), ("at", "<i8")])
 
 @dataclass(frozen=True, slots=True)
 class MessageIndex:
-    """The message indexes of a chunk. They tell no place in the file, so a copy keeps them.
+    """The Message Index records of a chunk.
+
+    They contain no file offsets, so a copied chunk keeps them unchanged.
 
     Parameters
     ----------
     records
-        One for each channel, one after another.
-    places
-        Where each starts in ``records``, by channel number.
+        Contiguous records, one for each channel.
+    offsets
+        Offset of each record in ``records``, by channel id.
     counts
-        Messages of each channel.
+        Number of messages, by channel id.
     """
 
     records: bytes
@@ -38,7 +40,7 @@ class MessageIndex:
 
 
 def index_of(block: Block) -> MessageIndex:
-    """The message indexes of a chunk that holds these messages."""
+    """Build the message indexes of a chunk that holds these messages."""
     counts = np.bincount(block.channel)
     numbers = np.flatnonzero(counts)
     counts = counts[numbers]
@@ -50,7 +52,7 @@ def index_of(block: Block) -> MessageIndex:
     heads["size"] = ENTRY_BYTES * counts
     heads["length"] = heads["size"] + 6
     put_at(records, starts, heads)
-    # Numbers of 16 bits are sorted in one go over them.
+    # NumPy uses a radix sort for 16-bit integers.
     order = np.argsort(block.channel.astype(np.uint16), kind="stable")
     entries = np.empty(len(block), _ENTRY)
     entries["time"] = block.time_ns[order]
@@ -62,26 +64,26 @@ def index_of(block: Block) -> MessageIndex:
 
 
 def indexes_size(counts: Mapping[int, int]) -> int:
-    """Length of the message indexes of channels with so many messages, bytes."""
+    """Return the total size of message indexes from the message counts by channel, bytes."""
     return INDEX.size * len(counts) + ENTRY_BYTES * sum(counts.values())
 
 
 def _places_of_entries(starts: Ints, counts: Ints) -> Ints:
-    """Where every entry stands, of records that start there and have so many."""
+    """Return the offset of every entry of records with these offsets and entry counts."""
     first = starts + INDEX.size - ENTRY_BYTES * (np.cumsum(counts) - counts)
     found: Ints = np.repeat(first, counts) + ENTRY_BYTES * np.arange(counts.sum())
     return found
 
 
 class Entries(NamedTuple):
-    """What message indexes say of the messages of a chunk, one channel after another.
+    """Entries of the message indexes of a chunk, channel by channel.
 
     Parameters
     ----------
-    channel, time_ns, at
-        (N,) channel number and log time of each message, and where its record starts.
+    channel, time_ns, offset
+        (N,) channel id and log time of each message, and the offset of its record in the chunk.
     counts
-        (C,) messages of each channel.
+        (C,) number of messages of each channel.
     """
 
     channel: Ints
@@ -91,21 +93,21 @@ class Entries(NamedTuple):
 
 
 def index_entries(path: Path, raw: bytes, places: Mapping[int, int]) -> Entries:
-    """The entries of some channels' message indexes.
+    """Parse the message indexes of some channels.
 
     Parameters
     ----------
     path
         The recording, for errors.
     raw
-        Bytes that they stand in.
-    places
-        Where each starts there, by channel number.
+        Bytes that contain the records.
+    offsets
+        Offset of each record in ``raw``, by channel id.
 
     Raises
     ------
     RecordingError
-        If there is none of a channel where it is said to be, or it is cut.
+        If a record is truncated, or is not the Message Index of its channel.
     """
     numbers = np.fromiter(places.keys(), np.int64, len(places))
     at = np.fromiter(places.values(), np.int64, len(places))

@@ -1,4 +1,4 @@
-"""A whole recording read record by record, for files without an index."""
+"""Read a whole MCAP file record by record, for files without an index."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -19,14 +19,14 @@ from dmrl.recording.mcap.message_batch import Block
 
 @dataclass(slots=True)
 class Walked:
-    """Everything in a recording.
+    """The content of a recording.
 
     Parameters
     ----------
     channels
-        By number.
-    blocks
-        Messages, in the order of the file.
+        By channel id.
+    batches
+        Messages, in file order.
     metadata, attachments
         By name.
     """
@@ -37,7 +37,7 @@ class Walked:
     attachments: dict[str, bytes] = field(default_factory=dict)
 
     def counts(self) -> Counter[int]:
-        """Messages of every channel number."""
+        """Count the messages of every channel id."""
         found: Counter[int] = Counter()
         for block in self.blocks:
             for number, count in zip(*np.unique(block.channel, return_counts=True), strict=True):
@@ -46,12 +46,12 @@ class Walked:
 
 
 def walked(path: Path, stream: Bounded) -> Walked:
-    """Everything in a complete recording, whether it has an index or not.
+    """Read everything in a complete recording, with or without an index.
 
     Raises
     ------
     RecordingError, McapError, CRCValidationError
-        If it is damaged, or unpacks to more than its size explains.
+        If it is corrupt, or decompresses to more than the limit for its size.
     """
     stream.seek(0)
     walk, schemas, messages, size = Walked(), dict[int, Schema](), list[Message](), 0
@@ -102,7 +102,7 @@ def _compare(said: Statistics, walk: Walked, messages: list[Message]) -> None:
 def channel_of(
     number: int, channels: dict[int, McapChannel], schemas: dict[int, Schema]
 ) -> Channel:
-    """Topic and schema of a channel number.
+    """Build the channel of a channel id from its Channel and Schema records.
 
     Raises
     ------

@@ -23,33 +23,36 @@ from dmrl.recording.mcap.summary_section import Section, section
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """One topic of a recording: message type and number of messages."""
+    """Message type and number of messages of one topic."""
 
     schema: str
     count: int
 
 
 SETTLED_NS, MOST_REMEMBERED = 1_000_000_000, 8
+"""Age from which the time stamp of a file is trusted, nanoseconds; and entries of the cache."""
 _MADE: dict[tuple[Path, str], tuple[tuple[int, int, int], Any]] = {}
 Made = TypeVar("Made")
 
 
 def mcap_summary(path: Path, stream: Bounded) -> Section | None:
-    """The verified summary section of a recording; None where messages are not found with it.
+    """Read and verify the Summary section; return None if it does not index the messages.
+
+    The result is cached.
 
     Raises
     ------
     RecordingError
-        If it contradicts itself or the file.
+        If the section contradicts itself or the file.
     """
     return remembered("raw", path, stream, lambda: section(path, stream))
 
 
 def remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made]) -> Made:
-    """What was made of a file, without making it again as long as it is the same file.
+    """Return the result for a file from the cache, or make it with ``make``.
 
-    A file that was written in the last second is read again: its time stamp might not tell
-    it from one that is written after it.
+    A result is valid while inode, size and modification time are the same. Local files that are
+    less than a second old are not cached: a later write might leave the same time stamp.
     """
     status = stream.status
     stamp = status.st_ino, status.st_size, status.st_mtime_ns
@@ -58,7 +61,7 @@ def remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made])
         made: Made = _MADE[key][1]
         return made
     made = make()
-    # What is in a bucket has a tag of its content, so its time does not matter.
+    # Files in a bucket are identified by a tag of their content, so their age does not matter.
     if stream.ranged is not None or time.time_ns() - status.st_mtime_ns > SETTLED_NS:
         while len(_MADE) >= MOST_REMEMBERED:
             del _MADE[next(iter(_MADE))]
@@ -67,7 +70,7 @@ def remembered(what: str, path: Path, stream: Bounded, make: Callable[[], Made])
 
 
 def channel_on(path: Path, topic: str) -> Channel:
-    """The first channel of a topic that a recording has."""
+    """Return the first channel of a topic."""
     with opened(path) as stream:
         found = mcap_summary(path, stream)
         if found is None:
@@ -78,12 +81,12 @@ def channel_on(path: Path, topic: str) -> Channel:
 
 
 def metadata_of(path: Path, stream: Bounded, found: McapSummary) -> dict[str, list[dict[str, str]]]:
-    """Metadata by name, held against its sum where the recording has one of its own.
+    """Read the metadata by name, and verify them against the CRC of dmrl's recordings.
 
     Raises
     ------
     RecordingError
-        If it fails its sum, or does not stand where the summary says.
+        If the CRC does not match, or a record is not where the Summary section lists it.
     """
     metadata: dict[str, list[dict[str, str]]] = {}
     crc = before = 0
@@ -104,7 +107,7 @@ def metadata_of(path: Path, stream: Bounded, found: McapSummary) -> dict[str, li
 
 
 def read_attachment(path: Path, stream: Bounded, place: AttachmentIndex) -> tuple[str, bytes]:
-    """Name and content of an attachment, held against its CRC."""
+    """Read the name and content of an attachment, and verify its CRC."""
     body = _record(path, stream, place, Opcode.ATTACHMENT)
     crc = int.from_bytes(body[-4:], "little")
     record = Attachment.read(ReadDataStream(BytesIO(body[RECORD.size :])))
@@ -116,7 +119,7 @@ def read_attachment(path: Path, stream: Bounded, place: AttachmentIndex) -> tupl
 def _record(
     path: Path, stream: Bounded, place: MetadataIndex | AttachmentIndex, kind: Opcode
 ) -> bytes:
-    """A whole record that an index names. mcap's reader would read the whole summary again."""
+    """Read the record that an index points at. mcap's reader would read the whole summary again."""
     stream.seek(place.offset)
     body = stream.read(place.length)
     if len(body) < RECORD.size or RECORD.unpack_from(body) != (kind, len(body) - RECORD.size):

@@ -1,7 +1,8 @@
-"""The summary section of a recording: read, and held against everything that can prove it wrong.
+"""Read and verify the Summary section of an MCAP file.
 
-Its CRC covers what it says. Writers may leave that out, and it says nothing of what the file
-holds: the statistics, the chunk indexes and the places between them are compared as well.
+The Summary CRC protects the section itself. Writers may omit it, and it does not prove that the
+section fits the file. Statistics, chunk indexes and the bytes between the listed records are
+therefore compared as well.
 """
 
 import struct
@@ -33,22 +34,24 @@ FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offse
 
 
 class Section(McapSummary):
-    """The summary section of a recording.
+    """The Summary section of a recording.
 
     Attributes
     ----------
-    proven
-        Whether it has a CRC. Without one it is held against what it repeats, where that is read.
+    has_crc
+        Whether the section has a CRC. Without one, every definition in a chunk that is read is
+        compared with the section.
     """
 
     proven: bool = False
     _firsts: frozenset[int] | None = None
 
     def must_confirm(self, chunk: ChunkIndex) -> bool:
-        """Whether a chunk is to be held against this section: without a CRC all are.
+        """Return whether the definitions in a chunk must be compared with this section.
 
-        With one, it is enough that definitions are the same where each channel begins: who made
-        two of them, and every sum right, would give other readers other topics.
+        Without a CRC this applies to every chunk. With one, the first chunk of each channel is
+        enough: it detects a file with two different definitions and valid CRCs, in which other
+        readers would find other topics.
         """
         if self._firsts is None:
             firsts: dict[int, int] = {}
@@ -58,34 +61,34 @@ class Section(McapSummary):
         return not self.proven or chunk.chunk_start_offset in self._firsts
 
     def confirm(self, path: Path, definitions: Iterable[Schema | Channel]) -> None:
-        """Nothing, if schemas and channels are defined among the messages as they are here.
+        """Raise RecordingError unless schemas and channels equal those of this section.
 
         Raises
         ------
         RecordingError
-            If one is another.
+            If a definition differs.
         """
         for one in definitions:
             known = self.schemas if isinstance(one, Schema) else self.channels
             if known.get(one.id, one) != one:
                 name = one.name if isinstance(one, Schema) else one.topic
-                raise damaged(path, f"{name} is not what its summary repeats of it")
+                raise damaged(path, f"the definition of {name} contradicts the summary")
 
 
 def section(path: Path, stream: Bounded) -> Section | None:
-    """The summary section, verified; None where it is none that messages can be found with.
+    """Read and verify the Summary section; return None if it does not index the messages.
 
     Parameters
     ----------
     path
         The recording, for errors.
     stream
-        Its file, whole.
+        The complete file.
 
     Raises
     ------
     RecordingError
-        If it fails its CRC, contradicts itself or the file, or asks for too much.
+        If the section fails its CRC, contradicts itself or the file, or exceeds a limit.
     """
     found, start = stated(path, stream)
     if found is None or not _usable(found):
@@ -99,20 +102,19 @@ def section(path: Path, stream: Bounded) -> Section | None:
 
 
 def stated(path: Path, stream: Bounded, start: int | None = None) -> tuple[Section | None, int]:
-    """The summary section as it stands there, its CRC checked, and where it starts.
+    """Read the Summary section and check only its CRC; return it and its offset.
 
     Parameters
     ----------
     path, stream
         The recording.
     start
-        Where the section is found, in a file that lost bytes before it. None: where the footer
-        says.
+        Offset of the section, for a file that lost bytes before it. None: the Footer contains it.
 
     Raises
     ------
     RecordingError
-        If there is no footer, or the section fails its CRC.
+        If there is no Footer, or the section fails its CRC.
     """
     end = stream.size - len(MAGIC) - FOOTER.size
     if end < len(MAGIC):
@@ -129,7 +131,7 @@ def stated(path: Path, stream: Bounded, start: int | None = None) -> tuple[Secti
         raise damaged(path, "its footer points beyond it")
     stream.seek(start)
     body = stream.read(end - start)
-    # The CRC ends before itself, the last four bytes.
+    # The CRC covers everything before its own four bytes.
     if crc and zlib.crc32(footer[:-4], zlib.crc32(body)) != crc:
         raise damaged(path, "its summary fails its CRC")
     found = _parsed(body + footer + MAGIC)
@@ -159,7 +161,7 @@ def _parsed(body: bytes) -> Section:
 
 
 def _usable(found: McapSummary) -> bool:
-    """Whether it repeats definitions and indexes chunks, which writers may leave out."""
+    """Return whether the section repeats definitions and indexes chunks. Writers may omit both."""
     some = found.statistics is None or found.statistics.message_count
     defined = bool(found.channels) and (
         bool(found.schemas) or not any(c.schema_id for c in found.channels.values())
@@ -183,7 +185,7 @@ def _within_budget(path: Path, stream: Bounded, found: McapSummary) -> None:
 
 
 def _counted(path: Path, found: McapSummary) -> None:
-    """Statistics, chunk indexes and channels of one summary against each other."""
+    """Raise unless Statistics, chunk indexes and channels agree with each other."""
     counts = found.statistics.channel_message_counts if found.statistics else {}
     mentioned = {number for number, count in counts.items() if count}
     for chunk in found.chunk_indexes:
@@ -216,27 +218,27 @@ def _before_the_end_of_time(path: Path, found: McapSummary) -> None:
 
 
 def _placed(path: Path, stream: Bounded, found: Section, end: int) -> bool:
-    """Whether all messages lie in the chunks that are listed, and these in the file.
+    """Return whether all messages are in listed chunks.
 
     Raises
     ------
     RecordingError
-        If a chunk is not listed, or two overlap.
+        If a chunk is not listed, two records overlap, or one runs beyond the data section.
     """
     at = len(MAGIC)
     for start, length in sorted(places(found)):
         if start < at:
-            raise damaged(path, f"two things are said to stand at byte {start}")
+            raise damaged(path, f"its summary lists two records that overlap at byte {start}")
         if not _between(path, stream, found, at, start):
             return False
         at = start + length
     if at > end:
-        raise damaged(path, "its summary points beyond its messages")
+        raise damaged(path, "its summary lists a record beyond the data section")
     return _between(path, stream, found, at, end)
 
 
 def places(found: McapSummary) -> Iterator[tuple[int, int]]:
-    """Start and length of everything that a summary lists."""
+    """Yield offset and length of every record that the section lists."""
     for chunk in found.chunk_indexes:
         yield chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length
     for metadata in found.metadata_indexes:
@@ -246,7 +248,7 @@ def places(found: McapSummary) -> Iterator[tuple[int, int]]:
 
 
 def _between(path: Path, stream: Bounded, found: Section, at: int, end: int) -> bool:
-    """Whether there is no message among the records from ``at`` to ``end``."""
+    """Return whether the records from ``at`` to ``end`` contain no message."""
     while at < end:
         stream.seek(at)
         opcode, length = RECORD.unpack(stream.read(RECORD.size))
@@ -259,5 +261,5 @@ def _between(path: Path, stream: Bounded, found: Section, at: int, end: int) -> 
             found.confirm(path, [DEFINITIONS[opcode].read(body)])
         at += RECORD.size + length
     if at > end:
-        raise damaged(path, f"a record ends at byte {at}, where none can")
+        raise damaged(path, f"a record that ends at byte {at} overlaps the next one")
     return True

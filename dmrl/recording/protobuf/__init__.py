@@ -1,1 +1,1 @@
-"""Encode and decode protobuf messages as columns."""
+"""Decode protobuf messages to Arrow columns, and encode columns to messages."""

@@ -1,4 +1,4 @@
-"""Blocks of messages, taken apart by topic and decoded to Arrow columns."""
+"""Split message batches by topic and decode them to Arrow columns."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ def by_topic(
     channels: Mapping[int, Channel],
     fields: Mapping[str, Sequence[str] | None],
 ) -> dict[str, pa.RecordBatch]:
-    """The messages of a block as columns, by topic."""
+    """Decode the messages of a batch to columns, by topic."""
     return {
         topic: decoded(path, topic, mine, channels, fields[topic])
         for topic, mine in apart(block, channels).items()
@@ -29,7 +29,7 @@ def by_topic(
 
 
 def apart(block: Block, channels: Mapping[int, Channel]) -> dict[str, Block]:
-    """The messages of a block by topic, in the order they have in it."""
+    """Split a batch by topic, keeping the order of the messages."""
     topics = sorted({channels[number].topic for number in block.numbers()})
     place = np.full(max(channels, default=0) + 1, -1, np.int64)
     for number, channel in channels.items():
@@ -49,12 +49,12 @@ def decoded(
     channels: Mapping[int, Channel],
     fields: Sequence[str] | None,
 ) -> pa.RecordBatch:
-    """The messages of one topic as columns.
+    """Decode the messages of one topic to columns.
 
     Raises
     ------
     RecordingError
-        If they are of several types, or not what they should be.
+        If the topic has several message types, or a message is not of its type.
     """
     numbers = block.numbers()
     own = [n for n, channel in channels.items() if channel.topic == topic]
@@ -72,7 +72,7 @@ def _decoded(
 
 
 def batch_of(block: Block, kind: Descriptor, fields: Sequence[str] | None) -> pa.RecordBatch:
-    """Messages of one type as columns, their times first."""
+    """Decode messages of one type to columns, log time and publish time first."""
     body = decode(block.data, block.start, block.end, kind, fields)
     times = {"log_time": pa.array(block.time_ns), "publish_time": pa.array(block.publish_ns)}
     return pa.RecordBatch.from_pydict(times | body)

@@ -1,8 +1,8 @@
-"""Protobuf messages to Arrow columns, thousands at a time.
+"""Decode protobuf messages to Arrow columns, thousands at a time.
 
-The wire format is decoded field by field over all messages of a block at once: every round
-reads the next tag of every message, groups messages by tag, and steps over the values. A
-block of equal-looking messages (nearly every sensor topic) costs a few NumPy calls a field.
+The wire format is decoded field by field over all messages of a batch at once. Every round
+reads the next tag of every message, groups the messages by tag, and skips the values. A batch
+of messages of one layout (nearly every sensor topic) takes a few NumPy calls per field.
 Source: Protocol Buffers encoding specification.
 """
 
@@ -32,9 +32,9 @@ F = FieldDescriptor
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Values of one field: the row each belongs to and where it lies.
+    """Occurrences of one field: row and byte range of each value.
 
-    For varints ``start`` is the value's first byte; for delimited values the payload.
+    For varints ``start`` is the first byte of the value, for delimited values that of the payload.
     """
 
     row: Ints
@@ -46,29 +46,29 @@ class Found:
 def decode(
     data: Bytes, start: Ints, end: Ints, descriptor: Descriptor, fields: Sequence[str] | None = None
 ) -> dict[str, pa.Array]:
-    """Messages as Arrow columns, one per field, by name.
+    """Decode messages to Arrow columns, one per field, by name.
 
     Parameters
     ----------
     data
-        Bytes that hold the messages.
+        Bytes that contain the messages.
     start, end
-        (N,) where each message lies in ``data``.
+        (N,) range of each message in ``data``.
     descriptor
-        Their type.
+        Message type.
     fields
-        Only these. None: all.
+        Fields to decode. None: all.
 
     Returns
     -------
     dict[str, pa.Array]
-        (N,) each, in the order of the schema. A field that a message lacks has its default,
-        as protobuf has it; an absent sub-message is null. Repeated fields are lists, enums int32.
+        (N,) each, in schema order. An absent field has its protobuf default; an absent
+        sub-message is null. Repeated fields are lists, enums int32.
 
     Raises
     ------
     WireError
-        If the bytes do not follow the wire format or the type.
+        If the bytes do not conform to the wire format or the type.
     """
     wanted = [f for f in descriptor.fields if fields is None or f.name in fields]
     return _columns(data, start, end, wanted, (descriptor.full_name,)) if wanted else {}
@@ -103,7 +103,7 @@ def _struct(
 
 
 def _scan(data: Bytes, start: Ints, end: Ints, wanted: set[int]) -> dict[int, list[Found]]:
-    """Where the wanted fields of every message lie, in wire order within a message."""
+    """Find the wanted fields of every message, in wire order within a message."""
     found: dict[int, list[Found]] = {}
     row, at, end = np.arange(len(start)), start.copy(), np.asarray(end)
     while True:
@@ -126,7 +126,7 @@ def _scan(data: Bytes, start: Ints, end: Ints, wanted: set[int]) -> dict[int, li
 def _step(
     data: Bytes, tag: int, row: Ints, at: Ints, wanted: set[int], found: dict[int, list[Found]]
 ) -> Ints:
-    """Note one field of some messages; where the next field of each begins."""
+    """Record one field of some messages; return the offset of each message's next field."""
     number, wire = tag >> 3, tag & 7
     first = at
     if wire == VARINT:
@@ -150,7 +150,7 @@ def _step(
 def _column(
     data: Bytes, count: int, found: list[Found], field: FieldDescriptor, within: tuple[str, ...]
 ) -> pa.Array:
-    """One field of all messages, in row order."""
+    """Decode one field of all messages, in row order."""
     if field.is_repeated:
         spans = _expand_packed(data, field, found)
         row = _joined(s.row for s in spans)
@@ -160,7 +160,7 @@ def _column(
         start, end = _joined(s.start for s in spans)[order], _joined(s.end for s in spans)[order]
         values = _values(data, start, end, None, field, within)
         return pa.ListArray.from_arrays(pa.array(offsets), values)
-    # Last one wins, as the specification says of scalars. Absent: an empty span.
+    # The last scalar wins, as the specification requires. Absent: an empty span.
     start, end = np.zeros(count, np.int64), np.zeros(count, np.int64)
     present = np.zeros(count, np.bool_)
     for span in found:
@@ -185,7 +185,7 @@ def _expect(field: FieldDescriptor, wire: int, *, packed: bool) -> None:
 
 
 def _expand_packed(data: Bytes, field: FieldDescriptor, found: list[Found]) -> list[Found]:
-    """Spans of single values, packed runs taken apart."""
+    """Split packed runs into spans of single values."""
     scalar = field.type in FIXED or field.type in VARINTS
     out = []
     for span in found:
@@ -207,7 +207,7 @@ def _expand_packed(data: Bytes, field: FieldDescriptor, found: list[Found]) -> l
 
 
 def _runs(span: Found, size: int) -> tuple[Ints, Ints]:
-    """Offset and row of every value of ``size`` bytes in some spans."""
+    """Return offset and row of every value of ``size`` bytes in some spans."""
     counts = (span.end - span.start) // size
     index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     return np.repeat(span.start, counts) + index * size, np.repeat(span.row, counts)
@@ -221,7 +221,7 @@ def _values(
     field: FieldDescriptor,
     within: tuple[str, ...],
 ) -> pa.Array:
-    """Values of a field's type in some spans; its default where ``present`` is false."""
+    """Decode the values in some spans; use the field's default where ``present`` is false."""
     if field.type in FIXED:
         dtype = np.dtype(FIXED[field.type])
         return pa.array(unless_absent(present, start, lambda at: fixed(data, at, dtype), dtype))

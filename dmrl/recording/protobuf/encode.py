@@ -1,8 +1,8 @@
-"""Columns to protobuf messages, thousands at a time; what `wire` does, the other way round.
+"""Encode columns to protobuf messages, thousands at a time; the inverse of `decode`.
 
-Every field gives a matrix of bytes, a row a message, and which of them are there: a value that is
-zero is left out, and a varint is as long as it has to be. All matrices side by side, read along
-the rows, are the messages, the same bytes that protobuf itself writes.
+Every field becomes a byte matrix with one row per message, and a mask of the bytes in use: a
+zero value is omitted, and a varint has its minimal length. The matrices side by side, read along
+the rows, are the messages. The bytes equal those of the protobuf package.
 Source: Protocol Buffers encoding specification.
 """
 
@@ -18,13 +18,17 @@ from dmrl.recording.protobuf.decode import DELIMITED, FIXED32, FIXED64, VARINT
 from dmrl.recording.protobuf.wire_values import FIXED, VARINTS
 
 Value = ArrayLike | Mapping[str, "Value"]
-"""A column (N,), or (N, K) of a repeated field; one value for all; of a sub-message, its fields."""
+"""Values of a field.
+
+A column (N,), or (N, K) for a repeated field; a single value for all messages; for a sub-message,
+its fields by name.
+"""
 Mask = NDArray[np.bool_]
 F = FieldDescriptor
 
 
 class Cells(NamedTuple):
-    """(N, W) bytes, and which of them are there."""
+    """(N, W) bytes, and a mask of those in use."""
 
     data: Bytes
     there: Mask
@@ -33,30 +37,28 @@ class Cells(NamedTuple):
 def encode(
     kind: Descriptor, fields: Mapping[str, Value], count: int, head_bytes: int = 0
 ) -> tuple[Bytes, Ints]:
-    """Messages from columns.
+    """Encode columns to messages.
 
     Parameters
     ----------
     kind
-        Their type.
+        Message type.
     fields
-        By name. Those that are missing have their default.
+        Columns by field name. Missing fields have their default.
     count
-        How many messages.
-    head_bytes
-        Zeros to leave before each.
+        Number of messages, N.
+    prefix_bytes
+        Zeros to leave before each message.
 
     Returns
     -------
     tuple
-        The messages, one after another, and (N + 1,) where each starts, with its head, and the
-        end of the last.
+        Contiguous messages, and (N + 1,) offset of each with its prefix, and the end of the last.
 
     Raises
     ------
     TypeError, ValueError
-        If the type has no field of a name, or a column is not of its type, or not as long as
-        ``count`` says.
+        If the type lacks a field, or a column has another type or length than the field needs.
     """
     cells = _message(kind, fields, count)
     if head_bytes:
@@ -84,7 +86,7 @@ def _side_by_side(parts: Sequence[Cells], count: int) -> Cells:
 def _field(field: FieldDescriptor, value: Value, count: int) -> Cells:
     if field.type == F.TYPE_MESSAGE:
         if field.is_repeated or not isinstance(value, Mapping) or field.message_type is None:
-            raise TypeError(f"{field.full_name} is no sub-message with columns")
+            raise TypeError(f"{field.full_name} needs a mapping of columns for its sub-message")
         body = _message(field.message_type, value, count)
         return _delimited(field, body, np.ones(count, bool))
     if field.type in (F.TYPE_STRING, F.TYPE_BYTES):
@@ -101,18 +103,18 @@ def _field(field: FieldDescriptor, value: Value, count: int) -> Cells:
 
 
 def _scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, Mask]:
-    """Values of a field, and which of them are its default."""
+    """Encode the values of a field, and return which of them are its default."""
     if field.type in FIXED:
         values = np.ascontiguousarray(array, dtype=FIXED[field.type])
         data = values.view(np.uint8).reshape(len(values), -1)
-        # As protobuf: -0.0 is no default.
+        # As in protobuf, -0.0 is not the default.
         return Cells(data, np.ones(data.shape, bool)), ~np.asarray(data.any(axis=1))
     if field.type not in VARINTS:
-        raise TypeError(f"{field.full_name} has a type that is not written from columns")
-    with np.errstate(invalid="ignore"):  # what is no number is refused
+        raise TypeError(f"{field.full_name} has a type that cannot be written from columns")
+    with np.errstate(invalid="ignore"):  # NaN is rejected below
         values = array.astype(VARINTS[field.type])
     if not np.array_equal(values, array):
-        raise ValueError(f"{field.full_name} takes whole numbers of its size")
+        raise ValueError(f"{field.full_name} takes integers within its range")
     signed = values.astype(np.int64)
     if field.type in (F.TYPE_SINT32, F.TYPE_SINT64):
         signed = (signed << 1) ^ (signed >> 63)
@@ -121,7 +123,7 @@ def _scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, 
 
 
 def _repeated(field: FieldDescriptor, array: NDArray[np.generic], count: int) -> Cells:
-    """Packed values, (N, K)."""
+    """Encode a packed repeated field from (N, K) values."""
     if field.type not in FIXED or array.ndim != 2 or len(array) != count:
         raise ValueError(f"{field.full_name} takes {count} rows of numbers of fixed size")
     values = np.ascontiguousarray(array, dtype=FIXED[field.type])
@@ -130,7 +132,7 @@ def _repeated(field: FieldDescriptor, array: NDArray[np.generic], count: int) ->
 
 
 def _text(field: FieldDescriptor, value: Value, count: int) -> Cells:
-    """Texts or bytes: one for all, or one for each."""
+    """Encode texts or bytes: one for all messages, or one for each."""
     if isinstance(value, Mapping):
         raise TypeError(f"{field.full_name} takes a text")
     texts = [value] * count if isinstance(value, str | bytes) else list(np.asarray(value, object))
@@ -149,7 +151,7 @@ def _text(field: FieldDescriptor, value: Value, count: int) -> Cells:
 
 
 def _delimited(field: FieldDescriptor, body: Cells, there: Mask) -> Cells:
-    """A body behind its tag and length."""
+    """Put the tag and length of a field before its payloads."""
     size = _varint(body.there.sum(axis=1).astype(np.uint64))
     cells = _side_by_side([_constant(_tag(field, DELIMITED), len(there)), size, body], len(there))
     return cells._replace(there=cells.there & there[:, None])

@@ -1,6 +1,6 @@
-"""Message types of topics: whether they are what they should be, and how their bytes are read.
+"""Find the message type of a channel, and check that topics carry their type.
 
-A recording brings its own schemas. dmrl's own are used where it knows the name.
+A recording contains its own schemas. For the types of dmrl, the built-in schemas are used.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,12 +18,12 @@ from dmrl.topics import row_of
 
 
 def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> None:
-    """Nothing, if topics of dmrl's carry the types they should.
+    """Raise RecordingError unless dmrl's topics carry the message types of `dmrl.topics`.
 
     Raises
     ------
     RecordingError
-        If one does not.
+        If a topic carries another type.
     """
     for topic in sorted(chosen):
         row = row_of(topic)
@@ -35,7 +35,7 @@ def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[
 
 
 def descriptor_of(path: Path, channel: Channel) -> Descriptor:
-    """Type of a channel's messages: dmrl's own where it knows it, else the recording's.
+    """Return the message type of a channel: dmrl's own if it has that name, else the recording's.
 
     Raises
     ------
@@ -58,12 +58,12 @@ def descriptor_of(path: Path, channel: Channel) -> Descriptor:
 
 
 def one_type(path: Path, topic: str, kinds: set[Descriptor]) -> Descriptor:
-    """The type of a topic's messages. It may have several channels, after a merge for instance.
+    """Return the common message type of a topic's channels. After a merge there can be several.
 
     Raises
     ------
     RecordingError
-        If they differ.
+        If the types differ.
     """
     if len(kinds) != 1:
         raise RecordingError(f"{path}: {topic} mixes message types. Split it: dmrl trim --help")

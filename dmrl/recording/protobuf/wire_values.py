@@ -1,4 +1,4 @@
-"""Values in protobuf's wire format, read at many places of a block at once."""
+"""Read values in protobuf's wire format at many offsets of a byte array at once."""
 
 from collections.abc import Callable
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
 
-# Below this mean size one gather of all bytes beats a slice per value.
 GATHER_BYTES = 64
+"""Mean size of a text below which one gather of all bytes is faster than a slice per text."""
 
 F = FieldDescriptor
 FIXED = {
@@ -34,11 +34,11 @@ VARINTS = {
 
 
 class WireError(ValueError):
-    """The bytes are not messages of the type they are said to be."""
+    """The bytes are not messages of the given type."""
 
 
 def varint(data: Bytes, at: Ints) -> tuple[NDArray[np.uint64], Ints]:
-    """Value of the varint at each offset, and the offset after it."""
+    """Read the varint at each offset; return values and the offsets after them."""
     try:
         byte = data[at]
     except IndexError:
@@ -67,7 +67,7 @@ def unless_absent(
     read: Callable[[Ints], NDArray[np.generic]],
     dtype: np.dtype[np.generic],
 ) -> NDArray[np.generic]:
-    """Values read at ``start``; zero where absent."""
+    """Read the values at ``start``; return zero for those that are absent."""
     if present is None or present.all():
         return read(start)
     out = np.zeros(len(start), dtype.newbyteorder("="))
@@ -76,12 +76,12 @@ def unless_absent(
 
 
 def fixed(data: Bytes, at: Ints, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
-    """(N,) values of fixed size at these offsets.
+    """Read (N,) values of fixed size.
 
     Raises
     ------
     WireError
-        If one reaches beyond the data.
+        If a value reaches beyond the data.
     """
     # A view with a stride of one byte reads unaligned values in one gather.
     view = np.ndarray((max(len(data) - dtype.itemsize + 1, 0),), dtype, data, 0, (1,))
@@ -94,7 +94,7 @@ def fixed(data: Bytes, at: Ints, dtype: np.dtype[np.generic]) -> NDArray[np.gene
 def integers(
     data: Bytes, at: Ints, dtype: np.dtype[np.generic], zigzag: bool
 ) -> NDArray[np.generic]:
-    """(N,) integers, enums or booleans whose varints begin at these offsets."""
+    """Read (N,) integers, enums or booleans, stored as varints."""
     value, _ = varint(data, at)
     if zigzag:
         value = (value >> np.uint64(1)) ^ (np.uint64(0) - (value & np.uint64(1)))
@@ -102,18 +102,18 @@ def integers(
 
 
 def text(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa.Array:
-    """(N,) strings or bytes that fill these spans.
+    """Read (N,) strings or bytes from spans.
 
     Raises
     ------
     WireError
-        If there are too many for a block, or one of strings is not UTF-8.
+        If a batch has more than 2 GiB of text, or a string is not UTF-8.
     """
     size = end - start
     offsets = np.zeros(len(size) + 1, np.int64)
     np.cumsum(size, out=offsets[1:])
     if offsets[-1] > np.iinfo(np.int32).max:
-        raise WireError("more than 2 GiB of text in one block")
+        raise WireError("more than 2 GiB of text in one batch")
     if len(size) and offsets[-1] > GATHER_BYTES * len(size):
         view = data.data
         body = b"".join(view[a:b] for a, b in zip(start.tolist(), end.tolist(), strict=True))

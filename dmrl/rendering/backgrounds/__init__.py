@@ -1,1 +1,1 @@
-"""Backgrounds of rendered images: photos, rooms and environments."""
+"""Backgrounds of rendered images: photos, panoramas, generated rooms and textures."""

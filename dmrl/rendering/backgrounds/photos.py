@@ -1,4 +1,4 @@
-"""What is behind the robots: photos, or what a panorama shows in the camera's direction."""
+"""Backdrops from photos and from panoramas."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,11 +19,11 @@ from dmrl.rendering.camera.sensor import LUMINANCE
 
 PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm")
 KEPT = 64
-"""Decoded photos that are kept; bounds memory."""
+"""Decoded photos in the cache. Bounds the memory."""
 
 
 def _table() -> Picture:
-    """Light for each of the 256 values of a photo, sRGB's curve."""
+    """Return the linear light of the 256 values of an sRGB photo."""
     value = np.arange(256) / 255
     low = value <= 0.04045
     return np.where(low, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
@@ -33,16 +33,16 @@ LIGHT_OF = _table()
 
 
 class Photos:
-    """Photos, fitted to an image.
+    """Photos that are cropped to fill an image.
 
     Parameters
     ----------
     load
-        Gives the photo of a number, from 0; raises SourceError if it is broken.
+        Returns the photo with an index, from 0. Raises SourceError if it is broken.
     count
-        How many there are.
+        Number of photos.
     broken
-        How many more were left out as broken.
+        Number of broken photos that are not counted in ``count``.
     """
 
     def __init__(self, load: Callable[[int], Rgb], count: int, broken: int = 0) -> None:
@@ -52,16 +52,16 @@ class Photos:
 
     @property
     def broken(self) -> int:
-        """Photos that turned out to be broken, so far."""
+        """Number of broken photos detected so far."""
         return self._left_out + len(self._broken)
 
     def photo(self, number: int) -> Rgb:
-        """Photo of that number, or the next one that is whole.
+        """Return the photo with this index, or the next one that is not broken.
 
         Raises
         ------
         SettingError
-            If none is.
+            If all photos are broken.
         """
         for step in range(self._count):
             here = (number + step) % self._count
@@ -71,27 +71,27 @@ class Photos:
                 return self._load(here)
             except SourceError:
                 self._broken.add(here)
-        raise SettingError("every photo is broken. Choose another --backgrounds")
+        raise SettingError("every photo is broken. Use another --backgrounds")
 
     def backdrop(
         self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True
     ) -> Picture:
-        """(H, W, 3) linear light of `part`."""
+        """Return a random crop as (H, W, 3) linear light, see `random_crop`."""
         return np.take(LIGHT_OF, self.part(rng, camera, zoom, averaged=averaged))
 
     def part(self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True) -> Rgb:
-        """(H, W, 3) uint8 of a photo at random, cropped to fill the image.
+        """Return a random (H, W, 3) uint8 crop of a random photo that fills the image.
 
         Parameters
         ----------
         rng
-            Chooses the photo, the part, and whether it is mirrored.
+            Selects the photo, the crop, and whether it is mirrored.
         camera
-            Gives the size.
+            Camera with the size of the image.
         zoom
-            1: as much of the photo as fits; 2: half its width and height.
+            1: as much of the photo as fits. 2: half its width and height.
         averaged
-            Whether a pixel is the mean of what it covers of the photo, or what is in its middle.
+            Whether a pixel averages the photo's pixels that it covers, or takes the middle one.
         """
         number, place_u, place_v, mirrored = rng.random(4)
         photo = self.photo(int(number * self._count))
@@ -108,12 +108,12 @@ class Photos:
 
 
 def photos_in(folder: Path) -> Photos:
-    """The photos of a folder: every picture in it, in order of names.
+    """Open all photos of a folder, in the order of their names.
 
     Raises
     ------
     SettingError
-        If it holds none that can be read.
+        If the folder does not exist or contains no readable photo.
     """
     if not folder.is_dir():
         raise SettingError(f"no folder {folder} of backgrounds. Check --backgrounds")
@@ -124,8 +124,8 @@ def photos_in(folder: Path) -> Photos:
     if not paths:
         why = f", {broken} are broken" if broken else ""
         raise SettingError(
-            f"{folder} holds no photo that can be read{why} "
-            f"({', '.join(PHOTO_KINDS)}). Choose another --backgrounds"
+            f"{folder} contains no readable photo{why} "
+            f"({', '.join(PHOTO_KINDS)}). Use another --backgrounds"
         )
 
     def photo(k: int) -> Rgb:
@@ -135,7 +135,7 @@ def photos_in(folder: Path) -> Photos:
 
 
 def _middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera) -> Rgb:
-    """A part of a photo: what is in the middles of pixels ``fit`` wide."""
+    """Return a crop of a photo, sampled at the middles of pixels ``fit`` wide."""
     height, width, _ = photo.shape
     limits = zip(corner, (camera.width_px, camera.height_px), (width, height), strict=True)
     u, v = (
@@ -156,16 +156,16 @@ def _begins(path: Path) -> bool:
 def panorama_view(
     panorama: Picture, camera: Camera, turn_rad: tuple[float, float, float]
 ) -> Picture:
-    """(H, W, 3) linear light of a panorama as the camera sees it.
+    """Return the (H, W, 3) linear light of a panorama in a camera's view.
 
     Parameters
     ----------
     panorama
-        (h, w, 3) all around: the middle column looks along -x, the top row up.
+        (h, w, 3), all around. The middle column points along -x, the top row up.
     camera
-        With its distortion.
+        Camera with its distortion.
     turn_rad
-        Roll and pitch of the camera, and the panorama's turn about the vertical.
+        Roll and pitch of the camera, and the panorama's rotation about the vertical.
     """
     x, y, z = _panorama_from_camera(turn_rad).astype(np.float32) @ _rays(camera)
     height, width, _ = panorama.shape
@@ -178,7 +178,7 @@ def panorama_view(
 
 @cache
 def _rays(camera: Camera) -> Picture:
-    """(3, H * W) what each pixel sees, camera frame."""
+    """Return the (3, H * W) rays of all pixels, camera frame."""
     v, u = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     right = (u - camera.cx_px) / camera.fx_px
     down = (v - camera.cy_px) / camera.fy_px
@@ -187,21 +187,21 @@ def _rays(camera: Camera) -> Picture:
 
 
 def _panorama_from_camera(turn_rad: tuple[float, float, float]) -> Array:
-    """Rz(turn) Ry(pitch) Rx(roll), as Blender's mapping of XYZ angles."""
+    """Return Rz(turn) Ry(pitch) Rx(roll), the order of Blender's XYZ angles."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(turn_rad), np.sin(turn_rad)
     tilt = np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
     return np.asarray(np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ tilt)
 
 
 def stretched(light: Picture, power: float) -> Picture:
-    """(H, W, 3) light whose brightness over its mean is raised to a power, the mean kept.
+    """Return (H, W, 3) light with its brightness raised to a power, at the same mean.
 
     Parameters
     ----------
     light
-        (H, W, 3) linear light; not changed.
+        (H, W, 3) linear light, not modified.
     power
-        Over 1: bright places stand out more; under 1: less.
+        Above 1, the contrast increases. Below 1, it decreases.
     """
     luminance = light @ LUMINANCE
     mean = max(float(luminance.mean()), 1e-6)
@@ -212,7 +212,7 @@ def stretched(light: Picture, power: float) -> Picture:
 
 
 def smeared(picture: Picture, move_px: Sequence[float]) -> Picture:
-    """(H, W, 3) picture that moved by so many pixels, u and v, while the shutter was open."""
+    """Return the (H, W, 3) image blurred by a motion in u and v during the exposure, pixels."""
     steps = int(np.ceil(math.hypot(*move_px)))
     if steps < 1:
         return picture

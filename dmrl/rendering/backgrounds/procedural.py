@@ -1,6 +1,6 @@
-"""Backgrounds made by code: rooms, gradients, textures and clutter of every size.
+"""Generated backgrounds: rooms, gradients, textures and clutter of all sizes.
 
-Pictures are rows of (W * 3) numbers here, as NumPy is slow at arrays that end in a side of 3.
+Images are arrays of rows of (W * 3) numbers here: NumPy is slow on a last axis of length 3.
 """
 
 from collections.abc import Callable
@@ -13,16 +13,16 @@ from dmrl.geometry.frames import Array
 from dmrl.images.canvas import LEVELS, Canvas, Colour, Levels, Outline, Picture, bands
 
 KNOTS = (3, 6, 12, 24, 48, 96)
-"""Of noise, from top to bottom of a picture, by the size of its detail."""
+"""Knots of the noise from top to bottom of an image, one entry per scale."""
 SMOOTH, MIDDLE, ROUGH = 0.4, 0.6, 0.8
-"""How strong each finer detail of a noise is beside the one before."""
+"""Amplitude of each scale of noise relative to the next coarser one."""
 DEVIATION = 0.4
 SPREADS = np.array([0.02, 0.05, 0.16])
-"""How far a colour is from grey."""
+"""Distance of a colour from grey, one entry per kind of colour."""
 
 BOX, BALL, CABLE, CROSS, WINDOW, SHARD = range(6)
 THICKNESS = np.array([[0.2, 1.5], [0.3, 1.0], [0.01, 0.05], [0.02, 0.1], [0.75, 0.92], [0, 0]])
-"""Of a box, ball, cable, cross, the inside of a window: least and most, by its size."""
+"""Thickness relative to size, minimum and maximum: box, ball, cable, cross, inside of a window."""
 THINNEST_PX = 0.7
 BAR = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 ROUND = np.linspace(0, 2 * np.pi, 20, endpoint=False)
@@ -30,14 +30,14 @@ DISC = np.column_stack([np.cos(ROUND), np.sin(ROUND)]) / 2
 
 
 def background(rng: Generator, width_px: int, height_px: int) -> Levels:
-    """A random background, (height_px, width_px, 3), uint8.
+    """Draw a random background, (height_px, width_px, 3), uint8.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
+        Random generator.
     width_px, height_px
-        Size.
+        Size of the image.
     """
     ground = (_gradient, _clouds, _room)[rng.integers(3)]
     canvas = ground(rng, width_px, height_px)
@@ -56,21 +56,21 @@ def background(rng: Generator, width_px: int, height_px: int) -> Levels:
 
 
 def window(rng: Generator, table: Picture, width_px: int, height_px: int) -> Picture:
-    """(height_px, width_px * 3) a random part of a larger picture of rows, not a copy."""
+    """Return a random (height_px, width_px * 3) window of a larger array, as a view."""
     top = int(rng.integers(len(table) - height_px + 1))
     left = 3 * int(rng.integers(table.shape[1] // 3 - width_px + 1))
     return table[top : top + height_px, left : left + 3 * width_px]
 
 
 def _colours(rng: Generator, count: int) -> Array:
-    """(count, 3) colours, mostly greyish as rooms are; now and then vivid."""
+    """Draw (count, 3) colours, mostly greyish as in rooms, sometimes vivid."""
     grey = rng.uniform(0.03, 0.9, (count, 1))
     spread = SPREADS[rng.integers(len(SPREADS), size=(count, 1))]
     return np.clip(grey + spread * rng.standard_normal((count, 3)), 0, 1)
 
 
 def _on(ground: Callable[[slice], Picture], width_px: int, height_px: int) -> Canvas:
-    """A canvas on the rows that ``ground`` gives, 0 to 1."""
+    """Return a canvas whose background is computed by ``ground``, 0 to 1, row by row."""
     levels = np.empty((height_px, 3 * width_px), np.uint8)
     for rows in bands(height_px):
         band = ground(rows)
@@ -86,7 +86,7 @@ def _row(colour: Colour, width_px: int) -> Picture:
 
 
 def _gradient(rng: Generator, width_px: int, height_px: int) -> Canvas:
-    """From one colour to another, in any direction."""
+    """Draw a gradient between two colours in a random direction."""
     angle = rng.uniform(0, 2 * np.pi)
     one, other = _colours(rng, 2)
     across = np.linspace(-0.5, 0.5, width_px)[:, None] * np.cos(angle) / 1.42
@@ -98,7 +98,7 @@ def _gradient(rng: Generator, width_px: int, height_px: int) -> Canvas:
 
 
 def _clouds(rng: Generator, width_px: int, height_px: int) -> Canvas:
-    """Two colours, and a little of every other, in clouds."""
+    """Draw clouds of two colours, with weak tints of others."""
     one, other = _colours(rng, 2)
     share = _noise(rng, width_px, height_px, (SMOOTH, MIDDLE, ROUGH)[rng.integers(3)])
     tints = window(rng, _tints(width_px, height_px), width_px, height_px)
@@ -114,7 +114,7 @@ def _clouds(rng: Generator, width_px: int, height_px: int) -> Canvas:
 
 
 def _room(rng: Generator, width_px: int, height_px: int) -> Canvas:
-    """A wall and a floor with boards that meet far away."""
+    """Draw a wall and a floor with boards that meet at a vanishing point."""
     horizon = height_px * rng.uniform(0.2, 0.8)
     floor, wall, *boards = _colours(rng, 11)
     light, row = _noise(rng, width_px, height_px, SMOOTH), _row(wall, width_px)
@@ -132,7 +132,7 @@ def _room(rng: Generator, width_px: int, height_px: int) -> Canvas:
 
 
 def _things(rng: Generator, canvas: Canvas) -> list[Outline]:
-    """Things that are no quadrotor, in the order in which they hide each other."""
+    """Return outlines of clutter without quadrotors, from back to front."""
     count = int(rng.integers(4, 30))
     kind = rng.integers(len(THICKNESS), size=count)
     size = np.exp(rng.uniform(np.log(4), np.log(110), count))
@@ -160,7 +160,7 @@ def _things(rng: Generator, canvas: Canvas) -> list[Outline]:
 
 
 def _places(rng: Generator, canvas: Canvas, count: int) -> Array:
-    """(count, 3, 2) a turn of corners, as rows, and a place in the picture under it."""
+    """Draw (count, 3, 2): a rotation of corners, as rows, followed by a position in the image."""
     upright = rng.random(count) < 0.5
     turn = np.where(upright, rng.normal(0, 0.06, count), rng.uniform(0, np.pi, count))
     c, s = np.cos(turn), np.sin(turn)
@@ -169,21 +169,21 @@ def _places(rng: Generator, canvas: Canvas, count: int) -> Array:
 
 
 def _noise(rng: Generator, width_px: int, height_px: int, rough: float) -> Picture:
-    """(H, W * 3) grey noise with detail of every size: a window of a table."""
+    """Return an (H, W * 3) window of grey noise with detail of all sizes."""
     table = _table(width_px, height_px, rough)
     return window(rng, table, width_px, height_px)
 
 
 @cache
 def _table(width_px: int, height_px: int, rough: float) -> Picture:
-    """Noise of twice the width and height, the same in every process."""
+    """Return noise of twice the width and height, identical in every process."""
     rng = np.random.default_rng(round(100 * rough))
     return _detail(rng, width_px, height_px, rough, KNOTS).repeat(3, axis=1)
 
 
 @cache
 def _tints(width_px: int, height_px: int) -> Picture:
-    """As `_table`, weak, of another noise in each channel, without fine detail."""
+    """Return weak noise as `_noise_table`, independent per channel and without fine detail."""
     rng = np.random.default_rng(1)
     parts = [0.06 * _detail(rng, width_px, height_px, 0.5, KNOTS[:4]) for _ in range(3)]
     return np.stack(parts, axis=2, dtype=np.float32).reshape(len(parts[0]), -1)
@@ -192,7 +192,7 @@ def _tints(width_px: int, height_px: int) -> Picture:
 def _detail(
     rng: Generator, width_px: int, height_px: int, rough: float, knots: tuple[int, ...]
 ) -> Picture:
-    """(2 H, 2 W) noise, each size of detail linear between its knots."""
+    """Return (2 H, 2 W) noise. Each scale is linear between its knots."""
     weights = rough ** np.arange(len(knots))
     weights *= 1.5 * DEVIATION / np.sqrt((weights**2).sum())
     total = np.zeros((2 * height_px, 2 * width_px), np.float32)
@@ -204,6 +204,6 @@ def _detail(
 
 
 def _stretch(size: int, knots: int) -> Picture:
-    """(size, knots) matrix that interpolates knots linearly to pixels."""
+    """Return a (size, knots) matrix that interpolates knots linearly to pixels."""
     place = np.linspace(0, knots - 1, size)
     return np.asarray(np.maximum(0, 1 - abs(place[:, None] - np.arange(knots))), np.float32)

@@ -1,7 +1,7 @@
-"""Rooms made by code: bright walls, doors with handles and spy holes, sockets, lamps, luggage.
+"""Generated rooms: bright walls, doors with handles and spy holes, sockets, lamps, luggage.
 
-What stands before a drone in a room, and what a network takes for one: small dark things on a
-bright wall. Photos of the web hold few of them.
+They contain small dark objects on bright walls, which networks confuse with drones. Photos from
+the web contain few of these.
 """
 
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from dmrl.images.codec import Rgb
 from dmrl.rendering.backgrounds.photos import Photos
 
 ROOMS = "rooms"
-"""What ``backgrounds`` says for `rooms`."""
+"""Value of the setting ``backgrounds`` that selects generated rooms."""
 COUNT = 1_000_000
-"""Rooms there are: more than anybody asks for."""
+"""Number of distinct rooms. More than any run needs."""
 SIZE_PX = (480, 336)
 SIDE = 1.5
-"""Of what is drawn over the picture, so that a turned room has no corners missing."""
+"""Overdraw relative to the image, so that a rotated room has no missing corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Room:
-    """A picture of a room that is drawn on; ``unit_px`` is the height of a door."""
+    """Canvas of a room, with the rotation of the image. ``unit_px`` is the height of a door."""
 
     canvas: Canvas
     rng: Generator
@@ -36,7 +36,7 @@ class _Room:
     wall: Colour
 
     def fill(self, corners: Array, colour: Colour, opacity: float = 1.0) -> None:
-        """Draw a polygon, its corners in the picture before it is turned."""
+        """Draw a polygon. Its corners are in the image before rotation."""
         middle = np.array([self.width_px, self.height_px]) / 2
         self.canvas.fill((corners - middle) @ self.turn.T + middle, colour, opacity)
 
@@ -51,14 +51,14 @@ class _Room:
         self.fill(at + half * np.column_stack([np.cos(angle), np.sin(angle)]), colour, opacity)
 
     def bar(self, start: Array, end: Array, thick: float, colour: Colour) -> None:
-        """Draw a straight bar from here to there."""
+        """Draw a straight bar between two points."""
         along = end - start
         side = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-6) * thick / 2
         self.fill(np.array([start - side, start + side, end + side, end - side]), colour)
 
 
 def rooms() -> Photos:
-    """Rooms in place of photos, the same by number on every machine."""
+    """Return generated rooms as photos. Room k is the same on every machine."""
     return Photos(_room_of, COUNT)
 
 
@@ -68,14 +68,14 @@ def _room_of(number: int) -> Rgb:
 
 
 def interior(rng: Generator, width_px: int, height_px: int) -> Picture:
-    """A random room, (height_px, width_px, 3), as a photo has it, 0 to 1.
+    """Draw a random room, (height_px, width_px, 3), with the values of a photo, 0 to 1.
 
     Parameters
     ----------
     rng
-        Where the randomness comes from.
+        Random generator.
     width_px, height_px
-        Size.
+        Size of the image.
     """
     wall = _grey(rng, 0.45, 0.95)
     angle = rng.normal(0, 0.12)
@@ -97,7 +97,7 @@ def interior(rng: Generator, width_px: int, height_px: int) -> Picture:
 
 
 def _grey(rng: Generator, low: float, high: float) -> Colour:
-    """A colour close to grey, as paint and furniture have; now and then a strong one."""
+    """Draw a colour close to grey, as of paint and furniture, sometimes a strong one."""
     spread = 0.15 if rng.random() < 0.15 else 0.03
     return np.clip(rng.uniform(low, high) + rng.normal(0, spread, 3), 0.01, 1)
 
@@ -107,7 +107,7 @@ def _dark(rng: Generator) -> Colour:
 
 
 def _floor(room: _Room, floor_px: float) -> None:
-    """Floor, often dark, with a skirting board and joints that run to a point."""
+    """Draw a floor, often dark, with a skirting board and joints that meet at a vanishing point."""
     rng, wide = room.rng, SIDE * room.width_px
     colour = _grey(rng, 0.04, 0.5)
     room.box(-wide, floor_px, 3 * wide, 2 * wide, colour)
@@ -121,7 +121,7 @@ def _floor(room: _Room, floor_px: float) -> None:
 
 
 def _door(room: _Room, floor_px: float) -> None:
-    """One or two leaves with a frame, hinges, a handle, a lock and perhaps a spy hole."""
+    """Draw one or two leaves with a frame, hinges, a handle, a lock and perhaps a spy hole."""
     rng, tall = room.rng, room.unit_px
     left = rng.uniform(-0.2, 0.9) * room.width_px
     colour = np.clip(room.wall * rng.uniform(0.7, 1.15), 0, 1)
@@ -144,7 +144,7 @@ def _door(room: _Room, floor_px: float) -> None:
 
 
 def _handle(room: _Room, at: Array, inwards: float) -> None:
-    """A lever on a plate or a rose, a keyhole below, and its shadow."""
+    """Draw a lever on a plate or a rose, a keyhole below, and its shadow."""
     rng, tall = room.rng, room.unit_px
     metal = _grey(rng, 0.1, 0.75)
     thick = tall * rng.uniform(0.008, 0.018)
@@ -162,7 +162,7 @@ def _handle(room: _Room, at: Array, inwards: float) -> None:
 
 
 def _cupboard(room: _Room, floor_px: float) -> None:
-    """Rows of fronts, each with a knob or a bar."""
+    """Draw rows of fronts, each with a knob or a bar."""
     rng, tall = room.rng, room.unit_px
     left, wide = rng.uniform(-0.4, 0.8) * room.width_px, tall * rng.uniform(0.2, 0.5)
     rows, columns = int(rng.integers(1, 5)), int(rng.integers(1, 4))
@@ -182,7 +182,7 @@ def _cupboard(room: _Room, floor_px: float) -> None:
 
 
 def _window(room: _Room, floor_px: float) -> None:
-    """Panes brighter than anything else, with bars between."""
+    """Draw panes brighter than anything else, with bars between them."""
     rng, tall = room.rng, room.unit_px
     left, top = rng.uniform(-0.2, 0.9) * room.width_px, floor_px - tall * rng.uniform(0.9, 1.1)
     wide, high = tall * rng.uniform(0.3, 0.8), tall * rng.uniform(0.4, 0.7)
@@ -195,7 +195,7 @@ def _window(room: _Room, floor_px: float) -> None:
 
 
 def _board(room: _Room, floor_px: float) -> None:
-    """A picture, notice board or screen."""
+    """Draw a picture, notice board or screen."""
     rng, tall = room.rng, room.unit_px
     left, top = rng.uniform(-0.1, 0.9) * room.width_px, floor_px - tall * rng.uniform(0.6, 1)
     wide, high = tall * rng.uniform(0.1, 0.5, 2)
@@ -210,7 +210,7 @@ def _board(room: _Room, floor_px: float) -> None:
 
 
 def _on_wall(room: _Room, floor_px: float) -> None:
-    """A socket, switch, hook, lamp bracket, screw or crack: small, and not flying."""
+    """Draw a small item on the wall: a socket, switch, hook, lamp bracket, screw or crack."""
     rng, tall = room.rng, room.unit_px
     at = np.array([rng.uniform(0, room.width_px), floor_px - tall * rng.uniform(0.05, 1.2)])
     size = tall * rng.uniform(0.012, 0.05)
@@ -221,7 +221,7 @@ def _on_wall(room: _Room, floor_px: float) -> None:
         room.disc(at, 0.75 * size, colour * 0.8)
         for side in (-0.3, 0.3):
             room.disc(np.add(at, (side * size, 0)), 0.15 * size, _dark(rng))
-    elif kind == 1:  # a bracket: an arm and what hangs on it
+    elif kind == 1:  # a bracket: an arm with a lamp
         end = at + size * rng.uniform(-3, 3, 2)
         room.bar(at, end, 0.3 * size, _dark(rng))
         room.disc(end, size * rng.uniform(0.3, 1), _grey(rng, 0.02, 0.9))
@@ -234,7 +234,7 @@ def _on_wall(room: _Room, floor_px: float) -> None:
 
 
 def _luggage(room: _Room, floor_px: float) -> None:
-    """A suitcase or bag that stands on the floor, with ribs, wheels and a handle."""
+    """Draw a suitcase or bag on the floor, with ribs, wheels and a handle."""
     rng, tall = room.rng, room.unit_px
     wide, high = tall * rng.uniform(0.12, 0.3), tall * rng.uniform(0.15, 0.4)
     left = rng.uniform(-0.1, 1) * room.width_px
@@ -250,7 +250,7 @@ def _luggage(room: _Room, floor_px: float) -> None:
 
 
 def _furniture(room: _Room, floor_px: float) -> None:
-    """A table, chair or stand: a top on thin legs."""
+    """Draw a table, chair or stand: a top on thin legs."""
     rng, tall = room.rng, room.unit_px
     wide, high = tall * rng.uniform(0.1, 0.7), tall * rng.uniform(0.15, 0.4)
     left = rng.uniform(-0.2, 1) * room.width_px
@@ -267,7 +267,7 @@ def _furniture(room: _Room, floor_px: float) -> None:
 
 
 def _cable(room: _Room, floor_px: float) -> None:
-    """A cable that hangs from somewhere above."""
+    """Draw a cable that hangs from above."""
     rng = room.rng
     at, colour = np.array([rng.uniform(0, room.width_px), -20.0]), _dark(rng)
     step = np.array([rng.normal(0, 6), room.unit_px * 0.08])
@@ -281,7 +281,7 @@ BEFORE = (_luggage, _furniture, _cable)
 
 
 def _lit(rng: Generator, picture: Picture) -> Picture:
-    """Light that falls off from a side, and lamps, or their reflections, with their bloom."""
+    """Add light that falls off to one side, and lamps or their reflections with bloom."""
     height, width, _ = picture.shape
     v, u = np.mgrid[:height, :width].astype(np.float32) / np.float32(width)
     angle, strength = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.6)

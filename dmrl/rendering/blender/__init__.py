@@ -1,1 +1,1 @@
-"""What runs in Blender's own Python, and the protocol that both sides speak."""
+"""Worker code that runs in Blender's own Python, and the protocol between dmrl and the worker."""

@@ -7,7 +7,7 @@
 # 3 of the License, or (at your option) any later version. It is distributed in the hope that
 # it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
 # MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
-"""One core while Blender is loaded, all of them afterwards."""
+"""Restriction of Blender to one core while it is loaded."""
 
 import os
 from contextlib import contextmanager
@@ -15,11 +15,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_core():
-    """Show this process a single core.
+    """Limit this process to one core inside the context.
 
-    Blender's libraries count the cores when they are loaded and start a thread for each. A
-    worker has work for one: the others would spin, waiting for some, and take half a core from
-    the other workers. Where cores cannot be chosen (macOS, Windows) this does nothing.
+    Blender's libraries count the cores when they are loaded and start one thread per core. A
+    worker has work for one thread. The others would spin idly and take half a core from the
+    other workers. Where affinity cannot be set (macOS, Windows) this has no effect.
     """
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
     if cores:

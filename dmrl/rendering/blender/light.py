@@ -7,7 +7,7 @@
 # 3 of the License, or (at your option) any later version. It is distributed in the hope that
 # it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
 # MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
-"""The light of panoramas, on robots and as backgrounds."""
+"""Light of panoramas, on robots and as backgrounds."""
 
 import math
 
@@ -21,9 +21,9 @@ LIGHT_CAP = 8.0
 
 
 class Sky:
-    """One world for all panoramas, one above the other in one picture.
+    """One Blender world for all panoramas, stacked in one image.
 
-    A world for each would be loaded anew at every change, which takes longer than a robot.
+    Separate worlds would be reloaded at every change, which takes longer than rendering a robot.
     """
 
     def __init__(self, scene, lights):
@@ -33,10 +33,10 @@ class Sky:
         self.numbers = {name: k for k, name in enumerate(lights)}
         scene.world = world = bpy.data.worlds.new("world")
         world.use_nodes = True
-        # Coarse and capped, it is met often enough by chance: the rays aimed at light go to
-        # the sun alone, and no map of the sky is made for every image.
+        # The coarse, capped panorama needs no importance sampling: random rays hit it often
+        # enough. Light sampling is left to the sun, and no importance map is built per image.
         world.cycles.sampling_method = "NONE"
-        world.cycles_visibility.camera = False  # the film is clear there: no need to look
+        world.cycles_visibility.camera = False  # the film is transparent there
         tree = world.node_tree
         self.background = tree.nodes["Background"]
         place = tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"]
@@ -44,7 +44,7 @@ class Sky:
         x, y, z = node(tree, "SeparateXYZ", self.turn.outputs[0]).outputs
         turn = calc(tree, "DIVIDE", calc(tree, "ARCTAN2", y, x), -2 * math.pi)
         height = calc(tree, "DIVIDE", calc(tree, "ARCSINE", z), math.pi)
-        # Half a row from the edges, where the next panorama would shine in.
+        # Stay half a row from the edges, where the next panorama would be interpolated.
         height = calc(tree, "MULTIPLY", calc(tree, "ADD", height, 0.5), (rows - 1) / rows)
         height = calc(tree, "ADD", height, 0.5 / rows)
         self.number = node(tree, "Math", height, 0.0, operation="ADD")
@@ -54,16 +54,16 @@ class Sky:
         tree.links.new(picture.outputs["Color"], self.background.inputs["Color"])
 
     def shine(self, name, turn_rad, strength):
-        """Show one panorama, turned by XYZ angles."""
+        """Select one panorama, rotated by XYZ angles."""
         self.number.inputs[1].default_value = self.numbers[name]
         self.turn.inputs["Rotation"].default_value = turn_rad
         self.background.inputs["Strength"].default_value = strength
 
 
 def small(name):
-    """(rows, columns, 4) a panorama's light by large parts, of mean MEAN_LIGHT.
+    """Return a (rows, columns, 4) downsampled panorama of mean MEAN_LIGHT.
 
-    Small hard lights would make fireflies; the sun of the scene is there for them.
+    Small bright lights would cause fireflies. The scene's sun replaces them.
     """
     columns, rows = LIGHT_SIZE_PX
     wide = panorama(name)[::-1]
@@ -79,7 +79,7 @@ def small(name):
 
 
 def panorama(name):
-    """(H, W, 3) linear light of a picture, all around, top row first."""
+    """Load the (H, W, 3) linear light of a panorama, top row first."""
     image = bpy.data.images.load(name)
     width, height = image.size
     pixels = np.empty(4 * width * height, np.float32)

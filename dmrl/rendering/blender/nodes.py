@@ -7,11 +7,11 @@
 # 3 of the License, or (at your option) any later version. It is distributed in the hope that
 # it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
 # MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
-"""Shader nodes in a line each."""
+"""Helpers that create a shader node in one line."""
 
 
 def node(tree, kind, *inputs, **options):
-    """A new node with its inputs linked or set, in order."""
+    """Create a node with its inputs linked or set, in order."""
     made = tree.nodes.new(f"ShaderNode{kind}")
     for name, value in options.items():
         setattr(made, name, value)
@@ -24,10 +24,10 @@ def node(tree, kind, *inputs, **options):
 
 
 def calc(tree, operation, *inputs):
-    """What an operation makes of its inputs."""
+    """Create a math node and return its output."""
     return node(tree, "Math", *inputs, operation=operation).outputs[0]
 
 
 def of_object(tree, name):
-    """A property of the object that is shaded."""
+    """Create a node that reads a property of the shaded object."""
     return node(tree, "Attribute", attribute_name=name, attribute_type="OBJECT")

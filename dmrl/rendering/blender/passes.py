@@ -7,7 +7,7 @@
 # 3 of the License, or (at your option) any later version. It is distributed in the hope that
 # it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
 # MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
-"""The pixels of a render: from memory, or through files where Blender does not hand them over."""
+"""Pixels of a render, read from memory, or from files where Blender does not expose them."""
 
 import tempfile
 from pathlib import Path
@@ -23,11 +23,11 @@ _taken = {}
 
 
 def _render_and_take(engine, depsgraph):
-    """Cycles' own render, after which the passes are read where they lie in memory."""
+    """Run Cycles' own render, then read the passes from memory."""
     _render(engine, depsgraph)
     try:
         _take(engine.get_result())
-    except AttributeError:  # this Blender has no such door
+    except AttributeError:  # this Blender does not expose the passes
         _taken.clear()
 
 
@@ -41,10 +41,10 @@ def _take(result):
 
 
 class Passes:
-    """How a scene is rendered and its pixels are had.
+    """Renderer of a scene that returns its passes.
 
-    Reading them from memory is not in Blender's documentation; a release without it costs
-    time, not pictures.
+    Reading passes from memory is not documented by Blender. A release without it is slower, but
+    gives the same images.
     """
 
     def __init__(self, scene):
@@ -53,7 +53,7 @@ class Passes:
         CyclesRender.render = _render_and_take
 
     def render(self):
-        """(H, W, 4) premultiplied light and opacity, and (H, W) depth, top row first."""
+        """Return (H, W, 4) premultiplied light and opacity, and (H, W) depth, top row first."""
         if self.folder is None:
             _taken.clear()
             bpy.ops.render.render()
@@ -65,7 +65,7 @@ class Passes:
         return {"light": light, "depth": depth[..., 0].copy()}
 
     def _use_files(self):
-        """Let the compositor write the passes of every render."""
+        """Configure the compositor to write the passes of every render to files."""
         CyclesRender.render = _render
         self.folder = tempfile.TemporaryDirectory(prefix="dmrl-")
         self.scene.render.use_compositing = self.scene.use_nodes = True

@@ -1,7 +1,7 @@
 """Messages over a pipe: a JSON head and raw arrays, each preceded by its length.
 
-Imported by dmrl, and by the worker beside it in another Python: nothing but the standard
-library and NumPy.
+Imported by dmrl and by the worker in Blender's Python. Therefore only the standard library and
+NumPy are used.
 """
 
 import json
@@ -22,11 +22,11 @@ def send(stream: IO[bytes], head: Mapping[str, Any], arrays: Arrays | None = Non
     Parameters
     ----------
     stream
-        Where to.
+        Stream to write to.
     head
         JSON values.
     arrays
-        Sent as they lie in memory, little-endian.
+        Arrays, sent as they lie in memory, little-endian.
     """
     arrays = {} if arrays is None else {k: np.ascontiguousarray(v) for k, v in arrays.items()}
     shapes = {name: (a.dtype.str, list(a.shape)) for name, a in arrays.items()}
@@ -38,12 +38,12 @@ def send(stream: IO[bytes], head: Mapping[str, Any], arrays: Arrays | None = Non
 
 
 def receive(stream: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
-    """Read one message: its head and its arrays.
+    """Read the head and the arrays of one message.
 
     Raises
     ------
     EOFError
-        If the other side has gone.
+        If the other side closed the pipe.
     """
     (length,) = _LENGTH.unpack(_exactly(stream, _LENGTH.size))
     message = json.loads(_exactly(stream, length))
@@ -60,6 +60,6 @@ def _exactly(stream: IO[bytes], count: int) -> bytes:
     while len(data) < count:
         part = stream.read(count - len(data))
         if not part:
-            raise EOFError("the other side of the pipe has gone")
+            raise EOFError("the other side closed the pipe")
         data += part
     return data

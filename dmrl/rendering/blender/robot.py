@@ -7,7 +7,7 @@
 # 3 of the License, or (at your option) any later version. It is distributed in the hope that
 # it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
 # MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
-"""The robot: drawn by dmrl, or the user's model."""
+"""Mesh of the robot: the built-in one, or the user's model."""
 
 import math
 
@@ -19,7 +19,7 @@ TURNED = (".glb", ".gltf", ".obj")
 
 
 def drawn(head, arrays):
-    """The robot that dmrl draws: vertices in metres, triangles, a material each."""
+    """Build the mesh of the built-in robot: vertices in metres, triangles with a material each."""
     mesh = bpy.data.meshes.new("robot")
     mesh.from_pydata(arrays["vertices"].tolist(), [], arrays["faces"].tolist())
     mesh.polygons.foreach_set("material_index", arrays["material"].astype(np.int32))
@@ -36,7 +36,7 @@ def drawn(head, arrays):
 
 
 def loaded(path, scale, up, *, boxed):
-    """The user's model, as one mesh about the middle of its bounding box or the file's origin."""
+    """Load the user's model as one mesh, centred on its bounding box or on the file's origin."""
     meshes = _meshes(path)
     robot = bpy.data.meshes.new("robot")
     corners, faces, indices, start = [], [], [], 0
@@ -63,9 +63,9 @@ def loaded(path, scale, up, *, boxed):
 
 
 def _upright(points, kind, up):
-    """Points with z up, of a file whose axis ``up`` points up; auto: as is usual for its kind.
+    """Rotate points to z up, from the file's axis ``up``. auto uses the convention of its format.
 
-    Blender's importers have turned .obj and .glb, whose y is up as a rule, already.
+    Blender's importers already rotate .obj and .glb, whose y is up by convention.
     """
     x, y, z = points.T
     if kind in TURNED:
@@ -74,7 +74,7 @@ def _upright(points, kind, up):
 
 
 def _paint(material, number):
-    """Colour and roughness from the robot's properties, so that no shader is built anew."""
+    """Create a material that reads its paint from object properties: no shader is rebuilt."""
     material.use_nodes = True
     material.cycles.emission_sampling = "NONE"
     tree = material.node_tree
@@ -86,23 +86,22 @@ def _paint(material, number):
     tree.links.new(finish.outputs[0], surface.inputs["Roughness"])
     tree.links.new(finish.outputs[1], surface.inputs["Metallic"])
     tree.links.new(finish.outputs[2], surface.inputs["Emission Strength"])
-    # Nothing here is brushed metal: without this, the direction of brushing would be worked out
-    # for every ray.
+    # No material is brushed metal: a constant tangent avoids computing one for every ray.
     tree.links.new(node(tree, "CombineXYZ").outputs[0], surface.inputs["Tangent"])
 
 
 def _show_blades(material, head):
-    """Opacity of the discs: the share of the exposure in which a blade covers a point.
+    """Set the opacity of rotor discs: the share of the exposure in which a blade covers a point.
 
-    "rotor" of a point is its place on the disc, x and y in metres, and the rotor's number;
-    the robot has the first angle of rotor 0 and how far all turn while the shutter is open.
+    The attribute "rotor" of a point is its place on the disc, x and y in metres, and the rotor's
+    number. The robot has the first angle of rotor 0 and the rotation during the exposure.
     """
     tree = material.node_tree
     place = node(tree, "Attribute", attribute_name="rotor", attribute_type="GEOMETRY")
     x, y, number = node(tree, "SeparateXYZ", place.outputs["Vector"]).outputs
     first = of_object(tree, "rotor_first_rad").outputs["Fac"]
     sweep = of_object(tree, "rotor_sweep_rad").outputs["Fac"]
-    # Half a turn of two blades covers all there is to cover.
+    # Half a turn of two blades covers the whole disc.
     sweep = calc(tree, "MINIMUM", calc(tree, "MAXIMUM", sweep, 0.02), math.pi)
     first = calc(tree, "ADD", first, calc(tree, "MULTIPLY", number, head["between_rotors_rad"]))
     angle = calc(tree, "SUBTRACT", calc(tree, "ARCTAN2", y, x), first)
@@ -118,7 +117,7 @@ def _show_blades(material, head):
         share = calc(tree, "MAXIMUM", calc(tree, "SUBTRACT", end, begin), 0.0)
         total = share if total is None else calc(tree, "ADD", total, share)
     opacity = calc(tree, "MINIMUM", calc(tree, "DIVIDE", total, sweep), 1.0)
-    # A mixture, since the side that has no share in it is not worked out; of alpha, it is.
+    # A mix shader skips the side whose share is 0. Alpha would evaluate both.
     clear = node(tree, "BsdfTransparent").outputs[0]
     blade = tree.nodes["Principled BSDF"].outputs[0]
     mixture = node(tree, "MixShader", opacity, clear, blade).outputs[0]
@@ -126,9 +125,10 @@ def _show_blades(material, head):
 
 
 def _meshes(path):
-    """Mesh and placement of every object of a file; of a .blend, without roots' own places.
+    """Return mesh and placement of every object of a file.
 
-    Importers turn y up into z up by the roots' rotation, so there it counts.
+    The placement of a .blend is relative to the root object. Other importers convert y up to z up
+    by the root's rotation, which is therefore kept.
     """
     kind, meshes = path.suffix.lower(), []
     things = _imported(path, kind)
@@ -144,7 +144,7 @@ def _meshes(path):
 
 
 def _imported(path, kind):
-    """Every object of a file, by the importer of its kind, with matrices that are up to date."""
+    """Import all objects of a file with updated matrices."""
     before = set(bpy.data.objects)
     if kind == ".blend":
         with bpy.data.libraries.load(str(path)) as (source, wanted):
@@ -160,7 +160,7 @@ def _imported(path, kind):
 
 
 def _root(thing):
-    """What an object hangs from, at the top; itself, where it hangs from nothing."""
+    """Return the topmost parent of an object, or the object itself."""
     while thing.parent is not None:
         thing = thing.parent
     return thing

@@ -7,11 +7,11 @@
 # 3 of the License, or (at your option) any later version. It is distributed in the hope that
 # it will be useful, but WITHOUT ANY WARRANTY; without even the implied warranty of
 # MERCHANTABILITY or FITNESS FOR A PARTICULAR PURPOSE. See <https://www.gnu.org/licenses/>.
-"""A robot's colour, opacity and depth as a pinhole camera sees it, over a pipe.
+"""Blender worker: renders a robot's colour, opacity and depth for a pinhole camera, over a pipe.
 
-Run by path in Blender's own Python; only this and its neighbours import bpy. Blender's world
-is dmrl's camera frame: x forward, y left, z up, metres, the camera at the origin. Light turns
-with gravity. Every answer depends on its request alone, not on those before it.
+Run by path in Blender's own Python. Only the files of this folder import bpy. Blender's world
+is dmrl's camera frame: x forward, y left, z up, metres, the camera at the origin. Light rotates
+with gravity. Every reply depends on its request alone, not on earlier ones.
 """
 
 import os
@@ -29,16 +29,16 @@ from passes import Passes
 from protocol import receive, send
 from robot import drawn, loaded
 
-# The camera of Blender looks along its -z, y up.
+# Blender's camera points along its -z axis, y up.
 WORLD_FROM_CAMERA = Matrix(((0, 0, -1, 0), (-1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 SENSOR_MM = 32.0
-# A crop's edges in the middle of pixels' quarters, so that rounding cannot move them.
+# Offset of a crop's edges into the pixels, so that rounding cannot move them.
 NUDGE_PX = 0.25
 OUT_OF_SIGHT_M = -1000.0
 
 
 class Stage:
-    """The scene: one robot, one camera, a sun and a sky."""
+    """Scene of one robot, one camera, a sun and a sky."""
 
     def __init__(self, head, arrays):
         bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -62,24 +62,25 @@ class Stage:
                 boxed=head["model_centre"] == "box",
             )
         self.robot = self.add("robot", mesh)
-        # A mesh that two objects share is kept as it is; that of one alone would be moved to
-        # its place, and its tree of triangles built anew, whenever robot or sun change.
+        # Blender keeps a mesh that two objects share. It would transform the mesh of a single
+        # object and rebuild its BVH whenever the robot or the sun change.
         self.add("twin", mesh).matrix_world = Matrix.Translation((OUT_OF_SIGHT_M, 0, 0))
         self.passes = Passes(self.scene)
 
     def settings(self, head):
+        """Set Cycles' options."""
         render, cycles = self.scene.render, self.scene.cycles
         render.engine = "CYCLES"
         cycles.device = "CPU"
         cycles.samples = head["samples"]
         cycles.use_denoising = cycles.use_adaptive_sampling = False
-        # A filter as wide as the pixel: opacity is the share of the pixel that is covered.
+        # A box filter of one pixel: opacity is the covered share of the pixel.
         cycles.pixel_filter_type = "BOX"
         cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = head["bounces"]
         cycles.transparent_max_bounces = 8
         cycles.caustics_reflective = cycles.caustics_refractive = False
         cycles.sample_clamp_indirect = 4.0
-        cycles.use_light_tree = False  # built anew for every image, at half its cost
+        cycles.use_light_tree = False  # it is rebuilt for every image, at half the image's cost
         render.threads_mode, render.threads = "FIXED", 1
         render.use_persistent_data = True
         render.film_transparent = True
@@ -90,17 +91,19 @@ class Stage:
         self.scene.view_layers[0].use_pass_z = True
 
     def add(self, name, data):
+        """Add an object to the scene."""
         thing = bpy.data.objects.new(name, data)
         self.scene.collection.objects.link(thing)
         return thing
 
     def points(self):
+        """Return the (N, 3) vertices of the robot."""
         found = np.empty(3 * len(self.robot.data.vertices), np.float32)
         self.robot.data.vertices.foreach_get("co", found)
         return found.reshape(-1, 3)
 
     def shoot(self, head):
-        """(H, W, 4) premultiplied light and opacity and (H, W) depth of a crop."""
+        """Return (H, W, 4) premultiplied light and opacity, and (H, W) depth of a crop."""
         self.aim(head)
         self.sky.shine(head["light"], head["light_turn_rad"], head["light_strength"])
         self.sun.data.energy = head["sun_strength"]
@@ -111,19 +114,20 @@ class Stage:
         for name, value in head["paint"].items():
             self.robot[name] = value
         self.robot.matrix_world = Matrix(head["camera_from_body"])
-        # Properties are seen with this; without naming what changed, the mesh would be copied.
+        # Required for changed properties. Without the refresh type, the mesh would be copied.
         self.robot.update_tag(refresh={"OBJECT"})
         self.scene.cycles.seed = head["seed"]
         return self.passes.render()
 
     def aim(self, head):
+        """Set the camera's intrinsics and the crop."""
         width, height = head["size_px"]
         fx, fy, cx, cy = head["intrinsics_px"]
         render, lens = self.scene.render, self.camera.data
         render.resolution_x, render.resolution_y = width, height
         render.pixel_aspect_x, render.pixel_aspect_y = max(fy / fx, 1.0), max(fx / fy, 1.0)
         lens.lens = SENSOR_MM * fx / width
-        # Shifts are in units of the image's width, of square pixels.
+        # Shifts are relative to the image's width, in square pixels.
         lens.shift_x, lens.shift_y = (width / 2 - cx) / width, (cy - height / 2) * fx / fy / width
         left, top, right, bottom = head["crop_px"]
         render.border_min_x, render.border_max_x = (
@@ -138,9 +142,9 @@ class Stage:
 
 
 def main():
-    """Answer requests until the other side closes the pipe."""
+    """Serve requests until the other side closes the pipe."""
     requests = sys.stdin.buffer
-    # Blender chats on standard output: only our answers may go there.
+    # Blender writes to standard output too, so replies use a duplicate of it.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     stage = None

@@ -1,1 +1,1 @@
-"""The simulated camera: lens, sensor, noise and image statistics."""
+"""Simulated camera: lens, sensor, noise and image statistics."""

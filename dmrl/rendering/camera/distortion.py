@@ -1,4 +1,4 @@
-"""A camera's image, the pinhole image behind it, and resampling from one to the other."""
+"""Conversion between a distorted image and its pinhole image, and resampling."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -12,7 +12,7 @@ from dmrl.geometry.lens import distort, undistort
 
 Picture = NDArray[np.float32]
 LONGEST_SIDE_PX = 4096
-"""Of an image to render: four times the widest camera's that a small drone carries."""
+"""Longest side of a rendered image, pixels. Four times the widest camera of small drones."""
 
 
 def _scale(camera: Camera) -> tuple[Array, Array]:
@@ -20,9 +20,9 @@ def _scale(camera: Camera) -> tuple[Array, Array]:
 
 
 def image_from_pinhole(uv: Array, camera: Camera) -> Array:
-    """(..., 2) pixels in the camera's image from those that it would have without distortion.
+    """Convert undistorted pixels (..., 2) to pixels of the camera's image.
 
-    NaN where the lens shows nothing.
+    The result is NaN where the lens cannot project the point.
     """
     focal, centre = _scale(camera)
     bent, _ = distort((uv - centre) / focal, camera.distortion)
@@ -30,26 +30,26 @@ def image_from_pinhole(uv: Array, camera: Camera) -> Array:
 
 
 def pinhole_from_image(uv: Array, camera: Camera) -> Array:
-    """(..., 2) pixels that the camera would have without distortion, from those it has."""
+    """Convert pixels (..., 2) of the camera's image to undistorted pixels."""
     focal, centre = _scale(camera)
     return np.asarray(undistort((uv - centre) / focal, camera.distortion) * focal + centre)
 
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """A pinhole image large enough to be bent into a camera's image.
+    """Pinhole image large enough to be distorted into a camera's image.
 
     Parameters
     ----------
     pinhole
-        Camera without distortion; its image covers what the real one sees.
+        Camera without distortion whose image covers the field of view of the real one.
     shift_px
-        (2,) what pixels of the canvas are more than undistorted pixels of the camera.
+        (2,) offset from undistorted pixels of the camera to pixels of the canvas.
     places_px
-        (H, W, 2) where each pixel's centre of the real image lies on the canvas; None where
-        the camera has no distortion and the two are the same.
+        (H, W, 2) place on the canvas of each pixel's centre. None where the camera has no
+        distortion and both images are identical.
     inside
-        (h, w) whether the real image shows a pixel of the canvas.
+        (h, w) whether the real image contains a pixel of the canvas.
     """
 
     pinhole: Camera
@@ -60,18 +60,17 @@ class Canvas:
 
 @cache
 def canvas_of(camera: Camera) -> Canvas:
-    """The canvas of a camera, worked out once.
+    """Return the canvas of a camera. The result is cached.
 
     Raises
     ------
     SettingError
-        If its images are too large to render, or its distortion folds them back before their
-        corners.
+        If its images are too large to render, or its distortion folds back before the corners.
     """
     if max(camera.width_px, camera.height_px) > LONGEST_SIDE_PX:
         raise SettingError(
             f"images of {camera.width_px}x{camera.height_px} px are too large to render: at most "
-            f"{LONGEST_SIDE_PX} px a side. Give a calibration of smaller ones"
+            f"{LONGEST_SIDE_PX} px a side. Use a calibration of smaller ones"
         )
     if not any(camera.distortion):
         everywhere = np.ones((camera.height_px, camera.width_px), bool)
@@ -82,7 +81,7 @@ def canvas_of(camera: Camera) -> Canvas:
         raise SettingError(
             f"a lens with distortion {list(camera.distortion)} cannot fill an image of "
             f"{camera.width_px}x{camera.height_px}: it folds back before the corners. Calibrate "
-            "it with boards there, or give fewer coefficients"
+            "it with boards there, or use fewer coefficients"
         )
     low = np.minimum(np.floor(places.min(axis=(0, 1))) - 2, 0)
     high = np.ceil(places.max(axis=(0, 1))) + 2
@@ -103,14 +102,19 @@ def canvas_of(camera: Camera) -> Canvas:
 
 
 def sample(picture: Picture, places_px: Picture) -> Picture:
-    """(H, W, C) picture at places between its pixels, bilinear; nothing outside it.
+    """Sample an image bilinearly. Places outside it are 0.
 
     Parameters
     ----------
     picture
         (h, w, C).
     places_px
-        (H, W, 2) u and v in the picture, pixel-edge coordinates.
+        (H, W, 2) u and v, pixel-edge coordinates.
+
+    Returns
+    -------
+    FloatImage
+        (H, W, C).
     """
     height, width, channels = picture.shape
     padded = np.zeros((height + 2, width + 2, channels), np.float32)
@@ -119,7 +123,7 @@ def sample(picture: Picture, places_px: Picture) -> Picture:
 
 
 def between(picture: Picture, places_px: Picture, *, around: bool = False) -> Picture:
-    """(H, W, C) picture at places between its pixels' centres, bilinear.
+    """Interpolate an image bilinearly at places relative to its first pixel's centre.
 
     Parameters
     ----------
@@ -128,7 +132,12 @@ def between(picture: Picture, places_px: Picture, *, around: bool = False) -> Pi
     places_px
         (H, W, 2) from the centre of the first pixel, right and down, above the last row.
     around
-        Whether the first column follows the last; else places are left of the last column.
+        Whether the first column follows the last. Otherwise places are left of the last column.
+
+    Returns
+    -------
+    FloatImage
+        (H, W, C).
     """
     _, width, channels = picture.shape
     corner = np.floor(places_px).astype(np.intp)
@@ -144,7 +153,7 @@ def between(picture: Picture, places_px: Picture, *, around: bool = False) -> Pi
 
 
 def _mixed(first: Picture, second: Picture, share: Picture) -> Picture:
-    """The first, into which a share of the second is mixed, in its place in memory."""
+    """Interpolate linearly from the first to the second, in place."""
     second -= first
     second *= share
     first += second

@@ -1,7 +1,7 @@
-"""What a camera does to its pictures, in numbers that real frames and renders can share.
+"""Image statistics that compare the cameras of real and rendered images.
 
-Every figure is of the picture as it is stored. None needs a target, a known scene or a label:
-they are meant to be compared between sets of pictures, not to calibrate a camera.
+All statistics refer to the stored pixels. None needs a target, a known scene or a label. They
+compare sets of images and do not calibrate a camera.
 """
 
 from collections.abc import Iterable
@@ -18,16 +18,16 @@ from dmrl.rendering.camera.sensor_noise import blocks_of, grain_of
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 REACH_PX = 4
-"""An edge is looked for within so many pixels to either side."""
+"""Search range for an edge, pixels to either side."""
 EDGE_SHARE = 0.02
-"""Share of the pixels that are taken for edges: those with the greatest step across."""
+"""Share of the pixels that count as edges: those with the largest step across."""
 CORNER, MIDDLE = 0.7, 0.1
-"""Squared distances from the middle, 1 in the corner, that bound the corners and the middle."""
+"""Squared radii that bound the corners and the middle. The radius is 1 in the corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """What a set of pictures looks like, on average; None: nothing in them shows it.
+    """Mean statistics of a set of images. None where the images do not determine one.
 
     Parameters
     ----------
@@ -36,18 +36,18 @@ class Likeness:
     contrast
         Standard deviation of luma over its mean.
     cast
-        Mean red over mean blue: over 1 is warm.
+        Mean red over mean blue. Above 1 is warm.
     colour
-        Standard deviation of red less blue, each over its mean: 0 for a grey camera.
+        Standard deviation of red minus blue, each over its mean. 0 for a grey camera.
     edge_px
         Step across an edge over its steepest slope, pixels.
     corners
-        Luma of the corners over that of the middle, of all pictures together.
+        Luma of the corners over that of the middle, of all images together.
     grain
-        Standard deviation of luma where things are smooth, levels of 256, of dark, grey and
-        bright places alike.
+        Standard deviation of luma in smooth areas, levels of 256. Dark, grey and bright areas have
+        equal weight.
     grain_correlation
-        Of the grain of neighbouring pixels: 0 is white noise.
+        Correlation of the noise of neighbouring pixels. 0 for white noise.
     """
 
     brightness: float | None
@@ -62,22 +62,22 @@ class Likeness:
 
 FIGURES = tuple(field.name for field in fields(Likeness))
 OF_ONE = FIGURES[:5]
-"""Those that one picture has by itself."""
+"""Statistics that a single image has."""
 RATIOS = ("contrast", "cast", "edge_px")
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What was measured of a set of pictures.
+    """Measurements of a set of images.
 
     Parameters
     ----------
     rows
-        (N, 5) `OF_ONE` of every picture; NaN where it cannot be known.
+        (N, 5) `IMAGE_FIGURES` of every image, NaN where they are undetermined.
     corners
-        (N, 2) luma of its corners and of its middle.
+        (N, 2) luma of the corners and of the middle.
     blocks
-        (M, 4) of all pictures, see `dmrl.rendering.camera.sensor_noise`.
+        (M, 4) of all images, see `dmrl.rendering.camera.sensor_noise`.
     """
 
     rows: Array
@@ -85,7 +85,7 @@ class Seen:
     blocks: NDArray[np.float32]
 
     def values(self, figure: str) -> Array:
-        """(N,) a figure of the pictures in which it can be known; (1,) of a figure of them all."""
+        """Return (N,) determined values of a statistic of images, or (1,) of one of the set."""
         if figure in OF_ONE:
             column = self.rows[:, OF_ONE.index(figure)]
         elif figure == "corners":
@@ -96,24 +96,24 @@ class Seen:
         return np.asarray(column[np.isfinite(column)])
 
     def middle(self, figure: str) -> float | None:
-        """Mean over pictures, of ratios the geometric mean."""
+        """Return the mean over images, geometric for ratios."""
         found = self.values(figure)
         return middle_of(figure, found) if len(found) else None
 
     def likeness(self) -> Likeness:
-        """All figures."""
+        """Return all statistics."""
         return Likeness(*(self.middle(figure) for figure in FIGURES))
 
 
 def middle_of(figure: str, values: Array) -> float:
-    """Mean of a figure's values, geometric for ratios.
+    """Return the mean of a statistic's values, geometric for ratios.
 
     Parameters
     ----------
     figure
         One of `FIGURES`.
     values
-        (N,) of as many pictures, one at least.
+        (N,) values of N images, at least one.
     """
     if figure in RATIOS:
         return float(np.exp(np.log(np.maximum(values, 1e-3)).mean()))
@@ -121,12 +121,12 @@ def middle_of(figure: str, values: Array) -> float:
 
 
 def seen(pictures: Iterable[Rgb]) -> Seen:
-    """What can be measured of pictures.
+    """Measure images.
 
     Parameters
     ----------
     pictures
-        (H, W, 3) uint8 each, of any size over 16 px; one at least.
+        (H, W, 3) uint8 each, larger than 16 px. At least one.
     """
     rows, corners, blocks = [], [], []
     for picture in pictures:
@@ -139,7 +139,7 @@ def seen(pictures: Iterable[Rgb]) -> Seen:
 
 
 def _of_one(levels: Picture, luma: Picture) -> list[float]:
-    """`OF_ONE` of one picture."""
+    """Return `IMAGE_FIGURES` of one image."""
     mean = max(float(luma.mean()), 1.0)
     red, blue = (levels[..., k] / max(float(levels[..., k].mean()), 1.0) for k in (0, 2))
     cast = max(float(levels[..., 0].mean()), 1.0) / max(float(levels[..., 2].mean()), 1.0)
@@ -148,7 +148,7 @@ def _of_one(levels: Picture, luma: Picture) -> list[float]:
 
 
 def _edge_px(luma: Picture) -> float:
-    """Median width of the strongest edges, across and down; NaN without any."""
+    """Return the median width of the strongest edges, across and down, or NaN without any."""
     steps, slopes = [], []
     for lines in (luma, luma.T):
         step = np.abs(lines[:, 2 * REACH_PX :] - lines[:, : -2 * REACH_PX])
@@ -165,13 +165,13 @@ def _edge_px(luma: Picture) -> float:
 
 
 def _corners(luma: Picture) -> list[float]:
-    """Luma of the corners, and of the middle."""
+    """Return the luma of the corners and of the middle."""
     radius2 = radius2_of(*luma.shape)
     return [float(luma[part].mean()) for part in (radius2 > CORNER, radius2 < MIDDLE)]
 
 
 @cache
 def radius2_of(height: int, width: int) -> NDArray[np.float64]:
-    """(H, W) squared distance from the middle, 1 in the corners."""
+    """Return the (H, W) squared distance from the middle, 1 in the corners."""
     v, u = np.mgrid[:height, :width] + 0.5
     return np.asarray(((u / width * 2 - 1) ** 2 + (v / height * 2 - 1) ** 2) / 2)

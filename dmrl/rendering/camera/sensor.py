@@ -1,4 +1,4 @@
-"""From light to the bytes of a small camera: lens, Bayer mosaic, noise, exposure."""
+"""Sensor model of a small camera, from light to bytes: lens, Bayer mosaic, noise, exposure."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -14,30 +14,30 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """How one picture is taken.
+    """Response of a camera in one image.
 
     Parameters
     ----------
     brightness
-        Mean of the picture, 0 to 1, before vignetting: what automatic exposure aims at. None:
-        a fixed exposure, where light of 1 is full scale.
+        Target of automatic exposure: mean of the image, 0 to 1, before vignetting. None: a fixed
+        exposure, where light of 1 is full scale.
     contrast_gamma
-        1: values are proportional to light, as raw sensors give; 2.2: as screens expect.
+        1: values are proportional to light, as of raw sensors. 2.2: as screens expect.
     balance
         Red, green and blue gains.
     saturation
-        1: colours as they are; 0: grey, and without a mosaic a grey camera: its three channels
-        are one. Small sensors' filters let other colours through.
+        1: unchanged colours. 0: grey; without a mosaic, a grey camera with three equal channels.
+        Small sensors have poor colour filters.
     vignetting
         Light lost in the farthest corner, 0 to 1.
     defocus_px
         Standard deviation of the lens' blur, pixels.
     bayer
-        Whether each pixel measures one colour, the others filled in from its neighbours.
+        Whether each pixel measures one colour and the others are interpolated.
     shot_noise
-        Variance of the noise per unit of light; full scale is 1.
+        Variance of the noise per unit of light. Full scale is 1.
     read_noise
-        Standard deviation of the noise in the dark; full scale is 1.
+        Standard deviation of the noise in the dark. Full scale is 1.
     """
 
     brightness: float | None = 0.4
@@ -52,16 +52,16 @@ class Sensor:
 
 
 def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 picture of linear light.
+    """Convert linear light to an (H, W, 3) uint8 image.
 
     Parameters
     ----------
     light
-        (H, W, 3) linear, any scale; not changed.
+        (H, W, 3) linear, any scale, not modified.
     sensor
-        How it is taken.
+        Response of the camera.
     rng
-        Where the noise comes from.
+        Random generator of the noise.
     """
     gain = np.array(sensor.balance, np.float32)
     if sensor.brightness is not None:
@@ -76,7 +76,7 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
     if sensor.vignetting > 0:
         falloff = 1 - np.float32(sensor.vignetting) * _radius2(height, width)
         values *= falloff if sensor.bayer else falloff[..., None]
-    grey = sensor.saturation == 0 and not sensor.bayer  # one value a pixel, and one noise
+    grey = sensor.saturation == 0 and not sensor.bayer  # one value and one noise per pixel
     values = _noisy(values[..., :1].copy() if grey else values, sensor, rng)
     if sensor.bayer:
         values = demosaic(values)
@@ -98,7 +98,7 @@ def _mixed(light: Picture, saturation: float) -> Picture:
 
 
 def _noisy(values: Picture, sensor: Sensor, rng: Generator) -> Picture:
-    """Values within 0 to 1 and with noise, in their place in memory."""
+    """Clip values to 0 to 1 and add noise, in place."""
     np.clip(values, 0, 1, out=values)
     if sensor.shot_noise or sensor.read_noise:
         spread = np.sqrt(values * np.float32(sensor.shot_noise) + np.float32(sensor.read_noise**2))
@@ -109,14 +109,14 @@ def _noisy(values: Picture, sensor: Sensor, rng: Generator) -> Picture:
 
 @cache
 def _radius2(height: int, width: int) -> Picture:
-    """Squared distance from the middle, 1 in the corners."""
+    """Return the squared distance from the middle, 1 in the corners."""
     v, u = np.mgrid[:height, :width] + 0.5
     u, v = u / width * 2 - 1, v / height * 2 - 1
     return np.asarray((u * u + v * v) / 2, np.float32)
 
 
 def blur(picture: Picture, sigma_px: float) -> Picture:
-    """(H, W, C) picture under a Gaussian; edges are continued."""
+    """Apply a Gaussian blur to an (H, W, C) image. Its edges are extended."""
     if sigma_px < 0.2:
         return picture
     reach = int(np.ceil(2.5 * sigma_px))
@@ -141,7 +141,7 @@ def blur(picture: Picture, sigma_px: float) -> Picture:
 
 
 def mosaic(picture: Picture) -> Picture:
-    """(H, W) what a sensor with red, green / green, blue squares measures of (H, W, 3)."""
+    """Convert (H, W, 3) to an (H, W) Bayer mosaic of red, green / green, blue squares."""
     raw = picture[..., 1].copy()
     raw[::2, ::2] = picture[::2, ::2, 0]
     raw[1::2, 1::2] = picture[1::2, 1::2, 2]
@@ -149,7 +149,7 @@ def mosaic(picture: Picture) -> Picture:
 
 
 def demosaic(raw: Picture) -> Picture:
-    """(H, W, 3) picture from a mosaic, each colour linear between where it was measured."""
+    """Interpolate an (H, W, 3) image from a Bayer mosaic, linearly per colour."""
     height, width = raw.shape
     across = np.pad(raw, ((0, 0), (1, 1)), mode="reflect")
     sides = (across[:, :-2] + across[:, 2:]) * np.float32(0.5)

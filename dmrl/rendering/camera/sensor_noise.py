@@ -1,10 +1,9 @@
-"""Grain of a camera, apart from the texture of what it sees and from how bright that is.
+"""Measurement of a camera's noise, separated from the scene's texture and brightness.
 
-Noise of light grows with light, so grain is told for every level by itself: else a dark street
-would seem to have a finer camera than a bright wall. And a street has texture of its own. So a
-block of a picture is measured where the block beside it is smooth: what a thing is like goes on
-from block to block, while noise does not know its neighbour, so that none is favoured for having
-little of it by chance, as it would be if blocks were chosen by their own.
+Shot noise grows with light, so noise is measured per brightness level. Otherwise a dark scene
+would appear to have a better camera than a bright one. Texture is excluded by measuring a block
+only where the block beside it is smooth. Texture continues from block to block, but noise is
+independent between blocks. Selecting blocks by their own smoothness would bias the noise down.
 """
 
 from dataclasses import dataclass
@@ -19,18 +18,18 @@ from dmrl.rendering.camera.distortion import Picture
 
 BLOCK_PX = 8
 SMOOTH_SHARE = 0.05
-"""Share of the blocks of a level that are measured: those beside the smoothest."""
+"""Share of a level's blocks that are measured: those beside the smoothest blocks."""
 LEVELS = (16.0, 48.0, 80.0, 112.0, 144.0, 176.0, 208.0, 240.0)
-"""Bounds of the levels that are told apart; beyond, black and white hide the grain."""
+"""Bounds of the brightness levels. Outside them, clipping hides the noise."""
 DARKEST, BRIGHTEST = 4.0, 251.0
-"""Of a block's pixels: beyond, some may be cut off."""
+"""Range of a block's pixels. Outside it, some may be clipped."""
 LEAST_SHARE, LEAST_BLOCKS, FEWEST = 0.01, 40, 8
-"""Of all blocks those of a level, how many that are, and of these measured, at least."""
+"""Minimum blocks of a level: as a share of all, as a number, and number of measured ones."""
 
 
 @cache
 def _flat() -> Array:
-    """(64, 64) what takes a block's plane out of it."""
+    """Return the (64, 64) matrix that removes the plane of a block."""
     place = np.linspace(-1, 1, BLOCK_PX)
     v, u = (grid.ravel() for grid in np.meshgrid(place, place, indexing="ij"))
     plane = np.stack([np.ones_like(u), u, v], axis=1)
@@ -38,11 +37,11 @@ def _flat() -> Array:
 
 
 FREE = BLOCK_PX**2 - 3
-"""Of the 64 pixels of a block, those that its plane leaves free."""
+"""Degrees of freedom of a block after removing its plane."""
 
 
 def _beside(blocks: Picture) -> Picture:
-    """(N,) mean product of neighbours, across and down, of (N, 8, 8)."""
+    """Return the (N,) mean product of neighbouring pixels of (N, 8, 8), across and down."""
     across = (blocks[:, :, 1:] * blocks[:, :, :-1]).mean(axis=(1, 2))
     down = (blocks[:, 1:] * blocks[:, :-1]).mean(axis=(1, 2))
     return np.asarray((across + down) / 2)
@@ -50,7 +49,7 @@ def _beside(blocks: Picture) -> Picture:
 
 @cache
 def of_white() -> float:
-    """Neighbours' correlation that taking out the plane leaves in white noise: under 0."""
+    """Return the negative correlation of neighbours in white noise after removing the plane."""
     each = _flat().reshape(BLOCK_PX, BLOCK_PX, BLOCK_PX, BLOCK_PX)
     k = np.arange(BLOCK_PX)
     row, col = np.meshgrid(k, k[:-1], indexing="ij")
@@ -60,15 +59,15 @@ def of_white() -> float:
 
 @dataclass(frozen=True, slots=True)
 class Grain:
-    """Grain of a set of pictures.
+    """Noise of a set of images.
 
     Parameters
     ----------
     grain
-        Standard deviation, levels of 256: mean over what is dark, grey and bright alike. NaN
+        Standard deviation, levels of 256, with equal weight of dark, grey and bright areas. NaN
         where no block could be measured.
     grain_correlation
-        Of neighbouring pixels: 0 is white noise. Median over levels, NaN likewise.
+        Correlation of neighbouring pixels, median over levels. 0 for white noise, NaN as above.
     """
 
     grain: float
@@ -76,7 +75,7 @@ class Grain:
 
 
 def blocks_of(luma: Picture) -> NDArray[np.float32]:
-    """(N, 4) of every block of a picture: level, variance, neighbours' product, next's variance."""
+    """Measure (N, 4) blocks: level, variance, neighbours' product, variance of the block beside."""
     height, width = luma.shape[0] // BLOCK_PX, luma.shape[1] // (2 * BLOCK_PX) * 2
     tiles = luma[: height * BLOCK_PX, : width * BLOCK_PX]
     tiles = tiles.reshape(height, BLOCK_PX, width, BLOCK_PX).swapaxes(1, 2)
@@ -85,18 +84,18 @@ def blocks_of(luma: Picture) -> NDArray[np.float32]:
     variance = (left**2).sum(axis=1) / np.float32(FREE)
     product = _beside(left.reshape(-1, BLOCK_PX, BLOCK_PX)) * np.float32(BLOCK_PX**2 / FREE)
     whole = (blocks.min(axis=1) > DARKEST) & (blocks.max(axis=1) < BRIGHTEST)
-    swapped = np.arange(len(blocks)) ^ 1  # the two of a pair lie beside each other
+    swapped = np.arange(len(blocks)) ^ 1  # the two blocks of a pair are neighbours
     measured = np.stack([blocks.mean(axis=1), variance, product, variance[swapped]], axis=1)
     return np.asarray(measured[whole & whole[swapped]], np.float32)
 
 
 def grain_of(blocks: NDArray[np.float32]) -> Grain:
-    """Grain of the blocks of a set of pictures.
+    """Estimate the noise from the blocks of a set of images.
 
     Parameters
     ----------
     blocks
-        (N, 4) as `blocks_of` gives them, one picture's after the other.
+        (N, 4) results of `measure_blocks`, concatenated.
     """
     middles, spreads, alike = [], [], []
     least = max(LEAST_BLOCKS, LEAST_SHARE * len(blocks))

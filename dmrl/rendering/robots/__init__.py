@@ -1,1 +1,1 @@
-"""Built-in robot models and their registry."""
+"""Built-in robot models."""

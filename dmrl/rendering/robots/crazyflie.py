@@ -1,7 +1,7 @@
-"""A Crazyflie 2.1 by code, at life size: one mesh, a material for each part.
+"""Model of a Crazyflie 2.1 at life size: one mesh with a material per part.
 
 92 mm from motor to motor, 29 mm high, rotors of 45 mm. Body frame: x forward, y left, z up,
-metres, the origin in the middle of the bounding box.
+metres, origin in the middle of the bounding box.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,7 +27,7 @@ HEIGHT_M = 0.029
 ROTOR_Z_M = HEIGHT_M / 2 - 0.0008
 BLADE_HALF_WIDTH_M = 0.0028
 BETWEEN_ROTORS_RAD = 1.7
-"""How much further each rotor has turned than the one before."""
+"""Rotation of each rotor beyond the previous one."""
 BOARD_Z_M = -0.0035
 MOTOR_ANGLES_RAD = np.pi / 4 + np.pi / 2 * np.arange(4)
 
@@ -50,7 +50,7 @@ PAINT: Mapping[str, Finish] = {
     "blue": ((0.05, 0.15, 1.0), 0.4, 0.0, 4.0),
     "rotor": ((0.012, 0.012, 0.012), 0.4, 0.0, 0.0),
 }
-# Colours that the parts are sold in, beside those above.
+# Alternative colours in which the parts are sold.
 OTHERS: Mapping[str, tuple[Colour, ...]] = {
     "deck": ((0.01, 0.02, 0.08), (0.01, 0.05, 0.02)),
     "battery": ((0.02, 0.02, 0.02), (0.05, 0.08, 0.3), (0.6, 0.6, 0.6)),
@@ -70,7 +70,7 @@ def _body() -> Iterator[Part]:
 
 
 def _frame() -> Iterator[Part]:
-    """The main board with its parts."""
+    """Yield the main board with its components."""
     z = BOARD_Z_M
     yield rounded("board", (0, 0, z), (0.030, 0.030, 0.0010), 0.005)
     for x, y, width, depth, height in (
@@ -88,7 +88,7 @@ def _frame() -> Iterator[Part]:
 
 
 def _stack() -> Iterator[Part]:
-    """What the headers hold: flow deck below, battery, UWB and AI decks above."""
+    """Yield battery and decks: flow deck below, UWB and AI decks above."""
     yield rounded("deck", (0, 0, -0.0100), (0.0285, 0.0280, 0.0009), 0.004)
     yield box("chip", (0.003, 0, -0.0113), (0.006, 0.006, 0.0018))
     yield cylinder("lens", (0.003, 0.0), 0.0017, -0.0130, -0.0122, 10)
@@ -108,7 +108,7 @@ def _stack() -> Iterator[Part]:
 
 
 def _headers() -> Iterator[Part]:
-    """Two rows of ten pins, 2 mm apart, through all decks."""
+    """Yield two rows of ten pins, 2 mm apart, through all decks."""
     for y in (-0.0110, 0.0110):
         yield box("header", (0, y, -0.0068), (0.0200, 0.0021, 0.0045))
         yield box("header", (0, y, 0.0040), (0.0200, 0.0021, 0.0060))
@@ -117,7 +117,7 @@ def _headers() -> Iterator[Part]:
 
 
 def _arm(number: int) -> Iterator[Part]:
-    """Arm, motor and LED along +x."""
+    """Yield arm, motor and LED along +x."""
     inner, z = 0.014, BOARD_Z_M
     yield box("board", ((inner + ARM_M) / 2, 0, z), (ARM_M - inner, 0.0068, 0.0010))
     mount = ((0.0047, -0.0145, -0.0105), (0.0053, -0.0105, -0.0015), (0.0046, -0.0015, 0.0010))
@@ -128,7 +128,7 @@ def _arm(number: int) -> Iterator[Part]:
     yield cylinder("mount", (ARM_M, 0.0), 0.0024, 0.0105, HEIGHT_M / 2, 10)
     yield box("wire", (ARM_M - 0.014, 0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
     yield box("wire", (ARM_M - 0.014, -0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
-    # As on the Crazyflie: blue behind, red and green in front.
+    # LEDs of the Crazyflie: blue at the back, red and green in front.
     colour = ("green", "blue", "blue", "red")[number]
     for side in (-1, 1):
         at = (0.0245, 0.0, z + side * 0.0010)
@@ -136,7 +136,7 @@ def _arm(number: int) -> Iterator[Part]:
 
 
 def _rotors() -> Iterator[Part]:
-    """Discs that the blades sweep; the material shows the blades in them."""
+    """Yield the discs that the blades sweep. Their material shows the blades."""
     sides = 40
     turn = 2 * np.pi * np.arange(sides) / sides
     rim = np.column_stack([np.cos(turn), np.sin(turn)]) * ROTOR_RADIUS_M
@@ -151,7 +151,7 @@ CRAZYFLIE = Design(PAINT, OTHERS, lambda: (*_body(), *_rotors()))
 
 
 def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
-    """(N, 3) points that reach as far as what is seen of a robot: body, and swept blades.
+    """Return (N, 3) points that span the visible robot: body and swept blades.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
     first_rad
         Angle of rotor 0 when the shutter opens.
     sweep_rad
-        How far all rotors turn until it closes.
+        Rotation of all rotors during the exposure.
     """
     whole = CRAZYFLIE.mesh()
     body = whole.vertices[

@@ -1,4 +1,4 @@
-"""Solids of which dmrl draws robots: boxes, prisms and rounds, each a part of one material."""
+"""Solids from which robots are built: boxes, prisms and cylinders, each of one material."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
 Part = tuple[str, Array, NDArray[np.int64]]
 """Material, (V, 3) points in metres, (F, 3) triangles, anticlockwise from outside."""
 ROTOR = "rotor"
-"""The material whose parts are rotors, numbered in their order."""
+"""Material whose parts are rotors, numbered in their order."""
 Colour = tuple[float, float, float]
 """Red, green, blue; linear light, 0 to 1."""
 Finish = tuple[Colour, float, float, float]
@@ -23,7 +23,7 @@ Finish = tuple[Colour, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A robot's surface.
+    """Surface of a robot.
 
     Parameters
     ----------
@@ -32,9 +32,9 @@ class Mesh:
     faces
         (F, 3) vertices of triangles, anticlockwise from outside.
     material
-        (F,) number of the material.
+        (F,) index of the material.
     rotor
-        (V, 3) of points of rotors: x and y from the hub, metres, and the rotor's number.
+        (V, 3) for points of rotors: x and y from the hub, metres, and the rotor's number.
     """
 
     vertices: Array
@@ -45,16 +45,16 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Design:
-    """A robot that dmrl draws.
+    """Built-in robot.
 
     Parameters
     ----------
     paint
         Finish of every material.
     others
-        Colours that parts are sold in, beside those of ``paint``.
+        Alternative colours in which parts are sold.
     parts
-        Makes its parts at life size, body frame.
+        Builds its parts at life size, body frame.
     """
 
     paint: Mapping[str, Finish]
@@ -63,11 +63,11 @@ class Design:
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """Names in the order of the mesh's numbers."""
+        """Names in the order of the mesh's indices."""
         return tuple(self.paint)
 
     def mesh(self) -> Mesh:
-        """The whole robot. The same arrays every time: do not write into them."""
+        """Return the mesh of the whole robot. The arrays are cached: do not modify them."""
         return _mesh(self.parts, self.materials)
 
 
@@ -77,14 +77,14 @@ def _mesh(parts: Callable[[], Iterable[Part]], materials: tuple[str, ...]) -> Me
 
 
 def joined(parts: Iterable[Part], materials: tuple[str, ...]) -> Mesh:
-    """Parts as one surface.
+    """Join parts into one surface.
 
     Parameters
     ----------
     parts
-        Of a robot, body frame.
+        Parts of a robot, body frame.
     materials
-        Their names, in the order of the mesh's numbers.
+        Names of the materials, in the order of the mesh's indices.
     """
     vertices, faces, material, rotor = [], [], [], []
     count = rotors = 0
@@ -100,7 +100,7 @@ def joined(parts: Iterable[Part], materials: tuple[str, ...]) -> Mesh:
 
 
 def prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.int64]]:
-    """A convex outline (K, 2), anticlockwise from above, stretched from low to high."""
+    """Make a prism of a convex (K, 2) outline, anticlockwise from above, between two heights."""
     count = len(outline)
     points = np.concatenate(
         [np.column_stack([outline, np.full(count, z)]) for z in (low, high)], axis=0
@@ -118,7 +118,7 @@ def prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.in
 
 
 def box(name: str, centre: tuple[float, float, float], size: tuple[float, float, float]) -> Part:
-    """A box, its sides along the axes, metres."""
+    """Build a box with sides along the axes, metres."""
     x, y, z = centre
     outline = CORNERS * np.array(size[:2]) / 2 + (x, y)
     return name, *prism(outline, z - size[2] / 2, z + size[2] / 2)
@@ -127,14 +127,14 @@ def box(name: str, centre: tuple[float, float, float], size: tuple[float, float,
 def cylinder(
     name: str, xy: tuple[float, float], radius: float, low: float, high: float, sides: int = 14
 ) -> Part:
-    """An upright cylinder about ``xy``, from ``low`` to ``high``, metres."""
+    """Build an upright cylinder about ``xy``, from ``low`` to ``high``, metres."""
     turn = 2 * np.pi * np.arange(sides) / sides
     outline = np.column_stack([np.cos(turn), np.sin(turn)]) * radius + xy
     return name, *prism(outline, low, high)
 
 
 def turned(part: Part, angle: float) -> Part:
-    """The part turned about the z axis."""
+    """Rotate a part about the z axis."""
     name, points, faces = part
     c, s = np.cos(angle), np.sin(angle)
     return name, points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), faces
@@ -143,7 +143,7 @@ def turned(part: Part, angle: float) -> Part:
 def rounded(
     name: str, centre: tuple[float, float, float], size: tuple[float, float, float], cut: float
 ) -> Part:
-    """A box with its upright edges cut, as circuit boards have."""
+    """Build a box with chamfered upright edges, as circuit boards have."""
     x, y, z = centre
     half_x, half_y = size[0] / 2, size[1] / 2
     outline = np.array(

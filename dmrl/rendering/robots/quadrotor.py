@@ -1,6 +1,6 @@
-"""A small quadrotor of boxes and discs, the size of a Crazyflie. Metres, body frame.
+"""Simple quadrotor of boxes and discs with the size of a Crazyflie, for sketches.
 
-Body frame: origin between the motors, x forward, y left, z up.
+Body frame: origin between the motors, x forward, y left, z up, metres.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ BLADE_HALF_WIDTH_M = 0.003
 DISC_CORNERS = 20
 ARM_ANGLES_RAD = np.pi / 4 + np.arange(4) * np.pi / 2
 
-# The six faces of a box by its corners; corner k has the signs of the bits of k (x, y, z).
+# Corners of the six faces of a box. Corner k has the signs of the bits of k (x, y, z).
 FACES = np.array(
     [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 )
@@ -27,18 +27,18 @@ SIGNS = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)]) * 2.0 - 1.
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """Flat faces.
+    """Flat faces of a robot.
 
     Parameters
     ----------
     corners
-        (F, 4, 3) metres, body frame, anticlockwise seen from outside.
+        (F, 4, 3) metres, body frame, anticlockwise from outside.
     normals
         (F, 3) outward, unit length.
     colours
         (F, 3) red, green, blue, 0 to 1.
     glows
-        (F,) whether a face shines by itself.
+        (F,) whether a face emits light.
     """
 
     corners: Array
@@ -48,7 +48,7 @@ class Mesh:
 
 
 def _boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Array, bool]]:
-    """Centre, half sizes, yaw, colour and glow of every box."""
+    """Yield centre, half sizes, yaw, colour and glow of every box."""
     black, dark = np.array([0.05, 0.05, 0.06]), np.array([0.12, 0.12, 0.13])
     metal, grey = np.array([0.45, 0.45, 0.47]), np.array([0.3, 0.31, 0.33])
     for angle in ARM_ANGLES_RAD:
@@ -59,7 +59,7 @@ def _boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Array, 
         yield motor, np.array([0.0038, 0.0038, 0.009]), angle, metal, False
         foot = (x * ARM_M, y * ARM_M, -0.0105)
         yield foot, np.array([0.003, 0.003, 0.004]), angle, dark, False
-        # As on the Crazyflie: blue behind, red and green in front.
+        # LEDs of the Crazyflie: blue at the back, red and green in front.
         led = np.array([0.2, 0.35, 1.0]) if x < 0 else np.array([1.0, 0.2, 0.1])
         at = (x * ARM_M * 0.72, y * ARM_M * 0.72, 0.0018)
         yield at, np.array([0.0017, 0.0017, 0.001]), angle, led, True
@@ -89,7 +89,7 @@ MESH = _mesh()
 
 
 def blades(turn_rad: float) -> Array:
-    """(4, 4, 3) outlines of the blades, each rotor a quarter of a turn further."""
+    """Return (4, 4, 3) outlines of the blades. Each rotor is a quarter turn ahead of the last."""
     angle = turn_rad + ARM_ANGLES_RAD * 1.5
     along = np.stack([np.cos(angle), np.sin(angle), np.zeros(4)], axis=1) * ROTOR_RADIUS_M
     across = np.stack([-np.sin(angle), np.cos(angle), np.zeros(4)], axis=1) * BLADE_HALF_WIDTH_M
@@ -109,7 +109,7 @@ def _discs() -> Array:
 
 
 DISCS = _discs()
-"""(4, DISC_CORNERS, 3) outlines of what the rotors sweep."""
+"""(4, DISC_CORNERS, 3) outlines of the discs that the rotors sweep."""
 
 RADIUS_M = float(np.hypot(ARM_M + ROTOR_RADIUS_M, ROTOR_Z_M))
-"""Radius of a ball about the origin that holds the whole quadrotor."""
+"""Radius of a ball about the origin that contains the whole quadrotor."""

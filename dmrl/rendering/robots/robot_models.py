@@ -1,4 +1,4 @@
-"""The robots that dmrl draws, by name."""
+"""Registry of the built-in robot models."""
 
 from collections.abc import Mapping
 

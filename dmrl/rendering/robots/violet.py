@@ -1,9 +1,9 @@
-"""A bare Crazyflie in bright colours, as in the published renders, by code at life size.
+"""Model of a bare Crazyflie in bright colours, as in the published renders, at life size.
 
-No decks: a blue board and arms, lilac mounts with long feet, motors of brass, violet blades at
-rest, a battery in a frame the colour of sea. Drawn by eye after the published pictures; nothing
-in it comes from the authors' model. Body frame: x forward, y left, z up, metres; the origin is
-what labels of those pictures are about.
+No decks: a blue board and arms, lilac mounts with long feet, brass motors, violet blades at
+rest, a battery in a sea-green frame. Modelled by eye after the published images; nothing comes
+from the authors' model. Body frame: x forward, y left, z up, metres. The origin is the reference
+point of those images' labels.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,7 +35,7 @@ OTHERS: Mapping[str, tuple[Colour, ...]] = {}
 
 FITTED_SIZE = 0.97
 FITTED_Z_M = 0.001
-"""How much smaller and higher it lies best over published training pictures, at their poses."""
+"""Scale and vertical offset that fit published training images best, at their labels' poses."""
 ARM_M = 0.046
 MOTOR_ANGLES_RAD = np.pi / 4 + np.pi / 2 * np.arange(4)
 BOARD_Z_M = 0.0
@@ -44,7 +44,7 @@ BLADES_AT_RAD = (1.65, 1.5, 1.65, 1.6)
 BLADE_M = np.array(
     [(0.0031, 0.0030), (0.0063, 0.0044), (0.0115, 0.0046), (0.0189, 0.0034), (0.0241, 0.0018)]
 )
-"""Half the width of a blade along its radius."""
+"""Radius and half width of a blade, metres."""
 PITCH_RAD = np.radians([32.0, 30.0, 24.0, 17.0, 12.0])
 
 
@@ -74,7 +74,7 @@ def _battery() -> Iterator[Part]:
 
 
 def _arm() -> Iterator[Part]:
-    """Arm, mount and motor along +x."""
+    """Yield arm, mount and motor along +x."""
     yield box("arm", (0.028, 0, BOARD_Z_M), (0.030, 0.0072, 0.0018))
     for y in (-0.0035, 0.0035):
         yield box("mount", (ARM_M - 0.008, y, BOARD_Z_M - 0.0010), (0.012, 0.0022, 0.0050))
@@ -86,7 +86,7 @@ def _arm() -> Iterator[Part]:
 
 
 def _blades(hub: tuple[float, float], at_rad: float, way: int) -> Part:
-    """Two twisted blades, opposite each other."""
+    """Build two twisted blades, opposite each other."""
     radius, half = BLADE_M.T
     across, up = half * np.cos(PITCH_RAD), way * half * np.sin(PITCH_RAD)
     edges = np.concatenate(

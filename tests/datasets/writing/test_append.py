@@ -133,7 +133,7 @@ def test_a_recording_that_is_there_and_an_image_that_is_there_come_once(
     result = add([more], out, PLAIN)
     assert result.images == {"train": 1} and result.tally.twice == 6
     assert len(open_dataset(out).split("train")) == 7
-    assert "6 images are there already" in (out / "README.md").read_text().replace("`", "")
+    assert "6 images are in the dataset already" in (out / "README.md").read_text().replace("`", "")
     all_there = record("all.mcap", [[peer(depth_m=2.0)]] * 6, seed=0)
     assert add([all_there], out, PLAIN).images == {}
     assert add([all_there], out, PLAIN).tally.kept == 0
@@ -145,7 +145,7 @@ def test_a_name_twice_or_a_part_of_what_is_there_is_refused(record: Record, tmp_
     run([first], out, PLAIN)
     made = contents(out)
     other = record("other/0.mcap", seed=5)
-    with pytest.raises(SettingError, match="have one name"):
+    with pytest.raises(SettingError, match="have the same name"):
         add([other], out, PLAIN)
     trim(first, tmp_path / "part.mcap", Cut(to_s=0.3))
     with pytest.raises(SettingError, match=r"part\.mcap is made from 0\.mcap"):
@@ -180,7 +180,7 @@ def test_a_flight_has_its_split_whatever_comes_with_it(record: Record, tmp_path:
 def test_what_cannot_grow_is_one_line(record: Record, tmp_path: Path) -> None:
     out = tmp_path / "set"
     first, new = flights(record, 0), flights(record, 1)
-    with pytest.raises(DatasetError, match="no dataset that can grow"):
+    with pytest.raises(DatasetError, match="cannot be extended"):
         add(first, out, PLAIN)
     run(first, out, PLAIN)
     held = contents(out)

@@ -91,7 +91,7 @@ def test_labels_that_were_estimated_go_before_the_truth_and_it_is_said(
         settings = Settings(split="none") if wanted == "auto" else Settings(wanted, split="none")
         assert run([flight], out, settings).sources == {"flight.mcap": used}
         assert f"labels from {used}, not from {other}, which it" in capsys.readouterr().err
-        told = f"- `flight.mcap`: labels of `{used}` are used; there were labels of `{other}` too."
+        told = f"- `flight.mcap`: labels from `{used}` are used. It also has labels from `{other}`."
         assert told in (out / "README.md").read_text()
 
 

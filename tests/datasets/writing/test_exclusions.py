@@ -29,8 +29,8 @@ def test_flags_are_read_with_reasons_or_without(tmp_path: Path) -> None:
     [
         ("source,robot\n", "flags.csv:1: no column log_time"),
         (HEAD.replace("robot", "robot,colour"), "flags.csv:1: column 'colour'"),
-        (HEAD + "a.mcap,cf1,1.5\n", "flags.csv:2: '1.5' is no time"),
-        (HEAD + "a.mcap,cf1,--5\n", "flags.csv:2: '--5' is no time"),
+        (HEAD + "a.mcap,cf1,1.5\n", "flags.csv:2: '1.5' is not a time"),
+        (HEAD + "a.mcap,cf1,--5\n", "flags.csv:2: '--5' is not a time"),
         (HEAD + "a.mcap,,1\n", "flags.csv:2: not a source, robot, log_time"),
         (HEAD + "a.mcap,cf1,1,2\n", "flags.csv:2: not a source, robot, log_time"),
         (HEAD + '"a.mcap,cf1', "flags.csv is not a CSV file"),

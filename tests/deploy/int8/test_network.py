@@ -153,7 +153,7 @@ def test_heads_are_signed_tensors_of_the_grid_that_nobody_reads() -> None:
     small = (*network().layers, conv(ins=2, stride=2, signed=True, source=1))
     other = Head(2, 1, 0.1, 0, network().depth.table)
     for change in ({"layers": unsigned}, {"layers": read}, {"layers": small, "depth": other}):
-        with pytest.raises(ModelError, match="is no signed tensor of the grid"):
+        with pytest.raises(ModelError, match="is not a signed tensor of the grid"):
             network(**change)
     late = (replace(network().layers[0], source=1),)
     with pytest.raises(ModelError, match="layer conv reads tensors"):

@@ -120,5 +120,5 @@ def test_other_last_layers_are_refused() -> None:
     odd = next(
         n for n in map(quantised_network, range(60)) if n.layers[n.layers[-1].sources[0] - 1].signed
     )
-    with pytest.raises(ModelError, match="cannot be learned on: that wants one 1x1 convolution"):
+    with pytest.raises(ModelError, match="cannot be refined: that requires one 1x1 convolution"):
         last_layer(odd)

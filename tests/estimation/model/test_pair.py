@@ -30,16 +30,16 @@ def test_a_pair_takes_only_what_is_finite_and_forward() -> None:
         Pair(GRID, STILL, STILL, np.array([9.0]), np.array([1.0]))
     with pytest.raises(ValueError, match="as many range times"):
         Pair(GRID, STILL, STILL, np.array([0.5]), np.array([1.0, 2.0]))
-    with pytest.raises(ValueError, match="not uniform and forward"):
+    with pytest.raises(ValueError, match="not uniform and increasing"):
         Pair(GRID[::-1], STILL, STILL, np.array([0.5]), np.array([1.0]))
     for at in (0.105, 0.11):  # a step that is longer, and one that is none
-        with pytest.raises(ValueError, match="not uniform and forward"):
+        with pytest.raises(ValueError, match="not uniform and increasing"):
             uneven = np.where(np.arange(200) == 10, at, GRID)
             Pair(uneven, STILL, STILL, np.array([0.5]), np.array([1.0]))
     broken = Track(np.full(200, np.nan), *np.zeros((3, 200)), np.zeros(200, bool))
     short = Track(*np.zeros((4, 199)), np.zeros(199, bool))
     for odd in (broken, short):
-        with pytest.raises(ValueError, match="peer signals are not 200 finite numbers"):
+        with pytest.raises(ValueError, match="peer: signals are not 200 finite numbers"):
             Pair(GRID, STILL, odd, np.array([0.5]), np.array([1.0]))
 
 

@@ -44,10 +44,10 @@ def test_maps_stand_at_the_time_of_their_picture_in_probabilities_and_metres(
 
 def test_half_a_pair_and_pairs_of_two_sizes_are_refused(frames: Path, tmp_path: Path) -> None:
     pgm(frames / "gap8-maps/dep00009.ppm", np.zeros((2, 4), int))
-    with pytest.raises(SourceError, match=r"dep00009\.ppm is of another size"):
+    with pytest.raises(SourceError, match=r"dep00009\.ppm differs in size"):
         dmrl.convert(frames, tmp_path / "out.mcap")
     (frames / "gap8-maps/dep00009.ppm").unlink()
-    with pytest.raises(SourceError, match=r"dep00009\.ppm: its other half"):
+    with pytest.raises(SourceError, match=r"dep00009\.ppm beside its other map"):
         dmrl.convert(frames, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
 

@@ -28,7 +28,7 @@ def test_a_packet_has_a_longest_length(function: int, counted: int) -> None:
     assert struct.unpack_from("<HBB", data) == (PACKET_MAX_BYTES, 3 | 4 << 3, function)
     follower = pack_packet(Packet(GAP8, HOST, function, b"x"))
     assert next(PacketReader().feed(data + follower)) == packet
-    with pytest.raises(ValueError, match=f"a packet of {PACKET_MAX_BYTES + 1} bytes"):
+    with pytest.raises(ValueError, match=f"packet of {PACKET_MAX_BYTES + 1} bytes"):
         pack_packet(Packet(GAP8, HOST, function, bytes(most + 1)))
 
 

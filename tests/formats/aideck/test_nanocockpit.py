@@ -60,14 +60,14 @@ def test_lost_pictures_are_counted_by_their_numbers(
     del lines[3:5]
     (folder / "metadata.csv").write_text("\n".join(lines) + "\n")
     assert len(samples(folder)["/cf1/camera/image"]) == 4
-    assert "2 pictures were lost on the way" in capsys.readouterr().err
+    assert "2 images were lost in transmission" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
         ("frame_id", "frame", r"metadata.csv:1: no column frame_id"),
-        ("00003.jpg", "00009.jpg", r"no picture 00009 in .*camera_raw"),
+        ("00003.jpg", "00009.jpg", r"no image 00009 in .*camera_raw"),
         (",10,255,", ",10,x,", r"metadata.csv:4: not a file and whole numbers"),
     ],
 )

@@ -75,11 +75,11 @@ def test_a_stream_that_was_cut_gives_what_is_whole_and_says_so(
     one = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
     found = samples(tmp_path / "a.cpx", one * 2 + one[:12] + one * 2)
     assert len(found["/cf1/camera/image"]) >= 3
-    assert "pictures are broken" in capsys.readouterr().err
+    assert "images are broken" in capsys.readouterr().err
 
 
 def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="holds no whole picture of a CPX stream"):
+    with pytest.raises(SourceError, match="has no whole image of a CPX stream"):
         samples(tmp_path / "a.cpx", b"\0" * 1000)
     assert not wifi_stream.recognises(tmp_path / "a.cpx")
 
@@ -98,7 +98,7 @@ def test_a_stream_that_was_cut_says_so(
     path.write_bytes(whole[: int(len(whole) * share)])
     found = wifi_stream.content(path, Options()).samples
     assert len([s for s in found if s.message == "CompressedImage"]) == int(3 * share)
-    assert "1 pictures are broken or cut short" in capsys.readouterr().err
+    assert "1 images are broken or cut short" in capsys.readouterr().err
     path.write_bytes(whole)
     list(wifi_stream.content(path, Options()).samples)
     assert not capsys.readouterr().err

@@ -134,7 +134,7 @@ def test_what_is_no_log_is_one_line(tmp_path: Path, text: str, message: str) -> 
     ("cells", "said"),
     [
         (("1500", "0", "2500"), ""),
-        (("1500.0", "0.0", "2500.0"), "whole numbers from 1500 on: taken for millimetres"),
+        (("1500.0", "0.0", "2500.0"), "only whole numbers, 1500 or more: read as millimetres"),
         (("1.5", "0.0", "2.5"), ""),
     ],
 )

@@ -229,7 +229,7 @@ def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> 
 @pytest.mark.parametrize(
     ("values", "range_m", "said"),
     [
-        (np.array([61.0, 1500.0]), [0.061, 1.5], "from 61 on: taken for millimetres"),
+        (np.array([61.0, 1500.0]), [0.061, 1.5], "61 or more: read as millimetres"),
         (np.array([59.0, 2.0]), [59.0, 2.0], ""),
         (np.array([61.5, 2.0]), [2.0], "1 ranges to cf2 left out"),
         (np.array([61, 1500]), [0.061, 1.5], ""),

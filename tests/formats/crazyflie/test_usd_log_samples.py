@@ -118,7 +118,7 @@ def test_a_folder_is_a_robot_per_file(tmp_path: Path, capsys: pytest.CaptureFixt
     found = samples(tmp_path)
     assert {"/cf1/attitude", "/cf2/attitude"} <= found.keys()
     err = capsys.readouterr().err
-    assert "cf3 is empty; left out" in err and "left out: notes.txt is no micro-SD log" in err
+    assert "cf3 is empty; left out" in err and "left out, as no micro-SD log: notes.txt" in err
 
 
 def test_attitude_before_the_estimator_starts_is_left_out(tmp_path: Path) -> None:
@@ -198,9 +198,9 @@ def test_of_what_is_left_out_three_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "cf1").write_bytes(foreign.usd_log())
-    for count, words in ((3, "a1, a2, a3 is no"), (5, "a1, a2, a3 and 2 more is no")):
+    for count, words in ((3, "a1, a2, a3\n"), (5, "a1, a2, a3 and 2 more\n")):
         for k in range(1, count + 1):
             (tmp_path / f"a{k}").write_text("x")
         (tmp_path / ".hidden").write_text("x")
         assert "/cf1/attitude" in samples(tmp_path)
-        assert f"left out: {words} micro-SD log" in capsys.readouterr().err
+        assert f"left out, as no micro-SD log: {words}" in capsys.readouterr().err

@@ -1,13 +1,10 @@
 """Records of several kinds, against a walk from one to the next."""
 
-from unittest.mock import patch
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.formats.crazyflie import usd_records
-from dmrl.formats.crazyflie.usd_records import Event, records_of
+from dmrl.formats.crazyflie.usd_records import Event, gather_records
 
 NUMBERS = st.lists(
     st.sampled_from([1, 2, 3, 255, 256, 257, 0x0201, 0xFF01, 0xFFFF]),
@@ -39,7 +36,6 @@ def plain(data: bytes, body: int, end: int, events: list[Event]) -> tuple[dict[s
     repeats=st.integers(1, 40),
     odd=st.lists(st.tuples(st.integers(0, 150), st.integers(0, 3)), max_size=3),
     rest=st.binary(max_size=7),
-    piece=st.sampled_from([1 << 19, 64, 37]),
     seed=st.integers(0, 9),
 )
 def test_records_are_those_of_a_walk_from_one_to_the_next(
@@ -50,7 +46,6 @@ def test_records_are_those_of_a_walk_from_one_to_the_next(
     repeats: int,
     odd: list[tuple[int, int]],
     rest: bytes,
-    piece: int,
     seed: int,
 ) -> None:
     events = [
@@ -68,12 +63,11 @@ def test_records_are_those_of_a_walk_from_one_to_the_next(
         for event in order
     )
     cut = data + rest + b"tail"
-    with patch.object(usd_records, "PIECE", piece):
-        for end in (len(data), len(data) - 1, len(data) + len(rest)):
-            rows, stop = records_of(cut, 4, end, events)
-            wanted, wanted_stop = plain(cut, 4, end, events)
-            assert stop == wanted_stop
-            assert {name: row.tobytes() for name, row in rows.items()} == wanted
+    for end in (len(data), len(data) - 1, len(data) + len(rest)):
+        rows, stop = gather_records(cut, 4, end, events)
+        wanted, wanted_stop = plain(cut, 4, end, events)
+        assert stop == wanted_stop
+        assert {name: row.tobytes() for name, row in rows.items()} == wanted
 
 
 def test_a_record_is_packed() -> None:

@@ -49,11 +49,11 @@ def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:
         "[pitch] sign: not 1 or -1",
         "[pitch] colour: no such key",
         "[vx] frame: not one of world, horizontal, body",
-        "[height] frame: of velocities only",
+        "[height] frame: for velocities only",
         "[range.cf2] unit: not one of m, cm, mm",
         "no [time]",
-        "[vx] wants [vy] too",
-        "[pitch] wants [roll] too",
+        "[vx] also needs [vy]",
+        "[pitch] also needs [roll]",
     ):
         assert fault in text
 
@@ -89,9 +89,9 @@ def test_units_are_what_they_are_called() -> None:
         (
             '[vy]\nname = "vy"\nunit = "cm/s"\nframe = "world"',
             '[vy]\nname = "vy"\nunit = "cm/s"\nframe = "body"',
-            "velocities of several frames",
+            "velocities in several frames",
         ),
-        ("[height]", '[z]\nname = "h"\nunit = "m"\n[height]', "leave one out"),
+        ("[height]", '[z]\nname = "h"\nunit = "m"\n[height]', "remove one"),
         ("[range.cf2]", "[range.cf2]\nsign = 2", "[range.cf2] sign: not 1 or -1"),
     ],
 )

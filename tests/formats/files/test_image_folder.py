@@ -136,7 +136,7 @@ def _write(text: str) -> Callable[[Path], None]:
     ("spoil", "message"),
     [
         (_write(HEADER + "a.pgn,cf2,1,2,3\n"), r"labels\.csv:2: .*'a\.pgn' .*mean a\.png\?"),
-        (_write(HEADER + "zzzz,cf2,1,2,3\n"), r"labels\.csv:2: .*Add the picture, or delete"),
+        (_write(HEADER + "zzzz,cf2,1,2,3\n"), r"labels\.csv:2: .*Add the image, or delete"),
         (_write(HEADER + "\na.png,cf2,1,x,3\n"), r"labels\.csv:3: v_px is 'x', not a number"),
         (_write(HEADER + "a.png,cf2,1,nan,3\n"), r"v_px is 'nan', not a number"),
         (_write(HEADER + "a.png,cf2,1,2,0\n"), r"labels\.csv:2: depth_m is 0"),
@@ -160,7 +160,7 @@ def _write(text: str) -> Callable[[Path], None]:
         ),
         (_write(""), r"labels\.csv:1: no column file, peer"),
         (lambda folder: (folder / "labels.csv").write_bytes(b"\xff\xfe\0") and None, "not a CSV"),
-        (lambda folder: (folder / "a.png").write_bytes(b"") and None, r"a\.png is not a picture"),
+        (lambda folder: (folder / "a.png").write_bytes(b"") and None, r"a\.png is not an image"),
         (lambda folder: (folder / "123456789012.png").write_bytes(b"") and None, "by its time"),
     ],
 )
@@ -174,7 +174,7 @@ def test_faults_name_the_file_and_the_way_out(
 
 
 def test_a_label_file_that_was_named_must_be_there(folder: Path) -> None:
-    with pytest.raises(SourceError, match=r"no label file .*mine\.csv\. Name another"):
+    with pytest.raises(SourceError, match=r"no label file .*mine\.csv\. Pass another"):
         image_folder.content(folder, Options(labels=folder / "mine.csv"))
 
 
@@ -214,8 +214,8 @@ def test_the_firmware_s_text_beside_pictures_becomes_messages_and_labels(folder:
 @pytest.mark.parametrize(
     ("line", "text"),
     [
-        ("a.png 1 2 3", r"label\.txt:1: not a picture and roll pitch x y z d"),
-        ("d.png 1 2 3 4 5 6", r"label\.txt:1: no picture d\.png"),
+        ("a.png 1 2 3", r"label\.txt:1: not an image and roll pitch x y z d"),
+        ("d.png 1 2 3 4 5 6", r"label\.txt:1: no image d\.png"),
     ],
 )
 def test_a_wrong_line_of_the_firmware_s_text_is_named(folder: Path, line: str, text: str) -> None:
@@ -229,7 +229,7 @@ def test_the_firmware_s_text_without_a_camera_is_said(
 ) -> None:
     (folder / "label.txt").write_text("a.png 1 2 1.0 0.1 0.0 1.0\n")
     assert not samples(folder, "PeerLabels")
-    assert "label.txt gives no labels without a camera. Try: --camera" in capsys.readouterr().err
+    assert "label.txt gives no labels without a camera. Pass: --camera" in capsys.readouterr().err
 
 
 def test_raw_pictures_get_their_colours(tmp_path: Path) -> None:
@@ -242,7 +242,7 @@ def test_raw_pictures_get_their_colours(tmp_path: Path) -> None:
 
 
 def test_coloured_pictures_are_not_raw(folder: Path) -> None:
-    with pytest.raises(SourceError, match=r"has colours already.* Leave out --raw"):
+    with pytest.raises(SourceError, match=r"has colours already.* Remove --raw"):
         samples(folder, "CompressedImage", Options(raw=True))
 
 

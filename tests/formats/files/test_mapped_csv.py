@@ -113,7 +113,7 @@ def test_a_wrong_line_is_named(line: str, text: str, table: Path) -> None:
 
 def test_a_column_that_is_not_there_is_named(table: Path) -> None:
     table.write_text(TABLE.replace('"phi"', '"roll"'))
-    with pytest.raises(SourceError, match=r"log\.csv:1: no column roll\. Mend the table"):
+    with pytest.raises(SourceError, match=r"log\.csv:1: no column roll\. Fix the table"):
         samples(table.with_name("log.csv"), Options(columns=table))
 
 
@@ -231,7 +231,7 @@ def test_lines_out_of_order_are_sorted_and_the_last_may_be_cut(
     assert [s.time_ns for s in found] == [1_000_000_000, 1_010_500_000]
     assert [s.fields["height_m"] for s in found] == [0.5, 0.51]
     err = capsys.readouterr().err
-    assert "its lines are not in order of time; sorted" in err
+    assert "its lines are not in time order; sorted" in err
     assert "its last line is cut short; left out" in err
 
 

@@ -194,8 +194,8 @@ def _remove(name: str) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (_remove("posLabel.txt"), r"no posLabel\.txt in .*synImgs\. Name the folder"),
-        (_remove("0001.jpg"), r"posLabel\.txt:2: no picture .*0001\.jpg\. Restore it"),
+        (_remove("posLabel.txt"), r"no posLabel\.txt in .*synImgs\. Pass the folder"),
+        (_remove("0001.jpg"), r"posLabel\.txt:2: no image .*0001\.jpg\. Restore it"),
         (_spoil("posLabel.txt", 2, "p/0001.jpg 0,0 1,2,x,0,0,0"), r"posLabel\.txt:2: .*'x'"),
         (_spoil("posLabel.txt", 2, "p/0001.jpg 0,0 1,2,3"), r"posLabel\.txt:2: not path"),
         (_spoil("posLabel.txt", 2, "p/0001.jpg 0,0 1,2,nan,0,0,0"), r":2: not .*finite"),
@@ -238,7 +238,7 @@ def test_a_picture_that_is_cut_or_of_another_size_is_named(folder: Path) -> None
 
 def test_two_sets_in_one_folder_are_not_mixed(folder: Path) -> None:
     (folder / "synImgsMulti").mkdir()
-    with pytest.raises(SourceError, match="holds two sets"):
+    with pytest.raises(SourceError, match="has two sets"):
         locanet.read(folder)
 
 

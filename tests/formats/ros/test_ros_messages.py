@@ -286,7 +286,7 @@ def test_compressed_pictures_keep_their_bytes() -> None:
         assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
         assert (found.fields["data"], found.fields["format"]) == (data, kind)
     ppm = b"P6\n8 8\n255\n" + rgb.tobytes()
-    with pytest.raises(SourceError, match=r"bag: pictures are ppm\. Save them as PNG or JPEG"):
+    with pytest.raises(SourceError, match=r"bag: images are ppm\. Save them as PNG or JPEG"):
         given("sensor_msgs/msg/CompressedImage", SimpleNamespace(data=np.frombuffer(ppm, np.uint8)))
 
 

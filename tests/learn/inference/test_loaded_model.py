@@ -183,7 +183,7 @@ def test_damaged_weights_are_one_line(run: Path) -> None:
         (
             "architecture",
             "resnet",
-            "asks for architecture resnet, this dmrl knows dmrl-large, dmrl-nano, ",
+            "requires architecture resnet, this dmrl has dmrl-large, dmrl-nano, ",
         ),
     ],
 )

@@ -97,7 +97,7 @@ def test_clocks_that_share_no_time_are_found(tmp_path: Path) -> None:
             write((k + 56) * 10**9, "/cf2/height", message("Height")())
 
     assert record(tmp_path / "b.mcap", two) == [
-        "warning /cf1 shares no time with /cf2: 37 s between. Clocks of their own? Try: dmrl align"
+        "warning /cf1 shares no time with /cf2: 37 s between. Separate clocks? Try: dmrl align"
     ]
 
 

@@ -25,7 +25,7 @@ def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path)
     assert (
         "error /cf1/camera/image images of 320x224, but the calibration is for 324x244" in findings
     )
-    assert "error /cf1/camera/image 1 messages hold no image that can be read" in findings
+    assert "error /cf1/camera/image 1 messages contain no readable image" in findings
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_images_are_of_one_size_and_of_the_calibrated(
             {"K": [180, 0, 160, 0, -180, 112, 0, 0, 1]},
             "error /cf1/camera/calibration has a focal length that is not above 0",
         ),
-        ({"height": 0}, "error /cf1/camera/calibration is of images of 320 x 0 px"),
+        ({"height": 0}, "error /cf1/camera/calibration has images of 320 x 0 px"),
     ],
 )
 def test_a_calibration_that_no_camera_has_is_found(

@@ -75,7 +75,7 @@ def test_a_clock_that_is_a_little_off_is_no_wrong_sign(tmp_path: Path) -> None:
 def test_another_sign(tmp_path: Path, name: str) -> None:
     measured, poses = flown()
     found = recorded(tmp_path / "a.mcap", measured | {name: -measured[name]}, poses)
-    assert len(found) == 1 and f"/cf1/attitude: {name} has the other sign" in found[0]
+    assert len(found) == 1 and f"/cf1/attitude: {name} has the opposite sign" in found[0]
 
 
 def test_velocities_of_another_frame(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_velocities_of_another_frame(tmp_path: Path) -> None:
         "to the right": [vx, -vy],
         "Forward seems to be negative": [-vx, vy],
         "Both seem": [-vx, -vy],
-        "exchanged": [vy, vx],
+        "swapped": [vy, vx],
     }
     for k, (words, (x, y)) in enumerate(wrong.items()):
         found = recorded(tmp_path / f"{k}.mcap", measured | {"vx_mps": x, "vy_mps": y}, poses)

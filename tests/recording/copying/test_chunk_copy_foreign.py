@@ -71,7 +71,9 @@ def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) 
     crc = chunks(path)[0].chunk_start_offset + 9 + 24
     data[crc : crc + 4] = bytes(4)
     path.write_bytes(data)
-    with pytest.raises(RecordingError, match="/cf9/height is not what its summary repeats of it"):
+    with pytest.raises(
+        RecordingError, match="the definition of /cf9/height contradicts the summary"
+    ):
         rewrite(path, tmp_path / "out.mcap", MADE, without=(), fresh=())
     assert not (tmp_path / "out.mcap").exists()
 

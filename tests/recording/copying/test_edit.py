@@ -98,7 +98,7 @@ def test_of_many_calibrations_the_one_of_then_goes_along(tmp_path: Path) -> None
 
 
 def test_trimming_to_nothing_is_an_error_and_leaves_no_file(tmp_path: Path, flight: Path) -> None:
-    with pytest.raises(RecordingError, match=r"no message in that stretch; it lasts 39.990 s"):
+    with pytest.raises(RecordingError, match=r"no message in that time range; it lasts 39.990 s"):
         trim(flight, tmp_path / "out.mcap", start_ns=10**12)
     with pytest.raises(MissingTopic, match=r"Did you mean /cf1/attitude\?"):
         trim(flight, tmp_path / "out.mcap", topics=["/cf1/atitude"])
@@ -216,7 +216,7 @@ def test_a_stretch_that_ends_before_it_begins_is_refused(tmp_path: Path, flight:
 
 
 def test_a_recording_is_called_mcap(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"out is no name of a recording\. Call it out\.mcap"):
+    with pytest.raises(OutputError, match=r"out is not named like a recording\. Use out\.mcap"):
         RecordingWriter(tmp_path / "out", Provenance("test"))
     assert not [*tmp_path.iterdir()]
 

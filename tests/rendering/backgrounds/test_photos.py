@@ -49,7 +49,9 @@ def test_a_photo_is_averaged_or_sampled_in_the_middles_of_pixels(tmp_path: Path)
 
 
 def test_a_folder_without_a_photo_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=r"holds no photo .*Choose another --backgrounds"):
+    with pytest.raises(
+        SettingError, match=r"contains no readable photo .*Use another --backgrounds"
+    ):
         photos_in(tmp_path)
     with pytest.raises(SettingError, match="no folder"):
         photos_in(tmp_path / "none")

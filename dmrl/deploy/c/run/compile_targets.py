@@ -1,4 +1,4 @@
-"""Where the C of an export is proved: compilers, their settings, and how each result is run."""
+"""Compile targets of the verification: compilers, their flags, and how each program is run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,8 @@ from dmrl.deploy.int8.network import IntegerNetwork
 
 RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding",
                "-Wl,--no-relax")  # fmt: skip
-"""For rv32imc without any library. No start-up code sets the register that relaxed code needs."""
+"""Flags for rv32imc without libraries. Without start-up code, no code sets the register for
+relaxation."""
 SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
               "-DHARNESS_GUARD")  # fmt: skip
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
@@ -18,16 +19,16 @@ LEVELS = ("-O0", "-O1", "-O2", "-O3")
 
 @dataclass(frozen=True, slots=True)
 class Build:
-    """One way to compile the C.
+    """One configuration in which the C is compiled.
 
     Parameters
     ----------
     label
-        For people: the settings.
+        Settings, for display.
     compiler
-        Program.
+        Compiler program.
     flags
-        Its flags.
+        Flags of the compiler.
     bayer
         Whether it takes raw mosaics.
     emulated
@@ -43,23 +44,23 @@ class Build:
     def program(
         self, network: IntegerNetwork, folder: Path, build: Path, *, refine: bool = False
     ) -> list[str | Path]:
-        """Compile the C of an export folder; how to call what comes of it.
+        """Compile the C of an export folder; return the command that runs the program.
 
         Parameters
         ----------
         network
-            What the C computes.
+            Network of the C.
         folder
-            The export folder.
+            Export folder.
         build
-            Folder for what is compiled.
+            Folder for compiled files.
         refine
-            The program that learns on, not the one that finds.
+            Build the refinement program instead of the detection program.
 
         Raises
         ------
         ToolError
-            If it does not compile.
+            If compilation fails.
         """
         harness_c, program = build / "harness.c", build / "program"
         harness_c.write_text(harness(network), encoding="utf-8")
@@ -87,13 +88,13 @@ class Target:
 
     @property
     def skipped(self) -> str:
-        """Why it cannot be tried on this machine; empty: it can."""
+        """Reason why it cannot run on this machine; empty if it can."""
         needed = [self.builds[0].compiler]
         return missing(*needed, *([EMULATOR] if self.builds[0].emulated else []))
 
 
 def targets() -> tuple[Target, ...]:
-    """Every target."""
+    """Return every target."""
     hosts = tuple(
         Target(
             name,
@@ -104,7 +105,7 @@ def targets() -> tuple[Target, ...]:
         )
         for name in ("gcc", "clang")
     )
-    # gcc brings its sanitizers along; clang's are a package of their own.
+    # gcc includes its sanitizers; those of clang are a separate package.
     checker = "clang" if missing("gcc") and not missing("clang") else "gcc"
     label = f"{checker} address, undefined"
     return (

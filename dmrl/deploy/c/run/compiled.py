@@ -1,4 +1,4 @@
-"""The C of a network as a shared library: what ``predict --backend c`` computes with."""
+"""C of a network as a shared library, for ``predict --backend c``."""
 
 import ctypes
 import platform
@@ -17,28 +17,28 @@ from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError
 
 FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
-# Rows are short: vectors of 512 bits would spend their time on what is left over.
+# Rows are short: 512-bit vectors would spend their time on remainders.
 PC_FLAGS = ("-march=native", "-mprefer-vector-width=256")
 
 
 class Compiled:
-    """A network, compiled for this machine. Not for several threads: the C holds one state.
+    """A network, compiled for this machine. Not thread-safe: the C has one state.
 
     Parameters
     ----------
     network
-        What the C computes.
+        Network of the C.
     folder
-        An export folder, whose C is used. None: the C is written anew.
+        Export folder with the C. None: the C is generated.
     compiler
-        Program that compiles it. None: the first that is found.
+        Compiler program. None: the first one found.
 
     Raises
     ------
     ToolError
-        If there is no C compiler, or the C does not compile.
+        If there is no C compiler, or compilation fails.
     ModelError
-        If the folder has no C, or the C cannot carry the network.
+        If the folder has no C, or the C does not support the network.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Compiled:
         self._run = ctypes.CDLL(str(library)).harness_run
 
     def answer(self, image: NDArray[np.uint8], most: int = MOST) -> Answer:
-        """Grids and detections of a (height, width, channels) image as the network takes it."""
+        """Return grids and detections of a (height, width, channels) image."""
         network = self.network
         assert image.shape == (network.height_px, network.width_px, network.channels)
         pixels = np.ascontiguousarray(image, np.uint8)
@@ -76,12 +76,12 @@ class Compiled:
         return Answer(named, detections_of(found[:count]), 0)
 
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
-        """Every head's grid, as ``reference.run`` gives it."""
+        """Return every head's grid, as `run_network` of ``reference`` does."""
         return self.answer(image).grids
 
 
 def require_c(network: IntegerNetwork, folder: Path) -> None:
-    """Nothing, if a folder holds the C of a network.
+    """Raise ModelError unless a folder contains the C of a network.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The C of a network on a 32-bit RISC-V, in an emulator: ``predict --backend riscv32``."""
+"""C of a network on a 32-bit RISC-V in an emulator, for ``predict --backend riscv32``."""
 
 import shutil
 import tempfile
@@ -20,21 +20,23 @@ RISCV32 = "riscv32"
 
 
 class Emulated:
-    """A network, compiled for rv32imc. An image takes seconds: the chip's words, not its speed.
+    """A network, compiled for rv32imc and emulated. An image takes seconds.
+
+    Output is that of the chip; speed is not.
 
     Parameters
     ----------
     network
-        What the C computes.
+        Network of the C.
     folder
-        An export folder, whose C is used. None: the C is written anew.
+        Export folder with the C. None: the C is generated.
 
     Raises
     ------
     ToolError
-        If the compiler or the emulator is missing, or the C does not compile.
+        If the compiler or the emulator is missing, or compilation fails.
     ModelError
-        If the folder has no C, or the C cannot carry the network.
+        If the folder has no C, or the C does not support the network.
     """
 
     def __init__(self, network: IntegerNetwork, folder: Path | None = None) -> None:
@@ -53,9 +55,9 @@ class Emulated:
         self._program = first.program(network, folder, build)
 
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
-        """Every head's grid, as ``reference.run`` gives it."""
+        """Return every head's grid, as `run_network` of ``reference`` does."""
         said = run(self._program, self._what, data=np.ascontiguousarray(image).tobytes())
         found = answers(self.network, said)
         if len(found) != 1:
-            raise ToolError(f"{self._what}: {len(found)} answers to an image. Export it again")
+            raise ToolError(f"{self._what}: {len(found)} results for one image. Export it again")
         return found[0].grids

@@ -1,4 +1,4 @@
-"""What the C costs on a 32-bit RISC-V: bytes, instructions, and an estimate of the rate."""
+"""Cost of the C on a 32-bit RISC-V: bytes, instructions, and an estimated frame rate."""
 
 import re
 import tempfile
@@ -24,22 +24,22 @@ from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError, ToolError
 
 CLUSTER_HZ = 175e6
-"""Clock of the GAP8's cluster of eight cores."""
+"""Clock of the GAP8's cluster of eight cores, Hz."""
 KERNEL_MACS = 4.1
-"""Multiply-accumulates a cycle of hand-written 8-bit kernels on eight cores, over a whole network
-of this size; the peak of PULP-NN, in one large layer, is 15.5."""
+"""Multiply-accumulates per cycle of hand-written 8-bit kernels on eight cores, over a whole network
+of this size. PULP-NN reaches 15.5 in one large layer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What one image costs on rv32imc at -O3.
+    """Cost on rv32imc at -O3.
 
     Parameters
     ----------
     code_bytes, constant_bytes
-        Of the object.
+        Bytes of the object file.
     instructions
-        Executed for one image; None: they could not be counted.
+        Instructions executed per image; None: not counted.
     """
 
     code_bytes: int
@@ -48,12 +48,12 @@ class Cost:
 
 
 def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cost | None:
-    """Cost of the C of an export folder; None without the cross compiler.
+    """Measure the cost of the C of an export folder; None without the cross compiler.
 
     Raises
     ------
     ToolError
-        If the C does not compile, or the emulator fails.
+        If compilation or the emulator fails.
     """
     if missing(RISCV):
         return None
@@ -67,16 +67,16 @@ def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cos
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """What the C of an export keeps between rows.
+    """Memory that the C of an export keeps between rows.
 
     Parameters
     ----------
     state_bytes
-        Of RAM; of the near one of two memories.
+        Bytes of RAM, of the near one if there are two memories.
     far_bytes
-        Of the far one; 0: there is none.
+        Bytes of the far memory; 0: none.
     traffic_bytes
-        That an image copies between the two.
+        Bytes copied between the two per image.
     """
 
     state_bytes: int
@@ -85,17 +85,17 @@ class Memory:
 
     @property
     def fits_l1(self) -> bool:
-        """Whether the state fits a GAP8's L1, the cores' stacks beside it."""
+        """Whether the state fits a GAP8's L1 beside the stacks of the cores."""
         return self.state_bytes <= L1_FOR_STATE
 
 
 def memory_of(network: IntegerNetwork, folder: Path) -> Memory:
-    """What the header of an export folder states; compilers hold it to the sizes.
+    """Read the sizes from the header of an export folder; the C checks them at compile time.
 
     Raises
     ------
     ModelError
-        If it states none.
+        If the header has none.
     """
     header = folder / f"{c_name(network)}.h"
     text = header.read_text(encoding="utf-8", errors="replace")
@@ -107,7 +107,7 @@ def memory_of(network: IntegerNetwork, folder: Path) -> Memory:
 
 
 def _sizes(network: IntegerNetwork, folder: Path, build: Path) -> tuple[int, int]:
-    """Bytes of code and of constants of the object."""
+    """Compile the object; return its bytes of code and of constants."""
     name = c_name(network)
     target = build / f"{name}.o"
     flags = ("-std=c99", "-O3", *RISCV_FLAGS, f"-D{name.upper()}_BAYER=0")
@@ -122,10 +122,10 @@ def _sizes(network: IntegerNetwork, folder: Path, build: Path) -> tuple[int, int
 def _instructions(
     network: IntegerNetwork, folder: Path, build: Path, image: NDArray[np.uint8]
 ) -> int | None:
-    """Instructions of one image: what two images take more than one."""
+    """Count the instructions per image: the difference between two images and one."""
     plugin, source = build / "count.so", build / "count.c"
     source.write_text(fill("count.c"), encoding="utf-8")
-    # Version 1 of the plugin interface until QEMU 9, which no longer takes it.
+    # QEMU 9 no longer accepts version 1 of the plugin interface.
     version = 1 if emulator_version() < 9 else 2
     flags = ("-O2", "-shared", "-fPIC", f"-DPLUGIN_VERSION={version}")
     harness = ("-O3", *RISCV_FLAGS, "-DHARNESS_COUNT")
@@ -146,16 +146,16 @@ def _instructions(
 
 
 def rates(network: IntegerNetwork, found: Cost | None, kept: Memory) -> list[tuple[float, str]]:
-    """Estimated images a second on a GAP8, each with what it assumes.
+    """Estimate images per second on a GAP8; each estimate comes with its assumptions.
 
     Parameters
     ----------
     network
         The network.
     found
-        Its cost, if known.
+        Its cost, if measured.
     kept
-        What the C keeps.
+        Its memory.
     """
     out = []
     memory = "no waiting for memory"

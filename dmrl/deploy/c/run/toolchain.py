@@ -1,4 +1,4 @@
-"""Compilers and the emulator: found on the machine, run, their failures made readable."""
+"""Compilers and emulator: found on the machine and run, with readable errors."""
 
 import re
 import shutil
@@ -11,25 +11,26 @@ from dmrl.errors import ToolError
 RISCV = "riscv64-unknown-elf-gcc"
 EMULATOR = "qemu-riscv32"
 HOST_COMPILERS = ("clang", "cc", "gcc")
-"""In the order of how fast the C is that they make."""
+"""C compilers of this machine, in order of the speed of the compiled C."""
 PACKAGES = {
     "gcc": "gcc",
     "clang": "clang",
     RISCV: "gcc-riscv64-unknown-elf",
     EMULATOR: "qemu-user",
 }
-"""Debian packages of the programs that are looked for."""
+"""Debian packages of the programs."""
 LONGEST_S = 3600.0
+"""Timeout of a program, seconds."""
 
 
 def missing(*programs: str) -> str:
-    """Which of these programs is absent, and how to get it; empty: none is."""
+    """Return which of these programs is missing, and how to install it; empty: none."""
     absent = [p for p in programs if shutil.which(p) is None]
     return f"no {absent[0]}. Try: apt-get install {PACKAGES[absent[0]]}" if absent else ""
 
 
 def host_compiler() -> str:
-    """A C compiler for this machine.
+    """Return a C compiler for this machine.
 
     Raises
     ------
@@ -43,16 +44,16 @@ def host_compiler() -> str:
 
 
 def run(command: Sequence[str | Path], what: str, *, data: bytes = b"") -> bytes:
-    """Standard output of a program that ends well.
+    """Run a program and return its standard output.
 
     Parameters
     ----------
     command
-        The program and its arguments.
+        Program and arguments.
     what
-        What it does, for the error.
+        Purpose, for the error.
     data
-        Its standard input.
+        Standard input.
 
     Raises
     ------
@@ -63,7 +64,7 @@ def run(command: Sequence[str | Path], what: str, *, data: bytes = b"") -> bytes
 
 
 def run_both(command: Sequence[str | Path], what: str, *, data: bytes = b"") -> tuple[bytes, str]:
-    """Standard output and standard error of a program that ends well; see ``run``."""
+    """Run a program and return standard output and standard error; see `run_program`."""
     try:
         done = subprocess.run(
             [str(word) for word in command],
@@ -83,22 +84,22 @@ def run_both(command: Sequence[str | Path], what: str, *, data: bytes = b"") -> 
 
 
 def _telling(errors: str, status: int) -> str:
-    """The line of a program's errors that says most."""
+    """Return the most informative line of a program's errors."""
     lines = [line.strip() for line in errors.splitlines() if line.strip()]
     telling = [line for line in lines if re.search(r"error|ERROR|undefined", line)]
     return (telling or lines or [f"exit status {status}"])[0]
 
 
 def emulator_version() -> int:
-    """Major version of the emulator.
+    """Return the major version of the emulator.
 
     Raises
     ------
     ToolError
-        If it does not say one.
+        If it prints none.
     """
     said = run((EMULATOR, "--version"), "the emulator's version").decode(errors="replace")
     found = re.search(r"version (\d+)", said)
     if not found:
-        raise ToolError(f"{EMULATOR} --version says no version. Try: apt-get install qemu-user")
+        raise ToolError(f"{EMULATOR} --version prints no version. Try: apt-get install qemu-user")
     return int(found[1])

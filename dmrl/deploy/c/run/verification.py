@@ -1,4 +1,4 @@
-"""Whether the C of an export computes what the reference does, bit for bit, on every target."""
+"""Verification: compares the C of an export with the reference, bit for bit, on every target."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -22,25 +22,25 @@ from dmrl.errors import ToolError
 
 Image = NDArray[np.uint8]
 LEARNT_IMAGES, LEARNING_RATE = 5, 3277
-"""Images that a build learns on, and how fast: 0.05."""
+"""Images and learning rate (0.05 in fixed point) of the refinement check."""
 BAYER_IMAGES = 4
-"""Images that a build for raw mosaics is tried on: it differs in the first rows of code alone."""
+"""Images for builds with raw mosaics: only the input stage of their code differs."""
 
 
 @dataclass(frozen=True, slots=True)
 class BuildResult:
-    """What one build gave.
+    """Result of one build.
 
     Parameters
     ----------
     label
         The compiler's settings.
     images
-        It was tried on.
+        Number of images.
     mismatches
         Images in which any grid or detection differs from the reference.
     stack_bytes
-        Largest stack it used; 0 where not measured.
+        Largest stack used; 0 where not measured.
     """
 
     label: str
@@ -51,18 +51,18 @@ class BuildResult:
 
 @dataclass(frozen=True, slots=True)
 class TargetResult:
-    """What a target gave.
+    """Result of a target.
 
     Parameters
     ----------
     target
-        Its name.
+        Name of the target.
     builds
-        That were tried.
+        Results of its builds.
     skipped
-        Why it was not tried; empty: it was.
+        Reason why it was not tried; empty: it was.
     error
-        What went wrong; empty: nothing.
+        Error; empty: none.
     """
 
     target: str
@@ -77,13 +77,13 @@ class TargetResult:
 
     @property
     def proved(self) -> bool:
-        """Whether it was tried and everything is as the reference says."""
+        """Whether it was tried and everything matches the reference."""
         return not (self.skipped or self.error or self.mismatches)
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """Images as the network takes them, raw mosaics of some, and what must come of both."""
+    """Images in the network's format, raw mosaics of some, and the expected results of both."""
 
     images: Sequence[Image]
     raws: Sequence[Image]
@@ -92,7 +92,7 @@ class Expected:
 
 
 def expected(network: IntegerNetwork, images: Sequence[Image]) -> Expected:
-    """What the reference says of (height, width, channels) images as the network takes them."""
+    """Compute the reference results of (height, width, channels) images."""
     raws = [mosaic(image) for image in images[:BAYER_IMAGES]]
     seen = [demosaic(raw, channels=network.channels) for raw in raws]
     return Expected(
@@ -113,20 +113,20 @@ def prove(
     *,
     on_build: Callable[[str], None] = lambda _: None,
 ) -> TargetResult:
-    """Try every build of a target on every image.
+    """Verify every build of a target on every image.
 
     Parameters
     ----------
     network
-        What the C of the export should compute.
+        Network of the C.
     folder
         The export folder.
     target
-        What to try.
+        The target.
     wanted
-        Images and what must come of them.
+        Images and their expected results.
     on_build
-        Called with what is tried next.
+        Called with the name of the next build.
     """
     result = TargetResult(target.name, skipped=target.skipped)
     if result.skipped:
@@ -165,14 +165,14 @@ def _try(network: IntegerNetwork, folder: Path, build: Build, wanted: Expected) 
 
 
 def learns(network: IntegerNetwork, folder: Path) -> bool:
-    """Whether an export folder has the C that learns on."""
+    """Return whether an export folder has the C for refinement."""
     return (folder / f"{c_name(network)}_refine.c").is_file()
 
 
 def _try_learning(
     network: IntegerNetwork, folder: Path, build: Build, images: Sequence[Image]
 ) -> BuildResult:
-    """Learn on image after image: every weight after every step."""
+    """Refine on image after image; compare every weight after every step."""
     few = images[:LEARNT_IMAGES]
     steps = [(*_made_up(network, k), LEARNING_RATE) for k in range(len(few))]
     pairs = zip(few, steps, strict=True)
@@ -191,7 +191,7 @@ def _try_learning(
 
 
 def _made_up(network: IntegerNetwork, number: int) -> Seen:
-    """Somebody somewhere in an image; in every third nobody."""
+    """Return a synthetic label: a robot at some position, or none in every third image."""
     if number % 3 == 2:
         return Seen(0, 0, 0)
     u_px, v_px = (37 + 61 * number) % network.width_px, (23 + 41 * number) % network.height_px
@@ -199,7 +199,7 @@ def _made_up(network: IntegerNetwork, number: int) -> Seen:
 
 
 def same(a: Answer, b: Answer) -> bool:
-    """Whether two answers agree in every grid and every detection."""
+    """Return whether two results agree in every grid and every detection."""
     return a.detections == b.detections and all(
         np.array_equal(a.grids[head], b.grids[head]) for head in b.grids
     )

@@ -1,4 +1,4 @@
-/* One output row of a sum: (a * first + b * second + 2^(shift - 1)) >> shift. */
+/* Computes one output row of a sum: (a * first + b * second + 2^(shift - 1)) >> shift. */
 INLINE void add_$suffixes(const uint8_t *const *in, uint8_t *out, int values, int32_t first,
                       int32_t second, int shift, int low, int high)
 {

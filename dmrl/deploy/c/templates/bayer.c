@@ -1,6 +1,6 @@
 #if ${PREFIX}_BAYER
-/* Makes image row `row` of the mosaic rows around it. What a pixel did not measure is the mean of
- * its two or four nearest neighbours that did, halves going up; the border is mirrored. */
+/* Demosaics image row `row` from the mosaic rows around it. A missing colour is the mean of the two
+ * or four nearest neighbours that measured it, halves rounded up; the border is mirrored. */
 static void demosaic(const ${prefix}_t *net, int row, uint8_t *out)
 {
     const int width = ${PREFIX}_WIDTH, height = ${PREFIX}_HEIGHT;

@@ -1,6 +1,6 @@
-/* One output row of a convolution, with a shortcut that is added or without. Blocks of four channels and
- * four pixels; the last block of a row, or of the channels, begins where it ends with them, and
- * makes some values twice. */
+/* Computes one output row of a convolution, with an optional shortcut, in blocks of four channels
+ * and four pixels. The last block of a row, or of the channels, is moved back to end with them, so
+ * some values are computed twice. */
 INLINE void convolve_$suffixes(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
                         const scale_t *scales, const uint8_t *shortcut, const int32_t *gains,
                         int adds, int cols, int taps, int run, int step, int outs, int low,
@@ -28,7 +28,7 @@ INLINE void convolve_$suffixes(const uint8_t *const *in, uint8_t *out, const int
         const int32_t *gain = adds ? gains + o : 0;
         for (int after = 0; after < cols; after += 4) {
             const int x = smallest(after, cols - 4);
-            int32_t sum[16]; /* begun with what is added, while registers are free */
+            int32_t sum[16]; /* bias and shortcut first, while registers are free */
             for (int k = 0; k < 16; k++)
                 sum[k] = scale[k % 4].bias;
             if (adds) {
@@ -46,7 +46,7 @@ INLINE void convolve_$suffixes(const uint8_t *const *in, uint8_t *out, const int
             const int32_t m[4] = {scale[0].multiplier, scale[1].multiplier, scale[2].multiplier,
                                   scale[3].multiplier};
             int32_t most = high;
-            AS_IT_IS(most); /* once a block, not once a value */
+            AS_IT_IS(most); /* load once per block, not per value */
             for (int k = 0; k < 16; k++)
                 store(&place[k / 4 * outs + k % 4], sum[k], m[k % 4], shift, low, most);
         }

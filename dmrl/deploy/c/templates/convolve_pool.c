@@ -1,5 +1,5 @@
-/* One output row of a convolution and a 2x2 max-pool. The largest sum gives the largest value,
- * so that only it is scaled. The upper row reads in[0 ... taps - 1], the lower one the next. */
+/* Computes one output row of a convolution and a 2x2 max-pool. The largest sum has the largest value,
+ * so only that sum is scaled. The upper row reads in[0 ... taps - 1], the lower row the next ones. */
 INLINE void convolve_pool_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
                              const scale_t *scales, int cols, int taps, int run, int step,
                              int outs, int low, int high, int shift)

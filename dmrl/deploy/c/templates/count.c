@@ -1,6 +1,6 @@
-/* Plugin for QEMU's user mode: counts the instructions that a program executes and prints the
- * number on standard error at its end. The few declarations that it needs of QEMU's plugin
- * interface, versions 1 to 4, stand here: Debian packages no header of it. */
+/* Plugin for QEMU's user mode: counts the executed instructions of a program and prints the number
+ * on standard error at exit. The required declarations of QEMU's plugin interface, versions 1 to 4,
+ * are repeated here, since Debian does not package its header. */
 #include <stddef.h>
 #include <stdint.h>
 #include <stdio.h>

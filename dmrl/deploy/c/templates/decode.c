@@ -12,7 +12,7 @@ $meanings    default: return 0;
     }
 }
 
-/* Confidence in a cell, in steps; below every cell outside the grid. */
+/* Returns the confidence of a cell, in steps; outside the grid, a value below all others. */
 static int confidence_at(const ${prefix}_t *net, int row, int col)
 {
     if (row < 0 || row >= ${PREFIX}_ROWS || col < 0 || col >= ${PREFIX}_COLS)
@@ -20,7 +20,8 @@ static int confidence_at(const ${prefix}_t *net, int row, int col)
     return ${prefix}_output(net, ${PREFIX}_CONFIDENCE, row, col);
 }
 
-/* Whether a cell exceeds those before it in reading order, and none after it exceeds the cell. */
+/* Returns whether a cell exceeds its neighbours before it in raster order, and none after it exceeds
+ * the cell. */
 static int is_peak(const ${prefix}_t *net, int row, int col, int confidence)
 {
     for (int k = 0; k < 4; k++)
@@ -32,7 +33,7 @@ static int is_peak(const ${prefix}_t *net, int row, int col, int confidence)
     return 1;
 }
 
-/* Field by field: compilers may call memcpy for a whole structure. */
+/* Copies field by field: compilers may call memcpy for a whole structure. */
 static void put(${prefix}_detection_t *to, const ${prefix}_detection_t *from)
 {
     to->u_q4 = from->u_q4;
@@ -66,7 +67,7 @@ int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int m
             else if (most < 1 || found[most - 1].confidence_step >= confidence)
                 continue;
             detect_cell(net, row, col, &found[count - 1]);
-            /* Up, past all that are less confident. */
+            /* Insertion sort: move it before all less confident ones. */
             for (int k = count - 1; k > 0 && found[k - 1].confidence_step < confidence; k--) {
                 ${prefix}_detection_t weaker;
                 put(&weaker, &found[k - 1]);

@@ -1,5 +1,5 @@
-/* Sum of products of one output channel at one pixel: `taps` runs of `run` values side by side,
- * the one of tap t starting at in[t] + at. */
+/* Returns the sum of products of one output channel at one pixel: `taps` runs of `run` adjacent
+ * values; the run of tap t starts at in[t] + at. */
 INLINE int32_t dot_$suffix(int32_t sum, const uint8_t *const *in, const int8_t *weights, int taps,
                       int run, int at)
 {
@@ -12,7 +12,7 @@ INLINE int32_t dot_$suffix(int32_t sum, const uint8_t *const *in, const int8_t *
     return sum;
 }
 
-/* The products of value i of a run: four output channels, `filter` weights apart, at two pixels. */
+/* Products of value i of a run: four output channels, `filter` weights apart, at two pixels. */
 #define PAIR_$suffix(i, first, second, a, b)                                   \
     {                                                                     \
         const int32_t w0 = w[i], w1 = w[(i) + filter];                    \
@@ -24,8 +24,8 @@ INLINE int32_t dot_$suffix(int32_t sum, const uint8_t *const *in, const int8_t *
     }
 
 #ifdef SMALL_CORE
-/* At all four pixels: sixteen products for eight loads. Sixteen sums, what is loaded and the
- * pointers fit the registers of a 32-bit RISC-V. */
+/* The same at four pixels: sixteen products for eight loads. Sixteen sums, the loaded values and the
+ * pointers fit into the registers of a 32-bit RISC-V. */
 #define FOUR_$suffix(i)                                                        \
     {                                                                     \
         PAIR_$suffix(i, x[i], x[(i) + step], a, b)                             \
@@ -37,8 +37,8 @@ INLINE int32_t dot_$suffix(int32_t sum, const uint8_t *const *in, const int8_t *
     FOUR_$suffix(i) FOUR_$suffix((i) + 1) FOUR_$suffix((i) + 2) FOUR_$suffix((i) + 3)         \
     FOUR_$suffix((i) + 4) FOUR_$suffix((i) + 5) FOUR_$suffix((i) + 6) FOUR_$suffix((i) + 7)
 
-/* Adds to the sums of four output channels at four pixels: four side by side, `step` values apart,
- * the first at in[t] + at; or two of each of two rows, where a 2x2 max-pool follows. */
+/* Adds the products to the sums of four output channels at four pixels. These are adjacent, `step`
+ * values apart, the first at in[t] + at; or 2x2 pixels of two rows, if a max-pool follows. */
 INLINE void block_$suffix(int32_t sum[16], const uint8_t *const *in, const int8_t *weights,
                      int taps, int run, int at, int step, int pooled)
 {
@@ -70,7 +70,7 @@ INLINE void block_$suffix(int32_t sum[16], const uint8_t *const *in, const int8_
     sum[12] = d0, sum[13] = d1, sum[14] = d2, sum[15] = d3;
 }
 #else
-/* Large cores take several values of a run at once, and two pixels fill their registers. */
+/* Large cores vectorise over the values of a run, and two pixels fill their registers. */
 INLINE void pair_$suffix(int32_t sum[8], const uint8_t *const *in,
                     const int8_t *weights, int taps, int run, int at, int step)
 {

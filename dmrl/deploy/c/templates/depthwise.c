@@ -1,5 +1,5 @@
-/* One output row of a depthwise 3x3 convolution: every channel is convolved alone, its nine
- * weights held while the row passes. `across` values lie between two taps of a row. */
+/* Computes one output row of a depthwise 3x3 convolution, channel by channel, with the nine weights
+ * of a channel in registers. Two taps of a row are `across` values apart. */
 INLINE void depthwise_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
                          const scale_t *scales, int cols, int across, int step, int channels,
                          int low, int high, int shift)

@@ -1,9 +1,9 @@
-/* The sum of nine products: three columns of three rows. */
+/* Sum of nine products: three columns of three rows. */
 #define NINE(a, b, c)                                                             \
     (bias + (a##0 * w0 + b##0 * w1 + c##0 * w2) + (a##1 * w3 + b##1 * w4 + c##1 * w5) \
      + (a##2 * w6 + b##2 * w7 + c##2 * w8))
 
-/* Three values from one place on, and the columns that follow: what is loaded takes turns. */
+/* Computes three values; the column registers a, b and c rotate, so each column is loaded once. */
 #define THREE(at)                                                                        \
     c0 = p[((at) + 1) * step], c1 = q[((at) + 1) * step], c2 = r[((at) + 1) * step];     \
     store(to + (at) * step, NINE(a, b, c), multiplier, shift, low, high);                \
@@ -12,10 +12,9 @@
     b0 = p[((at) + 3) * step], b1 = q[((at) + 3) * step], b2 = r[((at) + 3) * step];     \
     store(to + ((at) + 2) * step, NINE(c, a, b), multiplier, shift, low, high);
 
-/* One output row of a depthwise 3x3 convolution of stride 1, with as much padding as dilation.
- * Every channel is convolved alone, its nine weights held while the row passes, and so are two of
- * the three columns: of columns `dilation` apart each is loaded once. What lies left and right
- * of the row reads as `pad`. */
+/* Computes one output row of a depthwise 3x3 convolution with stride 1 and padding equal to the
+ * dilation, channel by channel. The nine weights and two of the three columns stay in registers, so
+ * each column is loaded once. Positions left and right of the row read as `pad`. */
 INLINE void depthwise_along_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
                                const scale_t *scales, int cols, int channels, int dilation,
                                int pad, int low, int high, int shift)

@@ -1,9 +1,9 @@
-/* Runs the network on every image that comes in on standard input, for `dmrl verify` and others;
- * or, as a shared library, on one at a time.
+/* Runs the network on every image from standard input, for `dmrl verify` and others; or, as a shared
+ * library, on one image per call.
  *
- * Out, for each image, in little endian: the grid of every head, int8, row by row; int32 stack
- * bytes used (0 where not measured); int32 count of detections; that many of them, as in the
- * header. On a bare RISC-V it makes its own system calls, so that it needs no library there. */
+ * Output for each image, little endian: the grid of every head, int8, row by row; int32 stack bytes
+ * used (0 where not measured); int32 number of detections; the detections, as in the header. On a
+ * bare RISC-V it makes its own system calls, so it needs no library. */
 #include "$prefix.h"
 
 static ${prefix}_t net;
@@ -15,8 +15,8 @@ static ${prefix}_far_t away;
 #endif
 
 #if defined(HARNESS_GUARD) && defined(${PREFIX}_FAR_BYTES)
-/* Under the address sanitizer nothing but copies may touch the far state, and they copy as many
- * bytes as the header states. */
+/* Under the address sanitizer, only copies may access the far state, and they must copy exactly the
+ * number of bytes in the header. */
 void __asan_poison_memory_region(const volatile void *place, size_t size);
 void __asan_unpoison_memory_region(const volatile void *place, size_t size);
 void *memmove(void *to, const void *from, size_t bytes);
@@ -49,7 +49,8 @@ static int network(const uint8_t *image, ${prefix}_detection_t *found, int most)
 }
 #endif
 
-/* Runs one image; `grids` takes every head's grid, `found` as many detections as it returns. */
+/* Runs one image; writes every head's grid to `grids` and the detections to `found`; returns their
+ * number. */
 int harness_run(const uint8_t *image, int8_t *grids, ${prefix}_detection_t *found, int most)
 {
     const int count = network(image, found, most);
@@ -109,7 +110,7 @@ static void give(const void *data, size_t count)
 #if defined(__riscv)
 enum { PAINT = 0x5a, PAINTED = 16384 };
 
-/* Paints the stack below, and afterwards counts the bytes that have lost the paint. */
+/* Measures the stack: fills it with a pattern, and later counts the bytes that have changed. */
 static __attribute__((noinline)) void paint(void)
 {
     volatile uint8_t space[PAINTED];
@@ -137,7 +138,7 @@ static int32_t unpainted(void)
 #endif
 
 #if defined(HARNESS_COUNT)
-/* Nothing but the network, for the number of its instructions. */
+/* Runs only the network, to count its instructions. */
 int main(void)
 {
     while (take(image, sizeof image))
@@ -150,7 +151,7 @@ int main(void)
 static ${prefix}_head_t head;
 static int32_t seen[4]; /* u, v, depth, rate */
 
-/* An image and who is in it, again and again; answers with the learned weights. */
+/* Reads pairs of image and label; writes the refined weights after each. */
 int main(void)
 {
     ${prefix}_head_init(&head);

@@ -3,12 +3,12 @@
  * Written by dmrl $version (`dmrl export`).
  *
  *   state      $state_bytes bytes of RAM (${PREFIX}_STATE_BYTES), yours: static ${prefix}_t net;
- *   stack      at most $stack_bytes bytes (${PREFIX}_STACK_BYTES), without yours and without -O0
+ *   stack      at most $stack_bytes bytes (${PREFIX}_STACK_BYTES), in optimised builds
  *   constants  $constant_bytes bytes of weights and tables
- *   work       $macs multiply-accumulates an image
+ *   work       $macs multiply-accumulates per image
  *
  * No library, no floating point, no heap, no recursion, no global variables: two states may run
- * side by side. Integers only; every machine and compiler gives the same result.
+ * concurrently. Integers only; every machine and compiler gives the same result.
  */
 #ifndef ${PREFIX}_H
 #define ${PREFIX}_H
@@ -23,9 +23,9 @@
 #define ${PREFIX}_ROWS $rows
 #define ${PREFIX}_STRIDE $stride
 
-/* 1: images are the camera's raw colour mosaic, one byte a pixel, its red pixels in the rows and
- * columns whose number modulo 2 is RED_ROW and RED_COL (both 0: RGGB, as on the AI-deck).
- * 0: images are as the network takes them, ${PREFIX}_CHANNELS bytes a pixel. */
+/* 1: images are raw Bayer mosaics, one byte per pixel, with red pixels in the rows and columns whose
+ * index modulo 2 is RED_ROW and RED_COL (both 0: RGGB, as on the AI-deck).
+ * 0: images have the network's format, ${PREFIX}_CHANNELS bytes per pixel. */
 #ifndef ${PREFIX}_BAYER
 #define ${PREFIX}_BAYER $bayer
 #endif
@@ -38,7 +38,7 @@
 #define ${PREFIX}_ROW_BYTES (${PREFIX}_WIDTH * (${PREFIX}_BAYER ? 1 : ${PREFIX}_CHANNELS))
 #define ${PREFIX}_IMAGE_BYTES (${PREFIX}_HEIGHT * ${PREFIX}_ROW_BYTES)
 
-/* Confidence, in steps of the network's output, from which a detection is reported: $threshold.
+/* Confidence threshold of detections, in steps of the network's output: $threshold.
  * ${PREFIX}_THRESHOLD_STEP 128 reports none, -128 every peak. */
 #ifndef ${PREFIX}_THRESHOLD_STEP
 #define ${PREFIX}_THRESHOLD_STEP ($threshold_step)
@@ -47,38 +47,38 @@
 #define ${PREFIX}_STATE_BYTES ($state_bytes + (${PREFIX}_BAYER ? $bayer_bytes : 0))
 #define ${PREFIX}_STACK_BYTES $stack_bytes
 
-/* What the network gives for every cell. */
+/* Outputs of the network in every cell. */
 enum { $heads, ${PREFIX}_HEADS };
 
 typedef struct {
     int32_t u_q4, v_q4;      /* 1/16 px from the image's left and top edge */
     uint16_t depth_mm;       /* along the optical axis */
     uint16_t confidence;     /* 65535 is 1 */
-    int8_t confidence_step;  /* the same as the network gives it; what peaks are compared by */
+    int8_t confidence_step;  /* the same in steps of the network's output; used for comparisons */
 } ${prefix}_detection_t;
 
-$far/* Rings of rows between the layers; yours to hold, not to touch. */
+$far/* Ring buffers between the layers. You allocate it; do not access its members. */
 typedef struct {
 $members} ${prefix}_t;
 
-/* Makes ready for an image. Call it before the first row of every image. */
+/* Prepares the state for an image. Call it before the first row of every image. */
 void ${prefix}_init($params);
 
-/* Takes the next row, ${PREFIX}_ROW_BYTES bytes, and computes all that it allows; `row` may be
- * overwritten afterwards. Returns 1 once the image is whole; rows beyond that are ignored. */
+/* Reads the next row, ${PREFIX}_ROW_BYTES bytes, and computes all output rows that it completes.
+ * `row` may be overwritten afterwards. Returns 1 after the last row; further rows are ignored. */
 int ${prefix}_row($params, const uint8_t *row);
 
-/* After the last row: writes at most `most` detections, best first, and returns how many. */
+/* After the last row: writes at most `most` detections, best first; returns their number. */
 int ${prefix}_detect(const ${prefix}_t *net, ${prefix}_detection_t *found, int most);
 
-/* After the last row: the network's own output in a cell, in its steps. */
+/* After the last row: returns the network's output in a cell, in steps. */
 int8_t ${prefix}_output(const ${prefix}_t *net, int head, int row, int col);
 
-/* What a value of an output means: confidence (65535 is 1), millimetres, 1/16 px from the cell's left
+/* Converts an output to units: confidence (65535 is 1), millimetres, or 1/16 px from the cell's left
  * or top edge. */
 int32_t ${prefix}_meaning(int head, int8_t value);
 
-/* All of it for an image that lies in memory, ${PREFIX}_IMAGE_BYTES bytes from the top left. */
+/* Runs init, all rows and detect on an image of ${PREFIX}_IMAGE_BYTES bytes, from the top left. */
 int ${prefix}_run($params, const uint8_t *image, ${prefix}_detection_t *found, int most);
 
 #endif

@@ -1,7 +1,7 @@
-/* Self-test of $prefix.c: runs the vectors and compares, bit for bit. Returns 0 if all is well.
+/* Self-test of $prefix.c: runs the vectors and compares the output, bit for bit. main returns the
+ * number of failed vectors.
  *
- * Prints what it finds; with -DSILENT it needs no library, for a chip: then the value that main
- * returns is the number of vectors that failed.
+ * Prints the detections; with -DSILENT it prints nothing and needs no library, for use on a chip.
  *
  * Written by dmrl $version (`dmrl export`). */
 #include "${prefix}_vectors.h"
@@ -71,7 +71,7 @@ int main(void)
     const int count = (int)(sizeof vectors / sizeof vectors[0]);
     int failed = 0;
     for (int k = 0; k < count; k++) {
-        SAY("vector %d, %s:\n", k, vectors[k].image ? "a picture" : "noise");
+        SAY("vector %d, %s:\n", k, vectors[k].image ? "an image" : "noise");
         const int right = passes(&vectors[k]);
         SAY("  %s\n", right ? "as the reference" : "DIFFERS from the reference");
         failed += !right;

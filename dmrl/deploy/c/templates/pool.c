@@ -1,4 +1,4 @@
-/* One output row of a 2x2 max-pool. */
+/* Computes one output row of a 2x2 max-pool. */
 INLINE void pool_$suffix(const uint8_t *const *in, uint8_t *out, int cols, int channels)
 {
     for (int x = 0; x < cols; x++) {

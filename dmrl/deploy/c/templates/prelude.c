@@ -1,11 +1,11 @@
 /* $description
  *
- * Written by dmrl $version (`dmrl export`). Change the model and export again, not this file.
+ * Written by dmrl $version (`dmrl export`). Do not edit: change the model and export again.
  *
- * The image comes row by row. What stands between two layers is a ring of the newest rows, as
- * many as its readers reach over. After each image row, the deepest layer that has the rows it
- * needs makes one output row, until none has. A row is a row of pixels; the channels of a pixel
- * lie side by side. A layer's output row ends in one rounding per value (see `scaled`).
+ * The image is read row by row. Between two layers is a ring buffer of the newest rows, as many as
+ * its readers need. After each image row, the deepest layer with all its input rows computes one
+ * output row, until no layer can. A row consists of pixels, a pixel of adjacent channels. Every
+ * value of an output row is rounded once (see `scaled`).
  *
  * C99 on a machine with 8-bit bytes where >> of a negative number rounds down, as on every
  * compiler known to us. No library, no floating point, no heap, no recursion.
@@ -20,14 +20,14 @@
 #define APART static
 #endif
 
-/* The sums of a block fill the registers of a 32-bit RISC-V: nothing may be loaded ahead of its
- * turn. Compilers for large cores know better what to do. */
+/* The sums of a block fill the registers of a 32-bit RISC-V, so no load may be moved ahead. For large
+ * cores, the compiler's own schedule is better. */
 #if defined(__GNUC__) && !defined(__clang__) && defined(__riscv)
 #pragma GCC optimize("no-predictive-commoning", "no-schedule-insns", "no-tree-coalesce-vars", \
                      "no-tree-sink")
 #define SMALL_CORE
 #define IN_ORDER __asm__ volatile("" ::: "memory")
-#define AS_IT_IS(value) __asm__ volatile("" : "+r"(value)) /* to be computed, not to be reasoned about */
+#define AS_IT_IS(value) __asm__ volatile("" : "+r"(value)) /* opaque to the optimiser */
 #else
 #define IN_ORDER ((void)0)
 #define AS_IT_IS(value) ((void)0)
@@ -36,8 +36,8 @@
 typedef char shifts_round_down[(-1 >> 1) == -1 ? 1 : -1];
 typedef char state_is_as_stated[sizeof(${prefix}_t) == ${PREFIX}_STATE_BYTES ? 1 : -1];
 
-/* How the sums of one output channel become its values: they begin at the bias, which holds the
- * half step that rounds and, where values are signed, the 128 levels that keep it above zero. */
+/* Requantization of one output channel. Sums start at the bias, which includes the half step for
+ * rounding and, if values are signed, an offset of 128 levels that keeps sums positive. */
 typedef struct {
     int32_t bias, multiplier;
 } scale_t;
@@ -47,8 +47,8 @@ INLINE int32_t smallest(int32_t a, int32_t b)
     return a < b ? a : b;
 }
 
-/* Half of what a ReLU sees is negative; other values seldom need clamping, and one comparison
- * tells. */
+/* Clamps with few comparisons: half of a ReLU's inputs are negative, and few other values need
+ * clamping. */
 INLINE int32_t clamp(int32_t value, int32_t low, int32_t high)
 {
     if (low == 0 && value < 0)
@@ -58,13 +58,14 @@ INLINE int32_t clamp(int32_t value, int32_t low, int32_t high)
     return value;
 }
 
-/* What a value of a shortcut adds to a sum. */
+/* Scales a value of a shortcut to the sum. */
 INLINE int32_t gained(int32_t gain, int32_t value)
 {
     return (gain * value) >> $gain_shift;
 }
 
-/* A value of a sum, which is `low` above it. `shift` is nearly always 32: a multiplication that keeps the high word. */
+/* Requantizes a sum, whose offset is -`low`. `shift` is nearly always 32: the high word of the
+ * product. */
 INLINE uint8_t scaled(int32_t sum, int32_t multiplier, int shift, int32_t low, int32_t high)
 {
     const int64_t value = (((int64_t)sum * multiplier) >> shift) + low;
@@ -75,8 +76,8 @@ INLINE uint8_t scaled(int32_t sum, int32_t multiplier, int shift, int32_t low, i
     return (uint8_t)clamped;
 }
 
-/* Stores a value of a sum. Half of what a ReLU sees is negative and needs no multiplication, and few
- * values are too large; large cores rather compute than branch. */
+/* Requantizes a sum and stores it. Half of a ReLU's inputs are negative and need no multiplication,
+ * and few values are too large. Large cores compute faster than they branch. */
 INLINE void store(uint8_t *out, int32_t sum, int32_t multiplier, int shift, int32_t low, int32_t high)
 {
 #ifdef SMALL_CORE
@@ -99,8 +100,8 @@ INLINE void store(uint8_t *out, int32_t sum, int32_t multiplier, int shift, int3
     *out = scaled(sum, multiplier, shift, low, high);
 }
 
-/* Compilers would make these two loops calls of memset and memcpy, which not every target has:
- * hence volatile. */
+/* volatile, since compilers would otherwise replace these two loops by memset and memcpy, which not
+ * every target has. */
 static void fill(uint8_t *out, uint8_t value, size_t count)
 {
     volatile uint8_t *to = out;

@@ -6,12 +6,12 @@ enum { ONE = 4096, LARGEST = 127 * 65536, LARGEST_BIAS = 1 << 30 };
 static const int8_t weights[${PREFIX}_HEADS * ${PREFIX}_FEATURES] = {
 $weights
 };
-/* Of each head: bias and multiplier as in $prefix.c, and by what a step of gradient moves weights and
- * bias, in 1/256. */
+/* For each head: bias and multiplier as in $prefix.c, and the gains of a gradient step for weights
+ * and bias, in 1/256. */
 static const int32_t heads[${PREFIX}_HEADS][4] = {
 $heads};
 
-/* value - slope * rate * gain / 2^shift, to the nearest and within -most to most. */
+/* Returns value - slope * rate * gain / 2^shift, rounded and clipped to -most to most. */
 static int32_t moved(int32_t value, int32_t slope, int32_t rate, int32_t gain, int shift, int32_t most)
 {
     const int64_t by = ((int64_t)slope * rate * gain + ((int64_t)1 << (shift - 1))) >> shift;
@@ -56,9 +56,8 @@ void ${prefix}_head_apply(const ${prefix}_head_t *head, ${prefix}_t *net)
     }
 }
 
-/* Gradient of the loss to a head's output in a cell, times ONE: of the confidence d * |d|, d what it
- * is off by, but for the cells around the robot's, which may believe what they like; of log depth
- * and offsets the sign. */
+/* Returns the gradient of the loss by a head's output in a cell, times ONE. Confidence: d * |d| for
+ * an error d, but 0 in the cells around the robot's. Log depth and offsets: sign of the error. */
 static int32_t slope(const ${prefix}_t *net, int h, int row, int col, int32_t u_q4, int32_t v_q4,
                      int32_t depth_mm)
 {

@@ -1,4 +1,4 @@
-/* Where the next row of the image goes, behind its padding. */
+/* Returns the address of the next image row, behind its padding. */
 static uint8_t *next_row(${prefix}_t *net)
 {
     return $place;

@@ -1,7 +1,7 @@
-/* Output row r of a layer needs rows up to r * stride + last of what it reads. */
+/* Output row r of a layer requires input rows up to r * stride + last. */
 typedef struct {
     uint8_t source, other; /* both tensors of a sum; the same one twice otherwise */
-    uint8_t reader;        /* the deepest layer that reads what it makes, or itself */
+    uint8_t reader;        /* the deepest layer that reads its output, or itself */
     int16_t stride, last, rows_in, rows_out;
 } layer_t;
 
@@ -23,8 +23,8 @@ static int ready(const ${prefix}_t *net, int index)
            && net->done[layer->other] > needed;
 }
 
-/* Makes every output row that can be made: of all layers that are ready the deepest first. Those
- * below were not before a row was made; those that read the row may be now. */
+/* Computes every possible output row; of all ready layers, the deepest first. Deeper layers were not
+ * ready before a row is computed; those that read the row may be ready after it. */
 static void advance($params)
 {
     int layer = $count - 1;

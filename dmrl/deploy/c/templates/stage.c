@@ -6,7 +6,7 @@ void ${PREFIX}_COPY(void *to, const void *from, int bytes);
 #define ${PREFIX}_COPY copy
 #endif
 
-/* Where a layer works. */
+/* Returns an address in the scratch buffer. */
 INLINE uint8_t *at_stage(${prefix}_t *net, int at)
 {
     return (uint8_t *)net->stage + at;

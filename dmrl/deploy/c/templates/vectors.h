@@ -1,4 +1,4 @@
-/* Vectors of the self-test in main.c: images, and what must come of them.
+/* Vectors of the self-test in main.c: images and their expected output.
  *
  * Written by dmrl $version (`dmrl export`). */
 #include "$prefix.h"
